@@ -1,0 +1,55 @@
+"""The errors that lanenet raises for bad input.
+
+    LanenetError
+    |- ConfigError           a setting: misspelt key, wrong type, empty range
+    |- CalibrationError      a camera file, or pixels that the camera cannot see
+    |- DriveFormatError      a recorded drive: tub, frames.csv, images, video
+    |- MapFormatError        a map folder
+    |- LabelFormatError      a label set or a table of detections
+    |- CheckpointError       a checkpoint folder
+    |- TrackingLostError     the drive cannot be mapped
+    |- ModelMismatchError    a model that does not fit this camera or window
+    |- MissingExtraError     a package of an extra that is not installed
+
+A message says what was found, what was expected and where (file, key, frame).
+"""
+
+
+class LanenetError(Exception):
+    """Base of every error that is the input's fault, shown to the user as one line."""
+
+
+class ConfigError(LanenetError):
+    """A setting is unknown, of the wrong type or out of range."""
+
+
+class CalibrationError(LanenetError):
+    """A camera file cannot be used, or does not fit the images."""
+
+
+class DriveFormatError(LanenetError):
+    """A recorded drive cannot be read."""
+
+
+class MapFormatError(LanenetError):
+    """A map folder cannot be read."""
+
+
+class LabelFormatError(LanenetError):
+    """A label set or table of detections cannot be read."""
+
+
+class CheckpointError(LanenetError):
+    """A checkpoint folder cannot be read or does not fit the config."""
+
+
+class TrackingLostError(LanenetError):
+    """The drive does not determine a map."""
+
+
+class ModelMismatchError(LanenetError):
+    """A model was made for another camera, window or format."""
+
+
+class MissingExtraError(LanenetError):
+    """A command needs a package that this installation left out."""

@@ -1,0 +1,1 @@
+"""Frames, cameras, the bird's-eye grid and parabolas; NumPy only."""

@@ -1,0 +1,68 @@
+"""The label contract: six x values, their rows, their order, and the parabola through them.
+
+Rows are y = 0, 15, 30 cm ahead of the front axle. The order of the six numbers is the left line near to
+far, then the right line near to far. A line's position is the middle of its marking. A missing value is NaN.
+Three points and the parabola x = a y^2 + b y + c are one-to-one (Kozlowski et al. 2024, eq. 7-8).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+ROWS_CM: tuple[float, float, float] = (0.0, 15.0, 30.0)
+SIDES: tuple[str, str] = ("left", "right")
+POINT_NAMES: tuple[str, ...] = tuple(f"{side}_{row:.0f}_cm" for side in SIDES for row in ROWS_CM)
+N_POINTS = len(POINT_NAMES)
+
+#: x at the three rows = POINTS_FROM_PARABOLA @ (a, b, c).
+POINTS_FROM_PARABOLA: Float[np.ndarray, "3 3"] = np.array([[y * y, y, 1.0] for y in ROWS_CM])
+#: (a, b, c) = PARABOLA_FROM_POINTS @ x at the three rows.
+PARABOLA_FROM_POINTS: Float[np.ndarray, "3 3"] = np.linalg.inv(POINTS_FROM_PARABOLA)
+
+
+def parabolas_from_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 2 3"]:
+    """Return (a, b, c) of the left and the right line; NaN where one of a line's points is missing."""
+    points = np.asarray(points_cm, dtype=np.float64)
+    return points.reshape(*points.shape[:-1], 2, 3) @ PARABOLA_FROM_POINTS.T
+
+
+def points_from_parabolas(parabolas: Float[np.ndarray, "*n 2 3"]) -> Float[np.ndarray, "*n 6"]:
+    """Return the six points of two parabolas; inverse of :func:`parabolas_from_points`."""
+    points = np.asarray(parabolas, dtype=np.float64) @ POINTS_FROM_PARABOLA.T
+    return points.reshape(*points.shape[:-2], N_POINTS)
+
+
+def parabola_x_cm(parabola: Float[np.ndarray, "*n 3"], y_cm: float) -> Float[np.ndarray, "*n"]:
+    """Evaluate x = a y^2 + b y + c, [cm]."""
+    return (parabola[..., 0] * y_cm + parabola[..., 1]) * y_cm + parabola[..., 2]
+
+
+def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"]:
+    """Find x where a lane line crosses the label rows.
+
+    The line is walked in the order of its points, which is the direction of travel; of several crossings of
+    one row the first that goes upwards (the line recedes from the car) counts. NaN where no stretch does,
+    so that a line that turns away or back is not answered with another stretch of itself.
+
+    Args:
+        line_car_cm: Polyline in the direction of travel, [cm], frame car; NaN rows break it.
+
+    Returns:
+        x at y = 0, 15, 30 cm, [cm], frame car.
+    """
+    x, y = line_car_cm[:, 0], line_car_cm[:, 1]
+    result = np.full(len(ROWS_CM), np.nan)
+    for i, row in enumerate(ROWS_CM):
+        crossings = np.flatnonzero((y[:-1] <= row) & (y[1:] > row))
+        if crossings.size:
+            k = crossings[0]
+            t = (row - y[k]) / (y[k + 1] - y[k])
+            result[i] = x[k] + t * (x[k + 1] - x[k])
+    return result
+
+
+def mirror_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6"]:
+    """Mirror left and right: x changes sign and the lines swap."""
+    points = np.asarray(points_cm)
+    return -np.concatenate([points[..., 3:], points[..., :3]], axis=-1)
