@@ -237,7 +237,7 @@ def _invert_fisheye(
             step = theta - error / slope
         inside = (step >= low) & (step <= high)
         theta = np.where(inside, step, 0.5 * (low + high))
-    return np.where(radius <= _fisheye_radius(np.array(max_angle_rad), D), theta, np.nan)
+    return np.where(radius <= _fisheye_radius(np.array([max_angle_rad]), D), theta, np.nan)
 
 
 def _pinhole_coefficients(D: Float[np.ndarray, "_"]) -> tuple[float, float, float, float, float]:

@@ -29,7 +29,9 @@ from jaxtyping import Float
 
 def wrap_angle(angle_rad: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Wrap angles into (-pi, pi], [rad]."""
-    return np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2.0 * np.pi)
+    wrapped = np.pi - np.mod(np.pi - np.asarray(angle_rad, dtype=np.float64), 2.0 * np.pi)
+    # Rounding may reach the open end.
+    return np.asarray(np.where(wrapped <= -np.pi, np.pi, wrapped))
 
 
 def map_from_car(

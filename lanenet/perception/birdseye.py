@@ -32,6 +32,13 @@ class RangeSettings(Settings):
     bottom_rows: int = Field(default=0, ge=0)
 
 
+class PerceptionSettings(Settings):
+    """Everything that decides which edge points a frame gives; stored with labels and models."""
+
+    edges: EdgeSettings = EdgeSettings()
+    range: RangeSettings = RangeSettings()
+
+
 @dataclass(frozen=True)
 class RoadEdges:
     """Edge points on the road.
@@ -113,10 +120,10 @@ class RoadTable:
 class RoadEdgeExtractor:
     """Frame in, edge points on the road out; the one path for training and for driving."""
 
-    def __init__(self, camera: Camera, edges: EdgeSettings, range_settings: RangeSettings) -> None:
+    def __init__(self, camera: Camera, settings: PerceptionSettings) -> None:
         self.camera = camera
-        self.settings = edges
-        self.table = RoadTable(camera, range_settings)
+        self.settings = settings
+        self.table = RoadTable(camera, settings.range)
 
     def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> RoadEdges:
         """Find a frame's edges and move them to the road.
@@ -130,6 +137,7 @@ class RoadEdgeExtractor:
                 f"frame of {width}x{height} px, but the camera is calibrated for "
                 f"{self.camera.width}x{self.camera.height}"
             )
-        edges = self.table.lift(find_edges(frame_bgr, self.settings, self.table.keep))
+        edges = self.table.lift(find_edges(frame_bgr, self.settings.edges, self.table.keep))
         good = np.isfinite(edges.points_cm).all(axis=1) & np.isfinite(edges.normals).all(axis=1)
-        return RoadEdges(edges.points_cm[good], edges.normals[good])
+        # The precision of the label files, so that a raster made from a file and one made on the car agree.
+        return RoadEdges(edges.points_cm[good].astype(np.float32), edges.normals[good].astype(np.float32))

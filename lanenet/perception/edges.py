@@ -13,18 +13,30 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.errors import DriveFormatError
 
+_TAN_22_5 = float(np.tan(np.pi / 8.0))
+
 
 class EdgeSettings(Settings):
     """How edges are found in a frame.
 
-    ``canny`` is the paper's detector: pixels only. ``directional`` uses the same edges, moves each along its
-    gradient to the sub-pixel maximum and keeps only edges as strong as the frame's contrast warrants.
+    ``canny`` is the paper's detector: fixed thresholds, whole pixels. ``directional`` raises the thresholds
+    with the contrast of the frame, so that soft mirror images of lamps fall below them where the tape is
+    bright, and moves each edge along its gradient to the sub-pixel maximum.
+
+    Attributes:
+        method: The detector.
+        blur_px: Size of the Gauss kernel; 0 for none.
+        low: Lower threshold of the hysteresis on Sobel responses.
+        high: Upper threshold.
+        contrast_share: ``directional``: the upper threshold is at least this share of the 99th percentile of
+            the frame's Sobel responses; the lower one keeps its ratio.
     """
 
     method: Literal["canny", "directional"] = "directional"
     blur_px: Literal[0, 3, 5] = 3
     low: float = Field(default=40.0, gt=0.0)
-    high: float = Field(default=100.0, gt=0.0)
+    high: float = Field(default=80.0, gt=0.0)
+    contrast_share: float = Field(default=0.3, ge=0.0, lt=1.0)
 
 
 @dataclass(frozen=True)
@@ -64,7 +76,10 @@ def find_edges(
         gray = cv2.GaussianBlur(gray, (settings.blur_px, settings.blur_px), 0)
     dx = cv2.Sobel(gray, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(gray, cv2.CV_16S, 0, 1)
-    edges = cv2.Canny(dx, dy, settings.low, settings.high, L2gradient=True)
+    raised = 1.0
+    if settings.method == "directional":
+        raised = max(1.0, settings.contrast_share * _strong_response(dx, dy, keep) / settings.high)
+    edges = cv2.Canny(dx, dy, raised * settings.low, raised * settings.high, L2gradient=True)
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
     found = cv2.findNonZero(edges)
@@ -79,6 +94,19 @@ def find_edges(
     if settings.method == "directional":
         uv += _subpixel_offset(dx, dy, u, v, normals, strength)[:, None] * normals
     return EdgePixels(uv, normals)
+
+
+def _strong_response(dx: np.ndarray, dy: np.ndarray, keep: np.ndarray | None) -> float:
+    """99th percentile of the Sobel magnitude over the kept pixels, from every third row and column."""
+    gx, gy = dx[::3, ::3], dy[::3, ::3]
+    if keep is not None:
+        inside = keep[::3, ::3] > 0
+        gx, gy = gx[inside], gy[inside]
+    squared = gx.ravel().astype(np.float32) ** 2 + gy.ravel().astype(np.float32) ** 2
+    if squared.size == 0:
+        return 0.0
+    rank = int(0.99 * (squared.size - 1))
+    return float(np.sqrt(np.partition(squared, rank)[rank]))
 
 
 def to_gray(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
@@ -101,12 +129,12 @@ def to_gray(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
 def _subpixel_offset(
     dx: np.ndarray, dy: np.ndarray, u: np.ndarray, v: np.ndarray, normals: np.ndarray, strength: np.ndarray
 ) -> np.ndarray:
-    """Offset along the normal, within +-0.5 px, at which the gradient magnitude peaks."""
+    """Offset along the normal, within half a step to the neighbour, where the gradient magnitude peaks."""
     height, width = dx.shape
-    # The neighbour along the axis that the gradient is closest to; one pixel there is `reach` along it.
-    along_u = np.abs(normals[:, 0]) >= np.abs(normals[:, 1])
-    step_u = np.where(along_u, np.sign(normals[:, 0]), 0.0).astype(np.intp)
-    step_v = np.where(along_u, 0.0, np.sign(normals[:, 1])).astype(np.intp)
+    # The neighbour that Canny compared with: beside, above or diagonal, whichever the gradient is closest to.
+    size_u, size_v = np.abs(normals[:, 0]), np.abs(normals[:, 1])
+    step_u = (np.sign(normals[:, 0]) * (size_u > _TAN_22_5 * size_v)).astype(np.intp)
+    step_v = (np.sign(normals[:, 1]) * (size_v > _TAN_22_5 * size_u)).astype(np.intp)
 
     def magnitude(sign: int) -> np.ndarray:
         uu = np.clip(u + sign * step_u, 0, width - 1)
@@ -119,5 +147,6 @@ def _subpixel_offset(
     curvature = before - 2.0 * strength + after
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = np.where(curvature < 0.0, 0.5 * (before - after) / curvature, 0.0)
-    reach = np.maximum(np.abs(normals[:, 0]), np.abs(normals[:, 1]))
+    # That neighbour is so far along the normal.
+    reach = np.abs(step_u * normals[:, 0] + step_v * normals[:, 1])
     return np.clip(offset, -0.5, 0.5) * reach

@@ -1,0 +1,81 @@
+# The project's commands. CI and pre-commit call the same targets, so that each line stands once, here.
+
+PYTHON ?= python3
+VENV ?= .venv
+CONFIG ?= configs/small.yaml
+# More arguments for pip, for example the package index of CPU-only PyTorch wheels.
+PIP_ARGS ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt
+# Shapes and types of arguments are checked at run time in tests, and only there.
+PYTEST := $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype
+
+.PHONY: help train env test test-slow check format format-check lint types imports bench clean
+
+help:
+	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
+	@echo "make test         environment for developers, then the fast tests"
+	@echo "make test-slow    the tests that take longer than about ten seconds each"
+	@echo "make check        format, lint, types, import rules, fast tests"
+	@echo "make format       rewrite the code in the project's format"
+	@echo "make bench        time the stages that run on the car, on this machine"
+	@echo "make env          environment for developers in $(VENV)"
+	@echo "make clean        remove caches and intermediate files; keeps checkpoints/ and $(VENV)"
+
+train: $(VENV)/.stamp-train
+	$(BIN)/lanenet train $(CONFIG)
+
+env: $(VENV)/.stamp-dev
+
+test: $(VENV)/.stamp-dev
+	$(PYTEST) -m "not slow"
+
+test-slow: $(VENV)/.stamp-dev
+	$(PYTEST) -m slow
+
+check: format-check lint types imports test
+
+format: $(VENV)/.stamp-dev
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+format-check: $(VENV)/.stamp-dev
+	$(BIN)/ruff format --check
+
+lint: $(VENV)/.stamp-dev
+	$(BIN)/ruff check
+
+types: $(VENV)/.stamp-dev
+	$(BIN)/mypy
+
+imports: $(VENV)/.stamp-dev
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.stamp-train
+	mkdir -p runs
+	$(BIN)/lanenet bench --out runs/bench.json
+
+clean:
+	rm -rf runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find lanenet datagen tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A stamp is written only when pip has finished, so that an interrupted installation is taken up again.
+$(VENV)/.stamp-train: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e '.[train,viz]'
+	touch $@
+
+# The developers' extra contains the other two.
+$(VENV)/.stamp-dev: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e '.[dev]'
+	touch $(VENV)/.stamp-train $@
+
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || \
+	  { echo "error: no '$(PYTHON)' found; lanenet needs Python 3.11 or newer (make PYTHON=...)" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: lanenet needs Python 3.11 or newer, '$(PYTHON)' is $$($(PYTHON) --version 2>&1);" \
+	    "name another one, as in: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+	  { rm -rf $(VENV); \
+	    echo "error: '$(PYTHON) -m venv' failed; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }

@@ -1,0 +1,73 @@
+"""How well the projected lines lie on the markings that each frame shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.data.label_set import LabelSet
+from lanenet.geometry.lane import POINT_NAMES
+
+_REACH_CM = 60.0
+
+
+def frame_residual_cm(
+    points_cm: Float[np.ndarray, "m 2"],
+    lines_cm: tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]],
+    tape_cm: float,
+) -> float:
+    """Median distance between the marking's borders and where the projected line says they are.
+
+    Args:
+        points_cm: Edge points of the frame, frame car.
+        lines_cm: Left and right line, frame car; NaN where unsupported.
+        tape_cm: Width of the marking.
+
+    Returns:
+        [cm]; NaN where the frame shows fewer than ten edge points near the lines.
+    """
+    near = points_cm[points_cm[:, 1] <= _REACH_CM]
+    distances = []
+    for line in lines_cm:
+        known = line[np.isfinite(line[:, 0])]
+        if len(known) < 2 or not len(near):
+            continue
+        offset = np.abs(_distance_to_polyline(near, known))
+        distances.append(offset[offset < 1.5 * tape_cm + 1.0])
+    found = np.concatenate(distances) if distances else np.empty(0)
+    return float(np.median(np.abs(found - 0.5 * tape_cm))) if found.size >= 10 else float("nan")
+
+
+def _distance_to_polyline(
+    points: Float[np.ndarray, "m 2"], line: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "m"]:
+    start, step = line[:-1], np.diff(line, axis=0)
+    length2 = np.maximum(np.sum(step**2, axis=1), 1e-12)
+    to_point = points[:, None, :] - start[None]
+    t = np.clip(np.sum(to_point * step[None], axis=2) / length2, 0.0, 1.0)
+    return np.linalg.norm(to_point - t[..., None] * step[None], axis=2).min(axis=1)
+
+
+def label_report(
+    labels: LabelSet, residual_cm: Float[np.ndarray, "n"], mapped_frames: int, skipped: dict[str, int]
+) -> dict[str, Any]:
+    """Figures of a label set's quality, for ``report.json`` and the printed summary."""
+    known = np.isfinite(labels.points_cm)
+    finite = residual_cm[np.isfinite(residual_cm)]
+
+    def percentile(q: float) -> float:
+        return float(np.percentile(finite, q)) if finite.size else float("nan")
+
+    return {
+        "frames_mapped": mapped_frames,
+        "frames_labelled": len(labels),
+        "labelled_share": len(labels) / max(mapped_frames, 1),
+        "frames_left_out": skipped,
+        "points_labelled_share": {
+            name: float(known[:, i].sum()) / max(mapped_frames, 1) for i, name in enumerate(POINT_NAMES)
+        },
+        "residual_cm": {"median": percentile(50), "p95": percentile(95), "frames": int(finite.size)},
+        "residual_of": "edge points within 60 cm, of frames that made the map, from the marking's borders",
+    }

@@ -1,0 +1,146 @@
+"""Curvilinear coordinates along the driven path: s along it, d to its left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+from scipy.ndimage import gaussian_filter1d
+
+from datagen.slam.scans import Scans
+
+
+@dataclass(frozen=True)
+class Path:
+    """A smooth path, sampled evenly.
+
+    Attributes:
+        step_cm: Distance between samples.
+        xy_cm: Samples, frame map.
+        left: Unit vector to the left at each sample.
+        s_frames_cm: Position of each frame's rear axle along the path.
+    """
+
+    step_cm: float
+    xy_cm: Float[np.ndarray, "m 2"]
+    left: Float[np.ndarray, "m 2"]
+    s_frames_cm: Float[np.ndarray, "n"]
+
+    @property
+    def s_cm(self) -> Float[np.ndarray, "m"]:
+        """Position of the samples along the path."""
+        return np.arange(len(self.xy_cm)) * self.step_cm
+
+    def points(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
+        """Return the point at offset d to the left of each sample, [cm], frame map."""
+        return self.xy_cm + d_cm[:, None] * self.left
+
+
+def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: float) -> Path:
+    """Smooth a trajectory of rear-axle poses and sample it evenly.
+
+    The path is carried on beyond the last pose with its last curvature, because the last frames see road
+    that was never driven.
+
+    Args:
+        poses: Rear-axle poses, frame map.
+        step_cm: Distance between samples.
+        ahead_cm: Length to add at the end.
+    """
+    smooth = gaussian_filter1d(poses[:, :2], 2.0, axis=0, mode="nearest")
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
+    # Standing still gives several frames at one place; interpolation needs a strictly growing argument.
+    s = distance + np.arange(len(distance)) * 1e-6
+    samples = np.arange(0.0, s[-1], step_cm)
+    xy = np.stack([np.interp(samples, s, smooth[:, i]) for i in range(2)], axis=1)
+    tail = min(len(xy) - 1, max(2, int(20.0 / step_cm)))
+    direction = np.unwrap(np.arctan2(*np.diff(xy[-tail - 1 :], axis=0).T[::-1]))
+    curvature = (direction[-1] - direction[0]) / max((len(direction) - 1) * step_cm, step_cm)
+    extra = np.arange(1, int(ahead_cm / step_cm) + 1) * step_cm
+    heading = direction[-1] + curvature * extra
+    added = xy[-1] + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1) * step_cm, axis=0)
+    xy = np.concatenate([xy, added])
+    xy = gaussian_filter1d(xy, max(1.0, 4.0 / step_cm), axis=0, mode="nearest")
+    tangent = np.gradient(xy, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    return Path(step_cm, xy, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1), s)
+
+
+@dataclass(frozen=True)
+class PathEdges:
+    """Edge points in the coordinates of a path.
+
+    Attributes:
+        s_cm: Position along the path.
+        d_cm: Offset to the left.
+        side: Component of the edge's normal (towards the brighter side) to the left, -1..1.
+        weight: Trust in the point.
+    """
+
+    s_cm: Float[np.ndarray, "m"]
+    d_cm: Float[np.ndarray, "m"]
+    side: Float[np.ndarray, "m"]
+    weight: Float[np.ndarray, "m"]
+
+
+def edges_along_path(
+    path: Path, scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float
+) -> PathEdges:
+    """Express every frame's edge points in path coordinates.
+
+    A point is looked for only on the stretch of path that its frame could see, so that other laps and
+    neighbouring stretches never take it.
+
+    Args:
+        path: The path of these poses.
+        scans: Edge points per frame.
+        poses: Rear-axle poses, frame map.
+        wheelbase_cm: Distance between the axles.
+        reach_cm: Edge points further than this from the front axle are left out.
+    """
+    keep = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1]) <= reach_cm
+    frame = scans.frame_of_point[keep]
+    s, d, side = _project(
+        path.xy_cm,
+        path.left,
+        path.step_cm,
+        path.s_frames_cm[frame],
+        poses[frame],
+        scans.points_cm[keep],
+        scans.normals[keep],
+        wheelbase_cm,
+        reach_cm + 2.0 * wheelbase_cm,
+    )
+    good = np.isfinite(s)
+    return PathEdges(s[good], d[good], side[good], scans.weights[keep][good])
+
+
+@njit(cache=True)
+def _project(xy, left, step, s_frame, pose, points, normals, wheelbase, span):  # type: ignore[no-untyped-def]
+    n = points.shape[0]
+    s_out, d_out, side_out = np.full(n, np.nan), np.zeros(n), np.zeros(n)
+    for i in range(n):
+        c, sn = np.cos(pose[i, 2]), np.sin(pose[i, 2])
+        forward, right = points[i, 1] + wheelbase, points[i, 0]
+        x = pose[i, 0] + forward * c + right * sn
+        y = pose[i, 1] + forward * sn - right * c
+        first = max(0, int(s_frame[i] / step) - 5)
+        last = min(xy.shape[0] - 1, int((s_frame[i] + span) / step))
+        best, nearest = 1e18, -1
+        for j in range(first, last + 1):
+            distance = (xy[j, 0] - x) ** 2 + (xy[j, 1] - y) ** 2
+            if distance < best:
+                best, nearest = distance, j
+        if nearest <= first or nearest >= last:
+            continue
+        dx, dy = x - xy[nearest, 0], y - xy[nearest, 1]
+        # The tangent is the left normal turned clockwise.
+        along = dx * left[nearest, 1] - dy * left[nearest, 0]
+        s_out[i] = nearest * step + along
+        d_out[i] = dx * left[nearest, 0] + dy * left[nearest, 1]
+        nx = normals[i, 1] * c + normals[i, 0] * sn
+        ny = normals[i, 1] * sn - normals[i, 0] * c
+        side_out[i] = nx * left[nearest, 0] + ny * left[nearest, 1]
+    return s_out, d_out, side_out

@@ -1,0 +1,184 @@
+"""The map on disk: a folder with poses, edges, lane lines, the camera, pictures and the report's figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float, Int
+
+from datagen.lanes.fit import LaneLine
+from lanenet.config import Settings, check_settings, read_yaml
+from lanenet.data.camera_file import read_camera, write_camera
+from lanenet.data.files import require, write_json, write_text
+from lanenet.data.tables import ColumnSpec, read_csv, write_csv
+from lanenet.data.trajectory import write_tum
+from lanenet.errors import ConfigError, MapFormatError
+from lanenet.geometry.camera import Camera
+
+FORMAT = "lanenet-map/1"
+
+
+class MapMeta(Settings):
+    """What ``map.yaml`` says.
+
+    Attributes:
+        format: Kind and version of the folder.
+        drive: The drive that was mapped, as given.
+        lane_width_cm: Lane width that the user gave.
+        mapped_lane_cm: Distance between the lines on this map.
+        tape_cm: Width of the markings on this map.
+        scale_from: What sets the scale: the camera's height or the lane width.
+        laps: Whole laps between revisits, 0 where no place was seen twice.
+    """
+
+    format: str
+    drive: str
+    lane_width_cm: float
+    mapped_lane_cm: float
+    tape_cm: float
+    scale_from: str
+    laps: int
+
+
+@dataclass(frozen=True)
+class DriveMap:
+    """A mapped drive.
+
+    Attributes:
+        meta: Origin and scale.
+        camera: The camera that was used or found.
+        frames: Frame numbers of the drive.
+        t_s: Time of each frame.
+        poses: Rear-axle x, y, heading (unwrapped) per frame, frame map.
+        lap: Lap of each frame, from 0.
+        segment: Uninterrupted stretch of the drive that each frame belongs to.
+        s_cm: Position along the segment's path.
+        match: Matched share of each frame's edges, 0..1.
+        lines: Left and right line of each segment.
+    """
+
+    meta: MapMeta
+    camera: Camera
+    frames: Int[np.ndarray, "n"]
+    t_s: Float[np.ndarray, "n"]
+    poses: Float[np.ndarray, "n 3"]
+    lap: Int[np.ndarray, "n"]
+    segment: Int[np.ndarray, "n"]
+    s_cm: Float[np.ndarray, "n"]
+    match: Float[np.ndarray, "n"]
+    lines: dict[int, list[LaneLine]]
+
+
+def write_map(
+    folder: Path,
+    drive_map: DriveMap,
+    edges: dict[str, np.ndarray],
+    report: dict[str, Any],
+    how_calibrated: str,
+) -> None:
+    """Write a map into an existing (temporary) folder; pictures are the caller's."""
+    m = drive_map
+    columns = {
+        "frame": m.frames,
+        "t_s": m.t_s,
+        "x_cm": m.poses[:, 0],
+        "y_cm": m.poses[:, 1],
+        "heading_rad": m.poses[:, 2],
+        "lap": m.lap,
+        "segment": m.segment,
+        "s_cm": m.s_cm,
+        "match": m.match,
+    }
+    write_csv(folder / "poses.csv", columns, allow_empty=("match",))
+    write_tum(folder / "trajectory.tum", m.t_s, m.poses)
+    write_camera(folder / "camera.yaml", m.camera, how_calibrated)
+    lines = [
+        {
+            "segment": segment,
+            "side": line.side,
+            "degree": 3,
+            "knots_cm": line.knots_cm,
+            "coefficients_cm": line.coefficients_cm,
+            "supported_cm": line.supported_cm,
+            "residual_cm": line.residual_cm,
+        }
+        for segment, pair in m.lines.items()
+        for line in pair
+    ]
+    write_json(folder / "lanes.json", {"format": "lanenet-lanes/1", "lines": lines})
+    pa, pq = require("pyarrow", "data"), require("pyarrow.parquet", "data")
+    pq.write_table(pa.table(edges), folder / "edges.parquet")
+    write_json(folder / "report.json", report)
+    write_text(folder / "map.yaml", yaml.safe_dump(m.meta.model_dump(), sort_keys=False))
+
+
+def read_map(folder: Path) -> DriveMap:
+    """Read a map folder.
+
+    Raises:
+        MapFormatError: If it is not a map, is of another version, or a file is damaged.
+    """
+    if not (folder / "map.yaml").is_file():
+        raise MapFormatError(f"{folder}: is not a map (no map.yaml in it)")
+    try:
+        plain = read_yaml(folder / "map.yaml")
+        if plain.get("format") != FORMAT:
+            raise MapFormatError(
+                f"{folder / 'map.yaml'}: format is {plain.get('format')!r}, expected {FORMAT!r}"
+            )
+        meta = check_settings(MapMeta, plain, str(folder / "map.yaml"))
+    except ConfigError as error:
+        raise MapFormatError(str(error)) from None
+    table = read_csv(
+        folder / "poses.csv",
+        {
+            "frame": ColumnSpec("int"),
+            "t_s": ColumnSpec(),
+            "x_cm": ColumnSpec(),
+            "y_cm": ColumnSpec(),
+            "heading_rad": ColumnSpec(),
+            "lap": ColumnSpec("int"),
+            "segment": ColumnSpec("int"),
+            "s_cm": ColumnSpec(),
+            "match": ColumnSpec(allow_empty=True),
+        },
+        error=MapFormatError,
+    )
+    return DriveMap(
+        meta=meta,
+        camera=read_camera(folder / "camera.yaml"),
+        frames=table["frame"],
+        t_s=table["t_s"],
+        poses=np.stack([table["x_cm"], table["y_cm"], table["heading_rad"]], axis=1),
+        lap=table["lap"],
+        segment=table["segment"],
+        s_cm=table["s_cm"],
+        match=table["match"],
+        lines=_read_lines(folder / "lanes.json"),
+    )
+
+
+def _read_lines(path: Path) -> dict[int, list[LaneLine]]:
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+        if plain["format"] != "lanenet-lanes/1":
+            raise MapFormatError(f"{path}: format is {plain['format']!r}, expected 'lanenet-lanes/1'")
+        lines: dict[int, list[LaneLine]] = {}
+        for item in plain["lines"]:
+            residual = item["residual_cm"]
+            line = LaneLine(
+                item["side"],
+                np.array(item["knots_cm"], dtype=np.float64),
+                np.array(item["coefficients_cm"], dtype=np.float64).reshape(-1, 2),
+                np.array(item["supported_cm"], dtype=np.float64).reshape(-1, 2),
+                float("nan") if residual is None else float(residual),
+            )
+            lines.setdefault(int(item["segment"]), []).append(line)
+    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise MapFormatError(f"{path}: lane lines cannot be read ({error!r})") from None
+    return lines

@@ -1,0 +1,137 @@
+"""Pictures for the eye: the map from above, and projected lines on frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from datagen.labels.project import FrameLines
+from datagen.map_folder import DriveMap
+from datagen.slam.scans import Scans
+from lanenet.errors import LanenetError
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+from lanenet.geometry.lane import ROWS_CM
+
+_LEFT, _RIGHT, _POINT = (80, 220, 80), (220, 80, 220), (60, 60, 255)
+_TILE_WIDTH = 400
+
+
+def draw_map(
+    path: Path,
+    drive_map: DriveMap,
+    parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
+    size_px: int = 1600,
+) -> None:
+    """Draw edges (hue = time), driven path (white), lane lines and a metre of scale.
+
+    Args:
+        path: PNG to write.
+        drive_map: The map.
+        parts: Scans, poses in map scale and scale factor of the scans, per segment.
+        size_px: Longer side of the picture.
+    """
+    clouds = []
+    for scans, poses, factor in parts:
+        reach = 3.0 * drive_map.camera.mounting.height_cm
+        points = scans.points_cm * factor
+        for k in range(len(poses)):
+            seen = points[scans.frame(k)]
+            seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach]
+            clouds.append(map_from_car(seen, poses[k], drive_map.camera.wheelbase_cm))
+    xy = np.concatenate([*clouds, drive_map.poses[:, :2]])
+    low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
+    scale = size_px / float((high - low).max())
+    width, height = ((high - low) * scale).astype(int) + 1
+    image = np.full((height, width, 3), 24, np.uint8)
+
+    def pixels(points: Float[np.ndarray, "m 2"]) -> np.ndarray:
+        p = (points - low) * scale
+        return np.stack([p[:, 0], height - 1 - p[:, 1]], axis=1).astype(np.int32)
+
+    hues = cv2.cvtColor(
+        np.stack(
+            [np.linspace(0, 150, len(clouds)), np.full(len(clouds), 200), np.full(len(clouds), 200)], axis=1
+        ).astype(np.uint8)[None],
+        cv2.COLOR_HSV2BGR,
+    )[0]
+    for cloud, colour in zip(clouds, hues, strict=True):
+        at = pixels(cloud)
+        image[at[:, 1], at[:, 0]] = colour
+    for segment, lines in drive_map.lines.items():
+        s = drive_map.s_cm[drive_map.segment == segment]
+        samples = np.arange(s.min(), s.max() + 60.0, 2.0)
+        for line in lines:
+            _polyline(image, pixels, line.points(samples), _LEFT if line.side == "left" else _RIGHT)
+        _polyline(image, pixels, drive_map.poses[drive_map.segment == segment, :2], (255, 255, 255))
+    metre = int(100.0 * scale)
+    cv2.line(image, (20, height - 20), (20 + metre, height - 20), (255, 255, 255), 2)
+    cv2.putText(
+        image, "1 m", (20, height - 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA
+    )
+    write_png(path, image)
+
+
+def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]
+    known = np.isfinite(points[:, 0])
+    for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(known.astype(int)) != 0) + 1):
+        if len(run) > 1 and known[run[0]]:
+            cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
+
+
+def draw_contact_sheet(
+    path: Path,
+    frames: list[tuple[UInt8[np.ndarray, "h w 3"], FrameLines, int]],
+    camera: Camera,
+    columns: int = 4,
+) -> None:
+    """Draw frames with their projected lines (green left, magenta right) and six points (red rings)."""
+    tiles = [draw_lines(image, lines, camera, f"{number}") for image, lines, number in frames]
+    while len(tiles) % columns:
+        tiles.append(np.zeros_like(tiles[0]))
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    write_png(path, np.vstack(rows))
+
+
+def draw_lines(
+    image: UInt8[np.ndarray, "h w 3"], lines: FrameLines, camera: Camera, text: str
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Enlarge a frame and draw its lane."""
+    zoom = max(1, round(_TILE_WIDTH / camera.width))
+    big = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+
+    def pixels(points_cm: Float[np.ndarray, "m 2"]) -> np.ndarray:
+        # Pixel centres are at integers, so that an enlarged pixel's middle moves by half the zoom less one.
+        return camera.project_ground(points_cm) * zoom + 0.5 * (zoom - 1)
+
+    for line, colour in ((lines.left_cm, _LEFT), (lines.right_cm, _RIGHT)):
+        at = pixels(line)
+        # Behind the bumper a fisheye still projects; what lies outside the picture is not drawn.
+        inside = (
+            np.isfinite(at).all(axis=1) & (np.abs(at) < 4 * big.shape[1]).all(axis=1) & (line[:, 1] > -5.0)
+        )
+        for k in np.flatnonzero(inside[:-1] & inside[1:]):
+            a, b = (tuple(int(v) for v in np.rint(at[i])) for i in (k, k + 1))
+            cv2.line(big, a, b, colour, 1, cv2.LINE_AA)
+    rows = np.tile(ROWS_CM, 2)
+    for u, v in pixels(np.stack([lines.points_cm, rows], axis=1)):
+        if np.isfinite(u) and np.isfinite(v) and abs(u) < 9999 and abs(v) < 9999:
+            cv2.circle(big, (round(u), round(v)), 5, _POINT, 1, cv2.LINE_AA)
+    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 2, cv2.LINE_AA)
+    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(big)
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
+    """Write a picture.
+
+    Raises:
+        LanenetError: If the disk refuses it.
+    """
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise LanenetError(f"{path}: the picture could not be encoded")
+    path.write_bytes(data.tobytes())

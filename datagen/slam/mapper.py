@@ -1,0 +1,182 @@
+"""From scans and commands to a trajectory: two passes of the filter, then loop closure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from datagen.slam.filter import FilterSettings, Trajectory, run_filter
+from datagen.slam.motion import MotionModel
+from datagen.slam.scans import Progress, Scans
+from lanenet.config import Settings
+from lanenet.data.drive import Drive
+from lanenet.geometry.camera import Camera
+
+_MAX_LAG = 10  # frames
+
+
+class MotionSettings(Settings):
+    """How far the car may stray from what the commands predict; lengths in camera heights.
+
+    The defaults come from real drives with a throttle only, where speed is a slow, unknown state: a wider
+    walk lets the filter stand still wherever mirrored lamps travel with the car.
+    """
+
+    first_step_heights: float = Field(default=0.2, gt=0.0)
+    factor_walk_heights: float = Field(default=0.006, gt=0.0)
+    factor_pull: float = Field(default=0.05, ge=0.0, lt=1.0)
+    distance_noise: float = Field(default=0.02, gt=0.0)
+    curvature_noise_heights: float = Field(default=0.01, gt=0.0)
+    max_curvature_heights: float = Field(default=0.8, gt=0.0)
+
+
+@dataclass(frozen=True)
+class CommandedMotion:
+    """What was commanded, in the form that the motion model predicts from.
+
+    Attributes:
+        distance_cm: Commanded distance per frame; relative time steps where no speed was recorded.
+        speed_known: Whether ``distance_cm`` is in centimetres.
+        turn: Per frame, something proportional to curvature (tan of steering over wheelbase, [1/cm], or
+            Donkeycar's angle), or None.
+    """
+
+    distance_cm: Float[np.ndarray, "n"]
+    speed_known: bool
+    turn: Float[np.ndarray, "n"] | None
+
+
+@dataclass(frozen=True)
+class SteeringFit:
+    """Curvature as found from the pictures, against the command: curvature = gain * turn(t - lag) + trim."""
+
+    gain: float
+    trim_per_cm: float
+    lag_frames: int
+    correlation: float
+
+
+def commands_of(drive: Drive, wheelbase_cm: float) -> CommandedMotion:
+    """Turn a drive's recorded commands into distances and turns."""
+    recorded = drive.commands
+    speed_cm_s, steering_rad, angle, yaw_rate_rad_s = (
+        None if values is None else _held(values)
+        for values in (recorded.speed_cm_s, recorded.steering_rad, recorded.angle, recorded.yaw_rate_rad_s)
+    )
+    step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
+    usual = float(np.median(step_s[1:])) if len(step_s) > 1 else 1.0
+    if speed_cm_s is not None:
+        distance, known = speed_cm_s * step_s, True
+    else:
+        distance, known = np.clip(step_s / max(usual, 1e-6), 0.0, 5.0), False
+    turn = None
+    if steering_rad is not None:
+        turn = np.tan(steering_rad) / wheelbase_cm
+    elif angle is not None:
+        turn = -angle
+    elif yaw_rate_rad_s is not None and speed_cm_s is not None:
+        turn = yaw_rate_rad_s / np.maximum(speed_cm_s, 1.0)
+    return CommandedMotion(distance, known, turn)
+
+
+def _held(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Carry the last known command over rows that lack one; zero before the first."""
+    known = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    return np.where(last >= 0, values[np.maximum(last, 0)], 0.0)
+
+
+def track(
+    scans: Scans,
+    commands: CommandedMotion,
+    camera: Camera,
+    filter_settings: FilterSettings,
+    motion_settings: MotionSettings,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> tuple[Trajectory, SteeringFit | None]:
+    """Estimate all poses without closing loops.
+
+    The first pass knows nothing of speed (where it was not recorded) and steering. It gives the usual step
+    and how curvature answers to the command: gain, trim and delay. The second pass uses both as prediction.
+    """
+    height = camera.mounting.height_cm
+    n = len(scans)
+
+    def run(motion: MotionModel, offset: int) -> Trajectory:
+        report = None if progress is None else lambda k, _: progress(offset + k, 2 * n)
+        return run_filter(scans, motion, filter_settings, height, camera.wheelbase_cm, rng, report)
+
+    m = motion_settings
+    step = m.first_step_heights * height
+    first = MotionModel(
+        distance_cm=commands.distance_cm,
+        curvature_per_cm=np.zeros(n),
+        factor_start=(1.0, 0.15) if commands.speed_known else (step, 0.5 * step),
+        factor_walk=0.01 if commands.speed_known else 0.01 * height,
+        factor_pull=0.02 if commands.speed_known else 0.0,
+        distance_noise=m.distance_noise,
+        offset_walk_per_cm=0.012 / height,
+        offset_decay=0.0,
+        curvature_noise_per_cm=2.0 * m.curvature_noise_heights / height,
+        max_curvature_per_cm=m.max_curvature_heights / height,
+    )
+    trajectory = run(first, 0)
+    fit = fit_steering(trajectory, commands, height)
+    usual = float(np.median(trajectory.factor[trajectory.factor > 0.1 * np.median(trajectory.factor)]))
+    predicted = np.zeros(n)
+    if fit is not None and commands.turn is not None:
+        predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
+    second = MotionModel(
+        distance_cm=commands.distance_cm,
+        curvature_per_cm=predicted,
+        factor_start=(usual, 0.1 * usual if commands.speed_known else 0.3 * usual),
+        factor_walk=0.005 if commands.speed_known else m.factor_walk_heights * height,
+        factor_pull=m.factor_pull,
+        distance_noise=m.distance_noise,
+        offset_walk_per_cm=(0.004 if fit is not None else 0.012) / height,
+        offset_decay=0.02 if fit is not None else 0.0,
+        curvature_noise_per_cm=m.curvature_noise_heights / height,
+        max_curvature_per_cm=m.max_curvature_heights / height,
+    )
+    return run(second, n), fit
+
+
+def delayed(values: Float[np.ndarray, "n"], frames: int) -> Float[np.ndarray, "n"]:
+    """Shift a signal later by some frames; the first value fills the front."""
+    return np.concatenate([np.full(frames, values[0]), values])[: len(values)]
+
+
+def fit_steering(
+    trajectory: Trajectory, commands: CommandedMotion, camera_height_cm: float
+) -> SteeringFit | None:
+    """Regress the found curvature on the command, at the delay where they correlate best.
+
+    Returns:
+        None where there is no command, it hardly changes, or it does not explain the curvature.
+    """
+    if commands.turn is None or np.std(commands.turn) < 1e-6:
+        return None
+    delta = np.diff(trajectory.poses, axis=0)
+    step = np.hypot(delta[:, 0], delta[:, 1])
+    moving = step > 0.3 * np.median(step)
+    if moving.sum() < 50:
+        return None
+    curvature = delta[moving, 2] / step[moving]
+    best: SteeringFit | None = None
+    for lag in range(_MAX_LAG + 1):
+        turn = delayed(commands.turn, lag)[1:][moving]
+        if np.std(turn) < 1e-9:
+            continue
+        r = float(np.corrcoef(turn, curvature)[0, 1])
+        if best is None or r > best.correlation:
+            gain, trim = np.polyfit(turn, curvature, 1)
+            best = SteeringFit(float(gain), float(trim), lag, r)
+    return (
+        best
+        if best is not None and best.correlation > 0.6 and abs(best.trim_per_cm) < 0.3 / camera_height_cm
+        else None
+    )

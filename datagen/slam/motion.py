@@ -1,0 +1,67 @@
+"""How the car may have moved between two frames: the Ackermann model with slow, unknown gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+#: Columns of a particle: x, y, heading of the rear axle, distance factor, curvature offset.
+X, Y, HEADING, FACTOR, OFFSET = range(5)
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """What the commands predict, and how far the car may stray from it.
+
+    Attributes:
+        distance_cm: Predicted distance from the previous frame to this one.
+        curvature_per_cm: Predicted curvature of the path, positive left.
+        factor_start: Mean and spread of the distance factor at the start.
+        factor_walk: Standard deviation of the factor's change per frame (slow: gain of the speed).
+        factor_pull: Share by which the factor returns to its mean per frame; a weak prior against standstill.
+        distance_noise: Standard deviation of the distance per frame, relative.
+        offset_walk_per_cm: Change of the curvature offset per frame (trim, servo lag).
+        offset_decay: Share of the offset that is forgotten per frame.
+        curvature_noise_per_cm: Standard deviation of the curvature per frame.
+        max_curvature_per_cm: Bound of the total curvature, so that the heading cannot spin.
+    """
+
+    distance_cm: Float[np.ndarray, "n"]
+    curvature_per_cm: Float[np.ndarray, "n"]
+    factor_start: tuple[float, float]
+    factor_walk: float
+    factor_pull: float
+    distance_noise: float
+    offset_walk_per_cm: float
+    offset_decay: float
+    curvature_noise_per_cm: float
+    max_curvature_per_cm: float
+
+    def start(self, particles: int, rng: np.random.Generator) -> Float[np.ndarray, "p 5"]:
+        """Draw particles at the origin of the map, heading along +x."""
+        states = np.zeros((particles, 5))
+        mean, spread = self.factor_start
+        states[:, FACTOR] = np.abs(rng.normal(mean, spread, particles))
+        return states
+
+    def predict(self, states: Float[np.ndarray, "p 5"], k: int, rng: np.random.Generator) -> None:
+        """Move particles in place from frame k - 1 to frame k.
+
+        Source:
+            Kozlowski et al. 2024, eq. 4-6, integrated exactly along an arc's chord (heading at mid-step),
+            with normal noise on distance and curvature (V and tan(beta) / L there).
+        """
+        noise = rng.standard_normal((4, len(states)))
+        pull = self.factor_pull * (self.factor_start[0] - states[:, FACTOR])
+        states[:, FACTOR] = np.abs(states[:, FACTOR] + pull + self.factor_walk * noise[0])
+        states[:, OFFSET] += -self.offset_decay * states[:, OFFSET] + self.offset_walk_per_cm * noise[1]
+        distance = self.distance_cm[k] * states[:, FACTOR] * (1.0 + self.distance_noise * noise[2])
+        curvature = self.curvature_per_cm[k] + states[:, OFFSET] + self.curvature_noise_per_cm * noise[3]
+        limit = self.max_curvature_per_cm
+        turn = distance * np.clip(curvature, -limit, limit)
+        middle = states[:, HEADING] + 0.5 * turn
+        states[:, X] += distance * np.cos(middle)
+        states[:, Y] += distance * np.sin(middle)
+        states[:, HEADING] += turn

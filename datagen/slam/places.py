@@ -1,0 +1,199 @@
+"""Revisits: frames that show the same place, and the relative pose between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from datagen.slam.field import DirectionField
+from datagen.slam.filter import thin_scan
+from datagen.slam.scans import Progress, Scans
+from lanenet.config import Settings
+from lanenet.data.drive import Drive
+from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
+from lanenet.perception.edges import to_gray
+
+_THUMB_WIDTH, _THUMB_HEIGHT = 24, 18
+
+
+class RevisitSettings(Settings):
+    """When two frames count as one place. Lengths are in camera heights.
+
+    Attributes:
+        min_gap_heights: Path between the two visits at least.
+        min_similarity: Correlation of the thumbnails, averaged over a few frames.
+        min_match: Matched share of the edges once aligned.
+        max_pairs: Pairs to verify at most, spread over the drive.
+        along_heights: Offset along the road between the two visits at most: the pictures are alike only
+            within a fraction of a camera height, and the next dash of a dashed line is not much further.
+        sideways_heights: Offset across the road at most.
+        search_rad: Difference of heading at most.
+    """
+
+    min_gap_heights: float = Field(default=20.0, gt=0.0)
+    min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
+    min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
+    max_pairs: int = Field(default=60, ge=1)
+    along_heights: float = Field(default=0.9, gt=0.0)
+    sideways_heights: float = Field(default=2.0, gt=0.0)
+    search_rad: float = Field(default=0.45, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Revisit:
+    """Frame ``later`` shows the place of frame ``earlier``.
+
+    Attributes:
+        relative: Pose of the later frame in the rear-axle frame of the earlier (x ahead, y left).
+        match: Matched share of the later frame's edges.
+    """
+
+    earlier: int
+    later: int
+    relative: Float[np.ndarray, "3"]
+    match: float
+
+
+def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarray, "n d"]:
+    """Return a small, contrast-normalised picture of each frame as a unit vector.
+
+    The whole frame counts, also what stands above the road: walls and people tell places apart that have the
+    same markings.
+    """
+    rows = np.empty((len(drive), _THUMB_HEIGHT * _THUMB_WIDTH), np.float32)
+    for k in range(len(drive)):
+        small = cv2.resize(
+            to_gray(drive.image(k)), (_THUMB_WIDTH, _THUMB_HEIGHT), interpolation=cv2.INTER_AREA
+        )
+        flat = small.astype(np.float32)
+        flat -= cv2.GaussianBlur(flat, (0, 0), 6.0)
+        rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 1e-6)
+        if progress is not None:
+            progress(k + 1, len(drive))
+    return rows
+
+
+def propose_revisits(
+    thumbs: Float[np.ndarray, "n d"],
+    path_cm: Float[np.ndarray, "n"],
+    min_gap_cm: float,
+    settings: RevisitSettings,
+) -> list[tuple[int, int]]:
+    """Propose pairs (earlier, later) that look alike, at least ``min_gap_cm`` of path apart.
+
+    Similarity is averaged along the diagonal, so that a pair counts when its neighbours agree, and allows
+    a sideways shift of the picture, because the car comes back with another heading.
+    """
+    n = len(thumbs)
+    picture = thumbs.reshape(n, _THUMB_HEIGHT, _THUMB_WIDTH)
+    similarity = np.full((n, n), -1.0, np.float32)
+    for shift in (-2, -1, 0, 1, 2):
+        shifted = np.roll(picture, shift, axis=2).reshape(n, -1)
+        np.maximum(similarity, thumbs @ shifted.T, out=similarity)
+    kernel = np.eye(9, dtype=np.float32) / 9.0
+    similarity = cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    far = path_cm[None, :] - path_cm[:, None] >= min_gap_cm
+    similarity[~far] = -1.0
+    pairs: list[tuple[float, int, int]] = []
+    for later in range(n):
+        earlier = int(similarity[:, later].argmax())
+        score = float(similarity[earlier, later])
+        if score >= settings.min_similarity and later == int(similarity[earlier].argmax()):
+            pairs.append((score, earlier, later))
+    if not pairs:
+        return []
+    # The best of each stretch of the drive, so that no corner takes all the pairs.
+    stretch = max(1.0, n / settings.max_pairs)
+    best: dict[int, tuple[float, int, int]] = {}
+    for pair in pairs:
+        key = int(pair[2] / stretch)
+        if key not in best or pair > best[key]:
+            best[key] = pair
+    return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda p: p[2])]
+
+
+def match_places(
+    scans: Scans,
+    poses: Float[np.ndarray, "n 3"],
+    pair: tuple[int, int],
+    camera_height_cm: float,
+    wheelbase_cm: float,
+    settings: RevisitSettings,
+    rng: np.random.Generator,
+) -> Revisit | None:
+    """Align the later visit's edges with a small map of the earlier one.
+
+    A coarse search over offsets and headings on a coarse field, then two rounds of samples on finer ones.
+
+    Returns:
+        The revisit, or None where too few edges match.
+    """
+    earlier, later = pair
+    origin = poses[earlier]
+    near = range(max(0, earlier - 20), min(len(scans), earlier + 21))
+    query = _submap(
+        scans, poses, range(max(0, later - 4), min(len(scans), later + 5)), later, wheelbase_cm, rng
+    )
+    points, normals, trust = query
+    if len(points) < 20:
+        return None
+    step = 0.15 * camera_height_cm
+    reach = np.array([settings.along_heights, settings.sideways_heights]) * camera_height_cm
+    along, sideways = (np.arange(-r, r + 1e-9, step) for r in reach)
+    angles = np.arange(-settings.search_rad, settings.search_rad + 1e-9, np.deg2rad(3.0))
+    grid = np.stack(np.meshgrid(along, sideways, angles, indexing="ij"), axis=-1).reshape(-1, 3)
+    spread = np.array([step, step, np.deg2rad(2.0)])
+    best, share = np.zeros(3), 0.0
+    for cell_heights in (0.12, 0.06, 0.04):
+        field = DirectionField.empty(cell_heights * camera_height_cm, 512, 1e9)
+        for k in near:
+            frame = scans.frame(k)
+            pose = relative_pose(origin, poses[k])
+            field.insert(
+                map_from_car(scans.points_cm[frame], pose, wheelbase_cm),
+                map_from_car_directions(scans.normals[frame], pose[2]),
+                scans.weights[frame] / len(near),
+                0,
+            )
+        # Cells were filled by many frames: bring the field to about one where all agree.
+        field.vectors[...] *= 8.0
+        scores = field.score(grid, wheelbase_cm, points, normals, trust, 0) / trust.sum()
+        # Alike pictures were taken at about the same place: a weak prior settles ties between dashes.
+        chosen = int(np.argmax(scores - 0.1 * np.sum((grid[:, :2] / reach) ** 2, axis=1)))
+        best, share = grid[chosen], float(scores[chosen])
+        grid = best + rng.normal(size=(600, 3)) * spread
+        grid[0] = best
+        spread = spread * 0.35
+    return Revisit(earlier, later, best, share) if share >= settings.min_match else None
+
+
+def relative_pose(origin: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return ``pose`` as seen from ``origin``: x ahead, y left, heading difference in (-pi, pi]."""
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    dx, dy = pose[0] - origin[0], pose[1] - origin[1]
+    return np.array([c * dx + s * dy, -s * dx + c * dy, wrap_angle(pose[2] - origin[2])])
+
+
+def _submap(
+    scans: Scans,
+    poses: Float[np.ndarray, "n 3"],
+    frames: range,
+    reference: int,
+    wheelbase_cm: float,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+    """Edges of several frames as points of the reference frame's car frame."""
+    parts = []
+    for k in frames:
+        points, normals, trust = thin_scan(scans, k, 60, rng)
+        pose = relative_pose(poses[reference], poses[k])
+        ahead_left = map_from_car(points, pose, wheelbase_cm)
+        directions = map_from_car_directions(normals, pose[2])
+        # Back to x right, y ahead of the front axle.
+        car = np.stack([-ahead_left[:, 1], ahead_left[:, 0] - wheelbase_cm], axis=1)
+        parts.append((car, np.stack([-directions[:, 1], directions[:, 0]], axis=1), trust))
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))  # type: ignore[return-value]

@@ -1,0 +1,133 @@
+"""Sparse least squares over all poses: odometry between neighbours, revisits across laps."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
+
+from datagen.slam.places import Revisit, relative_pose
+from lanenet.geometry.frames import wrap_angle
+
+_ITERATIONS = 12
+
+
+def close_loops(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "r 3"]]:
+    """Bend a trajectory so that revisits meet.
+
+    The headings are solved first, on their own: that is linear, and a path that is off by a turn of heading
+    is too far from its solution for the full problem. The path is then integrated again with them, and all
+    poses are solved together, first with plain, then with robust revisit factors.
+
+    Args:
+        poses: Open-loop trajectory, heading unwrapped.
+        revisits: Verified revisits.
+        camera_height_cm: Sets the scale of the tolerances.
+
+    Returns:
+        The closed trajectory, and each revisit's residual (ahead, left, heading) in it.
+    """
+    if not revisits:
+        return poses, np.empty((0, 3))
+    odometry = np.array([relative_pose(a, b) for a, b in pairwise(poses)])
+    closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits))
+    for robust in (False, True):
+        for _ in range(_ITERATIONS):
+            closed, step = _gauss_newton(closed, odometry, revisits, camera_height_cm, robust)
+            if step < 1e-4 * camera_height_cm:
+                break
+    return closed, _residuals(closed, revisits)
+
+
+def _solve_headings(heading: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Float[np.ndarray, "n"]:
+    """Headings that keep the turns between neighbours and meet the revisits up to whole turns."""
+    n = len(heading)
+    turn_sigma, revisit_sigma = 0.01, 0.05
+    rows, columns, values, targets = [0], [0], [1e3], [1e3 * heading[0]]
+    for k in range(n - 1):
+        rows += [k + 1, k + 1]
+        columns += [k, k + 1]
+        values += [-1.0 / turn_sigma, 1.0 / turn_sigma]
+        targets.append((heading[k + 1] - heading[k]) / turn_sigma)
+    for i, revisit in enumerate(revisits):
+        measured = heading[revisit.later] - heading[revisit.earlier]
+        turns = np.round((measured - revisit.relative[2]) / (2.0 * np.pi))
+        rows += [n + i, n + i]
+        columns += [revisit.earlier, revisit.later]
+        values += [-1.0 / revisit_sigma, 1.0 / revisit_sigma]
+        targets.append((revisit.relative[2] + 2.0 * np.pi * turns) / revisit_sigma)
+    entries = (np.array(values), (np.array(rows), np.array(columns)))
+    a = coo_matrix(entries, shape=(n + len(revisits), n)).tocsc()
+    return np.asarray(spsolve((a.T @ a).tocsc(), a.T @ np.array(targets)))
+
+
+def _integrate(
+    start: Float[np.ndarray, "3"], odometry: Float[np.ndarray, "m 3"], heading: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    steps = np.stack(
+        [c * odometry[:, 0] - s * odometry[:, 1], s * odometry[:, 0] + c * odometry[:, 1]], axis=1
+    )
+    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return np.concatenate([xy, heading[:, None]], axis=1)
+
+
+def _residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
+    seen = np.array([relative_pose(poses[r.earlier], poses[r.later]) for r in revisits])
+    residual = seen - np.array([r.relative for r in revisits])
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    return residual
+
+
+def _gauss_newton(
+    poses: Float[np.ndarray, "n 3"],
+    odometry: Float[np.ndarray, "m 3"],
+    revisits: list[Revisit],
+    camera_height_cm: float,
+    robust: bool,
+) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """One step on all factors; a factor is (from, to, relative pose, inverse sigmas)."""
+    n = len(poses)
+    i = np.concatenate([np.arange(n - 1), [r.earlier for r in revisits]]).astype(np.intp)
+    j = np.concatenate([np.arange(1, n), [r.later for r in revisits]]).astype(np.intp)
+    measured = np.concatenate([odometry, [r.relative for r in revisits]])
+    # Odometry is good to a few per cent of the step, and better across than along.
+    along = 0.1 * np.abs(odometry[:, 0]) + 0.01 * camera_height_cm
+    odometry_sigma = np.stack([along, 0.3 * along, np.full(n - 1, 0.015)], axis=1)
+    revisit_sigma = np.tile([0.15 * camera_height_cm, 0.05 * camera_height_cm, 0.02], (len(revisits), 1))
+    weight = 1.0 / np.concatenate([odometry_sigma, revisit_sigma])
+    c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+    dx, dy = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
+    residual = (
+        np.stack([c * dx + s * dy, -s * dx + c * dy, wrap_angle(poses[j, 2] - poses[i, 2])], axis=1)
+        - measured
+    )
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    if robust:
+        # Cauchy weights on whole revisits: a wrong one is wrong in all three numbers.
+        scaled = np.sum((residual * weight)[n - 1 :] ** 2, axis=1)
+        weight[n - 1 :] /= np.sqrt(1.0 + scaled[:, None] / 9.0)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    jac_i = np.array([[-c, -s, -s * dx + c * dy], [s, -c, -c * dx - s * dy], [zero, zero, -one]])
+    jac_j = np.array([[c, s, zero], [-s, c, zero], [zero, zero, one]])
+    m = len(i)
+    rows = np.broadcast_to(3 * np.arange(m) + np.arange(3)[:, None, None], (3, 3, m))
+    parts = []
+    for jac, index in ((jac_i, i), (jac_j, j)):
+        columns = np.broadcast_to(3 * index + np.arange(3)[None, :, None], (3, 3, m))
+        values = jac * weight.T[:, None, :]
+        parts.append((values.ravel(), rows.ravel(), columns.ravel()))
+    values, row, column = (np.concatenate(p) for p in zip(*parts, strict=True))
+    a = coo_matrix((values, (row, column)), shape=(3 * m, 3 * n)).tocsc()
+    # The first pose stays where it is.
+    free = a[:, 3:]
+    rhs = -(free.T @ (residual * weight).ravel())
+    delta = np.asarray(spsolve((free.T @ free).tocsc(), rhs)).reshape(-1, 3)
+    moved = poses.copy()
+    moved[1:] += delta
+    return moved, float(np.abs(delta).max())

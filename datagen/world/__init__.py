@@ -1,0 +1,1 @@
+"""Synthetic drives with exact truth: tracks, a fisheye renderer, a car with errors, a scripted driver."""

@@ -1,0 +1,86 @@
+"""The road of a synthetic drive on disk: ``track.json``, the truth that a map is compared with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from datagen.world.track import Marking, Track
+from lanenet.data.files import write_json
+from lanenet.errors import DriveFormatError
+
+FORMAT = "lanenet-track/1"
+
+
+def write_track(path: Path, track: Track) -> None:
+    """Write a track; lengths in cm, angles in rad, frame map."""
+    data = {
+        "format": FORMAT,
+        "closed": track.closed,
+        "lane_width_cm": track.lane_width_cm,
+        "s_cm": track.s_cm,
+        "xy_cm": track.xy_cm,
+        "heading_rad": track.heading_rad,
+        "curvature_per_cm": track.curvature_per_cm,
+        "markings": [
+            {
+                "offset_cm": marking.offset_cm,
+                "width_cm": marking.width_cm,
+                "colour_bgr": marking.colour_bgr,
+                "painted_cm": marking.painted_cm,
+            }
+            for marking in track.markings
+        ],
+    }
+    write_json(path, data)
+
+
+def read_track(path: Path) -> Track:
+    """Read a track.
+
+    Raises:
+        DriveFormatError: If the file is missing, is not a track of this version, or its columns do not fit.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DriveFormatError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DriveFormatError(f"{path}: not valid JSON ({error})") from None
+    found = data.get("format") if isinstance(data, dict) else type(data).__name__
+    if found != FORMAT:
+        raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
+    try:
+        track = Track(
+            s_cm=np.asarray(data["s_cm"], dtype=np.float64),
+            xy_cm=np.asarray(data["xy_cm"], dtype=np.float64).reshape(-1, 2),
+            heading_rad=np.asarray(data["heading_rad"], dtype=np.float64),
+            curvature_per_cm=np.asarray(data["curvature_per_cm"], dtype=np.float64),
+            closed=bool(data["closed"]),
+            lane_width_cm=float(data["lane_width_cm"]),
+            markings=tuple(
+                Marking(
+                    float(m["offset_cm"]),
+                    float(m["width_cm"]),
+                    (float(m["colour_bgr"][0]), float(m["colour_bgr"][1]), float(m["colour_bgr"][2])),
+                    np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2),
+                )
+                for m in data["markings"]
+            ),
+        )
+    except KeyError as error:
+        raise DriveFormatError(f"{path}: key {error} is missing") from None
+    except (TypeError, ValueError, IndexError) as error:
+        raise DriveFormatError(f"{path}: not the numbers of a track ({error})") from None
+    columns = (track.s_cm, track.xy_cm, track.heading_rad, track.curvature_per_cm)
+    lengths = [len(column) for column in columns]
+    if min(lengths) < 2 or len(set(lengths)) > 1:
+        raise DriveFormatError(
+            f"{path}: expected s_cm, xy_cm, heading_rad and curvature_per_cm of one length of at least 2, "
+            f"found {', '.join(map(str, lengths))}"
+        )
+    if not all(np.isfinite(column).all() for column in columns):
+        raise DriveFormatError(f"{path}: a number of the centre line is missing or not finite")
+    return track

@@ -1,0 +1,104 @@
+"""What the command line shows: progress, tables, and where to go next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+#: Reports progress: ``(done, total)``, or ``(stage, done, total)`` where work has stages.
+ProgressCall = Callable[..., None]
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[ProgressCall]:
+    """Show a bar on stderr while the body runs; a new stage starts a new bar.
+
+    Args:
+        title: What is being done; followed by the stage, if there is one.
+    """
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    ) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(*args: Any) -> None:
+            stage = str(args[0]) if args and isinstance(args[0], str) else ""
+            done, total = args[-2:]
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(f"{title}: {stage}" if stage else title, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+@contextmanager
+def training_bar() -> Iterator[ProgressCall]:
+    """Show epochs with the errors reached and the speed."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    ) as bars:
+        task = bars.add_task("train", total=None)
+
+        def report(*args: Any) -> None:
+            epoch, epochs, train_cm, validation_cm, samples_per_s = args
+            bars.update(
+                task,
+                completed=epoch,
+                total=epochs,
+                description=f"train  RMSE {train_cm:.2f} cm, validation {validation_cm:.2f} cm, "
+                f"{samples_per_s:.0f} samples/s",
+            )
+
+        yield report
+
+
+def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table whose first column is text and whose others are figures."""
+    table = Table(title=title, title_justify="left")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def show_lines(lines: Sequence[str]) -> None:
+    """Print what a stage found, indented below its progress bar."""
+    for line in lines:
+        typer.echo(f"  {line}")
+
+
+def show_problems(problems: Sequence[str], limit: int = 10) -> None:
+    """Print problems that did not stop the work, on stderr."""
+    for problem in problems[:limit]:
+        typer.echo(f"warning: {problem}", err=True)
+    if len(problems) > limit:
+        typer.echo(f"warning: and {len(problems) - limit} more", err=True)
+
+
+def wrote(*paths: Path | None) -> None:
+    """Say which files or folders were written."""
+    for path in paths:
+        if path is not None:
+            typer.echo(f"wrote {path}")
+
+
+def next_command(*words: str | Path) -> None:
+    """Say what to run next, quoted so that it can be pasted; words in capitals are to be filled in."""
+    typer.echo("next: " + shlex.join(["lanenet", *(str(word) for word in words)]))

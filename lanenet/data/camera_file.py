@@ -1,0 +1,276 @@
+"""Camera files: lanenet's own YAML, and ROS ``camera_info`` YAML in both directions."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import ConfigDict, Field, field_validator
+
+from lanenet.config import Settings, SettingsT, check_settings, read_yaml
+from lanenet.data.files import write_text
+from lanenet.errors import CalibrationError, ConfigError
+from lanenet.geometry.camera import Camera, CameraModel, Mounting
+
+Row = tuple[float, float, float]
+Length = Annotated[float, Field(gt=0.0)]
+
+_D_LENGTHS: dict[str, tuple[int, ...]] = {"fisheye": (4,), "pinhole": (4, 5)}
+_ROS_MODELS: dict[str, CameraModel] = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+
+
+class MountingFile(Settings):
+    """The mounting as a camera file holds it; see :class:`lanenet.geometry.camera.Mounting`."""
+
+    height_cm: Length
+    pitch_down_rad: float = 0.0
+    roll_rad: float = 0.0
+    yaw_rad: float = 0.0
+    ahead_of_front_axle_cm: float = 0.0
+    right_of_centre_cm: float = 0.0
+
+
+class CarFile(Settings):
+    """What a camera file knows about the car."""
+
+    wheelbase_cm: Length
+
+
+class CameraFile(Settings):
+    """A camera file.
+
+    Attributes:
+        format: Kind of file and version.
+        model: ``fisheye`` (Kannala-Brandt) or ``pinhole`` (Brown-Conrady).
+        width: Image width, [px].
+        height: Image height, [px].
+        K: Camera matrix, [px].
+        D: Distortion in OpenCV's order: four numbers for a fisheye, four or five for a pinhole.
+        mounting: Pose above the road.
+        car: The car it is mounted on.
+        method: How the camera was found.
+        residuals: Figures of the fit; each name ends in its unit.
+        date: Day of the calibration.
+    """
+
+    format: Literal["lanenet-camera/1"]
+    model: CameraModel
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    K: tuple[Row, Row, Row]
+    D: tuple[float, ...]
+    mounting: MountingFile
+    car: CarFile
+    method: str = ""
+    residuals: dict[str, float] = Field(default_factory=dict)
+    date: str | datetime.date | None = None
+
+    @field_validator("K")
+    @classmethod
+    def _check_matrix(cls, K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+        return _checked_matrix(K)
+
+    @field_validator("D")
+    @classmethod
+    def _check_distortion(cls, D: tuple[float, ...], info: Any) -> tuple[float, ...]:
+        # The model is absent here when it was refused itself.
+        return _checked_distortion(D, info.data["model"]) if "model" in info.data else D
+
+    def camera(self) -> Camera:
+        """Return the camera that the file describes."""
+        return Camera(
+            model=self.model,
+            width=self.width,
+            height=self.height,
+            K=np.array(self.K, dtype=np.float64),
+            D=np.array(self.D, dtype=np.float64),
+            mounting=Mounting(**self.mounting.model_dump()),
+            wheelbase_cm=self.car.wheelbase_cm,
+        )
+
+
+def read_camera(path: Path) -> Camera:
+    """Read a camera file.
+
+    Raises:
+        CalibrationError: If the file is missing, of an unknown version, or a value is missing, misspelt or
+            impossible; names the file and the key.
+    """
+    return _read(CameraFile, path).camera()
+
+
+def write_camera(
+    path: Path,
+    camera: Camera,
+    method: str,
+    residuals: dict[str, float] | None = None,
+    date: str | None = None,
+) -> None:
+    """Write a camera file; the camera read back has the same hash.
+
+    Args:
+        path: Destination.
+        camera: The camera.
+        method: How it was found.
+        residuals: Figures of the fit; each name ends in its unit.
+        date: Day of the calibration, ISO 8601; the same inputs give the same file, so there is no default.
+
+    Raises:
+        CalibrationError: If the camera is one that :func:`read_camera` would refuse.
+    """
+    m = camera.mounting
+    data = {
+        "format": "lanenet-camera/1",
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "K": np.asarray(camera.K, dtype=np.float64).tolist(),
+        "D": np.asarray(camera.D, dtype=np.float64).tolist(),
+        "mounting": {name: float(getattr(m, name)) for name in MountingFile.model_fields},
+        "car": {"wheelbase_cm": float(camera.wheelbase_cm)},
+        "method": method,
+        "residuals": {name: float(value) for name, value in (residuals or {}).items()},
+        "date": date,
+    }
+    checked = _checked(CameraFile, data, str(path))
+    write_text(path, _dump(checked.model_dump(mode="json")))
+
+
+class _RosMatrix(Settings):
+    rows: int = Field(gt=0)
+    cols: int = Field(gt=0)
+    data: tuple[float, ...]
+
+    @field_validator("data")
+    @classmethod
+    def _check_size(cls, data: tuple[float, ...], info: Any) -> tuple[float, ...]:
+        rows, cols = info.data.get("rows"), info.data.get("cols")
+        if rows is not None and cols is not None and rows * cols != len(data):
+            raise ValueError(f"expected {rows} x {cols} numbers, found {len(data)}")
+        return data
+
+
+class RosCameraInfo(Settings):
+    """A ROS ``camera_info`` file; keys that lanenet has no use for are skipped."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    image_width: int = Field(gt=0)
+    image_height: int = Field(gt=0)
+    distortion_model: Literal["plumb_bob", "equidistant", "fisheye"]
+    camera_matrix: _RosMatrix
+    distortion_coefficients: _RosMatrix
+
+    @field_validator("camera_matrix")
+    @classmethod
+    def _check_matrix(cls, matrix: _RosMatrix) -> _RosMatrix:
+        if (matrix.rows, matrix.cols) != (3, 3):
+            raise ValueError(f"expected 3 x 3 numbers, found {matrix.rows} x {matrix.cols}")
+        d = matrix.data
+        _checked_matrix(((d[0], d[1], d[2]), (d[3], d[4], d[5]), (d[6], d[7], d[8])))
+        return matrix
+
+    @field_validator("distortion_coefficients")
+    @classmethod
+    def _check_distortion(cls, matrix: _RosMatrix, info: Any) -> _RosMatrix:
+        if "distortion_model" in info.data:
+            _checked_distortion(matrix.data, _ROS_MODELS[info.data["distortion_model"]])
+        return matrix
+
+
+def read_ros_camera_info(path: Path, mounting: Mounting, wheelbase_cm: float) -> Camera:
+    """Read the YAML that ROS' ``camera_calibration`` writes.
+
+    Args:
+        path: The file.
+        mounting: Pose above the road, which ROS keeps elsewhere.
+        wheelbase_cm: Distance between the car's axles.
+
+    Raises:
+        CalibrationError: If the file is missing, or a value is missing or impossible; names file and key.
+    """
+    info = _read(RosCameraInfo, path)
+    _checked(MountingFile, {name: getattr(mounting, name) for name in MountingFile.model_fields}, "mounting")
+    _checked(CarFile, {"wheelbase_cm": wheelbase_cm}, "car")
+    return Camera(
+        model=_ROS_MODELS[info.distortion_model],
+        width=info.image_width,
+        height=info.image_height,
+        K=np.array(info.camera_matrix.data, dtype=np.float64).reshape(3, 3),
+        D=np.array(info.distortion_coefficients.data, dtype=np.float64),
+        mounting=mounting,
+        wheelbase_cm=wheelbase_cm,
+    )
+
+
+def write_ros_camera_info(path: Path, camera: Camera, name: str) -> None:
+    """Write a ROS ``camera_info`` YAML; ROS has no place in it for mounting and wheelbase.
+
+    A pinhole with four coefficients gets k3 = 0, because ``plumb_bob`` has five.
+
+    Args:
+        path: Destination.
+        camera: The camera.
+        name: Value of ``camera_name``.
+    """
+    D = [float(v) for v in camera.D]
+    if camera.model == "pinhole":
+        D += [0.0] * (5 - len(D))
+    K = np.asarray(camera.K, dtype=np.float64)
+    projection = np.concatenate([K, np.zeros((3, 1))], axis=1)
+    data = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _ros_matrix(K),
+        "distortion_model": "equidistant" if camera.model == "fisheye" else "plumb_bob",
+        "distortion_coefficients": _ros_matrix(np.array([D])),
+        "rectification_matrix": _ros_matrix(np.eye(3)),
+        "projection_matrix": _ros_matrix(projection),
+    }
+    _checked(RosCameraInfo, data, str(path))
+    write_text(path, _dump(data))
+
+
+def _ros_matrix(matrix: np.ndarray) -> dict[str, Any]:
+    rows, cols = matrix.shape
+    return {"rows": rows, "cols": cols, "data": matrix.ravel().tolist()}
+
+
+def _dump(data: dict[str, Any]) -> str:
+    # Flow style for the innermost level keeps a matrix row on one line.
+    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110))
+
+
+def _checked_matrix(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+    if K[0][0] <= 0.0 or K[1][1] <= 0.0:
+        raise ValueError(f"expected positive focal lengths, found {K[0][0]:g} and {K[1][1]:g}")
+    if K[1][0] != 0.0 or K[2] != (0.0, 0.0, 1.0):
+        raise ValueError("expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
+    return K
+
+
+def _checked_distortion(D: tuple[float, ...], model: str) -> tuple[float, ...]:
+    lengths = _D_LENGTHS[model]
+    if len(D) not in lengths:
+        expected = " or ".join(str(n) for n in lengths)
+        raise ValueError(f"expected {expected} coefficients for a {model} camera, found {len(D)}")
+    return D
+
+
+def _read(schema: type[SettingsT], path: Path) -> SettingsT:
+    try:
+        data = read_yaml(Path(path))
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None
+    return _checked(schema, data, str(path))
+
+
+def _checked(schema: type[SettingsT], data: dict[str, Any], where: str) -> SettingsT:
+    try:
+        return check_settings(schema, data, where)
+    except ConfigError as error:
+        raise CalibrationError(str(error)) from None

@@ -1,0 +1,155 @@
+"""Tables of detections: what a detector saw in each frame, as Parquet or CSV by the file's ending."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lanenet.data.files import require
+from lanenet.data.parquet import ParquetTable, float_array, write_parquet
+from lanenet.data.tables import ColumnSpec, read_csv, write_csv
+from lanenet.errors import LabelFormatError
+from lanenet.geometry.lane import POINT_NAMES, SIDES
+from lanenet.perception.estimate import LaneEstimate
+
+FORMAT = "lanenet-detections/1"
+
+SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
+PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
+#: Columns that may be empty.
+_OPEN_COLUMNS = ("t_s", *POINT_NAMES, *SIGMA_NAMES, *PARABOLA_NAMES, "steering_rad")
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """A table of detections, a row per frame; NaN where the detector did not know.
+
+    Attributes:
+        frame: Frame number.
+        t_s: Time of the frame; NaN for photos.
+        points_cm: Six points in the order of the label contract, frame car.
+        sigma_cm: Standard deviation of each point.
+        parabolas: (a, b, c) of the left and the right line, x and y in cm.
+        steering_rad: Steering target, positive left.
+        confidence: 0 to 1.
+    """
+
+    frame: Int[np.ndarray, "n"]
+    t_s: Float[np.ndarray, "n"]
+    points_cm: Float[np.ndarray, "n 6"]
+    sigma_cm: Float[np.ndarray, "n 6"]
+    parabolas: Float[np.ndarray, "n 2 3"]
+    steering_rad: Float[np.ndarray, "n"]
+    confidence: Float[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+class DetectionTable:
+    """Collects estimates frame by frame and writes them as one table."""
+
+    def __init__(self) -> None:
+        self._frames: list[int] = []
+        self._rows: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def add(self, frame: int, t_s: float, estimate: LaneEstimate) -> None:
+        """Append what one frame showed; ``t_s`` is NaN where there is no time."""
+        self._frames.append(int(frame))
+        self._rows.append(
+            np.concatenate(
+                [
+                    [t_s],
+                    estimate.points_cm,
+                    estimate.sigma_cm,
+                    estimate.parabolas.ravel(),
+                    [estimate.steering_rad, estimate.confidence],
+                ]
+            )
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the table, atomically: Parquet for ``.parquet``, CSV for ``.csv``.
+
+        Raises:
+            LabelFormatError: If the file has another ending, or a value is infinite.
+            MissingExtraError: If pyarrow is not installed and the table is Parquet.
+        """
+        ending = _ending(path)
+        names = (*_OPEN_COLUMNS, "confidence")
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(names))
+        bad = np.argwhere(np.isinf(rows))
+        if len(bad):
+            row, column = bad[0]
+            raise LabelFormatError(
+                f"{path}: frame {self._frames[row]}, column {names[column]!r}: found {rows[row, column]}"
+            )
+        if np.isnan(rows[:, -1]).any():
+            row = int(np.flatnonzero(np.isnan(rows[:, -1]))[0])
+            raise LabelFormatError(f"{path}: frame {self._frames[row]}, column 'confidence': found NaN")
+        frame = np.array(self._frames, dtype=np.int64)
+        if ending == ".csv":
+            columns = {"frame": frame, **{name: rows[:, k] for k, name in enumerate(names)}}
+            write_csv(path, columns, allow_empty=_OPEN_COLUMNS)
+            return
+        arrow = require("pyarrow", "data")
+        arrays: dict[str, Any] = {"frame": arrow.array(frame)}
+        arrays |= {name: float_array(rows[:, k]) for k, name in enumerate(names)}
+        units = {
+            "_cm": "centimetre",
+            "_rad": "radian",
+            "_s": "second",
+            "a": "1/cm",
+            "b": "1",
+            "c": "centimetre",
+        }
+        write_parquet(path, arrays, {"format": FORMAT, "units": units})
+
+
+def read_detections(path: Path) -> Detections:
+    """Read a table of detections, Parquet or CSV by the file's ending.
+
+    Raises:
+        LabelFormatError: If the file is missing, of another kind or version, lacks a column, or holds
+            something that is not a number; names file and column.
+        MissingExtraError: If pyarrow is not installed and the table is Parquet.
+    """
+    if _ending(path) == ".csv":
+        specs = {"frame": ColumnSpec("int"), "confidence": ColumnSpec()}
+        specs |= {name: ColumnSpec(allow_empty=True) for name in _OPEN_COLUMNS}
+        columns = read_csv(path, specs, LabelFormatError)
+    else:
+        table = ParquetTable(path)
+        if table.meta.get("format") != FORMAT:
+            raise LabelFormatError(f"{path}: expected format {FORMAT!r}, found {table.meta.get('format')!r}")
+        columns = {"frame": table.ints("frame"), "confidence": table.floats("confidence")}
+        columns |= {name: table.floats(name, allow_null=True) for name in _OPEN_COLUMNS}
+
+    def together(names: tuple[str, ...]) -> np.ndarray:
+        return np.stack([columns[name] for name in names], axis=1)
+
+    return Detections(
+        frame=columns["frame"],
+        t_s=columns["t_s"],
+        points_cm=together(POINT_NAMES),
+        sigma_cm=together(SIGMA_NAMES),
+        parabolas=together(PARABOLA_NAMES).reshape(-1, len(SIDES), 3),
+        steering_rad=columns["steering_rad"],
+        confidence=columns["confidence"],
+    )
+
+
+def _ending(path: Path) -> str:
+    ending = Path(path).suffix.lower()
+    if ending not in (".parquet", ".csv"):
+        raise LabelFormatError(
+            f"{path}: expected a file ending in .parquet or .csv, found {ending or 'none'!r}"
+        )
+    return ending

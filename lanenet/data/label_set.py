@@ -1,0 +1,294 @@
+"""Label sets: what the network learns from, a Parquet file with a row per frame.
+
+A row holds the six labels, and beside them the edge points and the lane lines in the car frame, from which
+shifted, rotated and thinned views get exact labels. The bird's-eye picture is there for people and for other
+tools; training makes it from the edge points again.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from pydantic import Field
+
+from lanenet.config import Settings, check_settings
+from lanenet.data.files import require
+from lanenet.data.parquet import ParquetTable, float_array, list_array, write_parquet
+from lanenet.data.png import png_bytes, png_size
+from lanenet.errors import ConfigError, LabelFormatError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
+
+FORMAT = "lanenet-labels/1"
+Source = Literal["map", "truth"]
+
+_EDGE_COLUMNS = ("edges_x_cm", "edges_y_cm", "edges_normal_x", "edges_normal_y")
+_LINE_COLUMNS = (("left_line_x_cm", "left_line_y_cm"), ("right_line_x_cm", "right_line_y_cm"))
+_POSE_COLUMNS = ("x_cm", "y_cm", "heading_rad")
+_UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 to 1"}
+
+
+class _WindowFile(Settings):
+    left_cm: float
+    near_cm: float
+    cell_cm: float = Field(gt=0.0)
+    rows: int = Field(gt=0)
+    columns: int = Field(gt=0)
+
+
+class _MetaFile(Settings):
+    format: Literal["lanenet-labels/1"]
+    rows_cm: tuple[float, ...]
+    order: tuple[str, ...]
+    units: dict[str, str]
+    window: _WindowFile
+    camera_hash: str
+    wheelbase_cm: float = Field(gt=0.0)
+    lane_width_cm: float = Field(gt=0.0)
+    source: Source
+    config_hash: str = ""
+
+
+@dataclass(frozen=True)
+class LabelMeta:
+    """What all rows of a label set share.
+
+    Attributes:
+        window: Patch of road that the bird's-eye pictures show.
+        camera_hash: Camera that the edge points came through.
+        wheelbase_cm: Distance between the car's axles; moves poses to the front axle.
+        lane_width_cm: Distance between the middles of the two lines.
+        source: ``map`` for labels from a map made of the drive, ``truth`` for a simulator's.
+        config_hash: Hash of the settings that made the labels; empty if unknown.
+    """
+
+    window: BirdseyeWindow
+    camera_hash: str
+    wheelbase_cm: float
+    lane_width_cm: float
+    source: Source
+    config_hash: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelSet:
+    """Labelled frames.
+
+    Attributes:
+        meta: What all rows share.
+        drive: Name of each frame's drive.
+        file: Path of each frame's image relative to its drive; empty when there is none.
+        frame: Frame number in its drive.
+        t_s: Time in its drive.
+        lap: Lap in its drive, from 0.
+        poses: Rear-axle centre and heading, [cm], [cm], [rad], frame map.
+        points_cm: The six labels, frame car; NaN where masked.
+        edges: Per frame x, y, normal x, normal y of the edge points, [cm], frame car.
+        lines: Per frame the left and the right line as polylines in the direction of travel, [cm], frame
+            car; NaN rows break them.
+        quality: 0 (worthless) to 1.
+    """
+
+    meta: LabelMeta
+    drive: list[str]
+    file: list[str]
+    frame: Int[np.ndarray, "n"]
+    t_s: Float[np.ndarray, "n"]
+    lap: Int[np.ndarray, "n"]
+    poses: Float[np.ndarray, "n 3"]
+    points_cm: Float[np.ndarray, "n 6"]
+    edges: list[Float[np.ndarray, "_ 4"]]
+    lines: list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]
+    quality: Float[np.ndarray, "n"]
+
+    def __post_init__(self) -> None:
+        for name in ("drive", "file", "t_s", "lap", "poses", "points_cm", "edges", "lines", "quality"):
+            if len(getattr(self, name)) != len(self.frame):
+                raise LabelFormatError(
+                    f"label set: {len(self.frame)} frames, but {len(getattr(self, name))} of {name!r}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def raster(self, i: int) -> UInt8[np.ndarray, "r c"]:
+        """Return the bird's-eye image of row ``i``, made from its edge points."""
+        return self.meta.window.rasterise(self.edges[i][:, :2])
+
+    def subset(self, keep: slice | Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> LabelSet:
+        """Return some of the rows, in the order asked for."""
+        rows = np.arange(len(self))[keep]
+        return LabelSet(
+            meta=self.meta,
+            drive=[self.drive[i] for i in rows],
+            file=[self.file[i] for i in rows],
+            frame=self.frame[rows],
+            t_s=self.t_s[rows],
+            lap=self.lap[rows],
+            poses=self.poses[rows],
+            points_cm=self.points_cm[rows],
+            edges=[self.edges[i] for i in rows],
+            lines=[self.lines[i] for i in rows],
+            quality=self.quality[rows],
+        )
+
+
+def write_labels(path: Path, label_set: LabelSet) -> None:
+    """Write a label set, atomically.
+
+    Edge points and lines are kept as float32 (1e-5 cm), everything else as float64.
+
+    Raises:
+        LabelFormatError: If a value is one that :func:`read_labels` would refuse.
+        MissingExtraError: If pyarrow is not installed.
+    """
+    arrow = require("pyarrow", "data")
+    meta = _meta_to_file(label_set.meta, str(path))
+    _check_values(label_set, str(path))
+    edges = [edge.astype(np.float32) for edge in label_set.edges]
+    arrays: dict[str, Any] = {
+        "drive": arrow.array(label_set.drive, type=arrow.string()),
+        "file": arrow.array(label_set.file, type=arrow.string()),
+        "frame": arrow.array(label_set.frame.astype(np.int64)),
+        "t_s": float_array(label_set.t_s),
+        "lap": arrow.array(label_set.lap.astype(np.int32)),
+    }
+    arrays |= {name: float_array(label_set.poses[:, k]) for k, name in enumerate(_POSE_COLUMNS)}
+    arrays |= {name: float_array(label_set.points_cm[:, k]) for k, name in enumerate(POINT_NAMES)}
+    arrays |= {name: list_array([edge[:, k] for edge in edges]) for k, name in enumerate(_EDGE_COLUMNS)}
+    for side, names in enumerate(_LINE_COLUMNS):
+        arrays |= {n: list_array([line[side][:, k] for line in label_set.lines]) for k, n in enumerate(names)}
+    arrays["quality"] = float_array(label_set.quality)
+    # The layout in which Hugging Face `datasets` stores pictures, and the note by which it shows them.
+    image_type = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
+    window = label_set.meta.window
+    images = [
+        {"bytes": png_bytes(window.rasterise(edge[:, :2])), "path": f"{drive}_{int(frame):06d}.png"}
+        for edge, drive, frame in zip(edges, label_set.drive, label_set.frame, strict=True)
+    ]
+    arrays["image"] = arrow.array(images, type=image_type)
+    hugging_face = {"info": {"features": {"image": {"_type": "Image"}}}}
+    write_parquet(path, arrays, meta, {b"huggingface": json.dumps(hugging_face).encode()})
+
+
+def read_labels(path: Path) -> LabelSet:
+    """Read a label set.
+
+    Raises:
+        LabelFormatError: If the file is missing, of another kind or version, made for other label rows, lacks
+            a column, holds an infinite value, or its pictures do not fit the window; names file and column.
+        MissingExtraError: If pyarrow is not installed.
+    """
+    table = ParquetTable(path)
+    meta = _meta_from_file(table.meta, str(path))
+    edge_columns = [table.lists(name) for name in _EDGE_COLUMNS]
+    line_columns = [[table.lists(name, allow_nan=True) for name in names] for names in _LINE_COLUMNS]
+    left, right = (
+        _stacked(names, columns, path) for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
+    )
+    _check_images(table, meta.window)
+    label_set = LabelSet(
+        meta=meta,
+        drive=table.texts("drive"),
+        file=table.texts("file"),
+        frame=table.ints("frame"),
+        t_s=table.floats("t_s"),
+        lap=table.ints("lap"),
+        poses=np.stack([table.floats(name) for name in _POSE_COLUMNS], axis=1),
+        points_cm=np.stack([table.floats(name, allow_null=True) for name in POINT_NAMES], axis=1),
+        edges=_stacked(_EDGE_COLUMNS, edge_columns, path),
+        lines=list(zip(left, right, strict=True)),
+        quality=table.floats("quality"),
+    )
+    _check_values(label_set, str(path))
+    return label_set
+
+
+def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
+    data = {
+        "format": FORMAT,
+        "rows_cm": list(ROWS_CM),
+        "order": list(POINT_NAMES),
+        "units": _UNITS,
+        **asdict(meta),
+    }
+    _meta_from_file(data, where)
+    return data
+
+
+def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
+    found = data.get("format")
+    if found != FORMAT:
+        raise LabelFormatError(f"{where}: expected format {FORMAT!r}, found {found!r}")
+    try:
+        file = check_settings(_MetaFile, data, f"{where}: metadata")
+    except ConfigError as error:
+        raise LabelFormatError(str(error)) from None
+    if file.rows_cm != ROWS_CM or file.order != POINT_NAMES:
+        raise LabelFormatError(
+            f"{where}: expected labels at rows {ROWS_CM} in the order {', '.join(POINT_NAMES)}; found rows "
+            f"{file.rows_cm} in the order {', '.join(file.order)}"
+        )
+    return LabelMeta(
+        window=BirdseyeWindow(**file.window.model_dump()),
+        camera_hash=file.camera_hash,
+        wheelbase_cm=file.wheelbase_cm,
+        lane_width_cm=file.lane_width_cm,
+        source=file.source,
+        config_hash=file.config_hash,
+    )
+
+
+def _check_values(label_set: LabelSet, where: str) -> None:
+    """Refuse numbers that are not there; on reading, most were refused before with their column's name."""
+    finite = {"t_s": label_set.t_s, "pose": label_set.poses, "quality": label_set.quality}
+    for name, values in finite.items():
+        if not np.isfinite(values).all():
+            raise LabelFormatError(
+                f"{where}: column {name!r}: not finite in row {_first(~np.isfinite(values))}"
+            )
+    for k, name in enumerate(POINT_NAMES):
+        infinite = np.isinf(label_set.points_cm[:, k])
+        if infinite.any():
+            raise LabelFormatError(f"{where}: column {name!r}: infinite in row {_first(infinite)}")
+    outside = (label_set.quality < 0.0) | (label_set.quality > 1.0)
+    if outside.any():
+        raise LabelFormatError(f"{where}: column 'quality': outside 0..1 in row {_first(outside)}")
+    for row, (edges, (left, right)) in enumerate(zip(label_set.edges, label_set.lines, strict=True)):
+        if not np.isfinite(edges).all():
+            raise LabelFormatError(f"{where}: column 'edges_*': not finite in row {row}")
+        if np.isinf(left).any() or np.isinf(right).any():
+            raise LabelFormatError(f"{where}: column '*_line_*': infinite in row {row}")
+
+
+def _first(bad: Bool[np.ndarray, "..."]) -> int:
+    return int(np.argwhere(bad)[0][0])
+
+
+def _stacked(names: tuple[str, ...], columns: list[list[np.ndarray]], path: Path) -> list[np.ndarray]:
+    """Join the coordinates of each row's points."""
+    for row, parts in enumerate(zip(*columns, strict=True)):
+        for name, part in zip(names, parts, strict=True):
+            if len(part) != len(parts[0]):
+                raise LabelFormatError(
+                    f"{path}: column {name!r}, row {row}: found {len(part)} values, expected "
+                    f"{len(parts[0])} as in {names[0]!r}"
+                )
+    return [np.stack(parts, axis=1) for parts in zip(*columns, strict=True)]
+
+
+def _check_images(table: ParquetTable, window: BirdseyeWindow) -> None:
+    expected = (window.columns, window.rows)
+    for row, image in enumerate(table.raw("image")):
+        found = png_size(image["bytes"]) if isinstance(image, dict) and image.get("bytes") else None
+        if found != expected:
+            shown = "no PNG" if found is None else f"{found[0]}x{found[1]} px"
+            raise LabelFormatError(
+                f"{table.path}: column 'image', row {row}: found {shown}, expected "
+                f"{expected[0]}x{expected[1]} px as the window says"
+            )

@@ -1,0 +1,1 @@
+"""Learning: network, loader, training, evaluation, export; the only package with torch."""

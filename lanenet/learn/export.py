@@ -1,0 +1,223 @@
+"""From weights to one self-contained ONNX file that says what it is."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from jaxtyping import UInt8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from lanenet.config import load_settings
+from lanenet.data.files import atomic_file
+from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
+
+#: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
+OPSET = 18
+IR_VERSION = 9
+#: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
+TOLERANCE = 1e-3
+
+CONFIG_NAME = "config.yaml"
+WEIGHTS_NAME = "weights.safetensors"
+MODEL_NAME = "model.onnx"
+RASTERS_NAME = "check_rasters.png"
+
+
+def export_onnx(
+    network: LaneNet, meta: ModelMeta, rasters: UInt8[np.ndarray, "n 1 r c"], path: Path
+) -> float:
+    """Write a network as ONNX, after a check against PyTorch.
+
+    The file appears at ``path`` only when onnxruntime answers as PyTorch does.
+
+    Args:
+        network: Trained network.
+        meta: Its description, stored in the file.
+        rasters: Real rasters for the check.
+        path: File to write.
+
+    Returns:
+        The largest difference of any output on the rasters, [cm] or smaller units.
+
+    Raises:
+        CheckpointError: If there is no raster, or the file's answers differ from PyTorch's.
+    """
+    if not len(rasters):
+        raise CheckpointError(f"{path}: no raster to check the export with, expected at least one")
+    deployed = DeployedLaneNet(network).eval()
+    model = _to_onnx(deployed, meta)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(model.SerializeToString())
+        try:
+            session, _ = open_model(temporary)
+        except ModelMismatchError as error:
+            raise CheckpointError(f"{path}: the exported model cannot be used ({error})") from None
+        difference = _largest_difference(deployed, session, rasters)
+        if not difference <= TOLERANCE:
+            raise CheckpointError(
+                f"{path}: onnxruntime differs from PyTorch by {difference:.2g}, "
+                f"expected at most {TOLERANCE:g}"
+            )
+    return difference
+
+
+def export_checkpoint(checkpoint: Path, out: Path | None = None) -> Path:
+    """Export the weights of a checkpoint folder.
+
+    Args:
+        checkpoint: Folder that :func:`lanenet.learn.train.train` wrote.
+        out: File to write; None replaces the folder's ``model.onnx``.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        CheckpointError: If a file of the folder is missing or does not fit, or the check fails.
+    """
+    path = checkpoint / MODEL_NAME if out is None else out
+    network, meta = read_network(checkpoint)
+    rasters = read_rasters(checkpoint / RASTERS_NAME, meta)
+    export_onnx(network, meta, rasters, path)
+    return path
+
+
+def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
+    """Write weights and their description as safetensors."""
+    tensors = {name: value.detach().contiguous() for name, value in network.state_dict().items()}
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(save(tensors, metadata=meta.to_properties()))
+
+
+def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
+    """Build the network of a checkpoint folder.
+
+    Raises:
+        CheckpointError: If a file is missing, cannot be read, or the weights do not fit the config.
+    """
+    if not checkpoint.is_dir():
+        raise CheckpointError(f"{checkpoint}: no such folder, expected a checkpoint")
+    try:
+        settings = load_settings(LearnSettings, checkpoint / CONFIG_NAME)
+    except ConfigError as error:
+        raise CheckpointError(str(error)) from None
+    path = checkpoint / WEIGHTS_NAME
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; was the training finished?")
+    try:
+        with safe_open(path, framework="pt") as file:
+            properties = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path}: cannot be read as safetensors ({error})") from None
+    try:
+        meta = ModelMeta.from_properties(properties, str(path))
+    except ModelMismatchError as error:
+        raise CheckpointError(str(error)) from None
+    network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        detail = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"{path}: weights do not fit {checkpoint / CONFIG_NAME} ({detail})") from None
+    return network.eval(), meta
+
+
+def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
+    """Keep rasters as one tall picture, so that a later export can be checked without the data."""
+    tall = rasters.reshape(-1, rasters.shape[-1])
+    done, png = cv2.imencode(".png", tall)
+    if not done:
+        raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as a picture")
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(png.tobytes())
+
+
+def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
+    """Read what :func:`write_rasters` wrote.
+
+    Raises:
+        CheckpointError: If the picture is missing or does not fit the window.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; the export is checked on its rasters")
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    rows, columns = meta.window.rows, meta.window.columns
+    if image is None or image.shape[1] != columns or image.shape[0] % rows:
+        found = "no picture" if image is None else f"{image.shape[0]} x {image.shape[1]}"
+        raise CheckpointError(f"{path}: found {found}, expected rasters of {rows} x {columns}")
+    return np.asarray(image).reshape(-1, 1, rows, columns)
+
+
+def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
+    example = torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)
+    with _silence():
+        program = torch.onnx.export(
+            deployed,
+            (example,),
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+            opset_version=OPSET,
+            input_names=[INPUT_NAME],
+            output_names=list(OUTPUT_NAMES),
+            dynamic_shapes={"raster": {0: torch.export.Dim("n", min=1)}},
+        )
+    if program is None:
+        raise CheckpointError("torch.onnx.export answered nothing, expected a program")
+    model: onnx.ModelProto = program.model_proto
+    # The exporter notes source lines and folders of this machine on every node; IR 9 does not know them.
+    for node in model.graph.node:
+        node.ClearField("doc_string")
+        if "metadata_props" in node.DESCRIPTOR.fields_by_name:
+            node.ClearField("metadata_props")
+    for owner in (model.graph, *model.graph.input, *model.graph.output, *model.graph.initializer):
+        if "metadata_props" in owner.DESCRIPTOR.fields_by_name:
+            owner.ClearField("metadata_props")
+    del model.graph.value_info[:]
+    model.ir_version = IR_VERSION
+    model.producer_name = "lanenet"
+    model.producer_version = ""
+    onnx.helper.set_model_props(model, meta.to_properties())
+    onnx.checker.check_model(model)
+    return model
+
+
+def _largest_difference(
+    deployed: DeployedLaneNet, session: onnxruntime.InferenceSession, rasters: UInt8[np.ndarray, "n 1 r c"]
+) -> float:
+    with torch.inference_mode():
+        expected = deployed(torch.from_numpy(rasters))
+    found = session.run(OUTPUT_NAMES, {INPUT_NAME: rasters})
+    return max(float(np.max(np.abs(np.asarray(f) - e.numpy()))) for f, e in zip(found, expected, strict=True))
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep the exporter's chatter (prints, log lines, warnings) to itself."""
+    previous = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(previous)

@@ -1,0 +1,130 @@
+"""What a finished training run leaves: weights, model, config, metrics and curve."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lanenet.config import dump_settings
+from lanenet.data.files import atomic_file, write_json, write_text
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.dataset import LaneSamples
+from lanenet.learn.evaluate import ErrorTable
+from lanenet.learn.export import (
+    CONFIG_NAME,
+    MODEL_NAME,
+    RASTERS_NAME,
+    WEIGHTS_NAME,
+    export_onnx,
+    write_rasters,
+    write_weights,
+)
+from lanenet.learn.network import LaneNet
+from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord
+from lanenet.perception.network import ModelMeta
+
+CURVE_NAME = "curve"
+
+_N_CHECK_RASTERS = 16
+_PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
+
+
+def write_checkpoint(
+    folder: Path,
+    settings: LearnSettings,
+    network: LaneNet,
+    samples: LaneSamples,
+    val: LaneSamples,
+    errors: ErrorTable,
+    history: Sequence[EpochRecord],
+    run_hash: str,
+) -> None:
+    """Write the results of a run; the metrics come last and mark it as finished.
+
+    Args:
+        folder: Checkpoint folder.
+        settings: Of the run.
+        network: Weights of the best epoch.
+        samples: Training frames.
+        val: Validation frames.
+        errors: Of the network on ``val``.
+        history: Training curve.
+        run_hash: Of settings and data.
+
+    Raises:
+        CheckpointError: If the exported model does not answer as PyTorch does.
+    """
+    meta = ModelMeta(
+        window=samples.window,
+        camera_hashes=tuple(samples.camera_hashes),
+        wheelbase_cm=samples.wheelbase_cm,
+        lane_width_cm=samples.lane_width_cm,
+        training_hash=run_hash,
+        rmse_cm=errors.point_rmse_cm,
+        reference=errors.reference,
+    )
+    chosen = np.unique(np.linspace(0, len(val) - 1, _N_CHECK_RASTERS).astype(np.intp))
+    rasters, _ = val.plain_batch(chosen)
+    write_text(folder / CONFIG_NAME, dump_settings(settings))
+    write_weights(folder / WEIGHTS_NAME, network, meta)
+    write_rasters(folder / RASTERS_NAME, rasters)
+    difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
+    write_curve(folder, history)
+    best = min(history, key=lambda record: record.val_rmse_cm)
+    metrics: dict[str, Any] = {
+        "format": METRICS_FORMAT,
+        "run_hash": run_hash,
+        "units": {"*_cm": "centimetres", "samples_per_s": "training samples per second"},
+        "val_rmse_cm": errors.all.rmse_cm,
+        "best_epoch": best.epoch,
+        "epochs": len(history),
+        "train_frames": len(samples),
+        "val_frames": len(val),
+        "parameters": network.n_parameters,
+        "onnx_difference_cm": difference,
+        "median_samples_per_s": float(np.median([record.samples_per_s for record in history])),
+        "seed": settings.seed,
+        "versions": {name: _version(name) for name in _PACKAGES},
+        "val": errors.as_dict(),
+    }
+    write_json(folder / METRICS_NAME, metrics)
+
+
+def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:
+    """Write the training curve as ``curve.csv`` and, where matplotlib is installed, as ``curve.png``."""
+    names = list(vars(history[0]))
+    lines = [",".join(f"{value:.9g}" for value in vars(record).values()) for record in history]
+    write_text(folder / f"{CURVE_NAME}.csv", "\n".join([",".join(names), *lines]) + "\n")
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return
+    # The figure is made without pyplot, which would pick a window system and keep global state.
+    figure = Figure(figsize=(6.0, 4.0), dpi=100)
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    epochs = [record.epoch for record in history]
+    axes.plot(epochs, [record.train_rmse_cm for record in history], label="training (augmented)")
+    axes.plot(epochs, [record.val_rmse_cm for record in history], label="validation")
+    axes.set_xlabel("epoch")
+    axes.set_ylabel("RMSE of the six points, cm")
+    axes.set_yscale("log")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend()
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", bbox_inches="tight")
+    with atomic_file(folder / f"{CURVE_NAME}.png") as temporary:
+        temporary.write_bytes(picture.getvalue())
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

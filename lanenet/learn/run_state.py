@@ -1,0 +1,155 @@
+"""What a training run keeps on disk: the state to go on from, and the sign that it is finished."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lanenet.data.files import atomic_file
+from lanenet.errors import CheckpointError
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.dataset import hash_files
+from lanenet.learn.export import MODEL_NAME, WEIGHTS_NAME
+
+STATE_NAME = "last.pt"
+METRICS_NAME = "metrics.json"
+METRICS_FORMAT = "lanenet-metrics/1"
+
+_ADVICE = "pick another name, or delete the folder to train anew"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """One line of the training curve.
+
+    Attributes:
+        epoch: Counted from 1.
+        train_rmse_cm: Over the augmented samples of the epoch, while the weights were changing.
+        val_rmse_cm: Over the validation frames, with the running mean of the weights.
+        learning_rate: At the end of the epoch.
+        samples_per_s: Speed of the training part.
+    """
+
+    epoch: int
+    train_rmse_cm: float
+    val_rmse_cm: float
+    learning_rate: float
+    samples_per_s: float
+
+
+@dataclass
+class RunState:
+    """All that a stopped run needs to go on as if it had not stopped.
+
+    Random numbers follow from the seed and the epoch, so no generator is kept.
+
+    Attributes:
+        network: Weights after the last epoch.
+        ema: Running mean of the weights.
+        optimizer: State of the optimiser.
+        step: Steps taken.
+        history: One record per finished epoch.
+        best: Running mean of the weights at the best epoch; None before the first.
+    """
+
+    network: dict[str, Tensor]
+    ema: dict[str, Tensor]
+    optimizer: dict[str, Any]
+    step: int
+    history: list[EpochRecord]
+    best: dict[str, Tensor] | None
+
+    @property
+    def best_record(self) -> EpochRecord:
+        """The epoch of the lowest validation error; the first of equals."""
+        return min(self.history, key=lambda record: record.val_rmse_cm)
+
+
+def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
+    """Return a hash of all that decides a run: settings and the contents of its files.
+
+    Raises:
+        LabelFormatError: If a file cannot be read.
+    """
+    text = f"{settings.hash} {hash_files(train_paths)} {hash_files(val_paths)}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_state(path: Path, state: RunState, run_hash: str) -> None:
+    """Write the state; a kill while writing leaves the one before."""
+    data = {
+        "run_hash": run_hash,
+        "network": state.network,
+        "ema": state.ema,
+        "optimizer": state.optimizer,
+        "step": state.step,
+        "history": [list(vars(record).values()) for record in state.history],
+        "best": state.best,
+    }
+    with atomic_file(path) as temporary:
+        torch.save(data, temporary)
+
+
+def read_state(path: Path, run_hash: str) -> RunState | None:
+    """Read the state that an earlier run with the same settings and data left; None if there is none.
+
+    Raises:
+        CheckpointError: If the file is of another run or cannot be read.
+    """
+    if not path.is_file():
+        return None
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+        found = data["run_hash"]
+        state = RunState(
+            network=data["network"],
+            ema=data["ema"],
+            optimizer=data["optimizer"],
+            step=int(data["step"]),
+            history=[EpochRecord(*values) for values in data["history"]],
+            best=data["best"],
+        )
+    except Exception as error:  # the unpickler raises whatever damaged bytes lead it to
+        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise CheckpointError(
+            f"{path}: cannot be read as the state of a run ({reason}); delete it to start over"
+        ) from None
+    if found != run_hash:
+        raise CheckpointError(
+            f"{path}: left by a run with other settings or data ({found}, now {run_hash}); {_ADVICE}"
+        )
+    return state
+
+
+def read_finished(folder: Path, run_hash: str) -> dict[str, Any] | None:
+    """Return the metrics of a finished run with the same settings and data; None if it is not finished.
+
+    Raises:
+        CheckpointError: If the folder holds a finished run with other settings or data.
+    """
+    path = folder / METRICS_NAME
+    if not path.is_file():
+        return None
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        found, form = metrics["run_hash"], metrics["format"]
+        best = float(metrics["val_rmse_cm"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise CheckpointError(f"{path}: not the metrics of a training run; {_ADVICE}") from None
+    if form != METRICS_FORMAT:
+        raise CheckpointError(f"{path}: format {form!r}, expected {METRICS_FORMAT!r}; {_ADVICE}")
+    if found != run_hash:
+        raise CheckpointError(
+            f"{folder}: holds a model trained with other settings or data ({found}, now {run_hash}); "
+            f"{_ADVICE}"
+        )
+    complete = (folder / MODEL_NAME).is_file() and (folder / WEIGHTS_NAME).is_file() and math.isfinite(best)
+    return metrics if complete else None

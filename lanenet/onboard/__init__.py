@@ -1,0 +1,1 @@
+"""What runs a detector: over recorded sources, and on the car."""

@@ -1,0 +1,175 @@
+"""Time of each onboard stage on this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib import metadata
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.edges import find_edges
+from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
+from lanenet.perception.network import NetworkDetector
+
+LANE_WIDTH_CM = 40.0
+_LINE_CM = 2.0
+_WARM_UP = 20
+
+
+def example_camera() -> Camera:
+    """The paper's camera: a fisheye of 170 degrees over 320 x 240 px, 20 cm up, 25 degrees down."""
+    focal = 320.0 / np.deg2rad(170.0)
+    K = np.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
+    return Camera("fisheye", 320, 240, K, np.zeros(4), Mounting(20.0, float(np.deg2rad(25.0))), 26.0)
+
+
+def example_frames(camera: Camera, count: int, rng: np.random.Generator) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Paint frames of a gently curved lane with sensor noise, each seen from elsewhere in the lane."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    road = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 2)
+    near = np.nan_to_num(road, nan=1e6)
+    frames = []
+    for _ in range(count):
+        shift, slope, bend = rng.uniform(-5.0, 5.0), rng.uniform(-0.2, 0.2), rng.uniform(-0.003, 0.003)
+        x = near[..., 0] - (shift + slope * near[..., 1] + bend * near[..., 1] ** 2)
+        line = np.abs(np.abs(x) - 0.5 * LANE_WIDTH_CM) < 0.5 * _LINE_CM
+        gray = np.where(line & (near[..., 1] < 200.0), 220.0, 70.0) + rng.normal(0.0, 4.0, u.shape)
+        frames.append(np.repeat(np.clip(gray, 0.0, 255.0).astype(np.uint8)[..., None], 3, axis=2))
+    return frames
+
+
+def time_stages(
+    camera: Camera,
+    model: Path | None = None,
+    rounds: int = 300,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Time the stages from a frame to a lane.
+
+    Every stage sees the same frames in turn, after a warm-up. OpenCV's plain Canny on the same frames is the
+    yardstick, timed in the same run.
+
+    Args:
+        camera: Camera whose frames are imitated.
+        model: Network to time as well; any camera is accepted, since only its speed matters here.
+        rounds: Timed frames.
+        threads: Threads of OpenCV and onnxruntime.
+        progress: Called with (frames done, frames).
+
+    Returns:
+        ``stages``: for each its ``median_ms``, ``p99_ms`` and ``ratio_to_canny``; ``edge_points``, ``image``,
+        ``threads``, ``rounds`` and ``machine``.
+
+    Raises:
+        ModelMismatchError: If the model cannot be used.
+        CalibrationError: If the camera sees no road.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        frames = example_frames(camera, 16, np.random.default_rng(0))
+        extractor = RoadEdgeExtractor(camera, PerceptionSettings())
+        lane_filter = LaneFilter(extractor, LaneFilterSettings(lane_width_cm=LANE_WIDTH_CM))
+        network = None
+        if model is not None:
+            network = NetworkDetector(model, extractor, any_camera=True, threads=threads)
+        window = network.meta.window if network is not None else BirdseyeWindow()
+        times_ms: dict[str, list[float]] = {}
+        points: list[int] = []
+        for i in range(_WARM_UP + rounds):
+            lap = _time_frame(frames[i % len(frames)], extractor, lane_filter, network, window, points)
+            if i >= _WARM_UP:
+                for stage, value in lap.items():
+                    times_ms.setdefault(stage, []).append(value)
+                if progress is not None:
+                    progress(i + 1 - _WARM_UP, rounds)
+    finally:
+        cv2.setNumThreads(before)
+    yardstick = float(np.median(times_ms["canny"]))
+    return {
+        "stages": {
+            stage: {
+                "median_ms": float(np.median(values)),
+                "p99_ms": float(np.percentile(values, 99)),
+                "ratio_to_canny": float(np.median(values)) / yardstick,
+            }
+            for stage, values in times_ms.items()
+        },
+        "edge_points": float(np.mean(points)),
+        "image": f"{camera.width}x{camera.height}",
+        "threads": threads,
+        "rounds": rounds,
+        "machine": machine_data(),
+    }
+
+
+def _time_frame(
+    frame: UInt8[np.ndarray, "h w 3"],
+    extractor: RoadEdgeExtractor,
+    lane_filter: LaneFilter,
+    network: NetworkDetector | None,
+    window: BirdseyeWindow,
+    points: list[int],
+) -> dict[str, float]:
+    marks = [("", time.perf_counter())]
+
+    def mark(stage: str) -> None:
+        marks.append((stage, time.perf_counter()))
+
+    cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
+    mark("canny")
+    pixels = find_edges(frame, extractor.settings.edges, extractor.table.keep)
+    mark("edges")
+    road = extractor.table.lift(pixels)
+    mark("lift")
+    raster = window.rasterise(road.points_cm)
+    mark("raster")
+    lane_filter.estimate(road.points_cm)
+    mark("lane filter")
+    if network is not None:
+        network.detect_raster(raster)
+        mark("network")
+    points.append(len(road.points_cm))
+    lap = {stage: 1e3 * (end - begin) for (_, begin), (stage, end) in pairwise(marks)}
+    path = ("edges", "lift", "raster", "network") if network is not None else ("edges", "lift", "lane filter")
+    lap["frame to lane"] = sum(lap[stage] for stage in path)
+    return lap
+
+
+def machine_data() -> dict[str, str | int]:
+    """Return what decides timings: processor, cores, system and library versions."""
+    versions = {name: metadata.version(name) for name in ("numpy", "onnxruntime")}
+    return {
+        "processor": _processor(),
+        "architecture": platform.machine(),
+        "cores": os.cpu_count() or 0,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "opencv": cv2.__version__,
+        **versions,
+    }
+
+
+def _processor() -> str:
+    """Name of the processor or board; the Raspberry Pi tells it in the device tree."""
+    board = Path("/proc/device-tree/model")
+    if board.exists():
+        return board.read_text(encoding="utf-8", errors="replace").strip("\0\n ")
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"

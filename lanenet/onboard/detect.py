@@ -1,0 +1,154 @@
+"""Run a detector over recorded frames: a table of detections and, on request, an annotated video."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.data.detections import DetectionTable
+from lanenet.data.files import atomic_file
+from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.geometry.camera import Camera
+from lanenet.onboard.sources import Source
+from lanenet.perception.draw import draw_estimate
+from lanenet.perception.estimate import LaneEstimate
+
+if TYPE_CHECKING:
+    from lanenet.perception.estimate import Detector
+else:
+    # What a detector is, is for the type checker: a protocol cannot be asked at run time.
+    Detector = Any
+
+#: Annotated frames are enlarged to at least this width, so that the text can be read.
+VIDEO_WIDTH_PX = 640
+VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class DetectReport:
+    """What a run did.
+
+    Attributes:
+        out: The table of detections.
+        video: The annotated video, if one was asked for.
+        frames: Rows of the table.
+        complete: Frames with all six points.
+        steered: Frames with a steering target.
+        median_ms: Median time of the detector per frame.
+        p99_ms: 99th percentile of it.
+        problems: A line for each frame that could not be read; its row is empty.
+    """
+
+    out: Path
+    video: Path | None
+    frames: int
+    complete: int
+    steered: int
+    median_ms: float
+    p99_ms: float
+    problems: tuple[str, ...]
+
+
+def run_detector(
+    source: Source,
+    detector: Detector,
+    camera: Camera,
+    out: Path,
+    video: Path | None = None,
+    progress: Progress | None = None,
+) -> DetectReport:
+    """Run a detector over every frame of a source and write what it finds.
+
+    Files are moved into place when they are complete. The detector forgets its state where the source is
+    interrupted. A frame that cannot be read gets an empty row and is named in the report.
+
+    Args:
+        source: The frames.
+        detector: Any detector.
+        camera: Camera of the frames, for drawing.
+        out: Table of detections, ``.parquet`` or ``.csv``.
+        video: Annotated video (mp4v), or None.
+        progress: Called with (frames done, frames).
+
+    Returns:
+        Counts, timings and problems.
+
+    Raises:
+        DriveFormatError: If no frame can be read.
+        CalibrationError: If a frame does not fit the camera; the message names it.
+        LabelFormatError: If the ending of ``out`` is unknown.
+    """
+    if video is not None and video.suffix.lower() not in VIDEO_ENDINGS:
+        raise DriveFormatError(f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}")
+    table = DetectionTable()
+    times_s: list[float] = []
+    problems: list[str] = []
+    complete = steered = 0
+    with ExitStack() as stack:
+        writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None
+        detector.reset()
+        for i in range(len(source)):
+            if source.starts[i]:
+                detector.reset()
+            frame, estimate = None, LaneEstimate()
+            try:
+                frame = source.image(i)
+            except DriveFormatError as error:
+                problems.append(str(error))
+            if frame is not None:
+                start_s = time.perf_counter()
+                try:
+                    estimate = detector.detect(frame)
+                except CalibrationError as error:
+                    raise CalibrationError(f"{source.name}, frame {source.frames[i]}: {error}") from None
+                times_s.append(time.perf_counter() - start_s)
+            complete += bool(estimate.mask.all())
+            steered += bool(np.isfinite(estimate.steering_rad))
+            table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
+            if writer is not None:
+                rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
+                writer.add(frame, estimate, f"{source.frames[i]}{rate}")
+            if progress is not None:
+                progress(i + 1, len(source))
+        if not times_s:
+            raise DriveFormatError(
+                f"{source.name}: none of its {len(source)} frames can be read; the first: {problems[0]}"
+            )
+        table.write(out)
+    median_ms, p99_ms = (1e3 * float(np.percentile(times_s, q)) for q in (50, 99))
+    return DetectReport(
+        out, video, len(source), complete, steered, median_ms, p99_ms, (*source.problems, *problems)
+    )
+
+
+class _AnnotatedVideo:
+    """Writes annotated frames to a temporary name; the stack moves the file into place or removes it."""
+
+    def __init__(self, stack: ExitStack, path: Path, camera: Camera, rate_hz: float) -> None:
+        self.path, self.camera = path, camera
+        self.scale = max(1, -(-VIDEO_WIDTH_PX // camera.width))
+        size = (camera.width * self.scale, camera.height * self.scale)
+        temporary = stack.enter_context(atomic_file(path))
+        self._writer: Any = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
+        # Released before the file is moved: the stack undoes in reverse.
+        stack.callback(self._writer.release)
+        if not self._writer.isOpened():
+            raise DriveFormatError(f"{path}: OpenCV cannot write mp4v video of {size[0]}x{size[1]} here")
+
+    def add(
+        self, frame_bgr: UInt8[np.ndarray, "h w *c"] | None, estimate: LaneEstimate, caption: str
+    ) -> None:
+        if frame_bgr is None:
+            # A black frame keeps the video in step with the table.
+            frame_bgr = np.zeros((self.camera.height, self.camera.width, 3), np.uint8)
+            caption += "  unreadable"
+        self._writer.write(draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption))

@@ -1,0 +1,114 @@
+"""A detector's answer drawn into its frame, for people."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.perception.estimate import LaneEstimate
+
+#: BGR; the left line is green, the right one orange, the steering arrow yellow.
+LEFT_BGR, RIGHT_BGR, ARROW_BGR, TEXT_BGR = (80, 220, 80), (40, 140, 255), (60, 230, 250), (255, 255, 255)
+FAR_CM = 40.0
+_SAMPLES = 41
+# OpenCV draws in fixed point: this many bits below a pixel.
+_SHIFT = 4
+
+
+def draw_estimate(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    estimate: LaneEstimate,
+    camera: Camera,
+    scale: int = 1,
+    caption: str = "",
+) -> UInt8[np.ndarray, "sh sw 3"]:
+    """Draw the two parabolas (y = 0 to 40 cm), the six points and the steering target into a frame.
+
+    Args:
+        frame_bgr: Colour or gray frame; it is not changed.
+        estimate: What a detector answered; what it does not know is not drawn.
+        camera: Camera of the frame.
+        scale: Whole factor by which the picture is enlarged, so that lines stay thin on small frames.
+        caption: Text for the top left corner.
+
+    Returns:
+        A new picture, ``scale`` times the frame's size.
+    """
+    picture = _enlarged(frame_bgr, scale)
+    thickness = max(1, round(picture.shape[1] / 320))
+    y_cm = np.linspace(0.0, FAR_CM, _SAMPLES)
+    for side, colour in enumerate((LEFT_BGR, RIGHT_BGR)):
+        x_cm = np.polyval(estimate.parabolas[side], y_cm)
+        _draw_polyline(picture, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
+    rows_cm = np.tile(ROWS_CM, len(SIDES))
+    points = _pixels(np.stack([estimate.points_cm, rows_cm], axis=1), camera, scale)
+    for index, point in enumerate(points):
+        if np.isfinite(point).all():
+            colour = LEFT_BGR if index < len(ROWS_CM) else RIGHT_BGR
+            centre = _fixed(point)
+            cv2.circle(picture, centre, (3 * thickness) << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(picture, centre, (3 * thickness) << _SHIFT, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
+    _draw_arrow(picture, estimate.steering_rad, 2 * thickness)
+    if caption:
+        _draw_text(picture, caption, thickness)
+    return picture
+
+
+def _enlarged(frame_bgr: UInt8[np.ndarray, "h w *c"], scale: int) -> UInt8[np.ndarray, "sh sw 3"]:
+    colour = cv2.cvtColor(frame_bgr, cv2.COLOR_GRAY2BGR) if frame_bgr.ndim == 2 else frame_bgr
+    if scale == 1:
+        return np.array(colour)
+    return np.asarray(cv2.resize(colour, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR))
+
+
+def _pixels(points_cm: Float[np.ndarray, "n 2"], camera: Camera, scale: int) -> Float[np.ndarray, "n 2"]:
+    """Pixels of the enlarged picture; NaN where unknown or so far outside that fixed point overflows."""
+    known = np.isfinite(points_cm).all(axis=1)
+    pixels = np.full_like(points_cm, np.nan)
+    pixels[known] = (camera.project_ground(points_cm[known]) + 0.5) * scale - 0.5
+    limit = 10.0 * scale * max(camera.width, camera.height)
+    with np.errstate(invalid="ignore"):
+        pixels[~(np.abs(pixels) < limit).all(axis=1)] = np.nan
+    return pixels
+
+
+def _fixed(point_px: Float[np.ndarray, "2"]) -> tuple[int, int]:
+    return round(float(point_px[0]) * (1 << _SHIFT)), round(float(point_px[1]) * (1 << _SHIFT))
+
+
+def _draw_polyline(
+    picture: UInt8[np.ndarray, "h w 3"],
+    points_px: Float[np.ndarray, "n 2"],
+    colour: tuple[int, int, int],
+    thickness: int,
+) -> None:
+    seen = np.isfinite(points_px).all(axis=1)
+    for k in np.flatnonzero(seen[:-1] & seen[1:]):
+        cv2.line(
+            picture, _fixed(points_px[k]), _fixed(points_px[k + 1]), colour, thickness, cv2.LINE_AA, _SHIFT
+        )
+
+
+def _draw_arrow(picture: UInt8[np.ndarray, "h w 3"], steering_rad: float, thickness: int) -> None:
+    """An arrow from the middle of the bottom edge: up is straight on, left is positive."""
+    if not math.isfinite(steering_rad):
+        return
+    height, width = picture.shape[:2]
+    length = 0.25 * height
+    tail = (0.5 * width, height - 1.0)
+    tip = (tail[0] - length * math.sin(steering_rad), tail[1] - length * math.cos(steering_rad))
+    cv2.arrowedLine(
+        picture, (round(tail[0]), round(tail[1])), (round(tip[0]), round(tip[1])), ARROW_BGR, thickness
+    )
+
+
+def _draw_text(picture: UInt8[np.ndarray, "h w 3"], text: str, thickness: int) -> None:
+    size = picture.shape[1] / 800.0
+    origin = (round(12 * size), round(30 * size))
+    for colour, width in (((0, 0, 0), 3 * thickness), (TEXT_BGR, thickness)):
+        cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lanenet.cli import run_settings_schema
+from lanenet.config import check_settings, load_settings, read_yaml
+from lanenet.errors import ConfigError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+ALL_FILES = sorted(CONFIGS.rglob("*.y*ml"))
+
+
+def read_training_run(path: Path) -> Any:
+    return load_settings(run_settings_schema(), path)
+
+
+def read_simulation(path: Path) -> Any:
+    from datagen.world.simulate import SimulationSettings
+
+    return load_settings(SimulationSettings, path)
+
+
+def read_camera_file(path: Path) -> Any:
+    from lanenet.data.camera_file import read_camera
+
+    return read_camera(path)
+
+
+#: What reads the YAML files of each folder below configs/.
+READERS = {".": read_training_run, "drives": read_simulation, "cameras": read_camera_file}
+
+
+def test_the_config_of_the_readme_ships() -> None:
+    assert CONFIGS / "small.yaml" in ALL_FILES
+
+
+@pytest.mark.parametrize("path", ALL_FILES, ids=lambda path: str(path.relative_to(CONFIGS)))
+def test_every_shipped_config_loads(path: Path) -> None:
+    kind = str(path.parent.relative_to(CONFIGS))
+    assert kind in READERS, f"say in this test what reads the files of configs/{kind}"
+    READERS[kind](path)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+def test_a_training_run_is_named_after_its_file(path: Path) -> None:
+    # checkpoints/<name>/ then tells which config made it, and two configs never share a folder.
+    assert read_training_run(path).name == path.stem
+
+
+def test_a_misspelt_key_is_named() -> None:
+    data = read_yaml(CONFIGS / "small.yaml")
+    with pytest.raises(ConfigError, match="'lern', did you mean 'learn'"):
+        check_settings(run_settings_schema(), {**data, "lern": {}}, "small.yaml")

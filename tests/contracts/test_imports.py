@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+LINT_IMPORTS = Path(sys.executable).parent / "lint-imports"
+#: Modules that start on the car, and the packages that the base installation does not have.
+ONBOARD_MODULES = ("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network")
+HEAVY = ("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow", "onnx")
+
+
+def lint_imports(tree: Path) -> subprocess.CompletedProcess[str]:
+    # The tree's own packages come first on the path, not those of the installation under test.
+    environment = {**os.environ, "PYTHONPATH": str(tree), "COLUMNS": "200"}
+    return subprocess.run(
+        [str(LINT_IMPORTS), "--no-cache", "--no-logo"],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of both packages and the import rules, free to be spoilt."""
+    for package in ("lanenet", "datagen"):
+        shutil.copytree(REPO / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(REPO / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def test_the_import_rules_hold(tree: Path) -> None:
+    result = lint_imports(tree)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "0 broken" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("planted_in", "imported"),
+    [
+        ("lanenet.geometry", "lanenet.data"),
+        ("lanenet.onboard", "torch"),
+        ("lanenet.perception", "scipy"),
+        ("datagen", "lanenet.learn"),
+        ("lanenet.learn", "datagen"),
+        ("datagen", "torch"),
+        ("datagen", "pyarrow"),
+    ],
+)
+def test_a_wrong_way_import_is_named(tree: Path, planted_in: str, imported: str) -> None:
+    # Inside a function, because a lazy import is an import all the same.
+    planted = tree.joinpath(*planted_in.split(".")) / "planted.py"
+    planted.write_text(f"def late() -> None:\n    import {imported}\n")
+    result = lint_imports(tree)
+    assert result.returncode != 0, result.stdout
+    assert f"{planted_in}.planted -> {imported}" in result.stdout
+
+
+def loaded_packages(module: str) -> set[str]:
+    """Import a module in a fresh interpreter and return the names of the packages that this loads."""
+    code = f"import sys, {module}; print(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize("module", ONBOARD_MODULES)
+def test_what_starts_on_the_car_loads_no_heavy_package(module: str) -> None:
+    loaded = loaded_packages(module)
+    assert "lanenet" in loaded
+    assert loaded.isdisjoint(HEAVY), sorted(loaded.intersection(HEAVY))
+
+
+def test_the_check_for_heavy_packages_can_fail() -> None:
+    assert "torch" in loaded_packages("lanenet.learn.network")

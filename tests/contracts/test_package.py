@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import lanenet
+from lanenet.cli import app
+
+REPO = Path(__file__).resolve().parents[2]
+VERBS = ("train", "simulate", "map", "label", "val", "export", "detect", "bench", "doctor")
+#: Wide enough that help texts are not wrapped inside an option's name.
+TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
+
+
+def commands(group: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Walk through all verbs, those of groups (``calibrate chessboard``) by their full names.
+
+    By attribute and not by class: typer stands on click or on a copy of it, by its version.
+    """
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*prefix, name))
+        else:
+            yield (*prefix, name), command
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+def readme_lines() -> list[str]:
+    """The command lines ``lanenet ...`` in the code blocks of the README."""
+    blocks = re.findall(r"```(?:bash|sh|console)?\n(.*?)```", (REPO / "README.md").read_text(), re.DOTALL)
+    lines = (line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines())
+    return [line for line in lines if line.startswith("lanenet ")]
+
+
+def test_the_version_stands_once() -> None:
+    project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+    assert lanenet.__version__ == project["version"] == version("lanenet")
+
+
+def test_the_installed_command_answers() -> None:
+    program = Path(sys.executable).parent / "lanenet"
+    result = subprocess.run([program, "--help"], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    for verb in VERBS:
+        assert verb in result.stdout
+
+
+def test_an_unknown_verb_is_refused() -> None:
+    result = CliRunner().invoke(app, ["trian"], env=TERMINAL)
+    assert result.exit_code == 2
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_verb_exists(verb: str) -> None:
+    assert (verb,) in COMMANDS
+
+
+@pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
+def test_every_verb_has_help_with_an_example(names: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, [*names, "--help"], env=TERMINAL)
+    assert result.exit_code == 0, result.output
+    text = f"{COMMANDS[names].help} {COMMANDS[names].epilog}"
+    assert f"lanenet {' '.join(names)} " in " ".join(text.split()) + " ", "help without an example"
+    for parameter in COMMANDS[names].params:
+        if parameter.param_type_name == "option" and not parameter.hidden:
+            assert parameter.help, f"{parameter.opts[0]} is not explained"
+
+
+def test_the_readme_shows_the_main_verbs() -> None:
+    shown = {line.split()[1] for line in readme_lines()}
+    assert {"train", "simulate", "map", "label", "val", "detect"} <= shown
+
+
+@pytest.mark.parametrize("line", readme_lines(), ids=lambda line: line.split()[1])
+def test_every_line_of_the_readme_names_what_exists(line: str) -> None:
+    words = shlex.split(line, comments=True)[1:]
+    names = tuple(words[:2]) if tuple(words[:2]) in COMMANDS else tuple(words[:1])
+    assert names in COMMANDS, f"no such verb: {line}"
+    known = {option for parameter in COMMANDS[names].params for option in parameter.opts}
+    for word in words:
+        if word.startswith("--"):
+            assert word.partition("=")[0] in known, f"{word} is no option of {' '.join(names)}"
+
+
+def test_constraints_pin_the_direct_dependencies_exactly() -> None:
+    lines = (REPO / "constraints.txt").read_text().splitlines()
+    pins = [re.fullmatch(r"([A-Za-z0-9_.-]+)==[0-9][0-9A-Za-z.]*", line) for line in lines]
+    assert all(pins), [line for line, pin in zip(lines, pins, strict=True) if not pin]
+    pinned = {pin[1].lower() for pin in pins if pin}
+    project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [
+        *project["dependencies"],
+        *(d for name in ("data", "train", "viz", "dev") for d in extras[name]),
+    ]
+    names = {re.match(r"[A-Za-z0-9_.-]+", requirement)[0].lower() for requirement in wanted}  # type: ignore[index]
+    assert names - {"lanenet"} <= pinned

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from lanenet.data.detections import DetectionTable, read_detections
+from lanenet.errors import LabelFormatError
+from lanenet.geometry.lane import POINT_NAMES, points_from_parabolas
+from lanenet.perception.estimate import LaneEstimate
+
+PARABOLAS = np.array([[0.01, -0.2, -20.0], [-0.02, 0.3, 20.5]])
+FULL = LaneEstimate(points_from_parabolas(PARABOLAS), np.arange(1.0, 7.0), 0.25, 0.875)
+HALF = LaneEstimate(np.array([-20.0, -19.0, np.nan, 20.0, 21.0, 22.0]), steering_rad=-0.1, confidence=0.5)
+
+
+def make_table() -> DetectionTable:
+    table = DetectionTable()
+    table.add(3, 0.15, FULL)
+    table.add(4, 0.2, LaneEstimate())
+    table.add(7, float("nan"), HALF)
+    return table
+
+
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet", "seen.PARQUET"])
+def test_round_trip(tmp_path: Path, name: str) -> None:
+    table = make_table()
+    assert len(table) == 3
+    table.write(tmp_path / name)
+    back = read_detections(tmp_path / name)
+    assert back.frame.tolist() == [3, 4, 7]
+    np.testing.assert_allclose(back.t_s, [0.15, 0.2, np.nan])
+    np.testing.assert_allclose(
+        back.points_cm, [FULL.points_cm, np.full(6, np.nan), HALF.points_cm], rtol=1e-8
+    )
+    np.testing.assert_allclose(back.sigma_cm, [np.arange(1.0, 7.0), *np.full((2, 6), np.nan)])
+    np.testing.assert_allclose(back.parabolas[0], PARABOLAS, rtol=1e-8, atol=1e-9)
+    assert np.isnan(back.parabolas[1]).all()
+    # Only the line that lacks a point has no parabola.
+    assert np.isnan(back.parabolas[2, 0]).all()
+    np.testing.assert_allclose(back.parabolas[2, 1], [0.0, 1.0 / 15.0, 20.0], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(back.steering_rad, [0.25, np.nan, -0.1])
+    assert back.confidence.tolist() == [0.875, 0.0, 0.5]
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
+    make_table().write(tmp_path / "seen.csv")
+    header = (tmp_path / "seen.csv").read_text().splitlines()[0].split(",")
+    assert header == [
+        *("frame", "t_s"),
+        *POINT_NAMES,
+        *("left_0_sigma_cm", "left_15_sigma_cm", "left_30_sigma_cm"),
+        *("right_0_sigma_cm", "right_15_sigma_cm", "right_30_sigma_cm"),
+        *("left_a", "left_b", "left_c", "right_a", "right_b", "right_c"),
+        *("steering_rad", "confidence"),
+    ]
+    make_table().write(tmp_path / "seen.parquet")
+    table = pq.read_table(tmp_path / "seen.parquet")
+    assert table.column_names == header
+    assert table.column("left_30_cm").null_count == 2
+    assert json.loads(table.schema.metadata[b"lanenet"])["format"] == "lanenet-detections/1"
+
+
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
+def test_an_empty_table(tmp_path: Path, name: str) -> None:
+    DetectionTable().write(tmp_path / name)
+    back = read_detections(tmp_path / name)
+    assert len(back) == 0
+    assert back.points_cm.shape == (0, 6)
+    assert back.parabolas.shape == (0, 2, 3)
+
+
+@pytest.mark.parametrize("name", ["seen.txt", "seen"])
+def test_other_endings_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(LabelFormatError, match=r"ending in \.parquet or \.csv"):
+        make_table().write(tmp_path / name)
+    with pytest.raises(LabelFormatError, match=r"ending in \.parquet or \.csv"):
+        read_detections(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
+def test_infinite_values_are_not_written(tmp_path: Path, name: str) -> None:
+    table = make_table()
+    table.add(9, 0.3, LaneEstimate(steering_rad=float("inf")))
+    with pytest.raises(LabelFormatError, match="frame 9, column 'steering_rad': found inf"):
+        table.write(tmp_path / name)
+    table = make_table()
+    table.add(9, 0.3, LaneEstimate(confidence=float("nan")))
+    with pytest.raises(LabelFormatError, match="frame 9, column 'confidence': found NaN"):
+        table.write(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_cell_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "seen.csv"
+    make_table().write(path)
+    path.write_text(path.read_text().replace("0.875", "high"))
+    with pytest.raises(LabelFormatError, match=r"seen\.csv: line 2, column 'confidence': expected a number"):
+        read_detections(path)
+    path.write_text(path.read_text().replace("left_30_cm", "left_31_cm"))
+    with pytest.raises(LabelFormatError, match="column 'left_30_cm' is missing"):
+        read_detections(path)
+
+
+def test_another_kind_of_parquet_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "seen.parquet"
+    make_table().write(path)
+    table = pq.read_table(path)
+    pq.write_table(table.replace_schema_metadata({b"lanenet": b'{"format": "lanenet-detections/2"}'}), path)
+    with pytest.raises(LabelFormatError, match="expected format 'lanenet-detections/1'"):
+        read_detections(path)
+    with pytest.raises(LabelFormatError, match="no such file"):
+        read_detections(tmp_path / "none.parquet")

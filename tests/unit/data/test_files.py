@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lanenet.data.files import atomic_file, atomic_folder, require, write_json, write_text
+from lanenet.errors import LanenetError, MissingExtraError
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_a_file_appears_complete(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.csv"
+    with atomic_file(path) as temporary:
+        assert temporary.suffix == ".csv"
+        assert temporary.parent == path.parent
+        temporary.write_text("x")
+        assert not path.exists()
+    assert path.read_text() == "x"
+    assert names(path.parent) == ["a.csv"]
+
+
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+    with pytest.raises(ZeroDivisionError), atomic_file(path) as temporary:
+        temporary.write_text("half")
+        raise ZeroDivisionError
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(LanenetError, match="is a folder"), atomic_file(tmp_path):
+        pass
+
+
+def test_a_file_below_a_file_is_refused(tmp_path: Path) -> None:
+    write_text(tmp_path / "a", "x")
+    with pytest.raises(LanenetError, match="cannot be made"):
+        write_text(tmp_path / "a" / "b.txt", "y")
+
+
+def test_a_link_keeps_pointing_at_its_file(tmp_path: Path) -> None:
+    write_text(tmp_path / "real.txt", "old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    write_text(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_text() == "new"
+
+
+def make_folder(path: Path, text: str) -> None:
+    with atomic_folder(path, "map") as temporary:
+        (temporary / "map.yaml").write_text("format: lanenet-map/1\n")
+        (temporary / "deep").mkdir()
+        (temporary / "deep" / "a.txt").write_text(text)
+
+
+def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    make_folder(path, "one")
+    (path / "stale.txt").write_text("from the first run")
+    make_folder(path, "two")
+    assert (path / "deep" / "a.txt").read_text() == "two"
+    assert names(path) == ["deep", "map.yaml"]
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_error_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    make_folder(path, "one")
+    with pytest.raises(KeyboardInterrupt), atomic_folder(path) as temporary:
+        (temporary / "half.txt").write_text("x")
+        raise KeyboardInterrupt
+    assert (path / "deep" / "a.txt").read_text() == "one"
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    make_folder(tmp_path / "out", "one")
+    assert names(tmp_path / "out") == ["deep", "map.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("marker", "text"),
+    [
+        ("photo.jpg", "mine"),
+        ("map.yaml", "format: something-else/1"),
+        ("map.yaml", "[not, a, mapping]"),
+        # A camera file may lie among anything.
+        ("camera.yaml", "format: lanenet-camera/1"),
+        ("drive.yaml", "format: lanenet-drive/1"),
+    ],
+)
+def test_a_folder_of_someone_else_is_kept(tmp_path: Path, marker: str, text: str) -> None:
+    path = tmp_path / "out"
+    path.mkdir()
+    (path / marker).write_text(text)
+    with pytest.raises(LanenetError, match=r"out: the folder is not empty and holds no map\.yaml"):
+        make_folder(path, "one")
+    assert (path / marker).read_text() == text
+
+
+def test_without_a_kind_any_earlier_output_is_replaced(tmp_path: Path) -> None:
+    make_folder(tmp_path / "out", "one")
+    with atomic_folder(tmp_path / "out") as temporary:
+        (temporary / "b.txt").write_text("x")
+    assert names(tmp_path / "out") == ["b.txt"]
+
+
+def test_a_folder_that_fills_up_meanwhile_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    with pytest.raises(LanenetError, match="not replaced"), atomic_folder(path):
+        path.mkdir()
+        (path / "mine.txt").write_text("x")
+    assert names(path) == ["mine.txt"]
+
+
+def test_json_has_null_for_what_is_not_finite(tmp_path: Path) -> None:
+    write_json(
+        tmp_path / "a.json",
+        {
+            "nan": float("nan"),
+            "deep": [np.float32(0.5), (np.int64(3), np.array([1.0, np.inf]))],
+            "flag": np.bool_(True),
+            "path": Path("a/b"),
+            "text": "\u00fc",
+        },
+    )
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {
+        "nan": None,
+        "deep": [0.5, [3, [1.0, None]]],
+        "flag": True,
+        "path": "a/b",
+        "text": "\u00fc",
+    }
+
+
+def test_require_returns_the_module() -> None:
+    assert require("json.decoder", "data").JSONDecoder is json.JSONDecoder
+
+
+def test_a_missing_package_names_its_extra() -> None:
+    with pytest.raises(MissingExtraError, match=r"no_such_package .*pip install 'lanenet\[data\]'"):
+        require("no_such_package.part", "data")

@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from lanenet.data.drive import open_drive
+from lanenet.errors import DriveFormatError
+
+
+def record(k: int, **changes: Any) -> dict[str, Any]:
+    return {
+        "_index": k,
+        "_session_id": "24-01-01_0",
+        "_timestamp_ms": 1700000000000 + 50 * k,
+        "cam/image_array": f"{k}_cam_image_array_.jpg",
+        "user/angle": -0.25,
+        "user/mode": "user",
+        "user/throttle": 0.01 * k,
+        **changes,
+    }
+
+
+def write_tub(
+    path: Path, records: list[dict[str, Any] | str], deleted: list[int] | None = None, per_catalog: int = 1000
+) -> Path:
+    """A tub as Donkeycar 4 writes it; a text in place of a record is written as it is."""
+    (path / "images").mkdir(parents=True)
+    picture = cv2.imencode(".jpg", np.full((12, 16, 3), 90, np.uint8))[1].tobytes()
+    names = []
+    for start in range(0, len(records), per_catalog):
+        names.append(f"catalog_{len(names)}.catalog")
+        lines = [r if isinstance(r, str) else json.dumps(r) for r in records[start : start + per_catalog]]
+        (path / names[-1]).write_text("\n".join(lines) + "\n")
+    for r in records:
+        if isinstance(r, dict) and isinstance(r.get("cam/image_array"), str):
+            (path / "images" / r["cam/image_array"]).write_bytes(picture)
+    inputs = ["cam/image_array", "user/angle", "user/throttle", "user/mode"]
+    catalogs = {
+        "paths": names,
+        "current_index": len(records),
+        "max_len": 1000,
+        "deleted_indexes": deleted or [],
+    }
+    lines = [inputs, ["image_array", "float", "float", "str"], {}, {"created_at": 1.0}, catalogs]
+    (path / "manifest.json").write_text("\n".join(json.dumps(line) for line in lines) + "\n")
+    return path
+
+
+def test_a_clean_tub(tmp_path: Path) -> None:
+    drive = open_drive(write_tub(tmp_path / "tub", [record(k) for k in range(7)], [2, 3], per_catalog=4))
+    assert (drive.name, len(drive), drive.width, drive.height) == ("tub", 7, 16, 12)
+    assert drive.problems == ()
+    assert drive.times_trusted
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(7))
+    assert np.flatnonzero(drive.deleted).tolist() == [2, 3]
+    assert drive.commands.angle is not None
+    assert drive.commands.throttle is not None
+    # Donkeycar's sign stays: -1 is full left.
+    assert drive.commands.angle.tolist() == [-0.25] * 7
+    np.testing.assert_allclose(drive.commands.throttle, 0.01 * np.arange(7))
+    assert drive.commands.steering_rad is None
+    assert not drive.breaks.any()
+    assert drive.image(6).shape == (12, 16, 3)
+
+
+def test_broken_rows_are_counted_and_named(tmp_path: Path) -> None:
+    rows: list[dict[str, Any] | str] = [record(k) for k in range(10)]
+    rows[2] = '{"_index": 2, "cam/image_ar'
+    rows[3] = "\0\0\0\0"
+    rows[4] = json.dumps({"_index": 4, "user/angle": 0.0})
+    rows[5] = json.dumps(record(5, **{"_index": "five"}))
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.frames.tolist() == [0, 1, 6, 7, 8, 9]
+    assert np.flatnonzero(drive.breaks).tolist() == [2]
+    assert len(drive.problems) == 1
+    assert "catalog_0.catalog: 4 rows are not JSON" in drive.problems[0]
+    assert "first: row 3" in drive.problems[0]
+
+
+def test_rows_that_repeat_or_go_back_are_left_out(tmp_path: Path) -> None:
+    rows: list[dict[str, Any] | str] = [record(k) for k in (0, 1, 1, 0, 2, 3)]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.frames.tolist() == [0, 1, 2, 3]
+    assert "2 rows repeat an earlier index or go back" in drive.problems[0]
+
+
+def test_missing_images_are_counted_and_named(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(6)])
+    for k in (0, 4):
+        (path / "images" / f"{k}_cam_image_array_.jpg").unlink()
+    drive = open_drive(path)
+    assert drive.frames.tolist() == [1, 2, 3, 5]
+    assert np.flatnonzero(drive.breaks).tolist() == [3]
+    assert "2 of 6 images are missing (first: frame 0, 0_cam_image_array_.jpg)" in drive.problems[0]
+
+
+def test_a_corrupt_image_is_named(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(3)])
+    (path / "images" / "1_cam_image_array_.jpg").write_bytes(b"\xff\xd8\xff\xdacut")
+    with pytest.raises(DriveFormatError, match=r"frame 1: .*1_cam_image_array_\.jpg: not a readable image"):
+        open_drive(path).image(1)
+
+
+def test_rows_without_an_angle_stay_and_are_counted(tmp_path: Path) -> None:
+    rows: list[dict[str, Any] | str] = [record(k) for k in range(4)]
+    rows[1] = record(1, **{"user/angle": None})
+    rows[3] = record(3, **{"user/angle": float("nan")})
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.commands.angle is not None
+    np.testing.assert_array_equal(drive.commands.angle, [-0.25, np.nan, -0.25, np.nan])
+    assert "2 of 4 rows have no angle (first: frame 1)" in drive.problems[0]
+
+
+def test_the_pilots_commands_count_when_the_pilot_drove(tmp_path: Path) -> None:
+    pilot = {"pilot/angle": 0.5, "pilot/throttle": 0.9}
+    rows: list[dict[str, Any] | str] = [
+        record(k, **{"user/mode": mode, **pilot}) for k, mode in enumerate(["user", "local_angle", "local"])
+    ]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.commands.angle is not None
+    assert drive.commands.throttle is not None
+    assert drive.commands.angle.tolist() == [-0.25, 0.5, 0.5]
+    np.testing.assert_allclose(drive.commands.throttle, [0.0, 0.01, 0.9])
+
+
+def test_useless_timestamps_are_replaced_and_said_so(tmp_path: Path) -> None:
+    rows: list[dict[str, Any] | str] = [record(k, _timestamp_ms=3 * k) for k in range(2, 8)]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert not drive.times_trusted
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(6))
+    assert "median step is 3 ms" in drive.problems[0]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "reason"),
+    [
+        ([0, 50, 100, 90, 150, 200], "do not increase at frame 3"),
+        ([0, 50, 51, 101, 102, 152, 202, 252], "29 % of the steps are far from the median of 0.050 s"),
+        ([0, 50, None, 150], "1 rows have none"),
+    ],
+)
+def test_irregular_timestamps_are_not_trusted(tmp_path: Path, stamps: list[int | None], reason: str) -> None:
+    rows: list[dict[str, Any] | str] = [record(k, _timestamp_ms=stamp) for k, stamp in enumerate(stamps)]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert not drive.times_trusted
+    assert reason in drive.problems[0]
+    assert (np.diff(drive.t_s) > 0.0).all()
+
+
+def test_a_new_session_and_a_pause_are_breaks(tmp_path: Path) -> None:
+    rows: list[dict[str, Any] | str] = [record(k) for k in range(9)]
+    for k in range(3, 9):
+        rows[k] = record(k, _session_id="24-01-01_1")
+    for k in range(7, 9):
+        rows[k] = record(k, _session_id="24-01-01_1", _timestamp_ms=1700000000000 + 50 * k + 2000)
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.times_trusted
+    assert np.flatnonzero(drive.breaks).tolist() == [3, 7]
+
+
+def test_shadow_files_of_a_mac_are_not_read(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(3)])
+    (path / "._catalog_0.catalog").write_bytes(b"\0\5\x16\7Mac OS X\xff\xfe")
+    manifest = (path / "manifest.json").read_text()
+    names = '["catalog_0.catalog"]'
+    (path / "manifest.json").write_text(
+        manifest.replace(names, '["._catalog_0.catalog", "catalog_0.catalog"]')
+    )
+    drive = open_drive(path)
+    assert len(drive) == 3
+    assert drive.problems == ()
+
+
+def test_a_lost_catalog_is_a_problem_only_if_others_are_there(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(8)], per_catalog=4)
+    (path / "catalog_0.catalog").unlink()
+    drive = open_drive(path)
+    assert drive.frames.tolist() == [4, 5, 6, 7]
+    assert drive.t_s[0] == 0.0
+    assert "catalogs listed but not there: catalog_0.catalog" in drive.problems[0]
+    (path / "catalog_1.catalog").unlink()
+    with pytest.raises(DriveFormatError, match=r"catalog_0\.catalog, catalog_1\.catalog are not there"):
+        open_drive(path)
+
+
+def test_an_empty_tub(tmp_path: Path) -> None:
+    with pytest.raises(DriveFormatError, match="the tub is empty: the manifest lists no catalog"):
+        open_drive(write_tub(tmp_path / "a", []))
+    path = write_tub(tmp_path / "b", [record(0)])
+    (path / "catalog_0.catalog").write_text("")
+    with pytest.raises(DriveFormatError, match="no usable frames"):
+        open_drive(path)
+    with pytest.raises(DriveFormatError, match=r"no usable frames .*1 rows are not JSON"):
+        open_drive(write_tub(tmp_path / "c", ["broken"]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("not json", "not a readable tub manifest"),
+        ("[]\n[]\n{}\n{}\n", "expected five lines of JSON, the last with the catalogs' 'paths', found 4"),
+        ('[]\n[]\n{}\n{}\n{"paths": ["a"], "deleted_indexes": "none"}', "'deleted_indexes'"),
+    ],
+)
+def test_a_broken_manifest_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(DriveFormatError) as caught:
+        open_drive(tmp_path)
+    assert "manifest.json: " in str(caught.value)
+    assert message in str(caught.value)
+
+
+def test_a_drive_yaml_in_the_tub_is_used(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(3)])
+    (path / "drive.yaml").write_text("format: lanenet-drive/1\nlane_width_cm: 59\nmax_steering_rad: 0.4\n")
+    drive = open_drive(path)
+    assert (drive.lane_width_cm, drive.max_steering_rad) == (59.0, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "n_deleted", "first", "trusted"),
+    [
+        ("donkey_circuit", 1000, 0, 0, False),
+        ("usi_mat", 2000, 518, 0, True),
+        ("garage_tape", 1500, 0, 2000, True),
+    ],
+)
+def test_real_tubs(shared_data: Path, name: str, n: int, n_deleted: int, first: int, trusted: bool) -> None:
+    drive = open_drive(shared_data / name)
+    assert (len(drive), int(drive.deleted.sum()), int(drive.frames[0])) == (n, n_deleted, first)
+    assert (drive.width, drive.height) == (160, 120)
+    assert drive.times_trusted is trusted
+    assert np.median(np.diff(drive.t_s)) == pytest.approx(0.05, abs=0.002)
+    assert drive.commands.angle is not None
+    assert np.abs(drive.commands.angle).max() <= 1.0
+    assert np.isfinite(drive.commands.angle).all()
+    for i in (0, n // 2, n - 1):
+        assert drive.image(i).std() > 5.0

@@ -1,0 +1,137 @@
+import contextlib
+import logging
+import math
+import shutil
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from synthetic_labels import WINDOW, make_label_set
+
+from lanenet.config import dump_settings
+from lanenet.errors import CheckpointError, ModelMismatchError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn import export
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.evaluate import network_predictor
+from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
+from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
+from lanenet.perception.network import ModelMeta, read_model_meta
+
+torch.set_num_threads(1)
+
+META = ModelMeta(WINDOW, ("cam0", "cam1"), 26.0, 40.0, "abc", (1.0, 0.5, 0.6, 1.1, 0.5, math.nan), "truth")
+LABELS = make_label_set(5, 3)
+RASTERS = np.stack([LABELS.raster(i) for i in range(5)])[:, None]
+
+
+def make_network():
+    network = new_network(LearnSettings().network, WINDOW.rows, WINDOW.columns, 1).eval()
+    network.mean_cm.copy_(torch.tensor([-20.0, -19.0, -17.0, 20.0, 22.0, 25.0]))
+    network.scale_cm.fill_(8.0)
+    return network
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoint")
+    (folder / "config.yaml").write_text(dump_settings(LearnSettings()))
+    write_weights(folder / "weights.safetensors", make_network(), META)
+    write_rasters(folder / "check_rasters.png", RASTERS)
+    export_checkpoint(folder)
+    return folder
+
+
+def test_one_file_that_old_runtimes_read(checkpoint):
+    assert sorted(p.name for p in checkpoint.iterdir()) == [
+        "check_rasters.png",
+        "config.yaml",
+        "model.onnx",
+        "weights.safetensors",
+    ]
+    model = onnx.load(checkpoint / "model.onnx", load_external_data=False)
+    assert model.ir_version <= 9
+    assert [(o.domain, o.version <= 20) for o in model.opset_import] == [("", True)]
+    assert not any(t.external_data for t in model.graph.initializer)
+    # Nothing of the machine that exported it.
+    assert b"site-packages" not in (checkpoint / "model.onnx").read_bytes()
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_onnx_agrees_with_torch_for_any_batch(checkpoint, n):
+    session = onnxruntime.InferenceSession(checkpoint / "model.onnx", providers=["CPUExecutionProvider"])
+    names = [o.name for o in session.get_outputs()]
+    assert names == ["points_cm", "parabolas", "centre_cm", "steering_rad"]
+    found = session.run(None, {"raster": RASTERS[:n]})
+    with torch.inference_mode():
+        expected = DeployedLaneNet(make_network()).eval()(torch.from_numpy(RASTERS[:n]))
+    for f, e in zip(found, expected, strict=True):
+        assert f.shape == tuple(e.shape)
+        np.testing.assert_allclose(f, e.numpy(), atol=1e-3)
+
+
+def test_the_file_describes_itself(checkpoint):
+    meta = read_model_meta(checkpoint / "model.onnx")
+    assert meta.window == WINDOW and meta.camera_hashes == ("cam0", "cam1")
+    np.testing.assert_equal(meta.rmse_cm, META.rmse_cm)
+    assert (meta.wheelbase_cm, meta.lane_width_cm, meta.training_hash, meta.reference) == (
+        26.0,
+        40.0,
+        "abc",
+        "truth",
+    )
+
+
+def test_export_is_silent(tmp_path, capfd, caplog):
+    export_onnx(make_network(), META, RASTERS, tmp_path / "m.onnx")
+    captured = capfd.readouterr()
+    assert captured.out == captured.err == ""
+    assert not [r for r in caplog.records if r.levelno >= logging.INFO]
+
+
+def test_predictor_answers_as_the_network_and_not_for_empty_rasters(checkpoint):
+    labels = make_label_set(3, 3)
+    labels.edges[1] = labels.edges[1][:0]
+    found = network_predictor(checkpoint / "model.onnx")(labels)
+    with torch.inference_mode():
+        expected = make_network()(input_of_rasters(torch.from_numpy(RASTERS[:3]))).numpy()
+    np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], atol=1e-3)
+    assert np.isnan(found[1]).all()
+    with pytest.raises(ModelMismatchError, match="window"):
+        network_predictor(checkpoint / "model.onnx")(make_label_set(1, 0, window=BirdseyeWindow()))
+
+
+def test_a_file_that_differs_never_appears(tmp_path, monkeypatch):
+    monkeypatch.setattr(export, "_largest_difference", lambda *_: 0.5)
+    with pytest.raises(CheckpointError, match=r"differs from PyTorch by 0\.5"):
+        export_onnx(make_network(), META, RASTERS, tmp_path / "m.onnx")
+    with pytest.raises(CheckpointError, match="no raster"):
+        export_onnx(make_network(), META, RASTERS[:0], tmp_path / "m.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
+    with pytest.raises(CheckpointError, match="no such folder"):
+        export_checkpoint(tmp_path / "none")
+    for i, (name, content, message) in enumerate(
+        [
+            ("config.yaml", None, "no such file"),
+            ("config.yaml", "sed: 3", "unknown key 'sed'"),
+            ("config.yaml", "network: {hidden: 8}", "weights do not fit"),
+            ("weights.safetensors", None, "was the training finished"),
+            ("weights.safetensors", "rubbish", "cannot be read as safetensors"),
+            ("check_rasters.png", None, "no such file"),
+            ("check_rasters.png", "rubbish", "no picture"),
+        ]
+    ):
+        folder = tmp_path / str(i)
+        shutil.copytree(checkpoint, folder)
+        (folder / "model.onnx").unlink()
+        (folder / name).unlink()
+        with contextlib.suppress(TypeError):
+            (folder / name).write_text(content)
+        with pytest.raises(CheckpointError, match=message):
+            export_checkpoint(folder)
+        assert not (folder / "model.onnx").exists()

@@ -1,0 +1,112 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_labels import WINDOW, make_label_set
+
+from lanenet.data.label_set import write_labels
+from lanenet.errors import LabelFormatError
+from lanenet.learn.config import AugmentSettings
+from lanenet.learn.dataset import LaneSamples, hash_files, read_samples
+
+
+def samples(n=50, seed=0):
+    return LaneSamples([make_label_set(n, seed)], ["a.parquet"])
+
+
+def test_frames_of_two_sets_stay_in_order(tmp_path):
+    a, b = make_label_set(3, 0), make_label_set(4, 1, camera_hash="cam1", source="map")
+    write_labels(tmp_path / "a.parquet", a)
+    write_labels(tmp_path / "b.parquet", b)
+    both = read_samples([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+    assert len(both) == 7
+    assert both.camera_hashes == ["cam0", "cam1"]
+    assert both.reference == "map and truth"
+    rasters, points = both.plain_batch(np.array([5, 0]))
+    np.testing.assert_array_equal(rasters[0, 0], b.raster(2))
+    np.testing.assert_allclose(points[1], a.points_cm[0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("other", "what"),
+    [
+        (make_label_set(2, 0, window=replace(WINDOW, cell_cm=2.0)), "window"),
+        (make_label_set(2, 0, wheelbase_cm=20.0), "wheelbase_cm 20"),
+    ],
+)
+def test_sets_that_disagree_are_both_named(other, what):
+    with pytest.raises(LabelFormatError, match=what) as caught:
+        LaneSamples([make_label_set(2, 0), other], ["one.parquet", "two.parquet"])
+    assert "one.parquet" in str(caught.value) and "two.parquet" in str(caught.value)
+
+
+def test_frames_without_labels_or_quality_are_left_out():
+    labels = make_label_set(4, 0)
+    points = labels.points_cm.copy()
+    points[1] = np.nan
+    labels = replace(labels, points_cm=points, quality=np.array([1.0, 1.0, 0.2, 0.9]))
+    kept = LaneSamples([labels], ["a"], min_quality=0.5)
+    np.testing.assert_array_equal(kept.points_cm, labels.points_cm[[0, 3]])
+    with pytest.raises(LabelFormatError, match="no frame has a label"):
+        LaneSamples([replace(labels, points_cm=points * np.nan)], ["a"])
+    with pytest.raises(LabelFormatError, match="no label set"):
+        LaneSamples([], [])
+
+
+def test_a_sample_depends_on_seed_epoch_and_index_alone():
+    data, settings = samples(), AugmentSettings()
+    together = data.augmented_batch(np.array([4, 9, 2]), settings, 1, 2)
+    alone = data.augmented_batch(np.array([9]), settings, 1, 2)
+    np.testing.assert_array_equal(together[0][1], alone[0][0])
+    np.testing.assert_array_equal(together[1][1], alone[1][0])
+    for seed, epoch in ((1, 3), (0, 2)):
+        other = data.augmented_batch(np.array([9]), settings, seed, epoch)
+        assert not np.array_equal(alone[1], other[1])
+
+
+def test_workers_do_not_change_an_epoch():
+    data, settings = samples(), AugmentSettings()
+    runs = [list(data.epoch(settings, 0, 0, 8, workers)) for workers in (0, 1, 3)]
+    for run in runs[1:]:
+        assert len(run) == len(runs[0]) == data.steps_per_epoch(8) == 7
+        for (raster, points), (raster0, points0) in zip(run, runs[0], strict=True):
+            np.testing.assert_array_equal(raster, raster0)
+            np.testing.assert_array_equal(points, points0)
+
+
+def test_an_epoch_shows_each_sample_once_in_an_order_of_its_own():
+    data = samples(49)
+    plain = AugmentSettings(mirror=0.0, shift_cm=0.0, rotate_rad=0.0)
+    first, second = (
+        np.concatenate([points for _, points in data.epoch(plain, 0, epoch, 8)]) for epoch in (0, 1)
+    )
+    # 49 = 6 x 8 + 1: the single last sample is left out.
+    assert len(first) == 48 and data.steps_per_epoch(8) == 6
+    assert len(np.unique(first[:, 0])) == 48
+    assert not np.array_equal(first, second)
+
+
+def test_an_epoch_can_be_left_early():
+    batches = samples().epoch(AugmentSettings(), 0, 0, 8)
+    next(batches)
+    batches.close()
+
+
+def test_normalisation_counts_known_points_and_mirrors():
+    labels = make_label_set(3, 0)
+    points = np.array([[-10.0, np.nan, -20.0, 10.0, 30.0, 20.0], [-30.0, np.nan, -20.0, 10.0, 30.0, 20.0]])
+    data = LaneSamples([replace(make_label_set(2, 0), points_cm=points)], ["a"])
+    mean, scale = data.normalisation(mirrored=False)
+    np.testing.assert_allclose(mean, [-20.0, 0.0, -20.0, 10.0, 30.0, 20.0])
+    np.testing.assert_allclose(scale, [10.0, 2.0, 2.0, 2.0, 2.0, 2.0])
+    mean, _ = LaneSamples([labels], ["a"]).normalisation(mirrored=True)
+    np.testing.assert_allclose(mean[:3], -mean[3:])
+
+
+def test_file_hash_is_of_contents(tmp_path):
+    for name, text in (("a", "1"), ("b", "1"), ("c", "2")):
+        (tmp_path / name).write_text(text)
+    a, b, c = (tmp_path / name for name in "abc")
+    assert hash_files([a, c]) == hash_files([b, c]) != hash_files([c, a])
+    with pytest.raises(LabelFormatError, match="missing"):
+        hash_files([tmp_path / "missing"])

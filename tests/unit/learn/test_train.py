@@ -1,0 +1,186 @@
+import csv
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import load_file
+from synthetic_labels import make_label_set
+
+from lanenet.config import load_settings
+from lanenet.data.label_set import read_labels, write_labels
+from lanenet.errors import CheckpointError, LabelFormatError, LanenetError
+from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
+from lanenet.learn.evaluate import evaluate_detectors, network_predictor
+from lanenet.learn.train import learning_rate_at, masked_loss, train
+from lanenet.perception.network import read_model_meta
+
+torch.set_num_threads(1)
+
+TINY = LearnSettings(
+    epochs=3,
+    batch_size=16,
+    threads=1,
+    network=NetworkSettings(channels=(4, 8), hidden=16),
+)
+
+
+class KilledError(Exception):
+    pass
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("labels")
+    for name, n, seed in (("train", 70, 0), ("val", 40, 1), ("big", 400, 2)):
+        write_labels(folder / f"{name}.parquet", make_label_set(n, seed))
+    return folder
+
+
+def run(data, out, settings=TINY, progress=None, name="train"):
+    return train(settings, [data / f"{name}.parquet"], [data / "val.parquet"], out, progress)
+
+
+def kill_at(last):
+    def progress(epoch, *_):
+        if epoch == last:
+            raise KilledError
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def finished(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run") / "tiny"
+    return run(data, out)
+
+
+def test_learns_far_better_than_a_constant(data, tmp_path):
+    settings = LearnSettings(
+        epochs=6,
+        batch_size=16,
+        threads=1,
+        network=NetworkSettings(channels=(8, 16, 24), hidden=32),
+        augment=AugmentSettings(clutter_points=3, clutter_segments=1),
+        ema_decay=0.98,
+    )
+    result = run(data, tmp_path / "learned", settings, name="big")
+    val = read_labels(data / "val.parquet")
+    tables = evaluate_detectors(
+        [val],
+        {
+            "network": network_predictor(result.model_path),
+            "constant": lambda s: np.tile(val.points_cm.mean(axis=0), (len(s), 1)),
+        },
+    )
+    assert tables["constant"].all.rmse_cm > 3.0
+    assert tables["network"].all.rmse_cm < 0.35 * tables["constant"].all.rmse_cm
+    assert tables["network"].all.rmse_cm == pytest.approx(result.val_rmse_cm, abs=1e-3)
+
+
+def test_the_folder_holds_what_it_should(finished, data):
+    names = {p.name for p in finished.folder.iterdir()}
+    assert names >= {
+        "weights.safetensors",
+        "model.onnx",
+        "config.yaml",
+        "metrics.json",
+        "curve.csv",
+        "curve.png",
+        "last.pt",
+    }
+    assert load_settings(LearnSettings, finished.folder / "config.yaml") == TINY
+    metrics = json.loads((finished.folder / "metrics.json").read_text())
+    assert metrics["val_rmse_cm"] == finished.val_rmse_cm
+    assert metrics["val"]["reference"] == "truth"
+    with (finished.folder / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["epoch"]) for row in rows] == [1, 2, 3]
+    best = min(rows, key=lambda row: float(row["val_rmse_cm"]))
+    assert int(best["epoch"]) == finished.best_epoch == metrics["best_epoch"]
+    assert float(best["val_rmse_cm"]) == pytest.approx(finished.val_rmse_cm, rel=1e-6)
+    meta = read_model_meta(finished.model_path)
+    assert meta.camera_hashes == ("cam0",) and meta.lane_width_cm == 40.0
+    assert math.isfinite(sum(meta.rmse_cm)) and meta.training_hash == metrics["run_hash"]
+    session = onnxruntime.InferenceSession(finished.model_path, providers=["CPUExecutionProvider"])
+    assert session.get_inputs()[0].shape[1:] == [1, 24, 32]
+    # Readable without trusting the file.
+    torch.load(finished.folder / "last.pt", weights_only=True)
+
+
+@pytest.mark.parametrize(("last", "every"), [(1, 1), (2, 1), (2, 5)])
+def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last, every):
+    settings = TINY.model_copy(update={"checkpoint_every": every})
+    with pytest.raises(KilledError):
+        run(data, tmp_path / "a", settings, kill_at(last))
+    assert not (tmp_path / "a" / "model.onnx").exists()
+    seen = []
+    result = run(data, tmp_path / "a", settings, lambda epoch, *_: seen.append(epoch))
+    assert seen == ([1, 2, 3] if every > last else list(range(last + 1, 4)))
+    a = load_file(result.folder / "weights.safetensors")
+    b = load_file(finished.folder / "weights.safetensors")
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    assert (result.best_epoch, result.val_rmse_cm) == (finished.best_epoch, finished.val_rmse_cm)
+
+
+def test_a_finished_run_is_not_repeated(data, finished):
+    def progress(*_):
+        raise KilledError
+
+    before = finished.model_path.stat().st_mtime_ns
+    again = run(data, finished.folder, progress=progress)
+    assert again == replace(finished, computed=False) and finished.computed
+    assert finished.model_path.stat().st_mtime_ns == before
+
+
+def test_another_run_in_the_same_folder_is_refused(data, finished, tmp_path):
+    other = TINY.model_copy(update={"seed": 1})
+    with pytest.raises(CheckpointError, match="pick another name, or delete"):
+        run(data, finished.folder, other)
+    with pytest.raises(CheckpointError, match="other settings or data"):
+        run(data, finished.folder, name="val")
+    with pytest.raises(KilledError):
+        run(data, tmp_path / "half", progress=kill_at(1))
+    with pytest.raises(CheckpointError, match="pick another name, or delete"):
+        run(data, tmp_path / "half", other)
+    (tmp_path / "half" / "last.pt").write_bytes(b"rubbish")
+    with pytest.raises(CheckpointError, match="delete it to start over"):
+        run(data, tmp_path / "half")
+
+
+def test_label_sets_must_fit_together(data, tmp_path):
+    write_labels(tmp_path / "other.parquet", make_label_set(5, 0, wheelbase_cm=20.0))
+    with pytest.raises(LabelFormatError, match="wheelbase_cm") as caught:
+        train(TINY, [data / "train.parquet"], [tmp_path / "other.parquet"], tmp_path / "out")
+    assert "train.parquet" in str(caught.value) and "other.parquet" in str(caught.value)
+    with pytest.raises(LabelFormatError, match="no label set"):
+        train(TINY, [data / "train.parquet"], [], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_divergence_is_an_error(data, tmp_path):
+    with pytest.raises(LanenetError, match="learning_rate"):
+        run(data, tmp_path / "wild", TINY.model_copy(update={"learning_rate": 1e30}))
+
+
+def test_masked_labels_give_neither_loss_nor_gradient():
+    points = torch.zeros(2, 6, requires_grad=True)
+    labels = torch.full((2, 6), float("nan"))
+    labels[0, 2], labels[1, 4] = 1.0, 10.0
+    loss = masked_loss(points, labels, 2.0)
+    loss.backward()
+    # 0.5 * 1^2 / 2 inside, 10 - 0.5 * 2 outside.
+    assert float(loss.detach()) == pytest.approx((0.25 + 9.0) / 2.0)
+    assert torch.isfinite(points.grad).all()
+    assert points.grad.count_nonzero() == 2
+
+
+def test_learning_rate_rises_and_falls():
+    settings = LearnSettings(learning_rate=1.0, warmup=0.1)
+    rates = [learning_rate_at(step, 100, settings) for step in range(100)]
+    assert int(np.argmax(rates)) == 10 and rates[10] == 1.0
+    assert (np.diff(rates[:11]) > 0).all() and (np.diff(rates[10:]) < 0).all()
+    assert 0.0 < rates[0] < 0.2 and 0.0 < rates[-1] < 1e-3

@@ -1,0 +1,305 @@
+"""The command line: what it asks of the functions behind it, and what it says when they fail."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from lanenet import cli
+from lanenet.config import Settings
+from lanenet.data.camera_file import write_camera
+from lanenet.data.detections import read_detections
+from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.onboard.bench import example_camera, example_frames
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(cli.app, [str(word) for word in words], env={"COLUMNS": "200"})
+
+
+def error_of(result: Result) -> str:
+    """The one line that a failure says."""
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert result.exit_code == 1 and len(lines) == 1 and "Traceback" not in result.output, result.output
+    return lines[0]
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i, frame in enumerate(example_frames(example_camera(), 3, np.random.default_rng(1))):
+        cv2.imwrite(str(folder / f"{i}.png"), frame)
+    write_camera(tmp_path / "camera.yaml", example_camera(), "nominal values")
+    return folder
+
+
+def test_detect_writes_table_and_video_and_says_so(tmp_path: Path, photos: Path) -> None:
+    out, video = tmp_path / "lanes.csv", tmp_path / "lanes.mp4"
+    result = run(
+        *("detect", photos, "--detector", "lane-filter", "--camera", tmp_path / "camera.yaml"),
+        *("--lane-width", "40", "--out", out, "--video", video),
+    )
+    assert result.exit_code == 0, result.output
+    assert np.isfinite(read_detections(out).points_cm).all()
+    assert video.stat().st_size > 0
+    for text in ("3 frames, 3 with all six points", f"wrote {out}", f"wrote {video}", "next: lanenet "):
+        assert text in result.stdout
+
+
+def test_detect_says_what_is_missing(tmp_path: Path, photos: Path) -> None:
+    camera = tmp_path / "camera.yaml"
+    always = ("--out", tmp_path / "l.csv")
+    lane_filter = ("--detector", "lane-filter", *always)
+    assert "no such file" in error_of(run("detect", tmp_path / "none", *lane_filter))
+    assert "--camera" in error_of(run("detect", photos, *lane_filter))
+    assert "--lane-width" in error_of(run("detect", photos, *lane_filter, "--camera", camera))
+    network = ("detect", photos, "--detector", "network", "--camera", camera, *always)
+    assert "--model" in error_of(run(*network))
+    assert "none.onnx" in error_of(run(*network, "--model", tmp_path / "none.onnx"))
+    wrong = run("detect", photos, "--detector", "lane-filter", "--out", tmp_path / "l.txt")
+    assert ".parquet or .csv" in error_of(wrong)
+    assert not (tmp_path / "l.csv").exists()
+
+
+def test_unknown_detector_is_a_usage_error(tmp_path: Path) -> None:
+    result = run("detect", tmp_path, "--detector", "eagle", "--out", "l.csv")
+    assert result.exit_code == 2 and "eagle" in result.stderr
+
+
+def test_bench_writes_json(tmp_path: Path) -> None:
+    result = run("bench", "--rounds", "10", "--out", tmp_path / "bench.json")
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "bench.json").read_text())
+    assert report["stages"]["edges"]["p99_ms"] > 0.0
+    assert "lane filter" in result.stdout and "next: lanenet" in result.stdout
+
+
+def test_doctor_fails_on_a_bad_camera_file(tmp_path: Path) -> None:
+    assert run("doctor").exit_code == 0
+    write_camera(tmp_path / "c.yaml", example_camera().with_mounting(height_cm=0.2), "in metres")
+    result = run("doctor", "--camera", tmp_path / "c.yaml")
+    assert "problem" in error_of(result)
+    assert "centimetres" in result.stdout
+
+
+def test_interrupt_is_one_line_and_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lanenet.onboard.bench.time_stages", interrupted)
+    result = run("bench")
+    assert result.exit_code == 130
+    assert "interrupted" in result.stderr and "Traceback" not in result.output
+
+
+def test_faults_of_the_program_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fault(*_: Any) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("lanenet.onboard.bench.time_stages", fault)
+    assert isinstance(run("bench").exception, ZeroDivisionError)
+
+
+def test_missing_extra_names_the_pip_command(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['torch'] = None; sys.argv = ['lanenet', 'export', sys.argv[1]]\n"
+        "from lanenet.cli import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and "pip install 'lanenet[train]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@dataclass(frozen=True)
+class Report:
+    lines: tuple[str, ...]
+
+
+class Asked:
+    """Stands in for the workstation's modules and notes what is asked of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls: dict[str, tuple[Any, ...]] = {}
+        self.order: list[str] = []
+        self._patch = monkeypatch
+
+    def module(self, name: str, **members: Any) -> None:
+        module = ModuleType(name)
+        for key, value in members.items():
+            setattr(module, key, value)
+        self._patch.setitem(sys.modules, name, module)
+
+    def function(self, name: str, answer: Any = None) -> Any:
+        def call(*args: Any) -> Any:
+            self.calls[name] = args
+            self.order.append(name)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+        return call
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    return Asked(monkeypatch)
+
+
+class FakeSettings(Settings):
+    frames: int = 5
+
+
+def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
+    map_drive = asked.function("map", Report(("7 frames mapped",)))
+    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=map_drive)
+    config = tmp_path / "map.yaml"
+    config.write_text("frames: 9\n")
+    result = run(
+        *("map", "tub", "--lane-width", "38.5", "--camera", "c.yaml", "--config", config, "--out", "m/one")
+    )
+    assert result.exit_code == 0, result.output
+    assert asked.calls["map"][:5] == (
+        Path("tub"),
+        38.5,
+        Path("c.yaml"),
+        FakeSettings(frames=9),
+        Path("m/one"),
+    )
+    for text in ("7 frames mapped", "wrote m/one", "lanenet label m/one --out m/one.parquet"):
+        assert text in result.stdout
+
+
+def test_map_that_is_lost_says_so(asked: Asked) -> None:
+    lost = asked.function("map", TrackingLostError("tub: lost at frame 12"))
+    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=lost)
+    assert error_of(run("map", "tub", "--lane-width", "40", "--out", "m")) == "error: tub: lost at frame 12"
+
+
+def test_label_hands_on_its_arguments(asked: Asked) -> None:
+    asked.module("datagen.pipeline", label_map=asked.function("label", Report(("7 frames mapped",))))
+    result = run("label", "m/one", "--out", "one.parquet")
+    assert result.exit_code == 0, result.output
+    assert asked.calls["label"][:2] == (Path("m/one"), Path("one.parquet"))
+    assert ".parquet" in error_of(run("label", "m/one", "--out", "one.txt"))
+
+
+def test_overrides_replace_settings_of_the_file(tmp_path: Path) -> None:
+    from datagen.world.simulate import SimulationSettings
+
+    config = tmp_path / "drive.yaml"
+    config.write_text(f"seed: {SimulationSettings().seed + 1}\n")
+    typo = run("simulate", config, "sed=3", "--out", tmp_path / "d")
+    assert "did you mean 'seed'" in error_of(typo)
+    assert "key=value" in error_of(run("simulate", config, "seed", "--out", tmp_path / "d"))
+
+
+def test_simulate_writes_a_drive(tmp_path: Path) -> None:
+    config = tmp_path / "drive.yaml"
+    config.write_text("seed: 1\n")
+    result = run("simulate", config, "frames=3", "--out", tmp_path / "d")
+    assert result.exit_code == 0, result.output
+    assert len((tmp_path / "d" / "frames.csv").read_text().splitlines()) == 4
+    assert "next: lanenet map" in result.stdout
+
+
+def tiny_labels(path: Path) -> LabelSet:
+    """Straight lanes with both edges of their tapes, shifted from frame to frame."""
+    y = np.arange(1.0, 60.0, 0.3)
+    edges, points = [], []
+    for shift in (-3.0, 0.0, 2.0, 5.0):
+        x = np.array([-21.0, -19.0, 19.0, 21.0]) + shift
+        edges.append(
+            np.concatenate([np.stack([y * 0 + v, y, y * 0 + 1.0, y * 0], axis=1) for v in x]).astype(
+                np.float32
+            )
+        )
+        points.append(np.repeat([-20.0 + shift, 20.0 + shift], 3))
+    n = len(points)
+    line = np.array([[0.0, -20.0], [0.0, 60.0]], np.float32)
+    labels = LabelSet(
+        LabelMeta(BirdseyeWindow(), "c" * 16, 26.0, 40.0, "truth"),
+        drive=["tiny"] * n,
+        file=[""] * n,
+        frame=np.arange(n),
+        t_s=np.arange(n, dtype=np.float64),
+        lap=np.zeros(n, np.int64),
+        poses=np.zeros((n, 3)),
+        points_cm=np.array(points),
+        edges=edges,
+        lines=[(line, line)] * n,
+        quality=np.ones(n),
+    )
+    write_labels(path, labels)
+    return labels
+
+
+def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny_labels(tmp_path / "l.parquet")
+    opened: list[Path] = []
+
+    def network_predictor(path: Path) -> Any:
+        opened.append(path)
+        return lambda labels: labels.points_cm + 1.0
+
+    monkeypatch.setattr("lanenet.learn.evaluate.network_predictor", network_predictor)
+    (tmp_path / "checkpoint").mkdir()
+    result = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--out", tmp_path / "table")
+    assert result.exit_code == 0, result.output
+    assert opened == [tmp_path / "checkpoint" / "model.onnx"]
+    detectors = json.loads((tmp_path / "table.json").read_text())["detectors"]
+    assert detectors["network"]["groups"]["all"]["rmse_cm"] == pytest.approx(1.0)
+    assert detectors["lane filter"]["groups"]["all"]["rmse_cm"] < 0.2
+    assert "| network |" in (tmp_path / "table.md").read_text()
+
+
+def test_train_prepares_trains_and_evaluates(
+    tmp_path: Path, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny_labels(tmp_path / "test.parquet")
+
+    @dataclass(frozen=True)
+    class Prepared:
+        train: list[Path]
+        validation: list[Path]
+        test: list[Path]
+
+    prepared = Prepared([Path("a")], [Path("b")], [tmp_path / "test.parquet"])
+    asked.module("datagen.pipeline", DataSettings=FakeSettings, prepare=asked.function("prepare", prepared))
+    asked.module("lanenet.learn.train", train=asked.function("train"))
+    monkeypatch.setattr(
+        "lanenet.learn.evaluate.network_predictor", lambda path: lambda labels: labels.points_cm
+    )
+    monkeypatch.chdir(tmp_path)
+    cli.run_settings_schema.cache_clear()
+    config = tmp_path / "tiny.yaml"
+    config.write_text("name: tiny\ndata: {frames: 2}\n")
+    try:
+        result = run("train", config, "learn.epochs=3")
+    finally:
+        cli.run_settings_schema.cache_clear()
+    assert result.exit_code == 0, result.output
+    assert asked.order == ["prepare", "train"]
+    assert asked.calls["prepare"][:2] == (FakeSettings(frames=2), Path("runs/tiny"))
+    settings, train_paths, validation_paths, checkpoint = asked.calls["train"][:4]
+    assert settings.epochs == 3
+    assert (train_paths, validation_paths) == ([Path("a")], [Path("b")])
+    assert checkpoint == Path("checkpoints/tiny")
+    assert {"results.json", "results.md", "run.yaml"} <= {p.name for p in checkpoint.iterdir()}
+    assert "network" in result.stdout and "lane filter" in result.stdout
+    assert "next: lanenet detect" in result.stdout

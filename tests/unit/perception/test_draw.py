@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.lane import ROWS_CM, parabola_x_cm
+from lanenet.perception.draw import ARROW_BGR, LEFT_BGR, RIGHT_BGR, draw_estimate
+from lanenet.perception.estimate import LaneEstimate
+
+NAN = float("nan")
+K = np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 59.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera("pinhole", 160, 120, K, np.zeros(5), Mounting(18.0, np.deg2rad(35.0)), 26.0)
+POINTS = np.array([-14.0, -12.0, -9.0, 6.0, 8.0, 11.0])
+
+
+def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    return (np.abs(picture.astype(int) - colour) <= 40).all(axis=2)
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+def test_lines_and_points_lie_where_the_camera_sees_them(scale: int) -> None:
+    estimate = LaneEstimate(POINTS)
+    picture = draw_estimate(np.zeros((120, 160, 3), np.uint8), estimate, CAMERA, scale)
+    assert picture.shape == (120 * scale, 160 * scale, 3)
+    for side, colour in enumerate((LEFT_BGR, RIGHT_BGR)):
+        # Smoothing spreads a thin line over two pixels.
+        drawn = picture.astype(int) @ colour > 0.4 * np.dot(colour, colour)
+        for y in (*ROWS_CM[1:], 22.0, 38.0):
+            x = float(parabola_x_cm(estimate.parabolas, y)[side])
+            u, v = (CAMERA.project_ground(np.array([[x, y]]))[0] + 0.5) * scale - 0.5
+            assert drawn[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].any(), (side, y)
+
+
+def test_frame_stays_as_it_was_and_gray_is_accepted() -> None:
+    frame = np.full((120, 160), 90, np.uint8)
+    picture = draw_estimate(frame, LaneEstimate(POINTS, steering_rad=0.1), CAMERA, caption="7")
+    assert (frame == 90).all()
+    assert picture.shape == (120, 160, 3) and (picture != 90).any()
+
+
+def test_unknown_lane_draws_nothing() -> None:
+    frame = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    assert (draw_estimate(frame, LaneEstimate(), CAMERA) == frame).all()
+    half = LaneEstimate(np.array([NAN, NAN, NAN, *POINTS[3:]]))
+    picture = draw_estimate(np.zeros_like(frame), half, CAMERA)
+    assert has_colour(picture, RIGHT_BGR).any() and not has_colour(picture, LEFT_BGR).any()
+
+
+def test_points_far_outside_do_not_upset_it() -> None:
+    wild = LaneEstimate(np.array([-1e6, -1e7, -1e8, 1e6, 1e7, 1e8]))
+    assert draw_estimate(np.zeros((120, 160, 3), np.uint8), wild, CAMERA).shape == (120, 160, 3)
+
+
+def test_positive_steering_points_left() -> None:
+    for steering, leftwards in ((0.4, True), (-0.4, False)):
+        picture = draw_estimate(
+            np.zeros((120, 160, 3), np.uint8), LaneEstimate(steering_rad=steering), CAMERA
+        )
+        columns = np.nonzero(has_colour(picture, ARROW_BGR))[1]
+        assert (columns.mean() < 80.0) == leftwards

@@ -1,0 +1,172 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lanenet.errors import CalibrationError, ModelMismatchError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.lane import mirror_points
+from lanenet.learn.config import NetworkSettings
+from lanenet.learn.export import export_onnx
+from lanenet.learn.network import new_network
+from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.network import ModelMeta, NetworkDetector, confidence, read_model_meta
+
+torch.set_num_threads(1)
+
+WINDOW = BirdseyeWindow(left_cm=-48.0, near_cm=0.0, cell_cm=3.0, rows=24, columns=32)
+CAMERA = Camera(
+    model="pinhole",
+    width=160,
+    height=120,
+    K=np.array([[80.0, 0.0, 79.5], [0.0, 80.0, 59.5], [0.0, 0.0, 1.0]]),
+    D=np.zeros(5),
+    mounting=Mounting(height_cm=15.0, pitch_down_rad=0.4),
+    wheelbase_cm=26.0,
+)
+META = ModelMeta(WINDOW, (CAMERA.hash,), 26.0, 40.0, "abc", (1.0, 0.5, 0.6, 1.1, 0.5, math.nan), "truth")
+LANE = np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0])
+
+
+def make_extractor(camera=CAMERA):
+    return RoadEdgeExtractor(camera, PerceptionSettings())
+
+
+@pytest.fixture(scope="module")
+def model_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "model.onnx"
+    network = new_network(NetworkSettings(channels=(4, 8), hidden=8), 24, 32, 0).eval()
+    network.mean_cm.copy_(torch.from_numpy(LANE))
+    raster = np.where(np.random.default_rng(0).random((2, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
+    export_onnx(network, META, raster, path)
+    return path
+
+
+def striped_frame():
+    """Two white lines on a dark road, at x = -20 and 20 cm."""
+    frame = np.full((120, 160, 3), 40, np.uint8)
+    v, u = np.mgrid[:120, :160]
+    road = CAMERA.intersect_ground(np.stack([u.ravel(), v.ravel()], 1).astype(float)).reshape(120, 160, 2)
+    with np.errstate(invalid="ignore"):
+        frame[np.abs(np.abs(road[..., 0]) - 20.0) < 2.0] = 230
+    return frame
+
+
+def change_properties(model_path, out, **changes):
+    model = onnx.load(model_path)
+    properties = {p.key: p.value for p in model.metadata_props} | changes
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {k: v for k, v in properties.items() if v is not None})
+    onnx.save(model, out)
+    return out
+
+
+def test_a_frame_gives_points_errors_and_steering(model_path):
+    detector = NetworkDetector(model_path, make_extractor(), window=WINDOW)
+    estimate = detector.detect(striped_frame())
+    assert estimate.mask.all()
+    # Hardly any training is in these weights: the answer is the mean lane, more or less.
+    np.testing.assert_allclose(estimate.points_cm, LANE, atol=3.0)
+    np.testing.assert_array_equal(estimate.sigma_cm, META.rmse_cm)
+    centre = (estimate.points_cm[1] + estimate.points_cm[4]) / 2.0
+    assert estimate.steering_rad == pytest.approx(math.atan2(-centre, 15.0), abs=1e-5)
+    assert 0.0 < estimate.confidence <= 1.0
+
+
+def test_frames_do_not_leak_into_each_other(model_path):
+    detector = NetworkDetector(model_path, make_extractor())
+    first = detector.detect(striped_frame())
+    empty = detector.detect(np.full((120, 160, 3), 40, np.uint8))
+    assert not empty.mask.any() and empty.confidence == 0.0 and math.isnan(empty.steering_rad)
+    detector.reset()
+    again = detector.detect(striped_frame())
+    np.testing.assert_array_equal(first.points_cm, again.points_cm)
+    # What the caller does with a result does not reach the next one.
+    again.sigma_cm[:] = 99.0
+    assert detector.detect(striped_frame()).sigma_cm[0] == 1.0
+
+
+def test_a_raster_gives_what_its_frame_gives(model_path):
+    detector = NetworkDetector(model_path, make_extractor())
+    frame = striped_frame()
+    raster = WINDOW.rasterise(make_extractor().extract(frame).points_cm)
+    np.testing.assert_array_equal(detector.detect_raster(raster).points_cm, detector.detect(frame).points_cm)
+
+
+def test_another_camera_is_refused_unless_allowed(model_path):
+    other = make_extractor(CAMERA.with_mounting(height_cm=16.0))
+    with pytest.raises(ModelMismatchError, match="camera") as caught:
+        NetworkDetector(model_path, other)
+    assert CAMERA.hash in str(caught.value) and other.camera.hash in str(caught.value)
+    assert NetworkDetector(model_path, other, any_camera=True).detect(striped_frame()).mask.all()
+
+
+def test_another_window_is_refused(model_path, tmp_path):
+    with pytest.raises(ModelMismatchError, match="window"):
+        NetworkDetector(model_path, make_extractor(), window=BirdseyeWindow())
+    properties = replace(META, window=BirdseyeWindow()).to_properties()
+    path = change_properties(model_path, tmp_path / "m.onnx", window=properties["window"])
+    with pytest.raises(ModelMismatchError, match="do not fit its window"):
+        NetworkDetector(path, make_extractor())
+
+
+def test_a_frame_of_another_size_is_refused(model_path):
+    with pytest.raises(CalibrationError, match="80x60"):
+        NetworkDetector(model_path, make_extractor()).detect(np.zeros((60, 80, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "lanenet-model/9"}, "format 'lanenet-model/9', expected 'lanenet-model/1'"),
+        ({"format": None}, "no format"),
+        ({"window": None}, "'window' is missing"),
+        ({"window": "{"}, "'window' is not JSON"),
+        ({"window": '{"rows": 24, "width": 3}'}, "unreadable description"),
+        ({"rows_cm": "[0.0, 10.0, 20.0]"}, "rows_cm"),
+        ({"signs": '{"steering_rad": "positive right"}'}, "signs"),
+        ({"rmse_cm": "[1.0]"}, "rmse_cm has 1 values, expected 6"),
+    ],
+)
+def test_faulty_descriptions_are_refused(model_path, tmp_path, changes, message):
+    path = change_properties(model_path, tmp_path / "m.onnx", **changes)
+    with pytest.raises(ModelMismatchError, match=message) as caught:
+        read_model_meta(path)
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_no_models_are_refused(tmp_path):
+    with pytest.raises(ModelMismatchError, match="no such file"):
+        read_model_meta(tmp_path / "none.onnx")
+    (tmp_path / "text.onnx").write_text("hello")
+    with pytest.raises(ModelMismatchError, match="cannot be opened"):
+        read_model_meta(tmp_path / "text.onnx")
+
+
+def test_description_survives_the_trip():
+    meta = ModelMeta.from_properties(META.to_properties(), "here")
+    assert replace(meta, rmse_cm=()) == replace(META, rmse_cm=())
+    np.testing.assert_equal(meta.rmse_cm, META.rmse_cm)
+
+
+def test_confidence_values():
+    assert confidence(LANE, 120, 40.0) == 1.0
+    assert confidence(LANE, 30, 40.0) == pytest.approx(0.25)
+    # One tolerance (15 % of 40 cm) too wide.
+    assert confidence(LANE * 1.15, 500, 40.0) == pytest.approx(math.exp(-0.5))
+    assert confidence(-LANE, 500, 40.0) == 0.0
+    assert confidence(np.full(6, np.nan), 500, 40.0) == 0.0
+
+
+@given(turn=st.floats(-0.6, 0.6), shift=st.floats(-10, 10))
+def test_confidence_measures_the_width_across_the_lane(turn, shift):
+    rows = np.array([0.0, 15.0, 30.0])
+    lane = np.concatenate([side / math.cos(turn) + shift + rows * math.tan(turn) for side in (-20.0, 20.0)])
+    assert confidence(lane, 500, 40.0) == pytest.approx(1.0)
+    assert confidence(mirror_points(lane), 500, 40.0) == pytest.approx(1.0)
