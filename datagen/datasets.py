@@ -191,7 +191,7 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
         return labels
     simulate_drive(simulation, drive)
     if job["role"] == "test":
-        write_labels(labels, truth_labels(drive))
+        write_labels(labels, truth_labels(drive, job["map"].perception))
     else:
         map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
         label_map(drive_map, labels, perception=job["map"].perception)
@@ -210,7 +210,8 @@ def truth_labels(
     drive, truth = open_drive(drive_path), read_truth(drive_path / "truth.csv")
     if truth is None or drive.camera is None or drive.lane_width_cm is None:
         raise DriveFormatError(f"{drive_path}: expected a simulated drive with truth, camera and lane width")
-    extractor = RoadEdgeExtractor(drive.camera, PerceptionSettings() if perception is None else perception)
+    perception = PerceptionSettings() if perception is None else perception
+    extractor = RoadEdgeExtractor(drive.camera, perception)
     edges = []
     for i in range(len(drive)):
         road = extractor.extract(drive.image(i))
@@ -224,6 +225,7 @@ def truth_labels(
             wheelbase_cm=drive.camera.wheelbase_cm,
             lane_width_cm=drive.lane_width_cm,
             source="truth",
+            perception=perception,
         ),
         drive=[drive.name] * n,
         file=[""] * n,
@@ -249,7 +251,7 @@ def _recorded_labels(settings: RecordedSettings, folder: Path) -> dict[Role, Pat
     }
     if not (_is_done(whole, key) and all(path.is_file() for path in parts.values())):
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
-        label_map(drive_map, whole)
+        label_map(drive_map, whole, perception=settings.map.perception)
         shares = (settings.train_share, settings.validation_share)
         pieces = split_along_time(read_labels(whole), shares, settings.gap_frames)
         for path, piece in zip(parts.values(), pieces, strict=True):

@@ -29,7 +29,14 @@ from datagen.slam.calibrate import (
 )
 from datagen.slam.filter import FilterSettings, Trajectory
 from datagen.slam.mapper import MotionSettings, SteeringFit, commands_of, track
-from datagen.slam.places import Revisit, RevisitSettings, match_places, propose_revisits, thumbnails
+from datagen.slam.places import (
+    Revisit,
+    RevisitSettings,
+    match_places,
+    path_lengths,
+    propose_revisits,
+    thumbnails,
+)
 from datagen.slam.posegraph import close_loops
 from datagen.slam.scans import Scans, scan_drive
 from lanenet.config import Settings, dump_settings
@@ -205,15 +212,14 @@ def _solve(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
-    path_cm = _distances(trajectory.poses)
-    pairs = propose_revisits(
-        thumbnails(drive), path_cm, settings.revisits.min_gap_heights * height, settings.revisits
-    )
+    pairs = propose_revisits(thumbnails(drive), trajectory.poses, height, settings.revisits)
     found = [
         match_places(scans, trajectory.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
         for pair in pairs
     ]
     revisits = [revisit for revisit in found if revisit is not None]
+    if len(revisits) < settings.revisits.min_revisits:
+        revisits = []
     poses, residuals = close_loops(trajectory.poses, revisits, height)
     drift = heading_error_per_lap(trajectory.poses, revisits) if revisits else None
     return _Solved(scans, trajectory, poses, steering, revisits, residuals, drift)
@@ -261,7 +267,7 @@ def _assemble(
 ) -> DriveMap:
     poses = np.concatenate([solved.poses for _, solved in parts]) * [factor, factor, 1.0]
     s_cm = np.concatenate([s for s, _, _ in traced]) * factor
-    laps = np.concatenate([count_laps(_distances(solved.poses), solved.revisits) for _, solved in parts])
+    laps = np.concatenate([count_laps(path_lengths(solved.poses), solved.revisits) for _, solved in parts])
     meta = MapMeta(
         format=FORMAT,
         drive=str(drive_path),
@@ -293,10 +299,6 @@ def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> np.n
     # Later visits may skip laps: the shortest gaps are those of one lap.
     lap_cm = float(np.median(gaps[gaps < 1.4 * np.percentile(gaps, 10)]))
     return (path_cm // lap_cm).astype(np.int64)
-
-
-def _distances(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
 def _map_edges(parts: list[tuple[slice, _Solved]], camera: Camera, factor: float) -> dict[str, np.ndarray]:
@@ -335,7 +337,7 @@ def _map_figures(
             {
                 "first_frame": segment.start,
                 "frames": len(solved.poses),
-                "path_cm": factor * float(_distances(solved.poses)[-1]),
+                "path_cm": factor * float(path_lengths(solved.poses)[-1]),
                 "median_match": float(np.nanmedian(solved.trajectory.match)),
                 "revisits": len(solved.revisits),
                 "closure_residual_median": {
@@ -455,6 +457,7 @@ def label_map(
             wheelbase_cm=drive_map.camera.wheelbase_cm,
             lane_width_cm=drive_map.meta.lane_width_cm,
             source="map",
+            perception=perception,
         ),
         drive=[drive.name] * len(rows),
         file=[""] * len(rows),

@@ -26,6 +26,10 @@ class RevisitSettings(Settings):
     Attributes:
         min_gap_heights: Path between the two visits at least.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
+        max_drift_share: Two frames can only be one place if the open-loop trajectory has them closer than
+            this share of the path between: rooms repeat, and one false revisit bends a whole map.
+        max_turn_drift_rad: Likewise for the heading, up to whole turns.
+        min_revisits: Fewer revisits than this are not believed.
         min_match: Matched share of the edges once aligned.
         max_pairs: Pairs to verify at most, spread over the drive.
         along_heights: Offset along the road between the two visits at most: the pictures are alike only
@@ -36,6 +40,9 @@ class RevisitSettings(Settings):
 
     min_gap_heights: float = Field(default=20.0, gt=0.0)
     min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
+    max_drift_share: float = Field(default=0.3, gt=0.0, lt=1.0)
+    max_turn_drift_rad: float = Field(default=1.2, gt=0.0)
+    min_revisits: int = Field(default=3, ge=1)
     min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
     max_pairs: int = Field(default=60, ge=1)
     along_heights: float = Field(default=0.9, gt=0.0)
@@ -79,14 +86,20 @@ def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarr
 
 def propose_revisits(
     thumbs: Float[np.ndarray, "n d"],
-    path_cm: Float[np.ndarray, "n"],
-    min_gap_cm: float,
+    poses: Float[np.ndarray, "n 3"],
+    camera_height_cm: float,
     settings: RevisitSettings,
 ) -> list[tuple[int, int]]:
-    """Propose pairs (earlier, later) that look alike, at least ``min_gap_cm`` of path apart.
+    """Propose pairs (earlier, later) that look alike and that the trajectory could have brought together.
 
     Similarity is averaged along the diagonal, so that a pair counts when its neighbours agree, and allows
     a sideways shift of the picture, because the car comes back with another heading.
+
+    Args:
+        thumbs: A picture per frame, see :func:`thumbnails`.
+        poses: Open-loop trajectory, heading unwrapped.
+        camera_height_cm: Sets the scale.
+        settings: Bounds.
     """
     n = len(thumbs)
     picture = thumbs.reshape(n, _THUMB_HEIGHT, _THUMB_WIDTH)
@@ -96,8 +109,7 @@ def propose_revisits(
         np.maximum(similarity, thumbs @ shifted.T, out=similarity)
     kernel = np.eye(9, dtype=np.float32) / 9.0
     similarity = cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE)
-    far = path_cm[None, :] - path_cm[:, None] >= min_gap_cm
-    similarity[~far] = -1.0
+    similarity[~_could_be_one_place(poses, camera_height_cm, settings)] = -1.0
     pairs: list[tuple[float, int, int]] = []
     for later in range(n):
         earlier = int(similarity[:, later].argmax())
@@ -114,6 +126,26 @@ def propose_revisits(
         if key not in best or pair > best[key]:
             best[key] = pair
     return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda p: p[2])]
+
+
+def path_lengths(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Length of the path up to each pose, [cm]."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+
+
+def _could_be_one_place(
+    poses: Float[np.ndarray, "n 3"], camera_height_cm: float, settings: RevisitSettings
+) -> np.ndarray:
+    """Tell for each (earlier, later) whether drift alone could explain what lies between them."""
+    path = path_lengths(poses)
+    between = path[None, :] - path[:, None]
+    apart = np.hypot(poses[None, :, 0] - poses[:, None, 0], poses[None, :, 1] - poses[:, None, 1])
+    turned = np.abs(wrap_angle(poses[None, :, 2] - poses[:, None, 2]))
+    return (
+        (between >= settings.min_gap_heights * camera_height_cm)
+        & (apart <= settings.max_drift_share * between)
+        & (turned <= settings.max_turn_drift_rad)
+    )
 
 
 def match_places(

@@ -228,7 +228,7 @@ class Renderer:
 
 
 def _nearest_sample_grid(track: Track) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
-    """Nearest sample of the centre line for each cell near the road (else -1); origin and cell of the grid."""
+    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid."""
     reach_cm = _GRID_MARGIN_CM + max(
         (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
     )

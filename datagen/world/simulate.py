@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,13 +16,18 @@ from datagen.world.look import LookSettings, random_look
 from datagen.world.renderer import Renderer
 from datagen.world.rig import CameraSettings
 from datagen.world.track import Track, TrackSettings, random_track
-from lanenet.config import Settings
+from datagen.world.track_file import write_track
+from lanenet.config import Settings, dump_settings
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.files import write_text
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import POINT_NAMES
 
 _START_CM = 40.0  # rear axle at the start of an open road
 _SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
 _LOOP_CM = 1200.0
+_FILE_JPEG_QUALITY = 92  # of images on disk, when the camera itself does not compress
 
 
 class SimulationSettings(Settings):
@@ -94,8 +100,62 @@ class World:
     car: Car
 
 
-def build_world(settings: SimulationSettings) -> World:
+def simulate_drive(
+    settings: SimulationSettings, out: Path, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Drive, and write a drive folder.
+
+    Beside the recording (images, ``frames.csv`` with the commands only, ``drive.yaml``, ``camera.yaml``) the
+    folder holds what no real drive has: ``truth.csv`` (pose and six points of each frame), ``track.json``
+    (the road) and ``simulation.yaml`` (the resolved settings, which give the same drive again).
+
+    Args:
+        settings: The drive; the same settings give the same bytes.
+        out: Folder to write; it appears when all is done.
+        progress: Called after each frame with the number done and the number in all.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ConfigError: See :func:`build_world`.
+        LanenetError: If the folder exists and is not a drive, or cannot be written.
+    """
+    # The file is the camera's own JPEG: compressing twice would change the look.
+    world = build_world(settings, compress=False)
+    quality = world.settings.look.jpeg_quality or _FILE_JPEG_QUALITY
+    writer = DriveWriter(
+        out,
+        camera=world.camera,
+        lane_width_cm=world.track.lane_width_cm,
+        notes=f"simulated, seed {settings.seed}",
+        jpeg_quality=quality,
+        camera_method="simulation",
+    )
+    with writer:
+        for done, frame in enumerate(frames_of(world), start=1):
+            pose = dict(zip(("x_cm", "y_cm", "heading_rad"), map(float, frame.pose), strict=True))
+            points = dict(zip(POINT_NAMES, map(float, frame.points_cm), strict=True))
+            writer.add(
+                frame.image_bgr,
+                frame.t_s,
+                truth={**pose, **points},
+                speed_cm_s=frame.speed_cm_s,
+                steering_rad=frame.steering_rad,
+            )
+            if progress is not None:
+                progress(done, settings.frames)
+        write_track(writer.folder / "track.json", world.track)
+        write_text(writer.folder / "simulation.yaml", dump_settings(world.settings))
+    return out
+
+
+def build_world(settings: SimulationSettings, compress: bool = True) -> World:
     """Draw road, look, driver and car.
+
+    Args:
+        settings: The drive.
+        compress: Whether the renderer applies the camera's JPEG compression.
 
     Raises:
         ConfigError: If the settings contradict each other, or the road is too short for the drive.
@@ -113,7 +173,8 @@ def build_world(settings: SimulationSettings) -> World:
         driver_rng,
     )
     car = Car(settings.car, driver.start_pose(), car_rng)
-    renderer = Renderer(camera, track, settings.look, scene_rng)
+    look = settings.look if compress else settings.look.model_copy(update={"jpeg_quality": None})
+    renderer = Renderer(camera, track, look, scene_rng)
     return World(settings, track, camera, renderer, driver, car)
 
 

@@ -53,29 +53,26 @@ def read_track(path: Path) -> Track:
     if found != FORMAT:
         raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     try:
-        track = Track(
-            s_cm=np.asarray(data["s_cm"], dtype=np.float64),
-            xy_cm=np.asarray(data["xy_cm"], dtype=np.float64).reshape(-1, 2),
-            heading_rad=np.asarray(data["heading_rad"], dtype=np.float64),
-            curvature_per_cm=np.asarray(data["curvature_per_cm"], dtype=np.float64),
-            closed=bool(data["closed"]),
-            lane_width_cm=float(data["lane_width_cm"]),
-            markings=tuple(
-                Marking(
-                    float(m["offset_cm"]),
-                    float(m["width_cm"]),
-                    (float(m["colour_bgr"][0]), float(m["colour_bgr"][1]), float(m["colour_bgr"][2])),
-                    np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2),
-                )
-                for m in data["markings"]
-            ),
+        s_cm, heading_rad, curvature_per_cm = (
+            np.asarray(data[name], dtype=np.float64) for name in ("s_cm", "heading_rad", "curvature_per_cm")
         )
+        xy_cm = np.asarray(data["xy_cm"], dtype=np.float64).reshape(-1, 2)
+        markings = tuple(
+            Marking(
+                float(m["offset_cm"]),
+                float(m["width_cm"]),
+                (float(m["colour_bgr"][0]), float(m["colour_bgr"][1]), float(m["colour_bgr"][2])),
+                np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2),
+            )
+            for m in data["markings"]
+        )
+        closed, lane_width_cm = bool(data["closed"]), float(data["lane_width_cm"])
     except KeyError as error:
         raise DriveFormatError(f"{path}: key {error} is missing") from None
     except (TypeError, ValueError, IndexError) as error:
         raise DriveFormatError(f"{path}: not the numbers of a track ({error})") from None
-    columns = (track.s_cm, track.xy_cm, track.heading_rad, track.curvature_per_cm)
-    lengths = [len(column) for column in columns]
+    columns = (s_cm, xy_cm, heading_rad, curvature_per_cm)
+    lengths = [len(column) if column.ndim else 0 for column in columns]
     if min(lengths) < 2 or len(set(lengths)) > 1:
         raise DriveFormatError(
             f"{path}: expected s_cm, xy_cm, heading_rad and curvature_per_cm of one length of at least 2, "
@@ -83,4 +80,4 @@ def read_track(path: Path) -> Track:
         )
     if not all(np.isfinite(column).all() for column in columns):
         raise DriveFormatError(f"{path}: a number of the centre line is missing or not finite")
-    return track
+    return Track(s_cm, xy_cm, heading_rad, curvature_per_cm, closed, lane_width_cm, markings)

@@ -8,7 +8,7 @@ tools; training makes it from the edge points again.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from lanenet.data.png import png_bytes, png_size
 from lanenet.errors import ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
+from lanenet.perception.birdseye import PerceptionSettings
 
 FORMAT = "lanenet-labels/1"
 Source = Literal["map", "truth"]
@@ -51,6 +52,7 @@ class _MetaFile(Settings):
     wheelbase_cm: float = Field(gt=0.0)
     lane_width_cm: float = Field(gt=0.0)
     source: Source
+    perception: PerceptionSettings
     config_hash: str = ""
 
 
@@ -64,6 +66,7 @@ class LabelMeta:
         wheelbase_cm: Distance between the car's axles; moves poses to the front axle.
         lane_width_cm: Distance between the middles of the two lines.
         source: ``map`` for labels from a map made of the drive, ``truth`` for a simulator's.
+        perception: How the edge points were found; the car has to find them the same way.
         config_hash: Hash of the settings that made the labels; empty if unknown.
     """
 
@@ -72,6 +75,7 @@ class LabelMeta:
     wheelbase_cm: float
     lane_width_cm: float
     source: Source
+    perception: PerceptionSettings = field(default_factory=PerceptionSettings)
     config_hash: str = ""
 
 
@@ -216,6 +220,7 @@ def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
         "order": list(POINT_NAMES),
         "units": _UNITS,
         **asdict(meta),
+        "perception": meta.perception.model_dump(mode="json"),
     }
     _meta_from_file(data, where)
     return data
@@ -240,6 +245,7 @@ def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
         wheelbase_cm=file.wheelbase_cm,
         lane_width_cm=file.lane_width_cm,
         source=file.source,
+        perception=file.perception,
         config_hash=file.config_hash,
     )
 
