@@ -20,8 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from datagen.pipeline import MapSettings, label_map, map_drive
-from datagen.world.simulate import SimulationSettings
-from datagen.world.simulate_drive import simulate_drive
+from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.config import Settings
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.files import write_json

@@ -17,7 +17,7 @@ from pydantic import Field
 from typer.core import TyperGroup
 
 from lanenet import console
-from lanenet.config import Settings, check_settings, dump_settings, load_settings
+from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
 
 if TYPE_CHECKING:
@@ -25,11 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from lanenet.data.label_set import LabelSet
-    from lanenet.geometry.camera import Camera
     from lanenet.learn.evaluate import Predictor
-    from lanenet.onboard.sources import Source
-    from lanenet.perception.estimate import Detector
-    from lanenet.perception.lane_filter import LaneFilterSettings
 
 _Config = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
@@ -97,7 +93,7 @@ def main() -> None:
 @functools.cache
 def run_settings_schema() -> type[Settings]:
     """Return the schema of ``lanenet train CONFIG``; built here because its parts need the workstation."""
-    from datagen.pipeline import DataSettings
+    from datagen.datasets import DataSettings
     from lanenet.learn.config import LearnSettings
 
     class RunSettings(Settings):
@@ -154,7 +150,7 @@ def train(
     marking: _MarkingOption = None,
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
-    from datagen.pipeline import prepare
+    from datagen.datasets import prepare
     from lanenet.data.files import write_text
     from lanenet.learn.evaluate import network_predictor
     from lanenet.learn.train import train as train_network
@@ -167,7 +163,11 @@ def train(
         train_network(settings.learn, data.train, data.validation, checkpoint, progress)
     write_text(checkpoint / "run.yaml", dump_settings(settings))
     model = checkpoint / "model.onnx"
-    _evaluate(data.test, {"network": network_predictor(model)}, marking, checkpoint / "results")
+    if not data.test:
+        console.show_problems(["the data has no test part: the table is over the validation labels"])
+    _evaluate(
+        data.test or data.validation, {"network": network_predictor(model)}, marking, checkpoint / "results"
+    )
     console.wrote(checkpoint)
     console.next_command("detect", "SOURCE", "--detector", "network", "--model", model, "--out", "lanes.csv")
 
@@ -286,6 +286,7 @@ def detect(
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
     from lanenet.onboard.detect import run_detector
+    from lanenet.onboard.detectors import build_detector
     from lanenet.onboard.sources import open_source
 
     _check_ending(out, ".parquet", ".csv")
@@ -293,7 +294,14 @@ def detect(
     used_camera = read_camera(camera) if camera is not None else frames.camera
     if used_camera is None:
         raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
-    chosen = _detector(detector, used_camera, frames, model, lane_width, marking, any_camera)
+    chosen = build_detector(
+        detector.value,
+        used_camera,
+        model=model,
+        lane_width_cm=lane_width if lane_width is not None else frames.lane_width_cm,
+        marking_cm=marking,
+        any_camera=any_camera,
+    )
     with console.progress_bar(f"detect ({detector.value})") as progress:
         report = run_detector(frames, chosen, used_camera, out, video, progress)
     console.show_problems(report.problems)
@@ -364,10 +372,10 @@ def _evaluate(
     from lanenet.data.files import write_json, write_text
     from lanenet.data.label_set import read_labels
     from lanenet.learn.evaluate import evaluate_detectors, format_table
-    from lanenet.onboard.baselines import lane_filter_points_cm
+    from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
 
     def lane_filter(labels: LabelSet) -> Float[np.ndarray, "n 6"]:
-        return lane_filter_points_cm(labels, _filter_settings(labels.meta.lane_width_cm, marking_cm))
+        return lane_filter_points_cm(labels, filter_settings(labels.meta.lane_width_cm, marking_cm))
 
     beside = {**predictors, "lane filter": lane_filter}
     tables = evaluate_detectors([read_labels(path) for path in labels], beside)
@@ -379,38 +387,6 @@ def _evaluate(
         write_json(as_json, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}})
         write_text(as_text, markdown)
         console.wrote(as_json, as_text)
-
-
-def _detector(
-    name: DetectorName,
-    camera: Camera,
-    source: Source,
-    model: Path | None,
-    lane_width_cm: float | None,
-    marking_cm: float | None,
-    any_camera: bool,
-) -> Detector:
-    from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-    from lanenet.perception.lane_filter import LaneFilter
-
-    extractor = RoadEdgeExtractor(camera, PerceptionSettings())
-    if name is DetectorName.NETWORK:
-        from lanenet.perception.network import NetworkDetector
-
-        if model is None:
-            raise ConfigError("--detector network: expected --model MODEL.onnx")
-        return NetworkDetector(model, extractor, any_camera=any_camera)
-    width_cm = lane_width_cm if lane_width_cm is not None else source.lane_width_cm
-    if width_cm is None:
-        raise ConfigError(f"{source.name}: comes without a lane width, expected --lane-width CM")
-    return LaneFilter(extractor, _filter_settings(width_cm, marking_cm))
-
-
-def _filter_settings(lane_width_cm: float, marking_cm: float | None) -> LaneFilterSettings:
-    from lanenet.perception.lane_filter import LaneFilterSettings
-
-    data = {"lane_width_cm": lane_width_cm} | ({} if marking_cm is None else {"marking_cm": marking_cm})
-    return check_settings(LaneFilterSettings, data, "lane filter")
 
 
 def _check_ending(path: Path, *endings: str) -> None:

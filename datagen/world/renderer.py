@@ -12,18 +12,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from datagen.world.kernels import fill_grid
+from datagen.world.kernels import develop, paint_floor, paint_room
 from datagen.world.look import LookSettings
+from datagen.world.nearest_grid import nearest_sample_grid
 from datagen.world.scene import TEXTURE_CELL_CM, build_scene
-from datagen.world.shading import develop, paint_floor, paint_room
 from datagen.world.track import Track
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map, map_from_car
 
 _NEAR_CM = 250.0  # markings and clutter are painted up to here
 _WALL_CM = 450.0  # the floor ends here
-_GRID_CELL_CM = 2.0
-_GRID_MARGIN_CM = 10.0  # around the markings, for pixels that reach over from outside
 _JOINT_WIDTH_CM = 0.4
 _NOISE_VALUES = 2**20
 
@@ -135,7 +133,7 @@ class Renderer:
             ],
             axis=1,
         )
-        self._grid, self._grid_frame = _nearest_sample_grid(track)
+        self._grid, self._grid_frame = nearest_sample_grid(track)
         self._markings, self._stretches = _marking_tables(track, look.line_brightness)
         scene = self._scene
         self._joints = np.array(
@@ -225,18 +223,6 @@ class Renderer:
         level = np.full(len(distance), self.look.lamp_level)
         reach2 = 12.0 * along_cm**2
         return np.column_stack([eye + towards, direction, along_cm, size_rad * slant, level, reach2])
-
-
-def _nearest_sample_grid(track: Track) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
-    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid."""
-    reach_cm = _GRID_MARGIN_CM + max(
-        (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
-    )
-    low = track.xy_cm.min(axis=0) - reach_cm - _GRID_CELL_CM
-    columns, rows = np.ceil((track.xy_cm.max(axis=0) + reach_cm - low) / _GRID_CELL_CM).astype(int) + 1
-    grid = np.full((rows, columns), -1, np.int32)
-    fill_grid(track.xy_cm, low[0], low[1], _GRID_CELL_CM, reach_cm, grid)
-    return grid, np.array([low[0], low[1], _GRID_CELL_CM])
 
 
 def _marking_tables(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -42,6 +42,7 @@ class LaneEstimate:
         return parabolas_from_points(self.points_cm)
 
 
+@runtime_checkable
 class Detector(Protocol):
     """A lane detector: frame in, estimate out; it may keep state from frame to frame."""
 

@@ -268,10 +268,11 @@ def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: 
     assert "| network |" in (tmp_path / "table.md").read_text()
 
 
+@pytest.mark.parametrize("has_test_part", [True, False])
 def test_train_prepares_trains_and_evaluates(
-    tmp_path: Path, asked: Asked, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, asked: Asked, monkeypatch: pytest.MonkeyPatch, has_test_part: bool
 ) -> None:
-    tiny_labels(tmp_path / "test.parquet")
+    tiny_labels(tmp_path / "l.parquet")
 
     @dataclass(frozen=True)
     class Prepared:
@@ -279,8 +280,9 @@ def test_train_prepares_trains_and_evaluates(
         validation: list[Path]
         test: list[Path]
 
-    prepared = Prepared([Path("a")], [Path("b")], [tmp_path / "test.parquet"])
-    asked.module("datagen.pipeline", DataSettings=FakeSettings, prepare=asked.function("prepare", prepared))
+    validation = tmp_path / "l.parquet"
+    prepared = Prepared([Path("a")], [validation], [validation] if has_test_part else [])
+    asked.module("datagen.datasets", DataSettings=FakeSettings, prepare=asked.function("prepare", prepared))
     asked.module("lanenet.learn.train", train=asked.function("train"))
     monkeypatch.setattr(
         "lanenet.learn.evaluate.network_predictor", lambda path: lambda labels: labels.points_cm
@@ -295,10 +297,11 @@ def test_train_prepares_trains_and_evaluates(
         cli.run_settings_schema.cache_clear()
     assert result.exit_code == 0, result.output
     assert asked.order == ["prepare", "train"]
+    assert ("no test part" in result.stderr) != has_test_part
     assert asked.calls["prepare"][:2] == (FakeSettings(frames=2), Path("runs/tiny"))
     settings, train_paths, validation_paths, checkpoint = asked.calls["train"][:4]
     assert settings.epochs == 3
-    assert (train_paths, validation_paths) == ([Path("a")], [Path("b")])
+    assert (train_paths, validation_paths) == ([Path("a")], [validation])
     assert checkpoint == Path("checkpoints/tiny")
     assert {"results.json", "results.md", "run.yaml"} <= {p.name for p in checkpoint.iterdir()}
     assert "network" in result.stdout and "lane filter" in result.stdout

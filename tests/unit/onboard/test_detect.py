@@ -9,9 +9,9 @@ import pytest
 
 from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
-from lanenet.onboard.baselines import lane_filter_points_cm
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.onboard.detect import run_detector
+from lanenet.onboard.detectors import lane_filter_points_cm
 from lanenet.onboard.sources import Source
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate

@@ -158,6 +158,32 @@ def test_dashes_are_painted_with_their_length():
     assert share[s == 20.0] == 1.0 and share[s == 40.0] == 0.0 and share[s == 50.0] == pytest.approx(0.5)
 
 
+def test_dashes_and_interruptions_appear_where_the_track_has_them():
+    road = TrackSettings(
+        length_cm=700.0,
+        left=MarkingSettings(kind="dashed", dash_cm=12.0, gap_cm=9.0),
+        interruptions_per_m=0.5,
+        max_interruption_cm=20.0,
+    )
+    checked = {True: 0, False: 0}
+    for seed in range(4):
+        track = random_track(road, np.random.default_rng(seed))
+        pose = _pose(track, 150.0)
+        image = _renderer(track).render(pose)
+        for side, marking in zip(("left", "right"), track.markings, strict=True):
+            line = car_from_map(track.line_xy(side)[150:240], pose, 26.0)
+            ends = marking.painted_cm.ravel()
+            for s, (u, v) in zip(track.s_cm[150:240], CAMERA.project_ground(line), strict=True):
+                # Half a centimetre is more than a pixel here; ends of the paint are left out by 1.5 cm.
+                near_end = np.min(np.abs(ends - s)) < 1.5
+                if near_end or not (2 < u < 317 and 130 < v < 237):
+                    continue
+                painted = bool(((marking.painted_cm[:, 0] < s) & (s < marking.painted_cm[:, 1])).any())
+                assert (image[round(v), round(u)].max() > 150) == painted, (seed, side, s)
+                checked[painted] += 1
+    assert checked[True] > 60 and checked[False] > 25
+
+
 def test_moving_the_world_moves_nothing_in_the_image():
     track = _road(2)
     pose = _pose(track, 150.0, 3.0)
