@@ -33,7 +33,7 @@ from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 Progress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
 
-_VERSION = 1  # of this module's outputs; raise it when the same settings give other labels
+_VERSION = 2  # of this module's outputs; raise it when the same settings give other labels
 
 
 class SyntheticSettings(Settings):
@@ -216,10 +216,11 @@ def truth_labels(
         road = extractor.extract(drive.image(i))
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
     n = len(drive)
+    window = BirdseyeWindow() if window is None else window
     nothing = np.empty((0, 2))
     return LabelSet(
         meta=LabelMeta(
-            window=BirdseyeWindow() if window is None else window,
+            window=window,
             camera_hash=drive.camera.hash,
             wheelbase_cm=drive.camera.wheelbase_cm,
             lane_width_cm=drive.lane_width_cm,
@@ -232,7 +233,7 @@ def truth_labels(
         t_s=drive.t_s,
         lap=np.zeros(n, dtype=np.int64),
         poses=np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1),
-        points_cm=np.stack([truth[name] for name in POINT_NAMES], axis=1),
+        points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
         edges=edges,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),

@@ -399,7 +399,7 @@ def label_map(
     """Project a map's lines into each frame and write the label set, its report and a contact sheet.
 
     A frame gets no labels where its pose is uncertain (few edges match the map) or the driver has deleted
-    it; a point is masked where the map does not support the line.
+    it; a point is masked where the map does not support the line, or where it lies beside the window.
 
     Args:
         map_folder: Folder that :func:`map_drive` wrote.
@@ -421,7 +421,7 @@ def label_map(
     index = {int(frame): i for i, frame in enumerate(drive.frames)}
     rows: list[int] = []
     edges, lines, points, residuals = [], [], [], []
-    skipped = {"deleted": 0, "pose uncertain": 0, "no line in reach": 0}
+    skipped = {"deleted": 0, "pose uncertain": 0, "no line in the window": 0}
     for k, frame in enumerate(drive_map.frames):
         if progress is not None:
             progress(k + 1, len(drive_map.frames))
@@ -436,14 +436,15 @@ def label_map(
             skipped["pose uncertain"] += 1
             continue
         seen = _frame_lines(drive_map, k)
-        if not np.isfinite(seen.points_cm).any():
-            skipped["no line in reach"] += 1
+        visible = window.labelled(seen.points_cm)
+        if not np.isfinite(visible).any():
+            skipped["no line in the window"] += 1
             continue
         road = extractor.extract(drive.image(i))
         rows.append(k)
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
         lines.append((seen.left_cm, seen.right_cm))
-        points.append(seen.points_cm)
+        points.append(visible)
         residuals.append(
             frame_residual_cm(road.points_cm, (seen.left_cm, seen.right_cm), drive_map.meta.tape_cm)
         )

@@ -50,6 +50,16 @@ class BirdseyeWindow:
         y = self.far_cm - (cells[:, 0] + 0.5) * self.cell_cm
         return np.stack([x, y], axis=1)
 
+    def labelled(self, points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6"]:
+        """Return labels with NaN where a point lies beside the window.
+
+        A line that leaves the window sideways before it reaches a row has no place in the picture there, and
+        a network that guesses it would be judged by where the map ends.
+        """
+        with np.errstate(invalid="ignore"):
+            inside = (points_cm >= self.left_cm) & (points_cm <= self.right_cm)
+        return np.where(inside, points_cm, np.nan)
+
     def rasterise(
         self, points_car_cm: Float[np.ndarray, "n 2"], out: UInt8[np.ndarray, "r c"] | None = None
     ) -> UInt8[np.ndarray, "r c"]:

@@ -80,7 +80,7 @@ def augment_batch(
     for i in range(size):
         rng = rngs[i]
         view = _draw_view(settings, rng)
-        labels[i] = labels_of_view(points_cm[i], lines_cm[i], view)
+        labels[i] = window.labelled(labels_of_view(points_cm[i], lines_cm[i], view))
         keep = _draw_kept(edges_cm[i], lines_cm[i], window, settings, rng)
         moved = view.move(edges_cm[i][keep])
         if settings.jitter_cm > 0.0:

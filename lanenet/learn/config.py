@@ -68,7 +68,8 @@ class LearnSettings(Settings):
         ema_decay: Of the running mean of the weights, which is what is evaluated and exported.
         huber_cm: Errors below this count squared, above it linearly.
         min_quality: Training frames whose labels have a lower quality are left out.
-        threads: Threads of the computation; 0 leaves the choice to torch.
+        threads: Threads of the computation; 0 leaves the choice to torch. One less than the cores is the
+            steadier choice on a machine that does other work too: the batches need a thread of their own.
         checkpoint_every: Epochs between two writings of the state from which a stopped run goes on.
         augment: Changes of the samples.
         network: Size of the network.

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS
+from lanenet.geometry.lane import mirror_points
 from lanenet.learn.augment import augment_batch
 from lanenet.learn.config import AugmentSettings
 
@@ -156,7 +156,7 @@ class LaneSamples:
         """
         points = self.points_cm
         if mirrored:
-            points = np.concatenate([points, -np.roll(points, N_POINTS // 2, axis=1)])
+            points = np.concatenate([points, mirror_points(points)])
         known = np.isfinite(points)
         count = np.maximum(known.sum(axis=0), 1)
         # Robust against the few frames of a sharp bend whose line lies a metre to the side.

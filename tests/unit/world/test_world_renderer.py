@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.world.kernels import box_share, painted_share
+from datagen.world.kernels import box_share, locate, painted_share
 from datagen.world.look import LookSettings, random_look
 from datagen.world.renderer import PixelGround, Renderer
 from datagen.world.rig import CameraSettings
@@ -211,14 +211,32 @@ def test_mirrored_road_gives_the_mirrored_image():
 def test_loop_is_painted_without_a_seam():
     road = ROAD.model_copy(update={"closed": True, "length_cm": 900.0})
     track = random_track(road, np.random.default_rng(0))
-    pose = _pose(track, 880.0)
-    image = _renderer(track).render(pose)
-    line = CAMERA.project_ground(car_from_map(track.line_xy("right")[:40], pose, 26.0))
-    seen = np.rint(line).astype(int)
-    inside = (seen >= 1).all(axis=1) & (seen[:, 0] < 319) & (seen[:, 1] < 239)
-    assert inside.sum() > 20
-    values = [image[v - 1 : v + 2, u - 1 : u + 2].max() for u, v in seen[inside]]
-    assert min(values) > 150
+    for s in (845.0, 850.3, 856.7):
+        pose = _pose(track, s)
+        image = _renderer(track).render(pose)
+        # The seam lies some 20 cm ahead of the front axle: paint is full on both sides and across.
+        ahead = (np.arange(-15, 15) + len(track.s_cm)) % len(track.s_cm)
+        for side in ("left", "right"):
+            line = CAMERA.project_ground(car_from_map(track.line_xy(side)[ahead], pose, 26.0))
+            seen = np.rint(line).astype(int)
+            assert ((seen > 0) & (seen < [319, 239])).all()
+            assert min(image[v, u].min() for u, v in seen) == PAINT
+
+
+def test_place_along_the_road_agrees_with_the_track():
+    rng = np.random.default_rng(0)
+    for closed in (False, True):
+        road = ROAD.model_copy(update={"closed": closed, "length_cm": 900.0})
+        track = random_track(road, np.random.default_rng(1))
+        renderer = _renderer(track)
+        for s, offset in zip(rng.uniform(2.0, 898.0, 200), rng.uniform(-25.0, 25.0, 200), strict=True):
+            xy, heading = track.point(s, offset)
+            guess = (int(s / track.step_cm) + int(rng.integers(-3, 4))) % len(track.s_cm)
+            found = locate(xy[0], xy[1], renderer._nodes, closed, guess)
+            near = (found[0] - s + 450.0) % 900.0 - 450.0 if closed else found[0] - s
+            assert abs(near) < 0.01
+            assert found[1] == pytest.approx(offset, abs=0.005)
+            np.testing.assert_allclose(found[2:4], [np.cos(heading), np.sin(heading)], atol=2e-4)
 
 
 def test_lines_keep_their_place_under_every_effect():
