@@ -94,11 +94,19 @@ class DataSettings(Settings):
 
 @dataclass(frozen=True)
 class PreparedData:
-    """Label sets of a run, by role."""
+    """Label sets of a run, by role.
+
+    Attributes:
+        train: To learn from.
+        validation: To choose the epoch by.
+        test: To score the result.
+        camera: Camera file, where all drives share one camera.
+    """
 
     train: list[Path]
     validation: list[Path]
     test: list[Path]
+    camera: Path | None
 
 
 def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = None) -> PreparedData:
@@ -148,7 +156,24 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
     for i in range(len(jobs)):
         for role, path in results[i].items():
             parts[role].append(path)
-    return PreparedData(parts["train"], parts["validation"], parts["test"])
+    return PreparedData(
+        parts["train"], parts["validation"], parts["test"], _shared_camera(settings, work_dir)
+    )
+
+
+def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:
+    """Camera file of the run's drives, if they share one: the simulation's, or the only recording's."""
+    if not settings.drives:
+        return next((work_dir / "synthetic" / "drives").glob("*/camera.yaml"), None)
+    synthetic = settings.synthetic
+    if len(settings.drives) == 1 and not (synthetic.train or synthetic.validation or synthetic.test):
+        return work_dir / "drives" / "maps" / _recorded_name(settings.drives[0]) / "camera.yaml"
+    return None
+
+
+def _recorded_name(settings: RecordedSettings) -> str:
+    """Name of a recording's outputs; two drives may have folders of the same name."""
+    return f"{settings.path.resolve().name}-{_key([str(settings.path.resolve())])[:6]}"
 
 
 def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Path) -> dict[str, Any]:
@@ -242,8 +267,7 @@ def truth_labels(
 
 def _recorded_labels(settings: RecordedSettings, folder: Path) -> dict[Role, Path]:
     """Map and label a recorded drive, and split it along time: to learn from, a gap, to judge by."""
-    # Two drives may have folders of the same name.
-    name = f"{settings.path.resolve().name}-{_key([str(settings.path.resolve())])[:6]}"
+    name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
     key = _key([settings.model_dump(mode="json"), _fingerprint(settings.path)])
     parts: dict[Role, Path] = {

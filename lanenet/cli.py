@@ -151,23 +151,29 @@ def train(
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
-    from lanenet.data.files import write_text
     from lanenet.learn.evaluate import network_predictor
+    from lanenet.learn.publish import publish
+    from lanenet.learn.run_state import hash_run
     from lanenet.learn.train import train as train_network
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)
     checkpoint = settings.checkpoints_dir / settings.name
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress)
+    # A folder per settings and data: a stopped run finds its own state again, and no other.
+    run_hash = hash_run(settings.learn, data.train, data.validation)
+    run_folder = settings.work_folder / f"train-{run_hash}"
     with console.training_bar() as progress:
-        train_network(settings.learn, data.train, data.validation, checkpoint, progress)
-    write_text(checkpoint / "run.yaml", dump_settings(settings))
-    model = checkpoint / "model.onnx"
+        train_network(settings.learn, data.train, data.validation, run_folder, progress)
     if not data.test:
         console.show_problems(["the data has no test part: the table is over the validation labels"])
-    _evaluate(
-        data.test or data.validation, {"network": network_predictor(model)}, marking, checkpoint / "results"
-    )
+    predictors = {"network": network_predictor(run_folder / "model.onnx")}
+    markdown, results = _evaluate(data.test or data.validation, predictors, marking)
+    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), "results.md": markdown}
+    if data.camera is not None:
+        files["camera.yaml"] = data.camera.read_bytes()
+    publish(run_folder, checkpoint, settings.name, files, results)
+    model = checkpoint / "model.onnx"
     console.wrote(checkpoint)
     console.next_command("detect", "SOURCE", "--detector", "network", "--model", model, "--out", "lanes.csv")
 
@@ -238,10 +244,15 @@ def val(
     marking: _MarkingOption = None,
 ) -> None:
     """Show a model's errors in cm on label sets, beside the baselines on the same frames."""
+    from lanenet.data.files import write_json, write_text
     from lanenet.learn.evaluate import network_predictor
 
     path = model / "model.onnx" if model.is_dir() else model
-    _evaluate(labels, {"network": network_predictor(path)}, marking, out)
+    markdown, results = _evaluate(labels, {"network": network_predictor(path)}, marking)
+    if out is not None:
+        write_json(Path(f"{out}.json"), results)
+        write_text(Path(f"{out}.md"), markdown)
+        console.wrote(Path(f"{out}.json"), Path(f"{out}.md"))
     console.next_command("detect", "SOURCE", "--detector", "network", "--model", path, "--out", "lanes.csv")
 
 
@@ -364,12 +375,11 @@ def doctor(camera: _CameraOption = None) -> None:
 
 
 def _evaluate(
-    labels: list[Path], predictors: dict[str, Predictor], marking_cm: float | None, out: Path | None
-) -> None:
-    """Compare detectors with the lane filter on label sets, show the table and write it."""
+    labels: list[Path], predictors: dict[str, Predictor], marking_cm: float | None
+) -> tuple[str, dict[str, Any]]:
+    """Compare detectors with the lane filter and show the table; returned as Markdown and as data."""
     from rich.console import Console
 
-    from lanenet.data.files import write_json, write_text
     from lanenet.data.label_set import read_labels
     from lanenet.learn.evaluate import evaluate_detectors, format_table
     from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
@@ -381,12 +391,8 @@ def _evaluate(
     tables = evaluate_detectors([read_labels(path) for path in labels], beside)
     table, markdown = format_table(tables)
     Console().print(table)
-    if out is not None:
-        as_json, as_text = Path(f"{out}.json"), Path(f"{out}.md")
-        sets = [str(path) for path in labels]
-        write_json(as_json, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}})
-        write_text(as_text, markdown)
-        console.wrote(as_json, as_text)
+    sets = [path.name for path in labels]
+    return markdown, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}}
 
 
 def _check_ending(path: Path, *endings: str) -> None:

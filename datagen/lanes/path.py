@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -118,7 +119,8 @@ def edges_along_path(
 
 
 @njit(cache=True)
-def _project(xy, left, step, s_frame, pose, points, normals, wheelbase, span):  # type: ignore[no-untyped-def]
+@no_type_check
+def _project(xy, left, step, s_frame, pose, points, normals, wheelbase, span):
     n = points.shape[0]
     s_out, d_out, side_out = np.full(n, np.nan), np.zeros(n), np.zeros(n)
     for i in range(n):

@@ -8,6 +8,7 @@ dashed line and an interrupted one are carried by the other.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -199,7 +200,8 @@ def _best_lane(
 
 
 @njit(cache=True)
-def _viterbi(support, smoothness, middle, width_cells):  # type: ignore[no-untyped-def]
+@no_type_check
+def _viterbi(support, smoothness, middle, width_cells):
     """Path of columns with the most support; steps of up to four columns, dearer the larger they are."""
     m, columns = support.shape
     cost = np.empty((m, columns), np.float32)

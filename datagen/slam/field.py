@@ -8,6 +8,7 @@ so that memory and cost per frame stay constant however long the drive is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -96,7 +97,8 @@ class DirectionField:
 
 
 @njit(cache=True, fastmath=True)
-def _insert(vectors, owner, seen, cell_cm, memory, points, normals, weights, frame):  # type: ignore[no-untyped-def]
+@no_type_check
+def _insert(vectors, owner, seen, cell_cm, memory, points, normals, weights, frame):
     mask = vectors.shape[0] - 1
     for i in range(points.shape[0]):
         gx, gy = points[i, 0] / cell_cm, points[i, 1] / cell_cm
@@ -120,9 +122,8 @@ def _insert(vectors, owner, seen, cell_cm, memory, points, normals, weights, fra
 
 
 @njit(cache=True, fastmath=True)
-def _score(  # type: ignore[no-untyped-def]
-    vectors, owner, seen, cell_cm, memory, poses, wheelbase, points, normals, weights, frame
-):
+@no_type_check
+def _score(vectors, owner, seen, cell_cm, memory, poses, wheelbase, points, normals, weights, frame):
     mask = vectors.shape[0] - 1
     scores = np.zeros(poses.shape[0])
     for p in range(poses.shape[0]):

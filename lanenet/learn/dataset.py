@@ -24,6 +24,7 @@ class LaneSamples:
     Attributes:
         window: The bird's-eye window that all sets share.
         wheelbase_cm: The wheelbase that all sets share.
+        perception: How all sets' edge points were found.
         lane_width_cm: Mean lane width over the frames.
         camera_hashes: Of the cameras that took the frames, sorted.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
@@ -53,6 +54,7 @@ class LaneSamples:
         first = label_sets[0].meta
         self.window: BirdseyeWindow = first.window
         self.wheelbase_cm = first.wheelbase_cm
+        self.perception = first.perception
         self.camera_hashes = sorted({labels.meta.camera_hash for labels in label_sets})
         self.reference = reference_of(label_sets)
         kept = [
@@ -184,6 +186,11 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
     if a.window != b.window:
         raise LabelFormatError(
             f"{name_b}: window {b.window}, but {name_a} has {a.window}; label both with the same window"
+        )
+    if a.perception != b.perception:
+        raise LabelFormatError(
+            f"{name_b}: its edges were found with {b.perception}, those of {name_a} with {a.perception}; "
+            "label both with the same settings"
         )
     if abs(a.wheelbase_cm - b.wheelbase_cm) > 1e-6 * abs(a.wheelbase_cm):
         raise LabelFormatError(

@@ -190,29 +190,30 @@ def format_table(tables: Mapping[str, ErrorTable]) -> tuple[Table, str]:
     """
     references = sorted({table.reference for table in tables.values() if table.reference})
     title = f"Errors in cm against the {' and '.join(references) or 'labels'}"
-    header = ["detector", "RMSE", "median", "p95", "worst", *_row_names(), *SIDES, "answered", "common RMSE"]
-    lines = [
-        [
-            name,
-            *(_cm(v) for v in (t.all.rmse_cm, t.all.median_cm, t.all.p95_cm, t.all.worst_cm)),
-            *(_cm(t.groups[group].rmse_cm) for group in (*_row_names(), *SIDES)),
-            f"{100.0 * t.all.coverage:.1f} %" if t.all.truth_count else "-",
-            _cm(t.common_rmse_cm),
+    header = ["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)]
+    lines = []
+    for name, t in tables.items():
+        groups = [t.groups[group] for group in ("all", *POINT_NAMES)]
+        lines += [
+            [name, "RMSE", *(_cm(stats.rmse_cm) for stats in groups)],
+            ["", "median", *(_cm(stats.median_cm) for stats in groups)],
+            ["", "p95", *(_cm(stats.p95_cm) for stats in groups)],
+            ["", "worst", *(_cm(stats.worst_cm) for stats in groups)],
+            ["", "answered", *(_percent(stats) for stats in groups)],
+            ["", "common RMSE", _cm(t.common_rmse_cm), *[""] * len(POINT_NAMES)],
         ]
-        for name, t in tables.items()
-    ]
     counts = ", ".join(sorted({f"{t.all.truth_count} labelled points" for t in tables.values()}))
     note = (
-        f"{counts}; columns by row and side are RMSE; "
+        f"{counts}; columns are the line and the distance ahead in cm; "
         "common RMSE is over the points that every detector answered"
         + "".join(sorted({f" ({t.common_count} points)" for t in tables.values() if t.common_count}))
     )
     rich_table = Table(title=title, caption=note)
     for i, name in enumerate(header):
-        rich_table.add_column(name, justify="left" if i == 0 else "right")
+        rich_table.add_column(name, justify="left" if i < 2 else "right")
     for line in lines:
-        rich_table.add_row(*line)
-    rule = ["---", *["---:"] * (len(header) - 1)]
+        rich_table.add_row(*line, end_section=line[1] == "common RMSE")
+    rule = ["---", "---", *["---:"] * (len(header) - 2)]
     rows = "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *lines])
     return rich_table, f"{title}\n\n{rows}\n\n{note}\n"
 
@@ -227,6 +228,10 @@ def _answers(name: str, predict: Predictor, label_sets: Sequence[LabelSet]) -> F
             )
         parts.append(part)
     return np.concatenate(parts)
+
+
+def _percent(stats: ErrorStats) -> str:
+    return f"{100.0 * stats.coverage:.0f} %" if stats.truth_count else "-"
 
 
 def _row_names() -> list[str]:

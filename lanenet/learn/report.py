@@ -67,6 +67,7 @@ def write_checkpoint(
         training_hash=run_hash,
         rmse_cm=errors.point_rmse_cm,
         reference=errors.reference,
+        perception=samples.perception,
     )
     chosen = np.unique(np.linspace(0, len(val) - 1, _N_CHECK_RASTERS).astype(np.intp))
     rasters, _ = val.plain_batch(chosen)

@@ -84,7 +84,7 @@ def time_stages(
         lane_filter = LaneFilter(extractor, LaneFilterSettings(lane_width_cm=LANE_WIDTH_CM))
         network = None
         if model is not None:
-            network = NetworkDetector(model, extractor, any_camera=True, threads=threads)
+            network = NetworkDetector(model, camera, any_camera=True, threads=threads)
         window = network.meta.window if network is not None else BirdseyeWindow()
         times_ms: dict[str, list[float]] = {}
         points: list[int] = []

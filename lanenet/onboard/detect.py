@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,13 +19,7 @@ from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.sources import Source
 from lanenet.perception.draw import draw_estimate
-from lanenet.perception.estimate import LaneEstimate
-
-if TYPE_CHECKING:
-    from lanenet.perception.estimate import Detector
-else:
-    # What a detector is, is for the type checker: a protocol cannot be asked at run time.
-    Detector = Any
+from lanenet.perception.estimate import Detector, LaneEstimate
 
 #: Annotated frames are enlarged to at least this width, so that the text can be read.
 VIDEO_WIDTH_PX = 640

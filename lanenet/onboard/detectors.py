@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -13,14 +13,9 @@ from lanenet.data.label_set import LabelSet
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.estimate import Detector
 from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
 from lanenet.perception.network import NetworkDetector
-
-if TYPE_CHECKING:
-    from lanenet.perception.estimate import Detector
-else:
-    # What a detector is, is for the type checker: a protocol cannot be asked at run time.
-    Detector = Any
 
 DetectorName = Literal["network", "lane-filter"]
 
@@ -49,15 +44,15 @@ def build_detector(
         ModelMismatchError: If the model cannot be used with this camera.
         CalibrationError: If the camera sees no road.
     """
-    extractor = RoadEdgeExtractor(camera, PerceptionSettings())
     if name == "network":
         if model is None:
             raise ConfigError("detector network: expected a model (--model MODEL.onnx)")
-        return NetworkDetector(model, extractor, any_camera=any_camera)
+        return NetworkDetector(model, camera, any_camera=any_camera)
     if lane_width_cm is None:
         raise ConfigError(
             "detector lane-filter: the source comes without a lane width, expected one (--lane-width CM)"
         )
+    extractor = RoadEdgeExtractor(camera, PerceptionSettings())
     return LaneFilter(extractor, filter_settings(lane_width_cm, marking_cm))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,12 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, UInt8
 
-from lanenet.errors import ModelMismatchError
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, POINT_NAMES, ROWS_CM
-from lanenet.perception.birdseye import RoadEdgeExtractor
+from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate
 
 FORMAT = "lanenet-model/1"
@@ -44,6 +46,7 @@ class ModelMeta:
         training_hash: Hash of the contents of its training files.
         rmse_cm: Error of each point on validation frames; NaN where it was not measured.
         reference: What the errors were measured against: ``truth``, ``map`` or ``map and truth``.
+        perception: How the edge points of its rasters were found.
     """
 
     window: BirdseyeWindow
@@ -53,6 +56,7 @@ class ModelMeta:
     training_hash: str
     rmse_cm: tuple[float, ...]
     reference: str
+    perception: PerceptionSettings = field(default_factory=PerceptionSettings)
 
     def to_properties(self) -> dict[str, str]:
         """Return the description as the text properties of an ONNX file."""
@@ -70,6 +74,7 @@ class ModelMeta:
             "training_hash": self.training_hash,
             "rmse_cm": json.dumps(errors),
             "reference": self.reference,
+            "perception": self.perception.model_dump_json(),
         }
 
     @staticmethod
@@ -109,8 +114,9 @@ class ModelMeta:
                 training_hash=str(properties.get("training_hash", "")),
                 rmse_cm=tuple(math.nan if v is None else float(v) for v in value("rmse_cm")),
                 reference=str(properties.get("reference", "")),
+                perception=check_settings(PerceptionSettings, value("perception"), "perception"),
             )
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ConfigError) as error:
             raise ModelMismatchError(f"{where}: unreadable description ({error})") from None
         if len(meta.rmse_cm) != N_POINTS:
             raise ModelMismatchError(f"{where}: rmse_cm has {len(meta.rmse_cm)} values, expected {N_POINTS}")
@@ -169,7 +175,7 @@ class NetworkDetector:
     def __init__(
         self,
         model_path: Path,
-        extractor: RoadEdgeExtractor,
+        camera: Camera,
         *,
         any_camera: bool = False,
         window: BirdseyeWindow | None = None,
@@ -179,7 +185,7 @@ class NetworkDetector:
 
         Args:
             model_path: ONNX file.
-            extractor: Finds the road edges; holds the car's camera.
+            camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
             window: The bird's-eye window that the caller counts on; None takes the model's.
@@ -194,14 +200,14 @@ class NetworkDetector:
             raise ModelMismatchError(
                 f"{model_path}: made for the window {self.meta.window}, but {window} is in use"
             )
-        camera_hash = extractor.camera.hash
+        camera_hash = camera.hash
         if not any_camera and camera_hash not in self.meta.camera_hashes:
             raise ModelMismatchError(
                 f"{model_path}: trained with camera {', '.join(self.meta.camera_hashes) or 'unknown'}, but "
                 f"this camera is {camera_hash}; train with this camera, or allow any camera if both are "
                 "calibrated and see about the same road"
             )
-        self._extractor = extractor
+        self._extractor = RoadEdgeExtractor(camera, self.meta.perception)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
         self._sigma_cm: Float[np.ndarray, "6"] = np.array(self.meta.rmse_cm)

@@ -83,8 +83,9 @@ def test_detectors_are_compared_on_common_points():
     rich_table, markdown = format_table(tables)
     assert "against the truth" in markdown and "against the truth" in str(rich_table.title)
     lines = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert len({line.count("|") for line in lines}) == 1 and len(lines) == 4
-    assert lines[2].split("|")[1:3] == [" shy ", " 1.00 "] and "50.0 %" in lines[2]
+    assert len({line.count("|") for line in lines}) == 1 and len(lines) == 2 + 2 * 6
+    assert lines[2].split("|")[1:4] == [" shy ", " RMSE ", " 1.00 "]
+    assert lines[6].split("|")[1:5] == ["  ", " answered ", " 50 % ", " 100 % "]
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(rich_table)
     assert "bold" in console.export_text()

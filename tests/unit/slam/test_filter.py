@@ -1,0 +1,210 @@
+"""The particle filter: its steps one by one, and a made-up road driven through."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, TapeRoad, tape_road
+
+from datagen.slam.filter import (
+    FilterSettings,
+    Trajectory,
+    mean_pose,
+    reweigh,
+    run_filter,
+    smooth_lineages,
+    systematic_resample,
+    thin_scan,
+)
+from datagen.slam.motion import MotionModel
+
+SETTINGS = FilterSettings(particles=250)
+FRAMES = 100
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        [0.5, 0.25, 0.25],
+        [0.0, 0.0, 1.0, 0.0],
+        [1.0, 0.0, 0.0],
+        [0.1, 0.2, 0.3, 0.4],
+        [0.001] * 7 + [0.993],
+    ],
+)
+def test_copies_are_n_times_the_weight_on_average(weights):
+    w = np.array(weights)
+    n, runs = len(w), 4000
+    copies = np.array(
+        [np.bincount(systematic_resample(w, np.random.default_rng(seed)), minlength=n) for seed in range(runs)]
+    )
+    assert (np.abs(copies - n * w) < 1.0 + 1e-9).all()
+    assert not copies[:, w == 0.0].any()
+    # Of a count that is one of two neighbours, the mean is within four standard errors.
+    np.testing.assert_allclose(copies.mean(axis=0), n * w, atol=4.0 * 0.5 / np.sqrt(runs))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=50).filter(lambda v: sum(v) > 0.1), st.integers(0, 99))
+def test_copies_differ_from_n_times_the_weight_by_less_than_one(raw, seed):
+    w = np.array(raw) / np.sum(raw)
+    chosen = systematic_resample(w, np.random.default_rng(seed))
+    assert (np.diff(chosen) >= 0).all()
+    copies = np.bincount(chosen, minlength=len(w))
+    assert copies.sum() == len(w)
+    assert (np.abs(copies - len(w) * w) < 1.0 + 1e-6).all()
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0, 250.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_reweigh_keeps_the_effective_share_and_the_order(seed, scale):
+    rng = np.random.default_rng(seed)
+    scores = scale * rng.normal(size=300)
+    new = reweigh(np.full(300, 1.0 / 300), scores, 0.15)
+    assert new.sum() == pytest.approx(1.0)
+    assert 1.0 / np.sum(new**2) >= 0.15 * 300
+    assert (np.diff(new[np.argsort(scores)]) >= 0.0).all()
+    # Not flatter than needed: scores that differ by hundreds still favour the best.
+    assert new.max() > 1.05 / 300
+    # Sums of hundreds of matches lose the last digits.
+    np.testing.assert_allclose(reweigh(np.full(300, 1.0 / 300), scores + 1234.5, 0.15), new, rtol=1e-6)
+
+
+def test_mild_scores_are_taken_at_their_word():
+    prior = np.array([0.1, 0.2, 0.3, 0.4])
+    scores = np.array([0.3, 0.1, 0.2, 0.0])
+    expected = prior * np.exp(scores)
+    np.testing.assert_allclose(reweigh(prior, scores, 0.15), expected / expected.sum())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_smoothing_equals_following_each_lineage(seed):
+    rng = np.random.default_rng(seed)
+    n, count = 12, 30
+    history = rng.normal(size=(n, count, 5))
+    parents = np.vstack([np.arange(count), rng.integers(0, count, (n - 1, count))])
+    final = rng.dirichlet(np.ones(count))
+    naive = np.zeros((n, 5))
+    for particle in range(count):
+        ancestor = particle
+        for k in range(n - 1, -1, -1):
+            naive[k] += final[particle] * history[k, ancestor]
+            ancestor = parents[k, ancestor]
+    np.testing.assert_allclose(smooth_lineages(history, parents, final), naive, atol=1e-12)
+
+
+def test_mean_pose_weighs():
+    states = np.array([[0.0, 0.0, 6.0, 1.0, 0.0], [4.0, 8.0, 6.4, 1.0, 0.0]])
+    np.testing.assert_allclose(mean_pose(states, np.array([0.25, 0.75])), [3.0, 6.0, 6.3])
+
+
+def test_thinned_scans_are_drawn_evenly_and_kept_whole_when_small():
+    scans = tape_road(3).scans()
+    rng = np.random.default_rng(0)
+    size = int(np.diff(scans.starts)[1])
+    points, normals, trust = thin_scan(scans, 1, size, rng)
+    np.testing.assert_array_equal(points, scans.points_cm[scans.frame(1)])
+    points, normals, trust = thin_scan(scans, 1, 50, rng)
+    assert len(points) == len(normals) == len(trust) == 50
+    whole = {tuple(p) for p in scans.points_cm[scans.frame(1)]}
+    assert {tuple(p) for p in points} <= whole
+    assert len({tuple(p) for p in points}) == 50
+    drawn = np.concatenate([thin_scan(scans, 1, 50, rng)[0] for _ in range(100)])
+    # Near points are not preferred: the mean over many draws is that of the frame.
+    np.testing.assert_allclose(drawn.mean(axis=0), scans.points_cm[scans.frame(1)].mean(axis=0), atol=1.5)
+
+
+def _motion(frames: int, speed_known: bool) -> MotionModel:
+    """Speed known up to its gain, or not at all; steering unknown."""
+    step = 1.0 if speed_known else 0.2 * HEIGHT_CM
+    return MotionModel(
+        distance_cm=np.full(frames, STEP_CM if speed_known else 1.0),
+        curvature_per_cm=np.zeros(frames),
+        factor_start=(step, 0.1 * step if speed_known else 0.3 * step),
+        factor_walk=0.005 * step,
+        factor_pull=0.02,
+        distance_noise=0.02,
+        offset_walk_per_cm=0.012 / HEIGHT_CM,
+        offset_decay=0.0,
+        curvature_noise_per_cm=0.02 / HEIGHT_CM,
+        max_curvature_per_cm=0.8 / HEIGHT_CM,
+    )
+
+
+def _run(road: TapeRoad, seed: int, speed_known: bool = True) -> Trajectory:
+    scans, motion = road.scans(), _motion(len(road.poses), speed_known)
+    rng = np.random.default_rng(seed)
+    return run_filter(scans, motion, SETTINGS, HEIGHT_CM, WHEELBASE_CM, rng)
+
+
+def _length_cm(poses: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("speed_known", [True, False])
+def test_a_noise_free_drive_follows_the_true_path(speed_known):
+    road = tape_road(FRAMES)
+    ends, headings, lengths = [], [], []
+    for seed in range(5):
+        result = _run(road, seed, speed_known)
+        ends.append(np.linalg.norm(result.poses[-1, :2] - road.poses[-1, :2]))
+        headings.append(np.abs(result.poses[:, 2] - road.poses[:, 2]).max())
+        lengths.append(_length_cm(result.poses) / _length_cm(road.poses) - 1.0)
+        assert np.isnan(result.match[0])
+        assert np.median(result.match[1:]) > 0.5
+        assert result.match[1:].max() <= 1.0
+        assert (result.factor > 0.0).all()
+    # A drive of 3 m.
+    assert np.median(ends) < 5.0
+    assert np.max(ends) < 12.0
+    assert np.median(headings) < np.deg2rad(2.0)
+    assert np.max(headings) < np.deg2rad(5.0)
+    assert np.median(np.abs(lengths)) < 0.02
+    assert np.max(np.abs(lengths)) < 0.04
+
+
+def test_where_the_road_lies_on_the_map_changes_nothing():
+    road = tape_road(60)
+    here, there = _run(road, 3), _run(road.moved(400.0, -250.0, 2.3), 3)
+    assert _length_cm(there.poses) == pytest.approx(_length_cm(here.poses), rel=0.02)
+    assert there.poses[-1, 2] == pytest.approx(here.poses[-1, 2], abs=np.deg2rad(2.0))
+
+
+def test_a_mirrored_road_gives_the_mirrored_path():
+    road = tape_road(FRAMES)
+    plain = [_run(road, seed).poses for seed in range(5)]
+    mirrored = [_run(road.mirrored(), seed).poses for seed in range(5)]
+    assert road.poses[-1, 2] > 0.5
+    turned, turned_mirrored = (np.median([p[-1, 2] for p in runs]) for runs in (plain, mirrored))
+    assert turned_mirrored == pytest.approx(-turned, abs=np.deg2rad(2.0))
+    lengths = [np.median([_length_cm(p) for p in runs]) for runs in (plain, mirrored)]
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.02)
+    sideways = [np.median([p[-1, 1] for p in runs]) for runs in (plain, mirrored)]
+    assert sideways[0] == pytest.approx(-sideways[1], abs=5.0)
+
+
+def test_the_same_seed_gives_the_same_trajectory():
+    road = tape_road(30)
+    first, second = _run(road, 1), _run(road, 1)
+    np.testing.assert_array_equal(first.poses, second.poses)
+    assert not np.array_equal(first.poses, _run(road, 2).poses)
+
+
+def test_frames_without_edges_are_bridged_by_the_prediction():
+    road = tape_road(50)
+    scans = road.scans()
+    empty = range(20, 25)
+    keep = ~np.isin(scans.frame_of_point, empty)
+    counts = np.bincount(scans.frame_of_point[keep], minlength=50)
+    thinned = type(scans)(
+        scans.points_cm[keep],
+        scans.normals[keep],
+        scans.weights[keep],
+        np.concatenate([[0], np.cumsum(counts)]),
+    )
+    result = run_filter(thinned, _motion(50, True), SETTINGS, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(0))
+    assert np.isnan(result.match[20:25]).all()
+    assert np.isfinite(result.poses).all()
+    assert np.linalg.norm(result.poses[-1, :2] - road.poses[-1, :2]) < 10.0
