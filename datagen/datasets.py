@@ -11,7 +11,7 @@ import multiprocessing
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +33,7 @@ from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 Progress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
 
-_VERSION = 2  # of this module's outputs; raise it when the same settings give other labels
+_VERSION = 3  # of this module's outputs; raise it when the same settings give other labels
 
 
 class SyntheticSettings(Settings):
@@ -83,12 +83,14 @@ class DataSettings(Settings):
         synthetic: Synthetic drives.
         drives: Recorded drives.
         map: Settings for mapping the synthetic drives.
+        window: The patch of road that the network sees: wide enough for the lane's lines on either side.
         workers: Processes that simulate and map; 0 takes one per core.
     """
 
     synthetic: SyntheticSettings = SyntheticSettings()
     drives: tuple[RecordedSettings, ...] = ()
     map: MapSettings = MapSettings()
+    window: BirdseyeWindow = BirdseyeWindow()
     workers: int = Field(default=0, ge=0)
 
 
@@ -129,7 +131,13 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
         for number in range(getattr(settings.synthetic, role)):
             jobs.append((role, _synthetic_job(settings, role, number, work_dir)))
     for drive in settings.drives:
-        jobs.append((None, {"kind": "recorded", "settings": drive, "folder": work_dir / "drives"}))
+        job = {
+            "kind": "recorded",
+            "settings": drive,
+            "window": settings.window,
+            "folder": work_dir / "drives",
+        }
+        jobs.append((None, job))
     if not jobs:
         raise ConfigError("data: no drives; set data.synthetic.train or list data.drives")
     workers = settings.workers or os.cpu_count() or 1
@@ -188,6 +196,7 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
         "name": name,
         "simulation": simulation,
         "map": settings.map,
+        "window": settings.window,
         "folder": work_dir / "synthetic",
     }
 
@@ -199,7 +208,7 @@ def _run_job(job: dict[str, Any]) -> dict[Role, Path]:
     cv2.setNumThreads(1)
     if job["kind"] == "synthetic":
         return {job["role"]: _synthetic_labels(job)}
-    return _recorded_labels(job["settings"], job["folder"])
+    return _recorded_labels(job["settings"], job["window"], job["folder"])
 
 
 def _synthetic_labels(job: dict[str, Any]) -> Path:
@@ -207,7 +216,7 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
     simulation: SimulationSettings = job["simulation"]
     drive, drive_map = folder / "drives" / job["name"], folder / "maps" / job["name"]
     labels = folder / "labels" / f"{job['name']}.parquet"
-    parts = [simulation.model_dump(mode="json"), job["role"]]
+    parts = [simulation.model_dump(mode="json"), job["role"], asdict(job["window"])]
     if job["role"] != "test":
         parts.append(job["map"].model_dump(mode="json"))
     key = _key(parts)
@@ -215,18 +224,28 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
         return labels
     simulate_drive(simulation, drive)
     if job["role"] == "test":
-        write_labels(labels, truth_labels(drive, job["map"].perception))
+        truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
+        write_labels(labels, truth)
     else:
         map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
-        label_map(drive_map, labels, perception=job["map"].perception)
+        label_map(drive_map, labels, perception=job["map"].perception, window=job["window"])
     _mark_done(labels, key)
     return labels
 
 
 def truth_labels(
-    drive_path: Path, perception: PerceptionSettings | None = None, window: BirdseyeWindow | None = None
+    drive_path: Path,
+    perception: PerceptionSettings | None = None,
+    window: BirdseyeWindow | None = None,
+    marking_cm: float | None = None,
 ) -> LabelSet:
     """Make a label set from a simulator's truth, for scoring.
+
+    Args:
+        drive_path: Simulated drive.
+        perception: How edge points are found; None takes the defaults.
+        window: The network's window; None takes the default.
+        marking_cm: Width of the markings, if known.
 
     Raises:
         DriveFormatError: If the drive has no truth, or no camera or lane width.
@@ -251,6 +270,7 @@ def truth_labels(
             lane_width_cm=drive.lane_width_cm,
             source="truth",
             perception=perception,
+            marking_cm=marking_cm,
         ),
         drive=[drive.name] * n,
         file=[""] * n,
@@ -265,17 +285,17 @@ def truth_labels(
     )
 
 
-def _recorded_labels(settings: RecordedSettings, folder: Path) -> dict[Role, Path]:
+def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder: Path) -> dict[Role, Path]:
     """Map and label a recorded drive, and split it along time: to learn from, a gap, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
-    key = _key([settings.model_dump(mode="json"), _fingerprint(settings.path)])
+    key = _key([settings.model_dump(mode="json"), asdict(window), _fingerprint(settings.path)])
     parts: dict[Role, Path] = {
         role: folder / "labels" / f"{name}.{role}.parquet" for role in ("train", "validation", "test")
     }
     if not (_is_done(whole, key) and all(path.is_file() for path in parts.values())):
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
-        label_map(drive_map, whole, perception=settings.map.perception)
+        label_map(drive_map, whole, perception=settings.map.perception, window=window)
         shares = (settings.train_share, settings.validation_share)
         pieces = split_along_time(read_labels(whole), shares, settings.gap_frames)
         for path, piece in zip(parts.values(), pieces, strict=True):

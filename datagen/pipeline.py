@@ -459,6 +459,7 @@ def label_map(
             lane_width_cm=drive_map.meta.lane_width_cm,
             source="map",
             perception=perception,
+            marking_cm=drive_map.meta.tape_cm,
         ),
         drive=[drive.name] * len(rows),
         file=[""] * len(rows),

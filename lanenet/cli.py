@@ -293,6 +293,12 @@ def detect(
     any_camera: Annotated[
         bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
     ] = False,
+    frames: Annotated[
+        str | None, typer.Option(help="Only these frame numbers, FIRST:LAST.", metavar="FIRST:LAST")
+    ] = None,
+    skip_unreadable: Annotated[
+        bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and go on.")
+    ] = False,
 ) -> None:
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
@@ -301,20 +307,24 @@ def detect(
     from lanenet.onboard.sources import open_source
 
     _check_ending(out, ".parquet", ".csv")
-    frames = open_source(source)
-    used_camera = read_camera(camera) if camera is not None else frames.camera
+    opened = open_source(source)
+    if frames is not None:
+        opened = opened.numbered(*_frame_range(frames))
+    used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is None:
         raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
     chosen = build_detector(
         detector.value,
         used_camera,
         model=model,
-        lane_width_cm=lane_width if lane_width is not None else frames.lane_width_cm,
+        lane_width_cm=lane_width if lane_width is not None else opened.lane_width_cm,
         marking_cm=marking,
         any_camera=any_camera,
     )
     with console.progress_bar(f"detect ({detector.value})") as progress:
-        report = run_detector(frames, chosen, used_camera, out, video, progress)
+        report = run_detector(
+            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
+        )
     console.show_problems(report.problems)
     typer.echo(
         f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
@@ -385,7 +395,8 @@ def _evaluate(
     from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
 
     def lane_filter(labels: LabelSet) -> Float[np.ndarray, "n 6"]:
-        return lane_filter_points_cm(labels, filter_settings(labels.meta.lane_width_cm, marking_cm))
+        width_cm = labels.meta.marking_cm if marking_cm is None else marking_cm
+        return lane_filter_points_cm(labels, filter_settings(labels.meta.lane_width_cm, width_cm))
 
     beside = {**predictors, "lane filter": lane_filter}
     tables = evaluate_detectors([read_labels(path) for path in labels], beside)
@@ -393,6 +404,13 @@ def _evaluate(
     Console().print(table)
     sets = [path.name for path in labels]
     return markdown, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}}
+
+
+def _frame_range(text: str) -> tuple[int, int]:
+    first, colon, last = text.partition(":")
+    if not (colon and first.strip().isdigit() and last.strip().isdigit()):
+        raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
+    return int(first), int(last)
 
 
 def _check_ending(path: Path, *endings: str) -> None:

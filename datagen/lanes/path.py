@@ -11,6 +11,9 @@ from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.slam.scans import Scans
+from lanenet.errors import TrackingLostError
+
+_SHORTEST_CM = 20.0
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,19 @@ def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: flo
         poses: Rear-axle poses, frame map.
         step_cm: Distance between samples.
         ahead_cm: Length to add at the end.
+
+    Raises:
+        TrackingLostError: If the car hardly moves.
     """
     smooth = gaussian_filter1d(poses[:, :2], 2.0, axis=0, mode="nearest")
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
     # Standing still gives several frames at one place; interpolation needs a strictly growing argument.
     s = distance + np.arange(len(distance)) * 1e-6
+    if s[-1] < max(_SHORTEST_CM, 3.0 * step_cm):
+        raise TrackingLostError(
+            f"the car moved {distance[-1]:.1f} cm in {len(poses)} frames, expected {_SHORTEST_CM:.0f} or more: "
+            "there is no path to look for lines along"
+        )
     samples = np.arange(0.0, s[-1], step_cm)
     xy = np.stack([np.interp(samples, s, smooth[:, i]) for i in range(2)], axis=1)
     tail = min(len(xy) - 1, max(2, int(20.0 / step_cm)))

@@ -78,7 +78,8 @@ def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarr
         )
         flat = small.astype(np.float32)
         flat -= cv2.GaussianBlur(flat, (0, 0), 6.0)
-        rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 1e-6)
+        # Less than a tenth of a gray level is rounding: blank pictures would be alike by it.
+        rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 2.0)
         if progress is not None:
             progress(k + 1, len(drive))
     return rows
@@ -207,7 +208,7 @@ def relative_pose(origin: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"]) 
     """Return ``pose`` as seen from ``origin``: x ahead, y left, heading difference in (-pi, pi]."""
     c, s = np.cos(origin[2]), np.sin(origin[2])
     dx, dy = pose[0] - origin[0], pose[1] - origin[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, wrap_angle(pose[2] - origin[2])])
+    return np.array([c * dx + s * dy, -s * dx + c * dy, wrap_angle(pose[2:] - origin[2:])[0]])
 
 
 def _submap(

@@ -53,6 +53,7 @@ class _MetaFile(Settings):
     lane_width_cm: float = Field(gt=0.0)
     source: Source
     perception: PerceptionSettings
+    marking_cm: float | None = Field(default=None, gt=0.0)
     config_hash: str = ""
 
 
@@ -67,6 +68,7 @@ class LabelMeta:
         lane_width_cm: Distance between the middles of the two lines.
         source: ``map`` for labels from a map made of the drive, ``truth`` for a simulator's.
         perception: How the edge points were found; the car has to find them the same way.
+        marking_cm: Width of the markings; None if unknown.
         config_hash: Hash of the settings that made the labels; empty if unknown.
     """
 
@@ -76,6 +78,7 @@ class LabelMeta:
     lane_width_cm: float
     source: Source
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
+    marking_cm: float | None = None
     config_hash: str = ""
 
 
@@ -246,6 +249,7 @@ def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
         lane_width_cm=file.lane_width_cm,
         source=file.source,
         perception=file.perception,
+        marking_cm=file.marking_cm,
         config_hash=file.config_hash,
     )
 

@@ -59,11 +59,13 @@ def run_detector(
     out: Path,
     video: Path | None = None,
     progress: Progress | None = None,
+    *,
+    skip_unreadable: bool = False,
 ) -> DetectReport:
     """Run a detector over every frame of a source and write what it finds.
 
     Files are moved into place when they are complete. The detector forgets its state where the source is
-    interrupted. A frame that cannot be read gets an empty row and is named in the report.
+    interrupted.
 
     Args:
         source: The frames.
@@ -72,12 +74,13 @@ def run_detector(
         out: Table of detections, ``.parquet`` or ``.csv``.
         video: Annotated video (mp4v), or None.
         progress: Called with (frames done, frames).
+        skip_unreadable: Give a frame that cannot be read an empty row and name it in the report.
 
     Returns:
         Counts, timings and problems.
 
     Raises:
-        DriveFormatError: If no frame can be read.
+        DriveFormatError: If a frame cannot be read; with ``skip_unreadable``, if none can.
         CalibrationError: If a frame does not fit the camera; the message names it.
         LabelFormatError: If the ending of ``out`` is unknown.
     """
@@ -97,6 +100,8 @@ def run_detector(
             try:
                 frame = source.image(i)
             except DriveFormatError as error:
+                if not skip_unreadable:
+                    raise
                 problems.append(str(error))
             if frame is not None:
                 start_s = time.perf_counter()

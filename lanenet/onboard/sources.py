@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -49,6 +49,26 @@ class Source:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def numbered(self, first: int, last: int) -> Source:
+        """Return the part whose frame numbers are first to last, both included.
+
+        Raises:
+            DriveFormatError: If there is none.
+        """
+        rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
+        if not rows.size:
+            raise DriveFormatError(
+                f"{self.name}: no frame from {first} to {last}; it has {self.frames[0]} to {self.frames[-1]}"
+            )
+        whole, start = self.image, int(rows[0])
+        return replace(
+            self,
+            frames=self.frames[rows],
+            t_s=self.t_s[rows],
+            starts=self.starts[rows],
+            image=lambda i: whole(start + i),
+        )
 
 
 def open_source(path: Path) -> Source:

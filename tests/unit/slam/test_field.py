@@ -62,7 +62,9 @@ def _unit(rng: np.random.Generator, n: int) -> np.ndarray:
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def _one_point(field: DirectionField, x_cm: float, y_cm: float, normal: tuple[float, float], frame: int) -> float:
+def _one_point(
+    field: DirectionField, x_cm: float, y_cm: float, normal: tuple[float, float], frame: int
+) -> float:
     """Score of one edge at a place of the map, for a car at the origin that heads along +x."""
     car = np.array([[-y_cm, x_cm - WHEELBASE_CM]])
     normal_car = np.array([[-normal[1], normal[0]]])

@@ -38,7 +38,10 @@ def test_copies_are_n_times_the_weight_on_average(weights):
     w = np.array(weights)
     n, runs = len(w), 4000
     copies = np.array(
-        [np.bincount(systematic_resample(w, np.random.default_rng(seed)), minlength=n) for seed in range(runs)]
+        [
+            np.bincount(systematic_resample(w, np.random.default_rng(seed)), minlength=n)
+            for seed in range(runs)
+        ]
     )
     assert (np.abs(copies - n * w) < 1.0 + 1e-9).all()
     assert not copies[:, w == 0.0].any()
@@ -47,7 +50,9 @@ def test_copies_are_n_times_the_weight_on_average(weights):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=50).filter(lambda v: sum(v) > 0.1), st.integers(0, 99))
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=50).filter(lambda v: sum(v) > 0.1), st.integers(0, 99)
+)
 def test_copies_differ_from_n_times_the_weight_by_less_than_one(raw, seed):
     w = np.array(raw) / np.sum(raw)
     chosen = systematic_resample(w, np.random.default_rng(seed))
@@ -156,13 +161,13 @@ def test_a_noise_free_drive_follows_the_true_path(speed_known):
         assert np.median(result.match[1:]) > 0.5
         assert result.match[1:].max() <= 1.0
         assert (result.factor > 0.0).all()
-    # A drive of 3 m.
-    assert np.median(ends) < 5.0
-    assert np.max(ends) < 12.0
-    assert np.median(headings) < np.deg2rad(2.0)
+    # A drive of 3 m that turns by 79 degrees. The path comes out short and turned too little, by 1 and 2 %.
+    assert np.median(ends) < 8.0
+    assert np.max(ends) < 16.0
+    assert np.median(headings) < np.deg2rad(2.5)
     assert np.max(headings) < np.deg2rad(5.0)
-    assert np.median(np.abs(lengths)) < 0.02
-    assert np.max(np.abs(lengths)) < 0.04
+    assert np.median(np.abs(lengths)) < 0.015
+    assert np.max(np.abs(lengths)) < 0.03
 
 
 def test_where_the_road_lies_on_the_map_changes_nothing():
@@ -204,7 +209,9 @@ def test_frames_without_edges_are_bridged_by_the_prediction():
         scans.weights[keep],
         np.concatenate([[0], np.cumsum(counts)]),
     )
-    result = run_filter(thinned, _motion(50, True), SETTINGS, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(0))
+    result = run_filter(
+        thinned, _motion(50, True), SETTINGS, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(0)
+    )
     assert np.isnan(result.match[20:25]).all()
     assert np.isfinite(result.poses).all()
     assert np.linalg.norm(result.poses[-1, :2] - road.poses[-1, :2]) < 10.0

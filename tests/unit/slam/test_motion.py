@@ -10,7 +10,9 @@ from datagen.slam.motion import FACTOR, HEADING, OFFSET, MotionModel, X, Y
 N = 20_000
 
 
-def _model(frames: int, curvature_per_cm: float = 0.0, distance_cm: float = 3.0, **changes: object) -> MotionModel:
+def _model(
+    frames: int, curvature_per_cm: float = 0.0, distance_cm: float = 3.0, **changes: object
+) -> MotionModel:
     plain: dict[str, object] = {
         "distance_cm": np.full(frames, distance_cm),
         "curvature_per_cm": np.full(frames, curvature_per_cm),
@@ -62,7 +64,9 @@ def test_the_distance_factor_scales_the_path():
 
 @pytest.mark.parametrize("curvature", [0.5, -0.5])
 def test_curvature_is_bounded_so_that_the_heading_cannot_spin(curvature):
-    model = _model(11, curvature, max_curvature_per_cm=0.02, curvature_noise_per_cm=1.0, offset_walk_per_cm=1.0)
+    model = _model(
+        11, curvature, max_curvature_per_cm=0.02, curvature_noise_per_cm=1.0, offset_walk_per_cm=1.0
+    )
     states = _drive(model, 500)
     assert np.abs(states[:, HEADING]).max() <= 0.02 * 3.0 * 10 + 1e-9
     steady = _drive(_model(11, curvature, max_curvature_per_cm=0.02), 1)[0]

@@ -1,0 +1,171 @@
+"""Bad input: one line that names file and key, an exit code, and nothing half-written."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from lanenet.cli import app
+from lanenet.data.camera_file import write_camera
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.geometry.camera import Camera, Mounting
+
+
+def camera(width=64, height=48):
+    K = np.array([[30.0, 0.0, (width - 1) / 2], [0.0, 30.0, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return Camera("fisheye", width, height, K, np.zeros(4), Mounting(15.0, 0.4), 20.0)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive", camera=camera(), lane_width_cm=40.0) as writer:
+        for k in range(70):
+            frame = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+            writer.add(frame, k * 0.05, speed_cm_s=50.0, steering_rad=0.0)
+    return tmp_path / "drive"
+
+
+@pytest.fixture
+def tub(tmp_path):
+    folder = tmp_path / "tub"
+    (folder / "images").mkdir(parents=True)
+    manifest = [["cam/image_array", "user/angle"], ["image_array", "float"], {}, {"created_at": 0.0}]
+    catalog = {"paths": ["catalog_0.catalog"], "current_index": 0, "max_len": 1000, "deleted_indexes": []}
+    lines = [json.dumps(part) for part in [*manifest, catalog]]
+    (folder / "manifest.json").write_text("\n".join(lines) + "\n")
+    (folder / "catalog_0.catalog").write_text("")
+    return folder
+
+
+def run(tmp_path, *words):
+    """Run a command that must fail; returns its one line."""
+    before = sorted(p for p in tmp_path.rglob("*"))
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 1, result.output
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1 and "Traceback" not in result.output
+    assert sorted(p for p in tmp_path.rglob("*")) == before, "something was written"
+    return lines[0]
+
+
+def config(tmp_path, **changes):
+    path = tmp_path / "run.yaml"
+    data = {"name": "bad", "work_dir": str(tmp_path / "work"), "checkpoints_dir": str(tmp_path / "ck")}
+    path.write_text(yaml.safe_dump(data | changes))
+    return path
+
+
+def test_a_misspelt_key_is_named_with_the_right_one(tmp_path):
+    line = run(tmp_path, "train", config(tmp_path, learn={"epoch": 3}))
+    assert "run.yaml" in line and "'learn.epoch'" in line and "'epochs'" in line
+
+
+def test_a_wrong_type_is_named(tmp_path):
+    line = run(tmp_path, "train", config(tmp_path), "learn.batch_size=many")
+    assert "run.yaml" in line and "'learn.batch_size'" in line and "'many'" in line
+
+
+def test_an_override_without_value(tmp_path):
+    assert "key=value" in run(tmp_path, "train", config(tmp_path), "learn.epochs")
+
+
+@pytest.mark.parametrize("verb", ["map", "detect"])
+def test_a_missing_drive(tmp_path, verb):
+    words = {
+        "map": ("--lane-width", 40, "--out", tmp_path / "m"),
+        "detect": ("--detector", "lane-filter", "--out", tmp_path / "o.csv"),
+    }[verb]
+    assert "nowhere" in run(tmp_path, verb, tmp_path / "nowhere", *words)
+
+
+def test_a_run_whose_drive_is_missing(tmp_path):
+    drives = [{"path": str(tmp_path / "gone"), "lane_width_cm": 40}]
+    line = run_keeping_work(tmp_path, config(tmp_path, data={"drives": drives}))
+    assert "gone" in line
+
+
+def run_keeping_work(tmp_path, path):
+    """A run may leave its work folder, but no checkpoint."""
+    result = CliRunner().invoke(app, ["train", str(path)])
+    assert result.exit_code == 1 and not (tmp_path / "ck").exists()
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    return line
+
+
+def test_an_empty_tub(tmp_path, tub):
+    line = run(tmp_path, "map", tub, "--lane-width", 40, "--out", tmp_path / "m")
+    assert "tub" in line and "no " in line
+
+
+@pytest.mark.parametrize("verb", ["map", "detect"])
+def test_a_corrupt_jpeg_in_the_middle(tmp_path, drive, verb):
+    image = drive / "images" / "000035.jpg"
+    image.write_bytes(image.read_bytes()[:200])
+    words = {
+        "map": ("--lane-width", 40, "--out", tmp_path / "m"),
+        "detect": ("--detector", "lane-filter", "--out", tmp_path / "o.csv", "--video", tmp_path / "o.mp4"),
+    }[verb]
+    assert "000035.jpg" in run(tmp_path, verb, drive, *words)
+
+
+def test_detect_can_go_on_past_a_corrupt_jpeg(tmp_path, drive):
+    image = drive / "images" / "000035.jpg"
+    image.write_bytes(image.read_bytes()[:200])
+    words = ["detect", drive, "--detector", "lane-filter", "--out", tmp_path / "o.csv", "--skip-unreadable"]
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0 and "000035.jpg" in result.stderr
+    assert len((tmp_path / "o.csv").read_text().splitlines()) == 71
+
+
+@pytest.mark.parametrize("verb", ["map", "detect"])
+def test_a_camera_of_another_resolution(tmp_path, drive, verb):
+    write_camera(tmp_path / "other.yaml", camera(80, 60), "made up")
+    words = {
+        "map": ("--lane-width", 40, "--out", tmp_path / "m"),
+        "detect": ("--detector", "lane-filter", "--out", tmp_path / "o.csv"),
+    }[verb]
+    line = run(tmp_path, verb, drive, "--camera", tmp_path / "other.yaml", *words)
+    assert "80x60" in line and "64x48" in line
+
+
+def test_a_nan_in_a_table(tmp_path, drive):
+    table = drive / "frames.csv"
+    table.write_text(table.read_text().replace("000012.jpg,0.6,", "000012.jpg,nan,"))
+    line = run(tmp_path, "map", drive, "--lane-width", 40, "--out", tmp_path / "m")
+    assert "frames.csv" in line and "line 14" in line and "'t_s'" in line
+
+
+def test_a_camera_file_with_a_nan(tmp_path, drive):
+    path = drive / "camera.yaml"
+    data = yaml.safe_load(path.read_text())
+    data["mounting"]["height_cm"] = float("nan")
+    path.write_text(yaml.safe_dump(data))
+    line = run(tmp_path, "map", drive, "--lane-width", 40, "--out", tmp_path / "m")
+    assert "camera.yaml" in line and "height_cm" in line and "NaN" in line
+
+
+def test_a_map_without_its_drive(tmp_path):
+    (tmp_path / "m").mkdir()
+    assert "map.yaml" in run(tmp_path, "label", tmp_path / "m", "--out", tmp_path / "l.parquet")
+
+
+def test_outputs_that_are_not_ours_are_kept(tmp_path, drive):
+    keep = tmp_path / "keep"
+    keep.mkdir()
+    (keep / "thesis.txt").write_text("years of work")
+    result = CliRunner().invoke(app, ["map", str(drive), "--lane-width", "40", "--out", str(keep)])
+    assert result.exit_code == 1 and (keep / "thesis.txt").read_text() == "years of work"
+
+
+def test_noise_is_not_mapped(tmp_path, drive):
+    shutil.rmtree(drive / "images")
+    (drive / "images").mkdir()
+    for k in range(70):
+        cv2.imwrite(str(drive / "images" / f"{k:06d}.jpg"), np.full((48, 64, 3), 90, np.uint8))
+    line = run(tmp_path, "map", drive, "--lane-width", 40, "--out", tmp_path / "m")
+    assert "edge points" in line

@@ -1,0 +1,188 @@
+"""Splits along time, and what counts as done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from datagen.datasets import (
+    DataSettings,
+    RecordedSettings,
+    SyntheticSettings,
+    _fingerprint,
+    _is_done,
+    _key,
+    _mark_done,
+    _synthetic_job,
+    prepare,
+    split_along_time,
+)
+from lanenet.data.label_set import LabelMeta, LabelSet
+from lanenet.errors import ConfigError, DriveFormatError
+from lanenet.geometry.birdseye import BirdseyeWindow
+
+
+def _labels(frames: np.ndarray) -> LabelSet:
+    n = len(frames)
+    nothing = np.empty((0, 2))
+    return LabelSet(
+        meta=LabelMeta(BirdseyeWindow(), "camera", 17.0, 40.0, "map"),
+        drive=["drive"] * n,
+        file=[""] * n,
+        frame=frames,
+        t_s=0.05 * frames,
+        lap=np.zeros(n, dtype=np.int64),
+        poses=np.zeros((n, 3)),
+        points_cm=np.column_stack([frames] * 6).astype(np.float64),
+        edges=[np.empty((0, 4), np.float32)] * n,
+        lines=[(nothing, nothing)] * n,
+        quality=np.ones(n),
+    )
+
+
+def test_a_whole_drive_is_cut_at_its_shares_with_gaps():
+    parts = split_along_time(_labels(np.arange(1000)), (0.6, 0.15), 40)
+    assert [(int(p.frame[0]), int(p.frame[-1])) for p in parts] == [(0, 599), (640, 749), (790, 999)]
+    # A row stays whole.
+    np.testing.assert_array_equal(parts[1].points_cm[:, 3], parts[1].frame)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.integers(1, 30), min_size=5, max_size=150),
+    st.lists(st.floats(0.05, 0.6), min_size=1, max_size=3),
+    st.integers(0, 60),
+)
+def test_no_two_frames_of_different_parts_are_within_the_gap(steps, shares, gap):
+    assume(sum(shares) < 0.98)
+    frames = np.cumsum(steps)
+    try:
+        parts = split_along_time(_labels(frames), tuple(shares), gap)
+    except ConfigError:
+        # Only where a part could not have had a frame beyond the gap.
+        assert len(frames) < 60 or gap > 0
+        return
+    assert len(parts) == len(shares) + 1
+    assert all(len(part) for part in parts)
+    for before, after in zip(parts[:-1], parts[1:], strict=True):
+        assert after.frame[0] - before.frame[-1] > gap
+    together = np.concatenate([part.frame for part in parts])
+    assert (np.diff(together) > 0).all()
+    assert set(together) <= set(frames)
+    # Left out are only frames within the gap after a part.
+    ends = [int(part.frame[-1]) for part in parts[:-1]]
+    assert all(any(0 < f - end <= gap for end in ends) for f in set(frames) - set(together))
+
+
+def test_without_a_gap_every_frame_is_used():
+    frames = np.arange(0, 400, 2)
+    parts = split_along_time(_labels(frames), (0.5, 0.25), 0)
+    assert [len(p) for p in parts] == [100, 50, 50]
+
+
+@pytest.mark.parametrize(
+    ("count", "shares", "gap"),
+    [
+        (100, (0.6, 0.15), 40),  # 15 frames for the validation, all within the gap
+        (3, (0.1, 0.1), 0),
+        (200, (0.7, 0.3), 0),  # nothing left for the test
+        (200, (0.9, 0.9), 0),  # more than there is
+        (0, (0.6, 0.15), 0),
+    ],
+)
+def test_an_empty_part_is_refused(count, shares, gap):
+    with pytest.raises(ConfigError, match="empty"):
+        split_along_time(_labels(np.arange(count)), shares, gap)
+
+
+def test_shares_that_leave_nothing_for_the_test_are_refused_before_any_work():
+    with pytest.raises(ValidationError, match="validation_share"):
+        RecordedSettings(path=Path("drive"), lane_width_cm=40.0, train_share=0.8, validation_share=0.2)
+    assert RecordedSettings(path=Path("drive"), lane_width_cm=40.0, train_share=0.8, validation_share=0.1)
+
+
+@pytest.fixture
+def labels_file(tmp_path: Path) -> Path:
+    path = tmp_path / "labels" / "drive.parquet"
+    path.parent.mkdir()
+    path.write_bytes(b"labels")
+    _mark_done(path, "0123abcd")
+    return path
+
+
+def test_what_is_marked_is_done(labels_file):
+    assert _is_done(labels_file, "0123abcd")
+
+
+def test_another_key_or_a_missing_file_is_not_done(labels_file):
+    assert not _is_done(labels_file, "0123abce")
+    labels_file.unlink()
+    assert not _is_done(labels_file, "0123abcd")
+
+
+def test_without_a_marker_nothing_is_done(tmp_path):
+    path = tmp_path / "drive.parquet"
+    path.write_bytes(b"labels")
+    assert not _is_done(path, "0123abcd")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b'{"key": 7}', b"{}", b"[1, 2]", b"null", b'"0123abcd"', b"\xff\xfe\x00"]
+)
+def test_a_damaged_marker_means_not_done(labels_file, content):
+    (marker,) = labels_file.parent.glob("*.json")
+    marker.write_bytes(content)
+    assert not _is_done(labels_file, "0123abcd")
+
+
+def test_parts_of_one_drive_have_markers_of_their_own(tmp_path):
+    for name in ("a.parquet", "a.train.parquet"):
+        (tmp_path / name).write_bytes(b"labels")
+    _mark_done(tmp_path / "a.parquet", "k")
+    assert not _is_done(tmp_path / "a.train.parquet", "k")
+
+
+def test_a_key_depends_on_every_setting_and_not_on_their_order():
+    first = _key([{"a": 1, "b": 2.0}, "train"])
+    assert first == _key([{"b": 2.0, "a": 1}, "train"])
+    assert first != _key([{"a": 1, "b": 2.5}, "train"])
+    assert first != _key([{"a": 1, "b": 2.0}, "test"])
+    json.loads(json.dumps(first))
+
+
+def test_a_recording_that_changes_has_another_fingerprint(tmp_path):
+    (tmp_path / "frames.csv").write_text("frame\n1\n")
+    first = _fingerprint(tmp_path)
+    assert first == _fingerprint(tmp_path)
+    (tmp_path / "frames.csv").write_text("frame\n1\n2\n")
+    assert first != _fingerprint(tmp_path)
+    with pytest.raises(DriveFormatError, match="no such drive"):
+        _fingerprint(tmp_path / "nowhere")
+
+
+def test_every_synthetic_drive_has_a_seed_of_its_own_that_stays(tmp_path):
+    def seeds(**counts: int) -> dict[str, int]:
+        data = DataSettings(synthetic=SyntheticSettings(seed=5, **counts))
+        jobs = [
+            _synthetic_job(data, role, k, tmp_path)
+            for role in ("train", "validation", "test")
+            for k in range(getattr(data.synthetic, role))
+        ]
+        return {job["name"]: job["simulation"].seed for job in jobs}
+
+    few, many = seeds(train=3, validation=1, test=2), seeds(train=12, validation=4, test=2)
+    assert len(set(many.values())) == 18
+    # More drives to learn from leave those that judge as they were.
+    assert few.items() <= many.items()
+
+
+def test_a_run_without_drives_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no drives"):
+        prepare(DataSettings(), tmp_path)
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,226 @@
+"""Map folders: what is written is read back, and damage is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.lanes.fit import LaneLine, Side
+from datagen.map_folder import FORMAT, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.files import require
+from lanenet.errors import LanenetError, MapFormatError
+from lanenet.geometry.camera import Camera, Mounting
+
+N = 30
+CAMERA = Camera(
+    "fisheye",
+    160,
+    120,
+    np.array([[80.0, 0.0, 79.5], [0.0, 80.0, 59.5], [0.0, 0.0, 1.0]]),
+    np.array([-0.03, 0.0, 0.0, 0.0]),
+    Mounting(15.0, pitch_down_rad=0.25, ahead_of_front_axle_cm=-3.5),
+    17.0,
+)
+
+
+def _line(side: Side, y_cm: float, residual_cm: float = 0.12) -> LaneLine:
+    knots = np.concatenate([np.zeros(3), np.linspace(0.0, 200.0, 11), np.full(3, 200.0)])
+    rng = np.random.default_rng(0)
+    coefficients = np.column_stack([np.linspace(0.0, 200.0, 13), y_cm + rng.normal(size=13)])
+    supported = np.array([[0.0, 80.0], [120.0, 200.0]])
+    return LaneLine(side, knots, coefficients, supported, residual_cm)
+
+
+def _drive_map() -> DriveMap:
+    rng = np.random.default_rng(1)
+    poses = np.column_stack([rng.uniform(-300.0, 300.0, (N, 2)), np.linspace(0.0, 14.0, N)])
+    match = rng.uniform(0.2, 0.9, N)
+    match[0] = match[20] = np.nan
+    never_seen = LaneLine(
+        "right", _line("right", -18.0).knots_cm, _line("right", -18.0).coefficients_cm, np.empty((0, 2)), np.nan
+    )
+    return DriveMap(
+        meta=MapMeta(
+            format=FORMAT,
+            drive="drives/circuit",
+            lane_width_cm=36.0,
+            mapped_lane_cm=36.4,
+            tape_cm=2.1,
+            scale_from="lane width",
+            laps=1,
+        ),
+        camera=CAMERA,
+        frames=np.arange(100, 100 + N),
+        t_s=0.05 * np.arange(N),
+        poses=poses,
+        lap=np.repeat([0, 1], N // 2),
+        segment=np.repeat([0, 1], [20, 10]),
+        s_cm=np.concatenate([np.linspace(0.0, 90.0, 20), np.linspace(0.0, 40.0, 10)]),
+        match=match,
+        lines={
+            0: [_line("left", 18.0), _line("right", -18.0)],
+            1: [_line("left", 18.0), never_seen],
+        },
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    edges = {"frame_index": np.arange(5), "x_cm": np.linspace(0.0, 1.0, 5).astype(np.float32)}
+    report = {"frames": N, "figures": np.array([1.0, np.nan])}
+    write_map(tmp_path, _drive_map(), edges, report, "from the drive")
+    return tmp_path
+
+
+def test_round_trip(folder):
+    written, found = _drive_map(), read_map(folder)
+    assert found.meta == written.meta
+    assert found.camera.hash == written.camera.hash
+    assert found.camera.wheelbase_cm == written.camera.wheelbase_cm
+    for name in ("frames", "lap", "segment"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
+    # Nine digits on paper.
+    for name in ("t_s", "poses", "s_cm", "match"):
+        np.testing.assert_allclose(getattr(found, name), getattr(written, name), rtol=1e-7)
+    assert found.lines.keys() == written.lines.keys()
+    s = np.linspace(-10.0, 210.0, 45)
+    for segment, pair in written.lines.items():
+        assert [line.side for line in found.lines[segment]] == ["left", "right"]
+        for line, again in zip(pair, found.lines[segment], strict=True):
+            np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
+            np.testing.assert_allclose(again.residual_cm, line.residual_cm)
+
+
+def test_other_tools_can_read_the_folder(folder):
+    table = require("pyarrow.parquet", "data").read_table(folder / "edges.parquet")
+    assert table.column("frame_index").to_pylist() == list(range(5))
+    # A trajectory in metres, by the TUM convention: time, position, quaternion.
+    tum = np.loadtxt(folder / "trajectory.tum")
+    assert tum.shape == (N, 8)
+    np.testing.assert_allclose(100.0 * tum[:, 1:3], _drive_map().poses[:, :2], atol=1e-3)
+    report = json.loads((folder / "report.json").read_text())
+    assert report == {"frames": N, "figures": [1.0, None]}
+    assert "from the drive" in (folder / "camera.yaml").read_text()
+
+
+def test_a_folder_that_is_no_map(tmp_path):
+    with pytest.raises(MapFormatError, match=r"no map\.yaml"):
+        read_map(tmp_path)
+    with pytest.raises(MapFormatError, match=r"no map\.yaml"):
+        read_map(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("replacement", ["lanenet-map/2", "lanenet-drive/1", "7"])
+def test_another_version_is_refused(folder, replacement):
+    path = folder / "map.yaml"
+    path.write_text(path.read_text().replace(FORMAT, replacement))
+    with pytest.raises(MapFormatError, match=f"format is '?{replacement}'?, expected '{FORMAT}'"):
+        read_map(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("laps: 1", "laps: one", "laps"),
+        ("tape_cm: 2.1\n", "", "'tape_cm' is missing"),
+        ("laps: 1", "lapps: 1", "lapps"),
+        ("drive: drives/circuit", "drive: [", "not valid YAML"),
+    ],
+)
+def test_damaged_meta_data(folder, old, new, message):
+    path = folder / "map.yaml"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(MapFormatError, match=rf"map\.yaml.*{message}"):
+        read_map(folder)
+
+
+@pytest.mark.parametrize("value", ["nan", "", "inf", "3,5"])
+def test_poses_without_a_number_are_refused(folder, value):
+    path = folder / "poses.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[5].split(",")
+    cells[2] = value
+    lines[5] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(MapFormatError, match=r"poses\.csv: line 6"):
+        read_map(folder)
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "lanes.json", "camera.yaml"])
+def test_a_missing_file_is_named(folder, name):
+    (folder / name).unlink()
+    with pytest.raises(LanenetError, match=name):
+        read_map(folder)
+
+
+def _damage(plain: dict, what: str) -> object:
+    line = plain["lines"][0]
+    if what == "a list":
+        return [1, 2]
+    if what == "other format":
+        plain["format"] = "lanenet-lanes/9"
+    elif what == "no lines":
+        del plain["lines"]
+    elif what == "no side":
+        del line["side"]
+    elif what == "unknown side":
+        line["side"] = "middle"
+    elif what == "text for a number":
+        line["knots_cm"][3] = "three"
+    elif what == "null for a number":
+        line["coefficients_cm"][3] = [None, None]
+    elif what == "odd coefficients":
+        line["coefficients_cm"][3] = [1.0]
+    elif what == "too few coefficients":
+        line["coefficients_cm"] = line["coefficients_cm"][:-2]
+    elif what == "knots out of order":
+        line["knots_cm"][5] = -40.0
+    elif what == "two left lines":
+        plain["lines"][1]["side"] = "left"
+    elif what == "one line":
+        del plain["lines"][0]
+    return plain
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "a list",
+        "other format",
+        "no lines",
+        "no side",
+        "unknown side",
+        "text for a number",
+        "null for a number",
+        "odd coefficients",
+        "too few coefficients",
+        "knots out of order",
+        "two left lines",
+        "one line",
+    ],
+)
+def test_damaged_lane_lines_are_refused(folder, what):
+    path = folder / "lanes.json"
+    path.write_text(json.dumps(_damage(json.loads(path.read_text()), what)))
+    with pytest.raises(MapFormatError, match=r"lanes\.json"):
+        read_map(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b'{"format": "lanenet-lanes/1", "lines": [', b"\xff\xfe\x00"])
+def test_a_cut_off_lane_file_is_refused(folder, content):
+    (folder / "lanes.json").write_bytes(content)
+    with pytest.raises(MapFormatError, match=r"lanes\.json"):
+        read_map(folder)
+
+
+def test_a_segment_without_lines_is_refused(folder):
+    path = folder / "lanes.json"
+    plain = json.loads(path.read_text())
+    plain["lines"] = plain["lines"][:2]
+    path.write_text(json.dumps(plain))
+    with pytest.raises(MapFormatError, match=r"lanes\.json.*segment 1"):
+        read_map(folder)

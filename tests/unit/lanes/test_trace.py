@@ -1,0 +1,213 @@
+"""The driven lane among edges: dashes, wanderings, clutter, gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.trace import TracedLane, TraceSettings, edge_profile, trace_lane
+from lanenet.errors import TrackingLostError
+
+HEIGHT_CM = 15.0
+STEP_CM = 1.8
+TAPE_CM = 2.4
+LANE_CM = 36.0
+FRAMES = 120
+SETTINGS = TraceSettings()
+CELL_CM = SETTINGS.cell_heights * HEIGHT_CM
+
+
+def _path() -> Path:
+    """A straight path: in its own coordinates, every path is straight."""
+    s = np.arange(0.0, 3.0 * FRAMES + 75.0, STEP_CM)
+    xy = np.column_stack([s, np.zeros_like(s)])
+    return Path(STEP_CM, xy, np.tile([0.0, 1.0], (len(s), 1)), 3.0 * np.arange(FRAMES))
+
+
+def _tape(
+    rng: np.random.Generator, middle: np.ndarray, seen: np.ndarray, tape_cm: float = TAPE_CM, noise_cm: float = 0.2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both edges of a tape, as if six frames had seen each place; s, d and side."""
+    rows = np.repeat(np.flatnonzero(seen), 6)
+    s = rows * STEP_CM + rng.uniform(-0.9, 0.9, len(rows))
+    noise = noise_cm * rng.normal(size=(2, len(rows)))
+    left = middle[rows] + 0.5 * tape_cm + noise[0]
+    right = middle[rows] - 0.5 * tape_cm + noise[1]
+    # The left edge brightens towards the tape, to the right.
+    side = np.concatenate([np.full(len(rows), -1.0), np.full(len(rows), 1.0)])
+    return np.concatenate([s, s]), np.concatenate([left, right]), side
+
+
+def _clutter(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    s = rng.uniform(0.0, 3.0 * FRAMES + 75.0, count)
+    return s, rng.uniform(-100.0, 100.0, count), np.cos(rng.uniform(-np.pi, np.pi, count))
+
+
+def _edges(*parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> PathEdges:
+    s, d, side = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return PathEdges(s, d, side, np.ones(len(s)))
+
+
+def _dashed(path: Path, dash_cm: float = 15.0, period_cm: float = 30.0) -> np.ndarray:
+    return np.mod(path.s_cm, period_cm) < dash_cm
+
+
+def _wandering(path: Path, amplitude_cm: float = 5.0) -> np.ndarray:
+    """Offset of the lane's centre from the driven path."""
+    return amplitude_cm * np.sin(2.0 * np.pi * path.s_cm / 170.0)
+
+
+def _lane(seed: int, lane_width_cm: float | None, lane_cm: float = LANE_CM, clutter: int = 2500) -> tuple[
+    TracedLane, np.ndarray, Path
+]:
+    rng = np.random.default_rng(seed)
+    path = _path()
+    centre = _wandering(path)
+    everywhere = np.ones(len(path.s_cm), dtype=bool)
+    edges = _edges(
+        _tape(rng, centre + 0.5 * lane_cm, _dashed(path)),
+        _tape(rng, centre - 0.5 * lane_cm, everywhere),
+        _clutter(rng, clutter),
+    )
+    return trace_lane(path, edges, HEIGHT_CM, lane_width_cm, SETTINGS), centre, path
+
+
+@pytest.mark.parametrize("given", [LANE_CM, 0.94 * LANE_CM, None])
+@pytest.mark.parametrize("seed", range(3))
+def test_lines_of_a_wandering_drive_among_clutter(seed, given):
+    lane, centre, path = _lane(seed, given)
+    dashes = _dashed(path)
+    left_error = lane.left_cm - (centre + 0.5 * LANE_CM)
+    right_error = lane.right_cm - (centre - 0.5 * LANE_CM)
+    # Solid line: everywhere. Dashed line: on the dashes.
+    assert np.isfinite(right_error).mean() > 0.97
+    assert np.isfinite(left_error[dashes]).mean() > 0.85
+    for error in (right_error, left_error[dashes]):
+        assert np.nanmedian(np.abs(error)) < 0.2
+        assert np.nanpercentile(np.abs(error), 95) < 0.6
+        assert np.nanmax(np.abs(error)) < 0.1 * HEIGHT_CM
+    assert np.abs(lane.centre_cm - centre).max() < 0.1 * HEIGHT_CM
+    assert lane.tape_cm == pytest.approx(TAPE_CM, abs=CELL_CM)
+    assert lane.lane_cm == pytest.approx(LANE_CM, abs=1.5)
+
+
+@pytest.mark.parametrize("lane_cm", [24.0, 45.0, 60.0])
+def test_the_lane_width_is_found(lane_cm):
+    lane, _, _ = _lane(0, None, lane_cm)
+    assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
+
+
+def test_left_and_right_are_mirror_images():
+    rng = np.random.default_rng(4)
+    path = _path()
+    centre = _wandering(path)
+    edges = _edges(
+        _tape(rng, centre + 0.5 * LANE_CM, _dashed(path)),
+        _tape(rng, centre - 0.5 * LANE_CM, np.ones(len(path.s_cm), dtype=bool)),
+        _clutter(rng, 1500),
+    )
+    mirrored = PathEdges(edges.s_cm, -edges.d_cm, -edges.side, edges.weight)
+    here = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    there = trace_lane(path, mirrored, HEIGHT_CM, LANE_CM, SETTINGS)
+    np.testing.assert_array_equal(np.isfinite(here.left_cm), np.isfinite(there.right_cm))
+    both = np.isfinite(here.left_cm)
+    np.testing.assert_allclose(there.right_cm[both], -here.left_cm[both], atol=0.1)
+    assert there.lane_cm == pytest.approx(here.lane_cm)
+
+
+def test_a_missing_stretch_stays_unknown_and_the_other_line_carries_the_lane():
+    rng = np.random.default_rng(1)
+    path = _path()
+    centre = _wandering(path)
+    gap = (path.s_cm > 120.0) & (path.s_cm < 200.0)
+    edges = _edges(
+        _tape(rng, centre + 0.5 * LANE_CM, ~gap),
+        _tape(rng, centre - 0.5 * LANE_CM, np.ones(len(path.s_cm), dtype=bool)),
+    )
+    lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    # The profile is smoothed by a quarter of a camera height along the path.
+    inner = (path.s_cm > 132.0) & (path.s_cm < 188.0)
+    assert np.isnan(lane.left_cm[inner]).all()
+    assert np.isfinite(lane.right_cm[inner]).all()
+    assert np.abs(lane.centre_cm - centre)[inner].max() < 0.1 * HEIGHT_CM
+    outside = (path.s_cm < 110.0) | (path.s_cm > 210.0)
+    assert np.isfinite(lane.left_cm[outside]).mean() > 0.97
+
+
+def test_one_edge_of_a_marking_is_no_middle():
+    rng = np.random.default_rng(2)
+    path = _path()
+    everywhere = np.ones(len(path.s_cm), dtype=bool)
+    s, d, side = _tape(rng, np.full(len(path.s_cm), 18.0), everywhere)
+    # From 150 to 230 cm only the tape's left edge was seen.
+    keep = ~((s > 150.0) & (s < 230.0) & (side > 0.0))
+    edges = _edges((s[keep], d[keep], side[keep]), _tape(rng, np.full(len(path.s_cm), -18.0), everywhere))
+    lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    assert np.isnan(lane.left_cm[(path.s_cm > 162.0) & (path.s_cm < 218.0)]).all()
+    known = lane.left_cm[np.isfinite(lane.left_cm)]
+    # Not pulled towards the edge that was seen, at 19.2, where the other one fades.
+    assert np.median(np.abs(known - 18.0)) < 0.15
+
+
+def test_the_car_starts_in_its_own_lane_and_stays_there():
+    rng = np.random.default_rng(3)
+    path = _path()
+    everywhere = np.ones(len(path.s_cm), dtype=bool)
+    # The neighbouring lane is painted better: both its lines are solid, our right one is dashed.
+    edges = _edges(
+        _tape(rng, np.full(len(path.s_cm), 18.0), everywhere),
+        _tape(rng, np.full(len(path.s_cm), 54.0), everywhere),
+        _tape(rng, np.full(len(path.s_cm), -18.0), _dashed(path)),
+    )
+    lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    assert np.abs(lane.centre_cm).max() < 0.1 * HEIGHT_CM
+    assert np.nanmedian(lane.right_cm) == pytest.approx(-18.0, abs=0.3)
+
+
+def test_without_lines_the_drive_cannot_be_mapped():
+    rng = np.random.default_rng(0)
+    path = _path()
+    with pytest.raises(TrackingLostError, match=r"36 cm apart.*lane width"):
+        trace_lane(path, _edges(_clutter(rng, 150)), HEIGHT_CM, LANE_CM, SETTINGS)
+    nothing = PathEdges(*(np.empty(0) for _ in range(4)))
+    with pytest.raises(TrackingLostError):
+        trace_lane(path, nothing, HEIGHT_CM, LANE_CM, SETTINGS)
+    with pytest.raises(TrackingLostError):
+        trace_lane(path, nothing, HEIGHT_CM, None, SETTINGS)
+
+
+def test_the_profile_keeps_directions_apart_and_saturates():
+    path = _path()
+    n = 400
+    at = np.full(n, 90.0)
+    edges = PathEdges(at, np.full(n, 10.0), np.full(n, -1.0), np.ones(n))
+    profile = edge_profile(path, edges, HEIGHT_CM, SETTINGS)
+    row, column = round(90.0 / STEP_CM), profile.half_cells + round(10.0 / profile.cell_cm)
+    assert profile.left[row, column] > 0.95
+    assert profile.left.max() < 1.0
+    assert profile.left[row].argmax() == column
+    assert not profile.right.any()
+    # An edge across the path belongs to neither.
+    across = PathEdges(at, np.full(n, 10.0), np.full(n, 0.3), np.ones(n))
+    assert not edge_profile(path, across, HEIGHT_CM, SETTINGS).left.any()
+
+
+def test_a_tape_is_supported_at_its_middle():
+    path = _path()
+    s = np.repeat(path.s_cm, 4)
+    one = np.ones(len(s))
+    edges = PathEdges(
+        np.concatenate([s, s]),
+        np.concatenate([11.2 * one, 8.8 * one]),
+        np.concatenate([-one, one]),
+        np.concatenate([one, one]),
+    )
+    profile = edge_profile(path, edges, HEIGHT_CM, SETTINGS)
+    tapes = profile.tapes(2.4)
+    middle = (tapes[50].argmax() - profile.half_cells) * profile.cell_cm
+    assert middle == pytest.approx(10.0, abs=profile.cell_cm)
+    # Of the wrong width, or with its edges swapped (a dark gap between tapes), it is none.
+    assert profile.tapes(6.0)[50].max() < 0.1
+    dark = PathEdges(edges.s_cm, edges.d_cm, -edges.side, edges.weight)
+    assert edge_profile(path, dark, HEIGHT_CM, SETTINGS).tapes(2.4)[50].max() < 0.5 * tapes[50].max()
