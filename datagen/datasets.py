@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from datagen.pipeline import MapSettings, label_map, map_drive
 from datagen.world.simulate import SimulationSettings, simulate_drive
@@ -75,6 +75,12 @@ class RecordedSettings(Settings):
     gap_frames: int = Field(default=40, ge=0)
     map: MapSettings = MapSettings()
 
+    @model_validator(mode="after")
+    def _leave_some_for_the_test(self) -> RecordedSettings:
+        if self.train_share + self.validation_share > 0.999:
+            raise ValueError("train_share and validation_share must sum to less than 1: the rest is the test")
+        return self
+
 
 class DataSettings(Settings):
     """Where the label sets of a run come from.
@@ -103,12 +109,14 @@ class PreparedData:
         validation: To choose the epoch by.
         test: To score the result.
         camera: Camera file, where all drives share one camera.
+        example: A frame of a synthetic test drive, to try the model on.
     """
 
     train: list[Path]
     validation: list[Path]
     test: list[Path]
     camera: Path | None
+    example: Path | None
 
 
 def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = None) -> PreparedData:
@@ -164,9 +172,10 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
     for i in range(len(jobs)):
         for role, path in results[i].items():
             parts[role].append(path)
-    return PreparedData(
-        parts["train"], parts["validation"], parts["test"], _shared_camera(settings, work_dir)
-    )
+    camera = _shared_camera(settings, work_dir)
+    pictures = sorted((work_dir / "synthetic" / "drives" / "test_00" / "images").glob("*.jpg"))
+    example = pictures[len(pictures) // 2] if pictures and settings.synthetic.test else None
+    return PreparedData(parts["train"], parts["validation"], parts["test"], camera, example)
 
 
 def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:
@@ -289,7 +298,10 @@ def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder:
     """Map and label a recorded drive, and split it along time: to learn from, a gap, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
-    key = _key([settings.model_dump(mode="json"), asdict(window), _fingerprint(settings.path)])
+    inputs = [settings.model_dump(mode="json"), asdict(window), _fingerprint(settings.path)]
+    if settings.camera is not None and settings.camera.is_file():
+        inputs.append(_fingerprint(settings.camera))
+    key = _key(inputs)
     parts: dict[Role, Path] = {
         role: folder / "labels" / f"{name}.{role}.parquet" for role in ("train", "validation", "test")
     }
@@ -319,7 +331,7 @@ def split_along_time(labels: LabelSet, shares: tuple[float, ...], gap_frames: in
         ConfigError: If a part would be empty.
     """
     cuts = np.rint(np.cumsum([0.0, *shares]) * len(labels)).astype(int)
-    cuts = np.append(cuts, len(labels))
+    cuts = np.append(np.minimum(cuts, len(labels)), len(labels))
     parts = []
     free_from = -np.inf
     for start, end in pairwise(cuts):
@@ -353,8 +365,8 @@ def _marker(path: Path) -> Path:
 
 def _is_done(path: Path, key: str) -> bool:
     try:
-        return path.is_file() and json.loads(_marker(path).read_text(encoding="utf-8")).get("key") == key
-    except (OSError, json.JSONDecodeError):
+        return path.is_file() and json.loads(_marker(path).read_text(encoding="utf-8")) == {"key": key}
+    except (OSError, ValueError):  # not there, not text, or not JSON
         return False
 
 

@@ -159,26 +159,44 @@ def read_map(folder: Path) -> DriveMap:
         segment=table["segment"],
         s_cm=table["s_cm"],
         match=table["match"],
-        lines=_read_lines(folder / "lanes.json"),
+        lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
     )
 
 
-def _read_lines(path: Path) -> dict[int, list[LaneLine]]:
+def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))
         if plain["format"] != "lanenet-lanes/1":
             raise MapFormatError(f"{path}: format is {plain['format']!r}, expected 'lanenet-lanes/1'")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
-            residual = item["residual_cm"]
-            line = LaneLine(
-                item["side"],
-                np.array(item["knots_cm"], dtype=np.float64),
-                np.array(item["coefficients_cm"], dtype=np.float64).reshape(-1, 2),
-                np.array(item["supported_cm"], dtype=np.float64).reshape(-1, 2),
-                float("nan") if residual is None else float(residual),
-            )
-            lines.setdefault(int(item["segment"]), []).append(line)
-    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+            lines.setdefault(int(item["segment"]), []).append(_line(item))
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise MapFormatError(f"{path}: lane lines cannot be read ({error!r})") from None
+    for segment in sorted(segments):
+        sides = sorted(line.side for line in lines.get(segment, []))
+        if sides != ["left", "right"]:
+            raise MapFormatError(
+                f"{path}: segment {segment} has lines {sides}, expected one left and one right line"
+            )
     return lines
+
+
+def _line(item: dict[str, Any]) -> LaneLine:
+    knots, coefficients, supported = (
+        np.array(item[name], dtype=np.float64) for name in ("knots_cm", "coefficients_cm", "supported_cm")
+    )
+    if item["side"] not in ("left", "right"):
+        raise ValueError(f"side is {item['side']!r}")
+    if len(knots) < 8 or coefficients.shape != (len(knots) - 4, 2):
+        raise ValueError(f"{len(knots)} knots with coefficients of shape {coefficients.shape}")
+    if not (np.isfinite(knots).all() and np.isfinite(coefficients).all() and (np.diff(knots) >= 0.0).all()):
+        raise ValueError("knots must not decrease, and all numbers must be finite")
+    residual = item["residual_cm"]
+    return LaneLine(
+        item["side"],
+        knots,
+        coefficients,
+        supported.reshape(-1, 2),
+        float("nan") if residual is None else float(residual),
+    )

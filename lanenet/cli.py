@@ -172,6 +172,8 @@ def train(
     files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), "results.md": markdown}
     if data.camera is not None:
         files["camera.yaml"] = data.camera.read_bytes()
+    if data.example is not None:
+        files[f"example{data.example.suffix}"] = data.example.read_bytes()
     publish(run_folder, checkpoint, settings.name, files, results)
     model = checkpoint / "model.onnx"
     console.wrote(checkpoint)

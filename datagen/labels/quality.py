@@ -68,6 +68,6 @@ def label_report(
         "points_labelled_share": {
             name: float(known[:, i].sum()) / max(mapped_frames, 1) for i, name in enumerate(POINT_NAMES)
         },
-        "residual_cm": {"median": percentile(50), "p95": percentile(95), "frames": int(finite.size)},
+        "residual_cm": {"median": percentile(50.0), "p95": percentile(95.0), "frames": int(finite.size)},
         "residual_of": "edge points within 60 cm, of frames that made the map, from the marking's borders",
     }

@@ -62,7 +62,7 @@ def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: flo
     s = distance + np.arange(len(distance)) * 1e-6
     if s[-1] < max(_SHORTEST_CM, 3.0 * step_cm):
         raise TrackingLostError(
-            f"the car moved {distance[-1]:.1f} cm in {len(poses)} frames, expected {_SHORTEST_CM:.0f} or more: "
+            f"the car moved {distance[-1]:.1f} cm in {len(poses)} frames, expected {_SHORTEST_CM:.0f} cm: "
             "there is no path to look for lines along"
         )
     samples = np.arange(0.0, s[-1], step_cm)

@@ -206,10 +206,10 @@ def _viterbi(support, smoothness, middle, width_cells):
     m, columns = support.shape
     cost = np.empty((m, columns), np.float32)
     back = np.zeros((m, columns), np.int8)
-    # The car starts inside its lane and stays near it: a second line never pays for a neighbouring lane.
-    outside = np.maximum(0.0, np.abs(np.arange(columns) - middle) / (0.5 * width_cells) - 1.0)
     for c in range(columns):
-        cost[0, c] = support[0, c] - 5.0 * outside[c]
+        # The car starts inside its lane.
+        outside = max(0.0, abs(c - middle) / (0.5 * width_cells) - 1.0)
+        cost[0, c] = support[0, c] - 5.0 * outside
     for i in range(1, m):
         for c in range(columns):
             best, step = -1e18, 0
@@ -218,7 +218,7 @@ def _viterbi(support, smoothness, middle, width_cells):
                     value = cost[i - 1, c + j] - smoothness * j * j
                     if value > best:
                         best, step = value, j
-            cost[i, c] = best + support[i, c] - 0.5 * outside[c]
+            cost[i, c] = best + support[i, c]
             back[i, c] = step
     track = np.empty(m, np.int64)
     track[m - 1] = np.argmax(cost[m - 1])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from rich import box
 from rich.table import Table
 
 from lanenet.data.label_set import LabelSet
@@ -200,19 +201,20 @@ def format_table(tables: Mapping[str, ErrorTable]) -> tuple[Table, str]:
             ["", "p95", *(_cm(stats.p95_cm) for stats in groups)],
             ["", "worst", *(_cm(stats.worst_cm) for stats in groups)],
             ["", "answered", *(_percent(stats) for stats in groups)],
-            ["", "common RMSE", _cm(t.common_rmse_cm), *[""] * len(POINT_NAMES)],
+            ["", "common", _cm(t.common_rmse_cm), *[""] * len(POINT_NAMES)],
         ]
     counts = ", ".join(sorted({f"{t.all.truth_count} labelled points" for t in tables.values()}))
     note = (
         f"{counts}; columns are the line and the distance ahead in cm; "
-        "common RMSE is over the points that every detector answered"
+        "common: RMSE over the points that every detector answered"
         + "".join(sorted({f" ({t.common_count} points)" for t in tables.values() if t.common_count}))
     )
-    rich_table = Table(title=title, caption=note)
+    # Narrow enough for a terminal of 80 columns.
+    rich_table = Table(title=title, caption=note, box=box.SIMPLE, pad_edge=False)
     for i, name in enumerate(header):
-        rich_table.add_column(name, justify="left" if i < 2 else "right")
+        rich_table.add_column(name.replace(" ", "\n"), justify="left" if i < 2 else "right", no_wrap=True)
     for line in lines:
-        rich_table.add_row(*line, end_section=line[1] == "common RMSE")
+        rich_table.add_row(*line, end_section=line[1] == "common")
     rule = ["---", "---", *["---:"] * (len(header) - 2)]
     rows = "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *lines])
     return rich_table, f"{title}\n\n{rows}\n\n{note}\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,12 @@ from datagen.datasets import (
     _is_done,
     _key,
     _mark_done,
+    _recorded_labels,
     _synthetic_job,
     prepare,
     split_along_time,
 )
-from lanenet.data.label_set import LabelMeta, LabelSet
+from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
@@ -70,7 +72,7 @@ def test_no_two_frames_of_different_parts_are_within_the_gap(steps, shares, gap)
         return
     assert len(parts) == len(shares) + 1
     assert all(len(part) for part in parts)
-    for before, after in zip(parts[:-1], parts[1:], strict=True):
+    for before, after in pairwise(parts):
         assert after.frame[0] - before.frame[-1] > gap
     together = np.concatenate([part.frame for part in parts])
     assert (np.diff(together) > 0).all()
@@ -186,3 +188,44 @@ def test_a_run_without_drives_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no drives"):
         prepare(DataSettings(), tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):
+    made: list[str] = []
+
+    def map_drive(
+        path: Path, lane_width_cm: float, camera: Path | None, map_settings: object, out: Path
+    ) -> None:
+        made.append("map")
+
+    def label_map(drive_map: Path, out: Path, perception: object, window: BirdseyeWindow) -> None:
+        write_labels(out, _labels(np.arange(400)))
+
+    monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.label_map", label_map)
+    drive, camera = tmp_path / "drive", tmp_path / "camera.yaml"
+    drive.mkdir()
+    (drive / "frames.csv").write_text("frame\n1\n")
+    camera.write_text("height_cm: 15\n")
+    recorded = RecordedSettings(path=drive, lane_width_cm=40.0, camera=camera)
+    window, folder = BirdseyeWindow(), tmp_path / "work"
+
+    def times(recorded: RecordedSettings, window: BirdseyeWindow = window) -> int:
+        """How often the drive was mapped so far, after asking for its labels once more."""
+        parts = _recorded_labels(recorded, window, folder)
+        assert [len(read_labels(parts[role])) for role in ("train", "validation", "test")] == [240, 20, 60]
+        return len(made)
+
+    assert times(recorded) == 1
+    assert times(recorded) == 1
+    camera.write_text("height_cm: 15.5\n")
+    assert times(recorded) == 2
+    (drive / "frames.csv").write_text("frame\n1\n2\n")
+    assert times(recorded) == 3
+    assert times(recorded.model_copy(update={"lane_width_cm": 41.0})) == 4
+    assert times(recorded) == 5
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 6
+    # A part that got lost is made again.
+    next((folder / "labels").glob("*.validation.parquet")).unlink()
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7

@@ -40,7 +40,11 @@ def _drive_map() -> DriveMap:
     match = rng.uniform(0.2, 0.9, N)
     match[0] = match[20] = np.nan
     never_seen = LaneLine(
-        "right", _line("right", -18.0).knots_cm, _line("right", -18.0).coefficients_cm, np.empty((0, 2)), np.nan
+        "right",
+        _line("right", -18.0).knots_cm,
+        _line("right", -18.0).coefficients_cm,
+        np.empty((0, 2)),
+        np.nan,
     )
     return DriveMap(
         meta=MapMeta(

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.pipeline import _check_size, count_laps, split_segments
+from datagen.pipeline import _check_size, split_segments
 from datagen.slam.calibrate import GuessSettings, guessed_camera
 from datagen.slam.places import Revisit
+from datagen.slam.segment import count_laps
 from lanenet.data.recording import Commands, Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 
@@ -70,7 +71,9 @@ def test_laps_are_as_long_as_the_path_between_visits():
 
 def test_revisits_that_skip_a_lap_do_not_lengthen_it():
     path = 3.0 * np.arange(350)
-    revisits = [_revisit(k, k + 100) for k in range(0, 100, 20)] + [_revisit(k, k + 200) for k in range(0, 140, 20)]
+    revisits = [_revisit(k, k + 100) for k in range(0, 100, 20)] + [
+        _revisit(k, k + 200) for k in range(0, 140, 20)
+    ]
     assert count_laps(path, revisits)[-1] == 3
 
 

@@ -55,7 +55,8 @@ def _bent() -> list[LaneLine]:
         LaneLine(
             line.side,
             line.knots_cm,
-            line.coefficients_cm + np.column_stack([np.zeros_like(wave), wave * (1.0 + 0.2 * (line.side == "left"))]),
+            line.coefficients_cm
+            + np.column_stack([np.zeros_like(wave), wave * (1.0 + 0.2 * (line.side == "left"))]),
             line.supported_cm,
             line.residual_cm,
         )
@@ -143,5 +144,7 @@ def test_only_the_stretch_around_the_frame_counts():
         y = np.where(s < 250.0, y_cm, 5.0 + 0.1 * y_cm)
         return LaneLine(side, knots, np.column_stack([bend, y]), np.array([[0.0, LENGTH_CM]]), 0.1)
 
-    found = lines_of_frame([line("left", 20.0), line("right", -20.0)], np.array([100.0, 0.0, 0.0]), 100.0, 17.0)
+    found = lines_of_frame(
+        [line("left", 20.0), line("right", -20.0)], np.array([100.0, 0.0, 0.0]), 100.0, 17.0
+    )
     np.testing.assert_allclose(found.points_cm, [-20.0] * 3 + [20.0] * 3, atol=1e-6)

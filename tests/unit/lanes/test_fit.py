@@ -61,7 +61,9 @@ def test_known_offsets_are_met_and_noise_is_smoothed(radius):
         np.testing.assert_allclose(line.supported_cm, [[path.s_cm[0], path.s_cm[-1]]])
     noisy, _ = _traced(path, noise_cm=0.3)
     for line, offset in zip(
-        fit_lines(path, noisy, HEIGHT_CM, SETTINGS), (centre + 0.5 * LANE_CM, centre - 0.5 * LANE_CM), strict=True
+        fit_lines(path, noisy, HEIGHT_CM, SETTINGS),
+        (centre + 0.5 * LANE_CM, centre - 0.5 * LANE_CM),
+        strict=True,
     ):
         error = _across(path, line, offset)
         assert np.sqrt(np.mean(error**2)) < 0.17
@@ -77,9 +79,7 @@ def test_outliers_are_ignored(seed):
     spoilt = lane.left_cm.copy()
     wrong = rng.choice(len(spoilt), len(spoilt) // 12, replace=False)
     spoilt[wrong] += rng.choice([-6.0, 6.0], len(wrong))
-    left, _ = fit_lines(
-        path, TracedLane(spoilt, lane.right_cm, centre, LANE_CM, 2.0), HEIGHT_CM, SETTINGS
-    )
+    left, _ = fit_lines(path, TracedLane(spoilt, lane.right_cm, centre, LANE_CM, 2.0), HEIGHT_CM, SETTINGS)
     error = np.abs(_across(path, left, centre + 0.5 * LANE_CM))
     assert np.median(error) < 0.15
     assert np.nanmax(error) < 1.0

@@ -93,7 +93,7 @@ def test_moving_the_drive_moves_the_path():
 
 
 def test_a_parked_car_has_no_path():
-    with pytest.raises(TrackingLostError, match="moved 0.0 cm in 80 frames"):
+    with pytest.raises(TrackingLostError, match=r"moved 0\.0 cm in 80 frames"):
         path_of_poses(np.tile([10.0, 20.0, 0.3], (80, 1)), 1.8, 75.0)
 
 

@@ -1,0 +1,123 @@
+"""What a map's report says: figures for machines, sentences for people, and the edges as a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from datagen.lanes.fit import LaneLine
+from datagen.lanes.trace import TracedLane
+from datagen.map_folder import DriveMap
+from datagen.slam.segment import SolvedSegment
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car, map_from_car_directions
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a stage found, for people (lines) and for machines (figures)."""
+
+    lines: tuple[str, ...]
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class MappedSegment:
+    """A segment with its lane, in the scale of its camera.
+
+    Attributes:
+        rows: Frames of the drive that it covers.
+        solved: Poses and scans.
+        s_frames_cm: Position of each frame along the driven path.
+        lane: The traced lane.
+        lines: Its two lines.
+    """
+
+    rows: slice
+    solved: SolvedSegment
+    s_frames_cm: Float[np.ndarray, "n"]
+    lane: TracedLane
+    lines: list[LaneLine]
+
+
+def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict[str, np.ndarray]:
+    """Every edge point with its direction, frame map, float32."""
+    points, normals, frames, segments = [], [], [], []
+    for i, part in enumerate(parts):
+        solved = part.solved
+        for k in range(len(solved.poses)):
+            rows = solved.scans.frame(k)
+            pose = solved.poses[k] * [factor, factor, 1.0]
+            points.append(map_from_car(factor * solved.scans.points_cm[rows], pose, camera.wheelbase_cm))
+            normals.append(map_from_car_directions(solved.scans.normals[rows], pose[2]))
+            frames.append(np.full(rows.stop - rows.start, part.rows.start + k))
+            segments.append(np.full(rows.stop - rows.start, i))
+    xy, normal = np.concatenate(points).astype(np.float32), np.concatenate(normals).astype(np.float32)
+    return {
+        "frame_index": np.concatenate(frames),
+        "segment": np.concatenate(segments),
+        "x_cm": xy[:, 0],
+        "y_cm": xy[:, 1],
+        "normal_x": normal[:, 0],
+        "normal_y": normal[:, 1],
+    }
+
+
+def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) -> dict[str, Any]:
+    """Collect a map's figures; ``factor`` turns the segments' lengths into centimetres."""
+    camera = drive_map.camera
+    segments = []
+    for part in parts:
+        solved, lane = part.solved, part.lane
+        residual = np.abs(solved.residuals)
+        segments.append(
+            {
+                "first_frame": part.rows.start,
+                "frames": len(solved.poses),
+                "path_cm": factor * float(solved.path_cm[-1]),
+                "median_match": float(np.nanmedian(solved.trajectory.match)),
+                "revisits": len(solved.revisits),
+                "closure_residual_median": {
+                    "along_cm": factor * float(np.median(residual[:, 0])) if len(residual) else None,
+                    "across_cm": factor * float(np.median(residual[:, 1])) if len(residual) else None,
+                    "heading_rad": float(np.median(residual[:, 2])) if len(residual) else None,
+                },
+                "heading_drift_per_lap_rad": solved.heading_drift_rad,
+                "steering": None if solved.steering is None else vars(solved.steering),
+                "lane_cm": factor * lane.lane_cm,
+                "tape_cm": factor * lane.tape_cm,
+                "line_residual_cm": {line.side: factor * line.residual_cm for line in part.lines},
+            }
+        )
+    m = camera.mounting
+    return {
+        "camera": {
+            "focal_px": float(camera.K[0, 0]),
+            "height_cm": m.height_cm,
+            "pitch_down_deg": float(np.rad2deg(m.pitch_down_rad)),
+            "yaw_deg": float(np.rad2deg(m.yaw_rad)),
+        },
+        "laps": drive_map.meta.laps,
+        "segments_mapped": segments,
+    }
+
+
+def map_notes(drive_map: DriveMap, figures: dict[str, Any], camera_known: bool) -> list[str]:
+    """Say what was mapped, in sentences."""
+    meta = drive_map.meta
+    revisits = sum(segment["revisits"] for segment in figures["segments_mapped"])
+    path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
+    notes = [
+        f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
+        f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, nothing to close"),
+        f"lane {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, scale from the {meta.scale_from}",
+    ]
+    if camera_known and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
+        notes.append(
+            f"the lane measures {meta.mapped_lane_cm:.1f} cm with this camera, "
+            f"{meta.lane_width_cm:.1f} cm was given"
+        )
+    return notes

@@ -1,0 +1,6 @@
+"""``python -m lanenet`` is the command line."""
+
+from lanenet.cli import main
+
+if __name__ == "__main__":
+    main()
