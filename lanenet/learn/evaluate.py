@@ -233,7 +233,7 @@ def _answers(name: str, predict: Predictor, label_sets: Sequence[LabelSet]) -> F
 
 
 def _percent(stats: ErrorStats) -> str:
-    return f"{100.0 * stats.coverage:.0f} %" if stats.truth_count else "-"
+    return f"{100.0 * stats.coverage:.0f}%" if stats.truth_count else "-"
 
 
 def _row_names() -> list[str]:
@@ -269,4 +269,4 @@ def _stats(
 
 
 def _cm(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.2f}"
+    return "-" if np.isnan(value) else f"{value:.2f}" if value < 99.5 else f"{value:.0f}"

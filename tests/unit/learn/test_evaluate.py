@@ -85,7 +85,7 @@ def test_detectors_are_compared_on_common_points():
     lines = [line for line in markdown.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in lines}) == 1 and len(lines) == 2 + 2 * 6
     assert lines[2].split("|")[1:4] == [" shy ", " RMSE ", " 1.00 "]
-    assert lines[6].split("|")[1:5] == ["  ", " answered ", " 50 % ", " 100 % "]
+    assert lines[6].split("|")[1:5] == ["  ", " answered ", " 50% ", " 100% "]
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(rich_table)
     assert "bold" in console.export_text()
