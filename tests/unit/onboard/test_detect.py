@@ -78,9 +78,13 @@ def test_state_is_forgotten_at_breaks(tmp_path: Path) -> None:
     assert detector.log[-1] == 4 and detector.log[-2] == 3
 
 
-def test_unreadable_frame_is_an_empty_row_and_a_problem(tmp_path: Path) -> None:
+def test_unreadable_frame_is_an_error_or_an_empty_row_and_a_problem(tmp_path: Path) -> None:
     out, video = tmp_path / "l.csv", tmp_path / "l.mp4"
-    report = run_detector(source_of([1, None, 3]), Scripted(), CAMERA, out, video)
+    source = source_of([1, None, 3])
+    with pytest.raises(DriveFormatError, match=r"000001\.jpg"):
+        run_detector(source, Scripted(), CAMERA, out, video)
+    assert list(tmp_path.iterdir()) == []
+    report = run_detector(source, Scripted(), CAMERA, out, video, skip_unreadable=True)
     table = read_detections(out)
     assert table.frame.tolist() == [10, 11, 12]
     assert np.isnan(table.points_cm[1]).all() and table.confidence[1] == 0.0
@@ -91,7 +95,7 @@ def test_unreadable_frame_is_an_empty_row_and_a_problem(tmp_path: Path) -> None:
 
 def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DriveFormatError, match=r"none of its 2 frames.*000000\.jpg"):
-        run_detector(source_of([None, None]), Scripted(), CAMERA, tmp_path / "l.csv")
+        run_detector(source_of([None, None]), Scripted(), CAMERA, tmp_path / "l.csv", skip_unreadable=True)
     assert list(tmp_path.iterdir()) == []
 
 
