@@ -68,8 +68,9 @@ class LearnSettings(Settings):
         ema_decay: Of the running mean of the weights, which is what is evaluated and exported.
         huber_cm: Errors below this count squared, above it linearly.
         min_quality: Training frames whose labels have a lower quality are left out.
-        threads: Threads of the computation; 0 leaves the choice to torch. One less than the cores is the
-            steadier choice on a machine that does other work too: the batches need a thread of their own.
+        threads: Threads of the computation; 0 leaves the choice to torch. One thread gives the same weights on
+            any number of cores, and does not stall when other programs are busy; a second core prepares the
+            next batches meanwhile.
         checkpoint_every: Epochs between two writings of the state from which a stopped run goes on.
         augment: Changes of the samples.
         network: Size of the network.
@@ -84,7 +85,7 @@ class LearnSettings(Settings):
     ema_decay: float = Field(default=0.995, ge=0.0, lt=1.0)
     huber_cm: float = Field(default=2.0, gt=0.0)
     min_quality: float = Field(default=0.0, ge=0.0, le=1.0)
-    threads: int = Field(default=0, ge=0)
+    threads: int = Field(default=1, ge=0)
     checkpoint_every: int = Field(default=1, ge=1)
     augment: AugmentSettings = AugmentSettings()
     network: NetworkSettings = NetworkSettings()
