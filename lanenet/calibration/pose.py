@@ -93,7 +93,7 @@ def mounting_from_pose(pose: Float[np.ndarray, "6"]) -> Mounting:
     return Mounting(
         height_cm=float(height_cm),
         pitch_down_rad=float(np.arcsin(np.clip(-axis[2], -1.0, 1.0))),
-        roll_rad=float(np.arctan2(rotation[0, 2], -rotation[1, 2])),
+        roll_rad=float(np.arctan2(-rotation[0, 2], -rotation[1, 2])),
         yaw_rad=float(np.arctan2(-axis[0], axis[1])),
         ahead_of_front_axle_cm=float(ahead_cm),
         right_of_centre_cm=float(right_cm),
