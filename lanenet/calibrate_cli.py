@@ -47,7 +47,9 @@ def chessboard(
     board: Annotated[str, typer.Option(help="Inner corners of the board, as 9x6.", show_default=False)],
     out: _Out,
     square: _Square = 2.5,
-    model: Annotated[LensModel, typer.Option(help="Lens; auto takes the one with more evidence.")] = LensModel.AUTO,
+    model: Annotated[
+        LensModel, typer.Option(help="Lens; auto takes the one with more evidence.")
+    ] = LensModel.AUTO,
     height: Annotated[
         float | None, typer.Option(min=0.1, help="Height of the lens above the ground, cm.")
     ] = None,
@@ -70,7 +72,8 @@ def chessboard(
             paths, wanted, lambda done, total: progress("find the board", done, total)
         )
         mounting = Mounting(
-            NOMINAL_HEIGHT_CM if height is None else height, float(np.deg2rad(0.0 if pitch is None else pitch))
+            NOMINAL_HEIGHT_CM if height is None else height,
+            float(np.deg2rad(0.0 if pitch is None else pitch)),
         )
         result = calibrate_lens(
             views,
@@ -105,7 +108,9 @@ def chessboard(
 
 @app.command(epilog="Example: lanenet calibrate ground points.csv --camera camera.yaml --out camera.yaml")
 def ground(
-    camera: Annotated[Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.", show_default=False)],
+    camera: Annotated[
+        Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.", show_default=False)
+    ],
     out: _Out,
     points: Annotated[
         Path | None,
@@ -141,7 +146,9 @@ def ground(
             f"{image}: {frame.shape[1]}x{frame.shape[0]} px, but the camera has {lens.width}x{lens.height}"
         )
     if (points is None) == (board is None):
-        raise ConfigError("expected either POINTS.csv or a board on the floor (--image, --board, --near-left)")
+        raise ConfigError(
+            "expected either POINTS.csv or a board on the floor (--image, --board, --near-left)"
+        )
     if points is not None:
         points_cm, pixels_px = _read_points(points)
     else:
@@ -182,8 +189,8 @@ def _read_lens(path: Path) -> Camera:
 def _figures(path: Path) -> dict[str, float]:
     """Figures of the lens, kept when only the mounting changes."""
     found = read_yaml(path).get("residuals") or {}
-    return {name: float(value) for name, value in found.items() if "ground" not in name and "_sigma_" in name
-            or name in ("rms_px", "worst_view_rms_px", "views_count", "seen_angle_rad")}
+    lens = ("rms_px", "worst_view_rms_px", "views_count", "seen_angle_rad")
+    return {name: float(found[name]) for name in found if name in lens or name.endswith("_sigma_px")}
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -100,11 +100,13 @@ def start_fit(model: CameraModel, views: Sequence[BoardView]) -> LensFit | None:
     rough[: len(_ROUGH)] = _ROUGH
     best: LensFit | None = None
     for _, lens, poses in starts[:_STARTS_KEPT]:
-        fit = refine(model, lens, poses, views, rough, _ROUGH_SCALE_PX, max_evaluations=25)
+        fit = refine(model, lens, poses, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4)
         # Poses that fell into the wrong one of a plane's two attitudes get a second chance.
         again = poses_of_views(model, fit.lens, views)
         if again is not None:
-            fit = refine(model, fit.lens, again, views, rough, _ROUGH_SCALE_PX, max_evaluations=25)
+            fit = refine(
+                model, fit.lens, again, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4
+            )
         if best is None or fit.robust_cost < best.robust_cost:
             best = fit
     return best
@@ -127,10 +129,11 @@ def view_residuals(
     views: Sequence[BoardView],
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Return measured minus projected corners of each view, [px]."""
-    return [
-        view.corners_px - project_points(model, lens, moved_points(pose, _solid(view))[0])[0]
-        for pose, view in zip(poses, views, strict=True)
-    ]
+    moved = [moved_points(pose, _solid(view))[0] for pose, view in zip(poses, views, strict=True)]
+    # All views in one call: many small ones cost more than their arithmetic.
+    pixels = project_points(model, lens, np.concatenate(moved))[0]
+    ends = np.cumsum([len(points) for points in moved])[:-1]
+    return [view.corners_px - part for view, part in zip(views, np.split(pixels, ends), strict=True)]
 
 
 def refine(
@@ -141,6 +144,7 @@ def refine(
     free: Bool[np.ndarray, "p"],
     scale_px: float = _FINE_SCALE_PX,
     max_evaluations: int = 60,
+    tolerance: float = 1e-8,
 ) -> LensFit:
     """Fit lens and poses to all corners.
 
@@ -152,6 +156,7 @@ def refine(
         free: Which numbers of the lens may move.
         scale_px: Residuals beyond this count less than quadratically (soft L1).
         max_evaluations: The solver stops after this many.
+        tolerance: The solver stops when a step improves the cost by less than this share.
 
     Returns:
         The fit, with standard deviations from its Jacobian and the spread of its residuals.
@@ -174,12 +179,13 @@ def refine(
     def jacobian(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r x"]:
         full, moved = unpack(x)
         matrix = np.zeros((int(ends[-1]), len(x)))
-        for k, (pose, solid) in enumerate(zip(moved, solids, strict=True)):
-            points, by_pose = moved_points(pose, solid)
-            _, by_point, by_lens = project_points(model, full, points)
-            rows = slice(int(ends[k]) - 2 * len(solid), int(ends[k]))
-            matrix[rows, :n_free] = by_lens[:, :, free].reshape(-1, n_free)
-            matrix[rows, n_free + 6 * k : n_free + 6 * k + 6] = (by_point @ by_pose).reshape(-1, 6)
+        boards = [moved_points(pose, solid) for pose, solid in zip(moved, solids, strict=True)]
+        _, by_point, by_lens = project_points(model, full, np.concatenate([points for points, _ in boards]))
+        by_pose = by_point @ np.concatenate([derivatives for _, derivatives in boards])
+        matrix[:, :n_free] = by_lens[:, :, free].reshape(-1, n_free)
+        for k, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
+            columns = slice(n_free + 6 * k, n_free + 6 * k + 6)
+            matrix[start:end, columns] = by_pose[start // 2 : end // 2].reshape(-1, 6)
         return matrix
 
     result = least_squares(
@@ -190,6 +196,7 @@ def refine(
         loss="soft_l1",
         f_scale=scale_px,
         max_nfev=max_evaluations,
+        ftol=tolerance,
     )
     full, moved = unpack(result.x)
     errors = view_residuals(model, full, moved, views)
@@ -209,7 +216,10 @@ def _solid(view: BoardView) -> Float[np.ndarray, "n 3"]:
 
 
 def _lens_sigma(
-    jacobian: Float[np.ndarray, "r x"], errors_px: Float[np.ndarray, "r"], free: Bool[np.ndarray, "p"], n_free: int
+    jacobian: Float[np.ndarray, "r x"],
+    errors_px: Float[np.ndarray, "r"],
+    free: Bool[np.ndarray, "p"],
+    n_free: int,
 ) -> Float[np.ndarray, "p"]:
     """Standard deviations of the lens, the poses being unknown too; infinite where nothing decides."""
     # A spread below a twentieth of a pixel is luck or a drawn picture, not knowledge.

@@ -139,7 +139,11 @@ def find_view(name: str, picture: np.ndarray, board: Board) -> BoardView | str:
     height, width = picture.shape[:2]
     if min(height, width) < _MIN_PICTURE_PX:
         return f"only {width}x{height} px, too small for a board"
-    gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2:] == (3,) else picture.reshape(height, width)
+    gray = (
+        cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        if picture.shape[2:] == (3,)
+        else picture.reshape(height, width)
+    )
     if int(gray.max()) - int(gray.min()) < 16:
         return "an even surface without contrast"
     corners = _find_complete(gray, board)
@@ -248,7 +252,9 @@ def _refined(
     half = int(np.clip(0.35 * _spacing(corners_px, size), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     start = np.ascontiguousarray(corners_px[:, None], np.float32)
-    return np.asarray(cv2.cornerSubPix(gray, start, (half, half), (-1, -1), criteria), np.float64).reshape(-1, 2)
+    return np.asarray(cv2.cornerSubPix(gray, start, (half, half), (-1, -1), criteria), np.float64).reshape(
+        -1, 2
+    )
 
 
 def _spacing(corners_px: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> float:
@@ -277,7 +283,10 @@ def _hint(paths: Sequence[Path], board: Board) -> str:
         if min(gray.shape) < _MIN_PICTURE_PX:
             continue
         part = _find_part(gray, Board(60, 60))
-        if part is not None and (part[0], part[1]) not in ((board.columns, board.rows), (board.rows, board.columns)):
+        if part is not None and (part[0], part[1]) not in (
+            (board.columns, board.rows),
+            (board.rows, board.columns),
+        ):
             return f"; {path} seems to show one with {part[0]}x{part[1]}"
     return "; count the corners where four squares meet, not the squares"
 

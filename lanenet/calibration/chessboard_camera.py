@@ -29,6 +29,8 @@ _STEPS: dict[CameraModel, tuple[tuple[int, ...], ...]] = {
 _SAME_VIEW = 0.01
 #: A view is dropped if its RMS is beyond this multiple of the median view's, and beyond the floor.
 _BAD_VIEW_RATIO, _BAD_VIEW_FLOOR_PX = 3.5, 0.3
+#: A model whose rough fit costs this many times the other's is not refined.
+_HOPELESS_RATIO = 30.0
 #: In units of the Bayesian information criterion: 20 is overwhelming evidence.
 _FOLD_COST = 20.0
 _MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.02, 0.03
@@ -105,17 +107,24 @@ def calibrate_lens(
     fits: dict[CameraModel, LensFit] = {}
     reasons: list[str] = []
     steps = 2 * len(models) + 1
+    starts: dict[CameraModel, LensFit] = {}
     for done, candidate in enumerate(models):
         start = start_fit(candidate, kept)
-        if progress is not None:
-            progress(2 * done + 1, steps)
-        if start is None:
+        if start is not None:
+            starts[candidate] = start
+        else:
             reasons.append(f"{candidate}: no focal length explains the corners")
+        if progress is not None:
+            progress(done + 1, steps)
+    least = min((start.robust_cost for start in starts.values()), default=0.0)
+    for done, (candidate, start) in enumerate(starts.items()):
+        if start.robust_cost > _HOPELESS_RATIO * least:
+            reasons.append(f"{candidate}: misses the corners by {start.rms_px:.1f} px")
             continue
         used = _consistent(start, kept)
         fit = _best_step(candidate, replace(start, poses=start.poses[used]), [kept[k] for k in used])
         if progress is not None:
-            progress(2 * done + 2, steps)
+            progress(len(models) + done + 1, steps)
         problem = _impossible(fit, [kept[k] for k in used])
         if problem is None:
             fits[candidate] = fit
@@ -238,7 +247,9 @@ def _judged(
             poses = poses_of_views(name, fit.lens, subset)
             if poses is not None:
                 current[name] = _best_step(name, replace(fit, poses=poses), subset)
-        current = {k: f for k, f in current.items() if _impossible(f, [views[i] for i in used]) is None} or current
+        current = {
+            k: f for k, f in current.items() if _impossible(f, [views[i] for i in used]) is None
+        } or current
         if not current:
             # Only views that the lens cannot see at all end here; the first fits speak for the rest.
             raise CalibrationError("the views contradict each other: no lens explains them together")

@@ -49,7 +49,9 @@ class GroundCalibration:
     @property
     def residuals(self) -> dict[str, float]:
         """Figures of the fit for the camera file; each name ends in its unit."""
-        figures = {f"{name.rpartition('_')[0]}_sigma_{name.rpartition('_')[2]}": v for name, v in self.sigma.items()}
+        figures = {
+            f"{name.rpartition('_')[0]}_sigma_{name.rpartition('_')[2]}": v for name, v in self.sigma.items()
+        }
         return {"ground_rms_px": self.rms_px, "ground_points_count": float(self.used.sum()), **figures}
 
 
@@ -132,7 +134,9 @@ def points_of_floor_board(
         grid = grid[::-1]
     right, ahead = (grid[:, -1] - grid[:, 0]).mean(axis=0), (grid[-1] - grid[0]).mean(axis=0)
     if abs(right[0]) < 1.5 * abs(right[1]) or abs(ahead[1]) < 0.5 * abs(ahead[0]):
-        raise CalibrationError(f"{view.name}: the board is turned, expected its edges along and across the car")
+        raise CalibrationError(
+            f"{view.name}: the board is turned, expected its edges along and across the car"
+        )
     y, x = np.mgrid[: grid.shape[0], : grid.shape[1]]
     steps = np.stack([x.ravel(), y.ravel()], axis=1) * board.square_cm
     return np.array(near_left_cm) + steps, grid.reshape(-1, 2).copy()
@@ -181,7 +185,9 @@ def _starts(
             continue
         moved = moved_points(pose, _solid(points_cm))[0]
         directions = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
-        angles = np.linalg.norm(np.cross(directions, rays), axis=1) + (np.sum(directions * rays, axis=1) < 0.0)
+        angles = np.linalg.norm(np.cross(directions, rays), axis=1) + (
+            np.sum(directions * rays, axis=1) < 0.0
+        )
         scored.append((float(np.sum(np.minimum(angles, 0.1))), pose))
     scored.sort(key=lambda item: item[0])
     return [pose for _, pose in scored[:4]]
@@ -202,8 +208,11 @@ def _fitted(
         points, by_pose = moved_points(pose, solid)
         return (project_points(camera.model, lens, points)[1] @ by_pose).reshape(-1, 6)
 
+    def residuals(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m"]:
+        return -_residuals(camera, pose, points_cm[used], pixels_px[used]).ravel()
+
     result = least_squares(
-        lambda pose: -_residuals(camera, pose, points_cm[used], pixels_px[used]).ravel(),
+        residuals,
         start,
         jacobian,
         x_scale="jac",
@@ -248,8 +257,8 @@ def _check_answer(answer: GroundCalibration) -> None:
     camera, mounting = answer.camera, answer.camera.mounting
     if mounting.height_cm <= 0.0:
         raise CalibrationError(
-            "the points are mirrored: they fit only a camera below the ground; expected x_cm to the right and "
-            "y_cm ahead of the car"
+            "the points are mirrored: they fit only a camera below the ground; expected x_cm to the right "
+            "and y_cm ahead of the car"
         )
     limit = _MAX_RMS_SHARE * camera.width
     if 2 * answer.used.sum() < len(answer.used) + 1 or not answer.rms_px <= limit:
@@ -260,8 +269,8 @@ def _check_answer(answer: GroundCalibration) -> None:
     height_sigma = answer.sigma["height_cm"] / mounting.height_cm
     if not height_sigma < _MAX_HEIGHT_SIGMA:
         raise CalibrationError(
-            f"the points leave the height open to {100.0 * height_sigma:.0f} % (found {mounting.height_cm:.1f} "
-            "cm); spread them further over the ground, also sideways"
+            f"the points leave the height open to {100.0 * height_sigma:.0f} % (found "
+            f"{mounting.height_cm:.1f} cm); spread them further over the ground, also sideways"
         )
 
 

@@ -104,4 +104,3 @@ def pose_from_mounting(mounting: Mounting) -> Float[np.ndarray, "6"]:
     """Return the pose of the car frame in the camera frame, [rad], [cm]."""
     rotation = mounting.camera_from_car
     return np.concatenate([vector_from_rotation(rotation), -rotation @ mounting.position_car_cm])
-

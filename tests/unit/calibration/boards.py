@@ -19,7 +19,9 @@ def fisheye_of(field_deg: float, rng: np.random.Generator, width: int = 640, hei
     D = rng.normal(0.0, 1.0, 4) * [0.03, 0.01, 0.003, 0.0006]
     focal = 0.5 * width / (half * (1.0 + D @ [half**2, half**4, half**6, half**8]))
     centre = [0.5 * width - 0.5, 0.5 * height - 0.5] + rng.normal(0.0, 5.0, 2)
-    K = np.array([[focal, 0.0, centre[0]], [0.0, focal * rng.uniform(0.98, 1.02), centre[1]], [0.0, 0.0, 1.0]])
+    K = np.array(
+        [[focal, 0.0, centre[0]], [0.0, focal * rng.uniform(0.98, 1.02), centre[1]], [0.0, 0.0, 1.0]]
+    )
     return Camera("fisheye", width, height, K, D, MOUNTING, 26.0)
 
 
@@ -68,7 +70,7 @@ def painted(camera: Camera, rotation: np.ndarray, centre: np.ndarray, rng: np.ra
     distance = (rotation[:, 2] @ centre) / (rays @ rotation[:, 2])
     with np.errstate(invalid="ignore"):
         seen = distance > 0.0
-    board_cm = np.where(seen[:, None], (rays * distance[:, None] - centre) @ rotation, 1e6)
+    board_cm = np.where(seen[:, None], ((rays * distance[:, None] - centre) @ rotation)[:, :2], 1e6)
     a, b = (board_cm / BOARD.square_cm + [0.5 * (BOARD.columns - 1), 0.5 * (BOARD.rows - 1)]).T
     gray = np.full(len(pixels), 110.0)
     gray[(a > -1.6) & (a < BOARD.columns + 0.6) & (b > -1.6) & (b < BOARD.rows + 0.6)] = 225.0

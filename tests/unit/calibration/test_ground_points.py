@@ -12,7 +12,9 @@ from lanenet.calibration.ground import calibrate_ground, points_of_floor_board
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
 
-GRID_CM = np.stack(np.meshgrid(np.linspace(-30.0, 30.0, 4), np.linspace(15.0, 70.0, 4)), axis=-1).reshape(-1, 2)
+GRID_CM = np.stack(np.meshgrid(np.linspace(-30.0, 30.0, 4), np.linspace(15.0, 70.0, 4)), axis=-1).reshape(
+    -1, 2
+)
 
 
 def camera_and_points(noise_px: float = 0.0) -> tuple[Camera, np.ndarray]:
@@ -64,7 +66,7 @@ def test_points_that_decide_nothing_are_refused() -> None:
     with pytest.raises(CalibrationError, match="point 1: pixel"):
         calibrate_ground(lens, GRID_CM, pixels + [1000.0, 0.0])
     with pytest.raises(CalibrationError, match="not finite"):
-        calibrate_ground(lens, np.where(GRID_CM == GRID_CM[3], np.nan, GRID_CM), pixels)
+        calibrate_ground(lens, np.full_like(GRID_CM, np.nan), pixels)
 
 
 def test_random_points_give_an_error_and_no_camera() -> None:
