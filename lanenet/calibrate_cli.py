@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Find the camera: its lens, and where it sits on the car.")
 
-#: What the bird's-eye picture of the ground shows: left, near, right, far, [cm].
+#: The bird's-eye picture's left, near, right and far edge, [cm].
 _AREA_CM = (-60.0, 0.0, 60.0, 120.0)
 
 _Board = Annotated[
@@ -164,8 +164,7 @@ def ground(
     )
     pictures = [] if frame is None else _ground_pictures(out, frame, result, pixels_px)
     _show_mounting(result, points_cm, pixels_px)
-    if frame is None:
-        console.show_problems(["no pictures without a photo; give --image"])
+    console.show_problems([] if image else ["no pictures without a photo; give --image"])
     console.wrote(out, *pictures)
     console.next_command("doctor", "--camera", out)
 

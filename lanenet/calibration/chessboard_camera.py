@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -14,19 +13,17 @@ from lanenet.calibration.bundle import LensFit, free_numbers, poses_of_views, re
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens, project_points
 from lanenet.calibration.pose import moved_points, rotation_from_vector
+from lanenet.calibration.views import MIN_VIEWS, check_count, usable_views
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
 
 ModelChoice = Literal["fisheye", "pinhole", "auto"]
 
-MIN_VIEWS = 5
 #: Entries of D that are fitted, in steps: a lens gets the further ones only if the views support them.
 _STEPS: dict[CameraModel, tuple[tuple[int, ...], ...]] = {
     "fisheye": ((0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)),
     "pinhole": ((0,), (0, 1), (0, 1, 2, 3), (0, 1, 2, 3, 4)),
 }
-#: Two views whose corners differ by less than this share of the diagonal are one view.
-_SAME_VIEW = 0.01
 #: A view is dropped if its RMS is beyond this multiple of the median view's, and beyond the floor.
 _BAD_VIEW_RATIO, _BAD_VIEW_FLOOR_PX = 3.5, 0.3
 #: A model whose rough fit costs this many times the other's is not refined.
@@ -101,8 +98,8 @@ def calibrate_lens(
             of them contradict each other, or the lens that fits best is not one that can exist.
     """
     dropped: dict[str, str] = {}
-    kept = _distinct(_of_one_size(_finite(views, dropped), dropped), dropped)
-    _check_count(kept, dropped)
+    kept = usable_views(views, dropped)
+    check_count(kept, dropped)
     models: tuple[CameraModel, ...] = ("fisheye", "pinhole") if model == "auto" else (model,)
     fits: dict[CameraModel, LensFit] = {}
     reasons: list[str] = []
@@ -137,7 +134,7 @@ def calibrate_lens(
     for view in kept:
         if view not in used_views:
             dropped[view.name] = "its corners contradict the other views"
-    _check_count(used_views, dropped)
+    check_count(used_views, dropped)
     if 2 * len(used_views) < len(kept):
         raise CalibrationError(
             f"only {len(used_views)} of {len(kept)} views agree with each other; are they of one camera with "
@@ -156,53 +153,6 @@ def calibrate_lens(
         notes=_notes(camera, used_views, float(angles.max()), reasons),
         seen_angle_rad=float(angles.max()),
         bic={name: candidate.bic for name, candidate in fits.items()},
-    )
-
-
-def _finite(views: Sequence[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    kept = []
-    for view in views:
-        if np.isfinite(view.corners_px).all() and len(view.corners_px) == len(view.points_cm) >= 9:
-            kept.append(view)
-        else:
-            dropped[view.name] = "its corners are incomplete"
-    return kept
-
-
-def _of_one_size(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    sizes = Counter((view.width, view.height) for view in views)
-    if not sizes:
-        return []
-    width, height = sizes.most_common(1)[0][0]
-    for view in views:
-        if (view.width, view.height) != (width, height):
-            dropped[view.name] = f"{view.width}x{view.height} px, most pictures have {width}x{height}"
-    return [view for view in views if (view.width, view.height) == (width, height)]
-
-
-def _distinct(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    kept: list[BoardView] = []
-    for view in views:
-        limit = _SAME_VIEW * np.hypot(view.width, view.height)
-        for other in kept:
-            if view.corners_px.shape == other.corners_px.shape:
-                shift = np.abs(view.corners_px - other.corners_px).max()
-                if shift < limit:
-                    dropped[view.name] = f"shows the board where {other.name} does"
-                    break
-        else:
-            kept.append(view)
-    return kept
-
-
-def _check_count(views: Sequence[BoardView], dropped: dict[str, str]) -> None:
-    if len(views) >= MIN_VIEWS:
-        return
-    shown = [f"{name}: {reason}" for name, reason in list(dropped.items())[:3]]
-    why = f" (left out: {'; '.join(shown)})" if shown else ""
-    raise CalibrationError(
-        f"{len(views)} usable view(s) of the board, expected at least {MIN_VIEWS}, better 12 to 20, with the "
-        f"board tilted and in all parts of the image{why}"
     )
 
 
