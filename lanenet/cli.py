@@ -16,7 +16,7 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import console
+from lanenet import calibrate_cli, console
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
 
@@ -83,6 +83,9 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
     help="Drive two laps, get a lane network. Every command has --help with an example.",
 )
+
+
+app.add_typer(calibrate_cli.app, name="calibrate")
 
 
 def main() -> None:

@@ -1,0 +1,235 @@
+"""Lens and board poses together, from corners in several views: one robust least-squares problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lanenet.calibration.chessboard import BoardView
+from lanenet.calibration.lens import N_DISTORTION, N_INTRINSIC, camera_of_lens, project_points
+from lanenet.calibration.pose import moved_points, pose_of_plane
+from lanenet.geometry.camera import CameraModel
+
+#: Angle between the axis and the picture's corner, [deg], from which a search starts.
+_START_ANGLES_DEG: dict[CameraModel, tuple[float, ...]] = {
+    "fisheye": (15.0, 25.0, 35.0, 50.0, 65.0, 80.0, 95.0, 110.0, 130.0),
+    "pinhole": (12.0, 20.0, 28.0, 36.0, 45.0, 54.0, 63.0),
+}
+_STARTS_KEPT = 3
+_ROUGH_SCALE_PX, _FINE_SCALE_PX = 3.0, 0.5
+#: What the solver may move at first: fx, fy, k1, k2.
+_ROUGH = np.array([True, True, False, False, True, True])
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A lens and where the boards were.
+
+    Attributes:
+        model: Lens model.
+        lens: fx, fy, cx, cy, D.
+        free: Which of these were fitted; the others are zero.
+        poses: Rotation vector and translation of each board, [rad], [cm], frame camera.
+        residuals_px: Per view, measured minus projected corners.
+        lens_sigma: Standard deviation of each number of the lens; 0 where it was not fitted.
+        robust_cost: Sum of the robust loss, [px^2].
+    """
+
+    model: CameraModel
+    lens: Float[np.ndarray, "p"]
+    free: Bool[np.ndarray, "p"]
+    poses: Float[np.ndarray, "v 6"]
+    residuals_px: list[Float[np.ndarray, "_ 2"]]
+    lens_sigma: Float[np.ndarray, "p"]
+    robust_cost: float
+
+    @property
+    def view_rms_px(self) -> Float[np.ndarray, "v"]:
+        """Root mean square distance of each view's corners."""
+        return np.array([np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in self.residuals_px])
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance over all corners, as OpenCV states it."""
+        return float(np.sqrt(np.mean(np.sum(np.concatenate(self.residuals_px) ** 2, axis=1))))
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion of the lens; the lower of two models is the better supported."""
+        n = 2 * sum(len(r) for r in self.residuals_px)
+        return float(n * np.log(max(self.robust_cost, 1e-12) / n) + np.count_nonzero(self.free) * np.log(n))
+
+
+def free_numbers(model: CameraModel, distortion: Sequence[int]) -> Bool[np.ndarray, "p"]:
+    """Return the mask of a fit that moves fx, fy, cx, cy and these entries of D."""
+    free = np.zeros(N_INTRINSIC + N_DISTORTION[model], bool)
+    free[:N_INTRINSIC] = True
+    free[[N_INTRINSIC + k for k in distortion]] = True
+    return free
+
+
+def start_fit(model: CameraModel, views: Sequence[BoardView]) -> LensFit | None:
+    """Find a lens from nothing: several focal lengths are tried, the best ones refined.
+
+    For a fisheye each start is an equidistant lens (radius = f * angle), up to 260 degrees of view, for a
+    pinhole one without distortion.
+
+    Args:
+        model: Lens model.
+        views: Views of one camera.
+
+    Returns:
+        A rough fit with k1 and k2, or None if no start explains the views.
+    """
+    width, height = views[0].width, views[0].height
+    starts: list[tuple[float, Float[np.ndarray, "p"], Float[np.ndarray, "v 6"]]] = []
+    for angle_deg in _START_ANGLES_DEG[model]:
+        angle = np.deg2rad(angle_deg)
+        focal = 0.5 * np.hypot(width, height) / (angle if model == "fisheye" else np.tan(angle))
+        lens = np.zeros(N_INTRINSIC + N_DISTORTION[model])
+        lens[:N_INTRINSIC] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
+        poses = poses_of_views(model, lens, views)
+        if poses is not None:
+            errors = np.concatenate(view_residuals(model, lens, poses, views))
+            starts.append((float(np.median(np.abs(errors))), lens, poses))
+    starts.sort(key=lambda start: start[0])
+    rough = np.zeros(N_INTRINSIC + N_DISTORTION[model], bool)
+    rough[: len(_ROUGH)] = _ROUGH
+    best: LensFit | None = None
+    for _, lens, poses in starts[:_STARTS_KEPT]:
+        fit = refine(model, lens, poses, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4)
+        # Poses that fell into the wrong one of a plane's two attitudes get a second chance.
+        again = poses_of_views(model, fit.lens, views)
+        if again is not None:
+            fit = refine(
+                model, fit.lens, again, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4
+            )
+        if best is None or fit.robust_cost < best.robust_cost:
+            best = fit
+    return best
+
+
+def poses_of_views(
+    model: CameraModel, lens: Float[np.ndarray, "p"], views: Sequence[BoardView]
+) -> Float[np.ndarray, "v 6"] | None:
+    """Find each board's pose directly, for a known lens; None if a view does not determine one."""
+    camera = camera_of_lens(model, lens, (views[0].width, views[0].height))
+    poses = [pose_of_plane(view.points_cm, camera.unproject(view.corners_px)) for view in views]
+    found = [pose for pose in poses if pose is not None]
+    return np.array(found) if len(found) == len(views) else None
+
+
+def view_residuals(
+    model: CameraModel,
+    lens: Float[np.ndarray, "p"],
+    poses: Float[np.ndarray, "v 6"],
+    views: Sequence[BoardView],
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """Return measured minus projected corners of each view, [px]."""
+    moved = [moved_points(pose, _solid(view))[0] for pose, view in zip(poses, views, strict=True)]
+    # All views in one call: many small ones cost more than their arithmetic.
+    pixels = project_points(model, lens, np.concatenate(moved))[0]
+    ends = np.cumsum([len(points) for points in moved])[:-1]
+    return [view.corners_px - part for view, part in zip(views, np.split(pixels, ends), strict=True)]
+
+
+def refine(
+    model: CameraModel,
+    lens: Float[np.ndarray, "p"],
+    poses: Float[np.ndarray, "v 6"],
+    views: Sequence[BoardView],
+    free: Bool[np.ndarray, "p"],
+    scale_px: float = _FINE_SCALE_PX,
+    max_evaluations: int = 60,
+    tolerance: float = 1e-8,
+) -> LensFit:
+    """Fit lens and poses to all corners.
+
+    Args:
+        model: Lens model.
+        lens: Where to start.
+        poses: Where the boards start.
+        views: Views of one camera.
+        free: Which numbers of the lens may move.
+        scale_px: Residuals beyond this count less than quadratically (soft L1).
+        max_evaluations: The solver stops after this many.
+        tolerance: The solver stops when a step improves the cost by less than this share.
+
+    Returns:
+        The fit, with standard deviations from its Jacobian and the spread of its residuals.
+    """
+    from scipy.optimize import least_squares
+
+    n_free = int(np.count_nonzero(free))
+    solids = [_solid(view) for view in views]
+    ends = 2 * np.cumsum([len(solid) for solid in solids])
+
+    def unpack(x: Float[np.ndarray, "x"]) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "v 6"]]:
+        full = lens.copy()
+        full[free] = x[:n_free]
+        return full, x[n_free:].reshape(-1, 6)
+
+    def residuals(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r"]:
+        full, moved = unpack(x)
+        return -np.concatenate([r.ravel() for r in view_residuals(model, full, moved, views)])
+
+    def jacobian(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r x"]:
+        full, moved = unpack(x)
+        matrix = np.zeros((int(ends[-1]), len(x)))
+        boards = [moved_points(pose, solid) for pose, solid in zip(moved, solids, strict=True)]
+        _, by_point, by_lens = project_points(model, full, np.concatenate([points for points, _ in boards]))
+        by_pose = by_point @ np.concatenate([derivatives for _, derivatives in boards])
+        matrix[:, :n_free] = by_lens[:, :, free].reshape(-1, n_free)
+        for k, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
+            columns = slice(n_free + 6 * k, n_free + 6 * k + 6)
+            matrix[start:end, columns] = by_pose[start // 2 : end // 2].reshape(-1, 6)
+        return matrix
+
+    result = least_squares(
+        residuals,
+        np.concatenate([lens[free], poses.ravel()]),
+        jacobian,
+        x_scale="jac",
+        loss="soft_l1",
+        f_scale=scale_px,
+        max_nfev=max_evaluations,
+        ftol=tolerance,
+    )
+    full, moved = unpack(result.x)
+    errors = view_residuals(model, full, moved, views)
+    return LensFit(
+        model=model,
+        lens=full,
+        free=free,
+        poses=moved,
+        residuals_px=errors,
+        lens_sigma=_lens_sigma(jacobian(result.x), np.concatenate(errors).ravel(), free, n_free),
+        robust_cost=2.0 * float(result.cost),
+    )
+
+
+def _solid(view: BoardView) -> Float[np.ndarray, "n 3"]:
+    return np.concatenate([view.points_cm, np.zeros((len(view.points_cm), 1))], axis=1)
+
+
+def _lens_sigma(
+    jacobian: Float[np.ndarray, "r x"],
+    errors_px: Float[np.ndarray, "r"],
+    free: Bool[np.ndarray, "p"],
+    n_free: int,
+) -> Float[np.ndarray, "p"]:
+    """Standard deviations of the lens, the poses being unknown too; infinite where nothing decides."""
+    # A spread below a twentieth of a pixel is luck or a drawn picture, not knowledge.
+    spread = max(float(np.sqrt(np.sum(errors_px**2) / max(len(errors_px) - jacobian.shape[1], 1))), 0.05)
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+    _, singular, rows = np.linalg.svd(jacobian / scale, full_matrices=False)
+    sigma = np.zeros(len(free))
+    with np.errstate(divide="ignore"):
+        inverse = np.where(singular > 1e-12 * singular[0], 1.0 / singular, np.inf)
+    with np.errstate(invalid="ignore"):
+        variance = np.nansum((rows[:, :n_free] * inverse[:, None]) ** 2, axis=0)
+    sigma[free] = spread * np.sqrt(variance) / scale[:n_free]
+    return sigma

@@ -1,0 +1,142 @@
+"""A lens as a vector of numbers, with the derivatives that the solver needs.
+
+The vector is fx, fy, cx, cy, then D in OpenCV's order. Projections equal those of
+:class:`lanenet.geometry.camera.Camera` (checked in ``tests/unit/calibration/test_lens.py``), except that
+nothing is cut off at the largest angle: a solver on its way needs a smooth function.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.geometry.camera import Camera, CameraModel, Mounting
+
+#: Numbers in D.
+N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}
+N_INTRINSIC = 4
+#: Where a lens has no mounting yet.
+NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM = 20.0, 26.0
+# Closer to the axis than this, the azimuth of a ray is noise.
+_NEAR_AXIS = 1e-9
+
+
+def camera_of_lens(
+    model: CameraModel,
+    lens: Float[np.ndarray, "p"],
+    size_px: tuple[int, int],
+    mounting: Mounting | None = None,
+    wheelbase_cm: float = NOMINAL_WHEELBASE_CM,
+) -> Camera:
+    """Return the camera of a lens vector; without a mounting a nominal, level one at 20 cm.
+
+    Args:
+        model: Lens model.
+        lens: fx, fy, cx, cy, D.
+        size_px: Width and height of the image.
+        mounting: Pose above the road.
+        wheelbase_cm: Distance between the car's axles.
+    """
+    fx, fy, cx, cy = (float(value) for value in lens[:N_INTRINSIC])
+    return Camera(
+        model=model,
+        width=size_px[0],
+        height=size_px[1],
+        K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        D=np.array(lens[N_INTRINSIC:], dtype=np.float64),
+        mounting=Mounting(NOMINAL_HEIGHT_CM) if mounting is None else mounting,
+        wheelbase_cm=wheelbase_cm,
+    )
+
+
+def project_points(
+    model: CameraModel, lens: Float[np.ndarray, "p"], points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 p"]]:
+    """Project points of the camera frame, with derivatives.
+
+    Args:
+        model: Lens model.
+        lens: fx, fy, cx, cy, D.
+        points: Positions, frame camera, any unit.
+
+    Returns:
+        Pixels, [px]; their derivatives by the points; their derivatives by the lens.
+
+    Source:
+        Kannala and Brandt 2006, eq. 6 with four terms (fisheye); Brown-Conrady (pinhole), both as in OpenCV.
+        Derivatives: own derivation, checked against differences.
+    """
+    if model == "fisheye":
+        flat, d_points, d_distortion = _fisheye(points, lens[N_INTRINSIC:])
+    else:
+        flat, d_points, d_distortion = _pinhole(points, lens[N_INTRINSIC:])
+    focal = lens[:2]
+    pixels = flat * focal + lens[2:4]
+    by_lens = np.zeros((len(points), 2, len(lens)))
+    by_lens[:, 0, 0] = flat[:, 0]
+    by_lens[:, 1, 1] = flat[:, 1]
+    by_lens[:, 0, 2] = 1.0
+    by_lens[:, 1, 3] = 1.0
+    by_lens[:, :, N_INTRINSIC:] = d_distortion * focal[:, None]
+    return pixels, d_points * focal[:, None], by_lens
+
+
+def _fisheye(
+    points: Float[np.ndarray, "n 3"], D: Float[np.ndarray, "4"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 4"]]:
+    x, y, z = points.T
+    r = np.maximum(np.hypot(x, y), _NEAR_AXIS)
+    theta = np.arctan2(r, z)
+    t2 = theta * theta
+    powers = theta[:, None] * np.stack([t2, t2**2, t2**3, t2**4], axis=1)
+    radius = theta + powers @ D
+    slope = 1.0 + np.stack([3.0 * t2, 5.0 * t2**2, 7.0 * t2**3, 9.0 * t2**4], axis=1) @ D
+    length2 = r * r + z * z
+    azimuth = np.stack([x, y], axis=1) / r[:, None]
+    scale = radius / r
+    d_theta = np.stack([x * z / (r * length2), y * z / (r * length2), -r / length2], axis=1)
+    d_r = np.stack([azimuth[:, 0], azimuth[:, 1], np.zeros_like(r)], axis=1)
+    d_scale = (slope[:, None] * d_theta - scale[:, None] * d_r) / r[:, None]
+    d_points = np.stack([x, y], axis=1)[:, :, None] * d_scale[:, None, :]
+    d_points[:, 0, 0] += scale
+    d_points[:, 1, 1] += scale
+    return azimuth * radius[:, None], d_points, azimuth[:, :, None] * powers[:, None, :]
+
+
+def _pinhole(
+    points: Float[np.ndarray, "n 3"], D: Float[np.ndarray, "5"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 5"]]:
+    k1, k2, p1, p2, k3 = D
+    # A point at or behind the lens has no picture; a far one keeps the solver's function finite.
+    depth = np.maximum(points[:, 2], 1e-3)
+    x, y = points[:, 0] / depth, points[:, 1] / depth
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    d_radial = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    flat = np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=1,
+    )
+    cross = 2.0 * x * y * d_radial + 2.0 * p1 * x + 2.0 * p2 * y
+    xx = radial + 2.0 * x * x * d_radial + 2.0 * p1 * y + 6.0 * p2 * x
+    yy = radial + 2.0 * y * y * d_radial + 6.0 * p1 * y + 2.0 * p2 * x
+    by_flat = np.stack([np.stack([xx, cross], axis=1), np.stack([cross, yy], axis=1)], axis=1)
+    zero, inverse = np.zeros_like(x), 1.0 / depth
+    flat_by_point = np.stack(
+        [
+            np.stack([inverse, zero, -x * inverse], axis=1),
+            np.stack([zero, inverse, -y * inverse], axis=1),
+        ],
+        axis=1,
+    )
+    by_distortion = np.stack(
+        [
+            np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1),
+            np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1),
+        ],
+        axis=1,
+    )
+    return flat, by_flat @ flat_by_point, by_distortion

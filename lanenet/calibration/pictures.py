@@ -1,0 +1,131 @@
+"""Pictures by which a person judges a calibration: without the lens, and from above with a grid in cm."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lanenet.calibration.pose import moved_points
+from lanenet.geometry.camera import Camera
+
+#: BGR of the grid's lines, of its axes, of measured and of projected points.
+GRID_BGR, AXIS_BGR, MEASURED_BGR, PROJECTED_BGR = (200, 160, 60), (60, 60, 230), (60, 220, 60), (40, 60, 240)
+_MAX_HALF_FIELD_RAD = float(np.deg2rad(60.0))
+_MAX_SIDE_PX = 1200
+#: Spacing of grid lines, [cm]: the finest that leaves this many pixels between them.
+_SPACINGS_CM, _MIN_SPACING_PX = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0), 28.0
+
+
+def undistorted_picture(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
+    """Show a frame as a lens without distortion would: what is straight becomes straight.
+
+    Args:
+        frame_bgr: Frame of the camera.
+        camera: The camera.
+
+    Returns:
+        A picture of the same size and direction, with the field of the frame up to 120 degrees across.
+    """
+    height, width = frame_bgr.shape[:2]
+    rim = np.array([[0.0, camera.K[1, 2]], [width - 1.0, camera.K[1, 2]]])
+    rays = camera.unproject(rim)
+    angles = np.arctan2(np.abs(rays[:, 0]), rays[:, 2])
+    # Where the lens does not see the image's rim, as much as a flat picture can show.
+    half = min(float(np.nan_to_num(angles, nan=np.pi).max()), _MAX_HALF_FIELD_RAD)
+    focal = 0.5 * width / np.tan(half)
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    x, y = (u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal
+    return _sampled(frame_bgr, camera, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1), x.shape)
+
+
+def plane_picture(
+    frame_bgr: UInt8[np.ndarray, "h w 3"],
+    camera: Camera,
+    pose: Float[np.ndarray, "6"],
+    area_cm: tuple[float, float, float, float],
+    px_per_cm: float | None = None,
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Show a plane (the road, a board) from above, with a grid in cm.
+
+    Args:
+        frame_bgr: Frame of the camera.
+        camera: The camera.
+        pose: Pose of the plane in the camera frame: rotation vector and translation, [rad], [cm].
+        area_cm: Left, near, right and far edge of what is shown, frame of the plane.
+        px_per_cm: Scale; by default so that the longer side has 800 px.
+
+    Returns:
+        The picture: x to the right, y upwards.
+    """
+    left, near, right, far = area_cm
+    scale = 800.0 / max(right - left, far - near) if px_per_cm is None else px_per_cm
+    columns = int(np.clip(round((right - left) * scale), 8, _MAX_SIDE_PX))
+    rows = int(np.clip(round((far - near) * scale), 8, _MAX_SIDE_PX))
+    v, u = np.mgrid[:rows, :columns].astype(np.float64)
+    x, y = left + (u + 0.5) / scale, far - (v + 0.5) / scale
+    plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    picture = _sampled(frame_bgr, camera, moved_points(pose, plane)[0], x.shape)
+    _draw_grid(picture, area_cm, scale)
+    return picture
+
+
+def points_picture(
+    frame_bgr: UInt8[np.ndarray, "h w 3"],
+    measured_px: Float[np.ndarray, "n 2"],
+    projected_px: Float[np.ndarray, "n 2"],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw measured points (green rings) and where the calibration puts them (red dots) into a frame."""
+    picture = frame_bgr.copy()
+    size = max(2, round(picture.shape[1] / 200))
+    for points, colour, radius, thickness in (
+        (measured_px, MEASURED_BGR, 2 * size, 1),
+        (projected_px, PROJECTED_BGR, size, -1),
+    ):
+        for point in points[np.isfinite(points).all(axis=1)]:
+            if (np.abs(point) < 1e4).all():
+                centre = (round(float(point[0])), round(float(point[1])))
+                cv2.circle(picture, centre, radius, colour, thickness, cv2.LINE_AA)
+    return picture
+
+
+def grid_spacing_cm(px_per_cm: float) -> float:
+    """Return the spacing of the grid's lines at a scale, [cm]."""
+    for spacing in _SPACINGS_CM:
+        if spacing * px_per_cm >= _MIN_SPACING_PX:
+            return spacing
+    return _SPACINGS_CM[-1]
+
+
+def _sampled(
+    frame_bgr: UInt8[np.ndarray, "h w 3"],
+    camera: Camera,
+    rays: Float[np.ndarray, "n 3"],
+    shape: tuple[int, ...],
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    # Far outside the frame for rays that the lens does not see: remap paints them black.
+    pixels = np.nan_to_num(camera.project_rays(rays), nan=-1e4).clip(-1e4, 1e5).astype(np.float32)
+    maps = pixels.reshape(*shape, 2)
+    return np.asarray(cv2.remap(frame_bgr, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR))
+
+
+def _draw_grid(
+    picture: UInt8[np.ndarray, "rows columns 3"], area_cm: tuple[float, float, float, float], scale: float
+) -> None:
+    left, near, right, far = area_cm
+    rows, columns = picture.shape[:2]
+    spacing = grid_spacing_cm(scale)
+    for k in range(int(np.ceil(left / spacing)), int(np.floor(right / spacing)) + 1):
+        u = round((k * spacing - left) * scale - 0.5)
+        cv2.line(picture, (u, 0), (u, rows - 1), AXIS_BGR if k == 0 else GRID_BGR, 1)
+        _write(picture, f"{k * spacing:g}", (u + 2, rows - 4))
+    for k in range(int(np.ceil(near / spacing)), int(np.floor(far / spacing)) + 1):
+        v = round((far - k * spacing) * scale - 0.5)
+        cv2.line(picture, (0, v), (columns - 1, v), AXIS_BGR if k == 0 else GRID_BGR, 1)
+        _write(picture, f"{k * spacing:g}", (2, v - 3))
+    _write(picture, "cm", (columns - 28, 14))
+
+
+def _write(picture: UInt8[np.ndarray, "rows columns 3"], text: str, place: tuple[int, int]) -> None:
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from boards import fisheye_of, views_of
+
+from lanenet.calibration.chessboard import BoardView
+from lanenet.calibration.chessboard_camera import calibrate_lens, view_errors_px
+from lanenet.calibration.ground import calibrate_ground
+from lanenet.errors import CalibrationError
+from lanenet.geometry.camera import Camera, Mounting
+
+NEAR_METRE_CM = np.stack(
+    np.meshgrid(np.arange(-40.0, 41.0, 10.0), np.arange(10.0, 101.0, 10.0)), axis=-1
+).reshape(-1, 2)
+
+
+def check_lens(field_deg: float, seed: int) -> None:
+    """The limits that a fisheye of 160 to 200 degrees has to keep, at 12 views with 0.2 px of noise."""
+    rng = np.random.default_rng(seed)
+    truth = fisheye_of(field_deg, rng)
+    found = calibrate_lens(views_of(truth, rng), "fisheye").camera
+    assert found.K[0, 0] == pytest.approx(truth.K[0, 0], rel=0.003)
+    assert found.K[1, 1] == pytest.approx(truth.K[1, 1], rel=0.003)
+    pixels = truth.project_ground(NEAR_METRE_CM)
+    with np.errstate(invalid="ignore"):
+        seen = ((pixels > 0.0) & (pixels < [truth.width - 1, truth.height - 1])).all(axis=1)
+    mounted = calibrate_ground(found, NEAR_METRE_CM[seen], pixels[seen])
+    error_cm = np.linalg.norm(mounted.camera.intersect_ground(pixels[seen]) - NEAR_METRE_CM[seen], axis=1)
+    assert error_cm.max() < 0.2
+
+
+@pytest.mark.parametrize("field_deg", [160.0, 180.0, 200.0])
+def test_a_wide_fisheye_is_found(field_deg: float) -> None:
+    check_lens(field_deg, seed=int(field_deg))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_lenses_without_one_failure(seed: int) -> None:
+    check_lens((160.0, 180.0, 200.0)[seed % 3], seed)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Camera:
+    return fisheye_of(170.0, np.random.default_rng(3))
+
+
+@pytest.fixture(scope="module")
+def views(truth: Camera) -> list[BoardView]:
+    return views_of(truth, np.random.default_rng(4), 10)
+
+
+def test_bad_views_are_dropped_and_named(truth: Camera, views: list[BoardView]) -> None:
+    rng = np.random.default_rng(0)
+    spoilt = dataclasses.replace(
+        views[2], name="spoilt", corners_px=views[2].corners_px + rng.normal(0.0, 8.0, (54, 2))
+    )
+    small = dataclasses.replace(views[3], name="small", width=320, height=240)
+    again = dataclasses.replace(views[4], name="again")
+    result = calibrate_lens([*views, spoilt, small, again], "fisheye")
+    assert set(result.dropped) == {"spoilt", "small", "again"}
+    assert "320x240" in result.dropped["small"]
+    assert "view4" in result.dropped["again"]
+    assert set(view_errors_px(result)) == {view.name for view in views}
+    assert result.fit.rms_px == pytest.approx(0.2 * np.sqrt(2.0), rel=0.15)
+    assert result.camera.K[0, 0] == pytest.approx(truth.K[0, 0], rel=0.005)
+    assert abs(result.camera.K[0, 0] - truth.K[0, 0]) < 4.0 * result.residuals["fx_sigma_px"]
+
+
+def test_the_model_is_chosen_by_evidence(views: list[BoardView]) -> None:
+    assert calibrate_lens(views).camera.model == "fisheye"
+    K = np.array([[500.0, 0.0, 322.0], [0.0, 505.0, 238.0], [0.0, 0.0, 1.0]])
+    straight = Camera(
+        "pinhole", 640, 480, K, np.array([-0.3, 0.12, 0.004, -0.003, 0.0]), Mounting(20.0), 26.0
+    )
+    rng = np.random.default_rng(1)
+    result = calibrate_lens(views_of(straight, rng, 12, near_cm=25.0, far_cm=60.0))
+    assert result.camera.model == "pinhole"
+    np.testing.assert_allclose(result.camera.K, K, rtol=0.01, atol=3.0)
+
+
+def test_too_few_or_equal_views_are_refused(truth: Camera, views: list[BoardView]) -> None:
+    with pytest.raises(CalibrationError, match="3 usable view"):
+        calibrate_lens(views[:3])
+    rng = np.random.default_rng(0)
+    copies = [
+        dataclasses.replace(
+            views[0], name=f"copy{k}", corners_px=views[0].corners_px + rng.normal(0, 0.2, (54, 2))
+        )
+        for k in range(12)
+    ]
+    with pytest.raises(CalibrationError, match="1 usable view"):
+        calibrate_lens(copies)
+    with pytest.raises(CalibrationError, match="0 usable view"):
+        calibrate_lens([])
+
+
+def test_boards_that_all_face_the_camera_are_refused() -> None:
+    K = np.array([[900.0, 0.0, 319.5], [0.0, 900.0, 239.5], [0.0, 0.0, 1.0]])
+    lens = Camera("pinhole", 640, 480, K, np.zeros(5), Mounting(20.0), 26.0)
+    rng = np.random.default_rng(2)
+    flat = np.column_stack([views_of(lens, rng, 1, near_cm=60.0, far_cm=80.0)[0].points_cm, np.zeros(54)])
+    views = [
+        BoardView(
+            f"{k}",
+            640,
+            480,
+            flat[:, :2],
+            lens.project_rays(flat + [x, y, 70.0]) + rng.normal(0.0, 0.1, (54, 2)),
+        )
+        for k, (x, y) in enumerate(rng.uniform([-22.0, -16.0], [4.0, 4.0], (8, 2)))
+    ]
+    with pytest.raises(CalibrationError, match="too alike"):
+        calibrate_lens(views, "pinhole")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_random_corners_give_an_error_and_no_camera(seed: int, views: list[BoardView]) -> None:
+    rng = np.random.default_rng(seed)
+    noise = [dataclasses.replace(v, corners_px=rng.uniform(0.0, 470.0, (54, 2))) for v in views[:6]]
+    with pytest.raises(CalibrationError):
+        calibrate_lens(noise)
