@@ -14,9 +14,14 @@ from lanenet.config import Settings
 from lanenet.perception.edge_pixels import EdgePixels, edge_pixels, gradients
 
 #: Sides of the top-hat's square, [px]; each row takes the smallest that the widest marking fits into.
-_KERNELS_PX = (7, 11, 17, 25, 37, 55)
+_KERNELS_PX = (9, 17, 31, 47)
 #: Sobel response of a step of one gray level, without blur.
 _SOBEL_GAIN = 4.0
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+#: Lab's L (0-255) of a gray level; for colours, of their luma.
+_LIGHTNESS = cv2.cvtColor(np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3), cv2.COLOR_BGR2Lab)[
+    ..., 0
+].reshape(-1)
 
 
 class ColourSettings(Settings):
@@ -30,18 +35,18 @@ class ColourSettings(Settings):
         yellow_floor: The same in levels of Lab's b (0-255): yellower than the road beside.
         contrast_share: The threshold is at least this share of the 99th percentile of the responses.
         least_area_px: Smaller components are dropped.
-        least_elongation: Length over thickness; a disk has 2 to 3, a square 4 (by its boundary).
+        least_elongation: Length over thickness; by its boundary; a disk has 3, a square 4.
         least_sharpness: Mean gradient on a component's boundary over that of a sharp step of its contrast.
         yellow: Look for yellow at all.
     """
 
     markings: Literal["light", "dark", "both"] = "light"
-    thickest_cm: float = Field(default=6.0, gt=0.0)
+    thickest_cm: float = Field(default=7.0, gt=0.0)
     white_floor: int = Field(default=12, ge=1, le=255)
     yellow_floor: int = Field(default=8, ge=1, le=255)
     contrast_share: float = Field(default=0.35, ge=0.0, lt=1.0)
     least_area_px: int = Field(default=8, ge=1)
-    least_elongation: float = Field(default=3.0, ge=0.0)
+    least_elongation: float = Field(default=3.5, ge=0.0)
     least_sharpness: float = Field(default=0.25, ge=0.0, le=1.0)
     yellow: bool = True
 
@@ -91,61 +96,89 @@ def colour_edges(
     row_px = _thickest_px(settings.thickest_cm, scale, height, width)[top:bottom]
     cm_per_px = None if scale is None else scale.cm_per_px[top:bottom]
 
-    channels = [(part, settings.white_floor, settings.markings)]
-    if part.ndim == 3:
-        lab = cv2.cvtColor(part, cv2.COLOR_BGR2Lab)
-        channels = [(cv2.extractChannel(lab, 0), settings.white_floor, settings.markings)]
-        if settings.yellow:
-            # Yellow first: where both see a marking, the road's brightness disturbs the yellow edge less.
-            channels.insert(0, (cv2.extractChannel(lab, 2), settings.yellow_floor, "light"))
+    gray = part if part.ndim == 2 else cv2.cvtColor(part, cv2.COLOR_BGR2GRAY)
+    light = cv2.LUT(gray, _LIGHTNESS)
+    dx, dy = gradients(light, blur_px)
+    white = _strips(light, settings.white_floor, settings, settings.markings, row_px)
+    kept = np.zeros_like(light)
     found: list[EdgePixels] = []
-    taken: np.ndarray | None = None
-    for channel, floor, markings in channels:
-        mask, threshold = _strips(channel, floor, markings, settings.contrast_share, row_px, keep_part)
-        if mask is None:
-            continue
-        if taken is not None:
-            mask[taken > 0] = 0
-        dx, dy = gradients(channel, blur_px)
-        mask = _marking_shapes(mask, dx, dy, threshold, cm_per_px, settings)
-        if mask is None:
-            continue
-        around = cv2.dilate(mask, _square(3))
-        step = _SOBEL_GAIN * threshold
-        edges = cv2.Canny(dx, dy, 0.25 * step, 0.5 * step, L2gradient=True)
-        cv2.bitwise_and(edges, around, dst=edges)
-        if keep_part is not None:
-            cv2.bitwise_and(edges, keep_part, dst=edges)
-        found.append(edge_pixels(edges, dx, dy, subpixel=True))
-        taken = cv2.dilate(mask, _square(7))
-    if not found:
-        return EdgePixels(np.empty((0, 2)), np.empty((0, 2)))
+    yellow = _yellow_strips(part, settings, row_px) if part.ndim == 3 and settings.yellow else None
+    if yellow is not None:
+        strips, b_channel = yellow
+        shapes = _measure(_only(strips.mask, keep_part), strips.response, cm_per_px)
+        by_light = shapes.gradient(dx, dy)
+        b_dx, b_dy = gradients(b_channel, blur_px)
+        by_colour = shapes.gradient(b_dx, b_dy)
+        # Colour is blurred by the camera's and JPEG's half resolution: brightness places the edge better
+        # wherever it shows the marking at all.
+        shown = by_light >= settings.least_sharpness * white.level
+        good = shapes.good(np.where(shown, 1.0, by_colour / shapes.contrast), settings)
+        kept = shapes.paint(good & shown)
+        if np.any(good & ~shown):
+            faint = shapes.paint(good & ~shown)
+            found.append(_edges_around(faint, b_dx, b_dy, strips.level, keep_part))
+        white.mask[cv2.dilate(shapes.paint(good), _square(7)) > 0] = 0
+    shapes = _measure(_only(white.mask, keep_part), white.response, cm_per_px)
+    kept |= shapes.paint(shapes.good(shapes.gradient(dx, dy) / shapes.contrast, settings))
+    found.append(_edges_around(kept, dx, dy, white.level, keep_part))
     uv = np.concatenate([edges.uv_px for edges in found])
     uv[:, 1] += top
     return EdgePixels(uv, np.concatenate([edges.normals for edges in found]))
 
 
+def _edges_around(
+    mask: np.ndarray, dx: np.ndarray, dy: np.ndarray, level: float, keep: np.ndarray | None
+) -> EdgePixels:
+    """Edges of a channel that belong to the components of a mask."""
+    edges = cv2.Canny(dx, dy, 0.25 * _SOBEL_GAIN * level, 0.5 * _SOBEL_GAIN * level, L2gradient=True)
+    cv2.bitwise_and(edges, cv2.dilate(mask, _square(3)), dst=edges)
+    return edge_pixels(_only(edges, keep), dx, dy, subpixel=True)
+
+
+def _yellow_strips(
+    part: np.ndarray, settings: ColourSettings, row_px: np.ndarray
+) -> tuple[_Strips, np.ndarray] | None:
+    """Find what is yellower than its surroundings; with Lab's b. None if nothing is.
+
+    The work is done at half the resolution: cameras and JPEG store colour no finer.
+    """
+    height, width = part.shape[:2]
+    half = cv2.resize(part, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA)
+    b_half = cv2.extractChannel(cv2.cvtColor(half, cv2.COLOR_BGR2Lab), 2)
+    strips = _strips(b_half, settings.yellow_floor, settings, "light", 0.5 * row_px[::2])
+    if not cv2.countNonZero(strips.mask):
+        return None
+    size = (width, height)
+    mask = cv2.resize(strips.mask, size, interpolation=cv2.INTER_NEAREST)
+    response = cv2.resize(strips.response, size, interpolation=cv2.INTER_LINEAR)
+    b_channel = cv2.resize(b_half, size, interpolation=cv2.INTER_LINEAR)
+    return _Strips(mask, response, strips.level), b_channel
+
+
+@dataclass(frozen=True, eq=False)
+class _Strips:
+    """What stands out from its surroundings and is thin.
+
+    Attributes:
+        mask: 255 where the response passes the threshold; may be empty.
+        response: By how many levels a pixel stands out.
+        level: The threshold.
+    """
+
+    mask: np.ndarray
+    response: np.ndarray
+    level: float
+
+
 def _strips(
-    channel: np.ndarray,
-    floor: int,
-    markings: str,
-    contrast_share: float,
-    row_px: np.ndarray,
-    keep: np.ndarray | None,
-) -> tuple[np.ndarray | None, float]:
-    """Mask of what stands out from its surroundings and is thin; and the threshold in levels."""
+    channel: np.ndarray, floor: int, settings: ColourSettings, markings: str, row_px: np.ndarray
+) -> _Strips:
+    """Find the strips of one channel, with a threshold that follows the frame's contrast."""
     response = _thin_response(channel, markings, row_px)
-    sample = response[::2, ::2]
-    inside = sample.ravel() if keep is None else sample[keep[::2, ::2] > 0]
-    counts = np.bincount(inside, minlength=256)
-    if not counts[floor:].any():
-        return None, 0.0
-    strong = int(np.searchsorted(np.cumsum(counts), 0.99 * inside.size))
-    threshold = max(float(floor), contrast_share * strong)
-    mask = cv2.threshold(response, threshold, 255, cv2.THRESH_BINARY)[1]
-    if keep is not None:
-        cv2.bitwise_and(mask, keep, dst=mask)
-    return mask, threshold
+    counts = np.bincount(response[::3, ::3].ravel(), minlength=256).cumsum()
+    strong = int(np.searchsorted(counts, 0.99 * counts[-1]))
+    level = max(float(floor), settings.contrast_share * strong)
+    return _Strips(cv2.threshold(response, level, 255, cv2.THRESH_BINARY)[1], response, level)
 
 
 def _thin_response(channel: np.ndarray, markings: str, row_px: np.ndarray) -> np.ndarray:
@@ -167,46 +200,82 @@ def _thin_response(channel: np.ndarray, markings: str, row_px: np.ndarray) -> np
     return response
 
 
-def _marking_shapes(
-    mask: np.ndarray,
-    dx: np.ndarray,
-    dy: np.ndarray,
-    threshold: float,
-    cm_per_px: np.ndarray | None,
-    settings: ColourSettings,
-) -> np.ndarray | None:
-    """Keep the components that are long, thin and sharp; None if there are none."""
-    count, labels = cv2.connectedComponents(mask, connectivity=8, ltype=cv2.CV_32S)
-    if count < 2:
-        return None
-    flat = labels.reshape(-1)
-    inside = np.flatnonzero(flat)
-    of_inside = flat[inside]
-    # Label 0 is the background, which has no entries here.
-    area = np.maximum(np.bincount(of_inside, minlength=count), 1).astype(np.float64)
-    # The picture's border is no boundary: a marking that leaves the picture goes on.
-    rim = cv2.subtract(mask, cv2.erode(mask, _cross()))
-    on_rim = np.flatnonzero(rim.reshape(-1))
-    of_rim = flat[on_rim]
-    boundary = np.maximum(np.bincount(of_rim, minlength=count), 1).astype(np.float64)
-    # A strip of length l and thickness t has the area l t and, for t > 1, a boundary of about 2 l pixels.
-    thickness_px = np.maximum(2.0 * area / boundary, 1.0)
-    elongation = boundary * boundary / (4.0 * area)
-    good = (area >= settings.least_area_px) & (elongation >= settings.least_elongation)
-    gx, gy = dx.reshape(-1)[on_rim].astype(np.float32), dy.reshape(-1)[on_rim].astype(np.float32)
-    gradient = np.bincount(of_rim, np.sqrt(gx * gx + gy * gy), count) / boundary
-    good &= gradient >= settings.least_sharpness * _SOBEL_GAIN * threshold
-    if cm_per_px is not None:
-        mean_scale = np.bincount(of_rim, cm_per_px.reshape(-1)[on_rim], count) / boundary
-        good &= ~(thickness_px * mean_scale > settings.thickest_cm)
-    good[0] = False
-    if not good.any():
-        return None
-    if good[1:].all():
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Connected components of a mask and their measures; label 0 is the background.
+
+    Attributes:
+        shape: Of the mask.
+        inside: Flat indices of the components' pixels; ``of_inside`` their labels.
+        on_rim: Flat indices of the boundary pixels; ``of_rim`` their labels.
+        area: Pixels of each component.
+        rim: Boundary pixels of each component, without those on the picture's border, where a marking goes
+            on unseen.
+        outline: Boundary pixels with those on the border.
+        contrast: Mean response of each component, in levels.
+        thickness_cm: Thickness of each component on the road, [cm]; NaN where unknown.
+    """
+
+    shape: tuple[int, ...]
+    inside: np.ndarray
+    of_inside: np.ndarray
+    on_rim: np.ndarray
+    of_rim: np.ndarray
+    area: np.ndarray
+    rim: np.ndarray
+    outline: np.ndarray
+    contrast: np.ndarray
+    thickness_cm: np.ndarray
+
+    def gradient(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Mean gradient on each component's boundary, as the step of so many levels has it."""
+        gx = dx.reshape(-1)[self.on_rim].astype(np.float32)
+        gy = dy.reshape(-1)[self.on_rim].astype(np.float32)
+        total = np.bincount(self.of_rim, np.sqrt(gx * gx + gy * gy), len(self.rim))
+        return total / (_SOBEL_GAIN * self.rim)
+
+    def good(self, sharpness: np.ndarray, settings: ColourSettings) -> np.ndarray:
+        """Tell which components are large, long, thin and sharp."""
+        # Corners count once in the boundary's pixels: four more make small squares and large ones alike.
+        elongation = (self.outline + 4.0) ** 2 / (4.0 * self.area)
+        good = (
+            (self.area >= settings.least_area_px)
+            & (elongation >= settings.least_elongation)
+            & (sharpness >= settings.least_sharpness)
+            & ~(self.thickness_cm > settings.thickest_cm)
+        )
+        good[0] = False
+        return good
+
+    def paint(self, chosen: np.ndarray) -> np.ndarray:
+        """Mask of the chosen components."""
+        mask = np.zeros(self.shape, np.uint8)
+        mask.reshape(-1)[self.inside[chosen[self.of_inside]]] = 255
         return mask
-    kept = np.zeros_like(mask)
-    kept.reshape(-1)[inside[good[of_inside]]] = 255
-    return kept
+
+
+def _measure(mask: np.ndarray, response: np.ndarray, cm_per_px: np.ndarray | None) -> _Shapes:
+    """Label the components of a mask and measure them."""
+    kind = cv2.CV_16U if mask.size < 4 * 65535 else cv2.CV_32S
+    count, labels = cv2.connectedComponents(mask, connectivity=8, ltype=kind)
+    flat = labels.reshape(-1)
+    inside = np.flatnonzero(mask.reshape(-1) != 0)
+    of_inside = flat[inside]
+    # The background has no pixels here; one is put in, so that nothing is divided by zero.
+    area = np.maximum(np.bincount(of_inside, minlength=count), 1)
+    contrast = np.maximum(np.bincount(of_inside, response.reshape(-1)[inside], count), 1.0) / area
+    on_rim = np.flatnonzero(cv2.subtract(mask, cv2.erode(mask, _CROSS)).reshape(-1) != 0)
+    of_rim = flat[on_rim]
+    rim = np.maximum(np.bincount(of_rim, minlength=count), 1)
+    outline = rim.copy()
+    for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        outline += np.bincount(side, minlength=count)
+    thickness_cm = np.full(count, np.nan)
+    if cm_per_px is not None:
+        # A strip of length l and thickness t has the area l t and a boundary of about 2 l pixels.
+        scale = np.bincount(of_rim, cm_per_px.reshape(-1)[on_rim], count) / rim
+        thickness_cm = np.maximum(2.0 * area / rim, 1.0) * scale
+    return _Shapes(mask.shape, inside, of_inside, on_rim, of_rim, area, rim, outline, contrast, thickness_cm)
 
 
 def _thickest_px(thickest_cm: float, scale: PixelScale | None, height: int, width: int) -> np.ndarray:
@@ -214,7 +283,7 @@ def _thickest_px(thickest_cm: float, scale: PixelScale | None, height: int, widt
     if scale is None:
         return np.full(height, width / 8.0)
     with np.errstate(invalid="ignore"):
-        return np.nan_to_num(1.5 * thickest_cm / scale.row_cm_per_px, nan=_KERNELS_PX[0])
+        return np.nan_to_num(1.25 * thickest_cm / scale.row_cm_per_px, nan=_KERNELS_PX[0])
 
 
 def _rows_in_use(keep: np.ndarray | None, height: int) -> tuple[int, int]:
@@ -231,5 +300,6 @@ def _square(side: int) -> np.ndarray:
     return np.ones((side, side), np.uint8)
 
 
-def _cross() -> np.ndarray:
-    return np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+def _only(mask: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+    """Clear a mask in place where ``keep`` is zero."""
+    return mask if keep is None else cv2.bitwise_and(mask, keep, dst=mask)
