@@ -124,8 +124,7 @@ class RoadTable:
             Their points and directions on the road, [cm], frame car.
         """
         nearest = np.rint(edges.uv_px)
-        np.clip(nearest[:, 0], 0, self.width - 1, out=nearest[:, 0])
-        np.clip(nearest[:, 1], 0, self.height - 1, out=nearest[:, 1])
+        nearest = np.minimum(np.maximum(nearest, 0.0), [self.width - 1.0, self.height - 1.0])
         at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
         x, y, x_u, y_u, x_v, y_v = self._rows[at].T
         off_u, off_v = (edges.uv_px - nearest).T

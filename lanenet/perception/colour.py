@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -11,13 +12,12 @@ from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
+from lanenet.perception.components import SOBEL_GAIN, Components, measure_components
 from lanenet.perception.edge_pixels import EdgePixels, edge_pixels, gradients
 
-#: Sides of the top-hat's square, [px]; each row takes the smallest that the widest marking fits into.
-_KERNELS_PX = (9, 17, 31, 47)
-#: Sobel response of a step of one gray level, without blur.
-_SOBEL_GAIN = 4.0
-_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+#: Sides of the top-hat's square, [px]; each row takes the one nearest to the widest marking.
+_KERNELS_PX = (9, 17, 31, 59)
+_KERNEL_LIMITS_PX = np.sqrt(np.multiply(_KERNELS_PX[:-1], _KERNELS_PX[1:]))
 #: Lab's L (0-255) of a gray level; for colours, of their luma.
 _LIGHTNESS = cv2.cvtColor(np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3), cv2.COLOR_BGR2Lab)[
     ..., 0
@@ -88,7 +88,7 @@ def colour_edges(
         Own derivation. Top-hat: Serra 1982; thickness and length of a strip from its area and boundary.
     """
     height, width = frame_bgr.shape[:2]
-    top, bottom = _rows_in_use(keep, height)
+    top, bottom = _rows_in_use(keep, scale, height)
     if bottom - top < 3 or width < 3:
         return EdgePixels(np.empty((0, 2)), np.empty((0, 2)))
     part = frame_bgr[top:bottom]
@@ -104,22 +104,26 @@ def colour_edges(
     found: list[EdgePixels] = []
     yellow = _yellow_strips(part, settings, row_px) if part.ndim == 3 and settings.yellow else None
     if yellow is not None:
-        strips, b_channel = yellow
-        shapes = _measure(_only(strips.mask, keep_part), strips.response, cm_per_px)
-        by_light = shapes.gradient(dx, dy)
-        b_dx, b_dy = gradients(b_channel, blur_px)
-        by_colour = shapes.gradient(b_dx, b_dy)
         # Colour is blurred by the camera's and JPEG's half resolution: brightness places the edge better
         # wherever it shows the marking at all.
-        shown = by_light >= settings.least_sharpness * white.level
-        good = shapes.good(np.where(shown, 1.0, by_colour / shapes.contrast), settings)
+        shapes = measure_components(_only(yellow.mask, keep_part), cm_per_px)
+        shown = shapes.boundary_step(dx, dy) >= settings.least_sharpness * white.level
+        good = _marking_shaped(shapes, settings)
         kept = shapes.paint(good & shown)
         if np.any(good & ~shown):
-            faint = shapes.paint(good & ~shown)
-            found.append(_edges_around(faint, b_dx, b_dy, strips.level, keep_part))
-        white.mask[cv2.dilate(shapes.paint(good), _square(7)) > 0] = 0
-    shapes = _measure(_only(white.mask, keep_part), white.response, cm_per_px)
-    kept |= shapes.paint(shapes.good(shapes.gradient(dx, dy) / shapes.contrast, settings))
+            size = (light.shape[1], light.shape[0])
+            b_dx, b_dy = gradients(cv2.resize(yellow.channel, size), blur_px)
+            contrast = shapes.mean(cv2.resize(yellow.response, size))
+            faint = good & ~shown
+            faint &= shapes.boundary_step(b_dx, b_dy) >= settings.least_sharpness * contrast
+            found.append(_edges_around(shapes.paint(faint), b_dx, b_dy, yellow.level, keep_part))
+            good = faint | (good & shown)
+        # What is yellow is not white as well.
+        white.mask[...] = cv2.subtract(white.mask, cv2.dilate(shapes.paint(good), _square(7)))
+    shapes = measure_components(_only(white.mask, keep_part), cm_per_px)
+    good = _marking_shaped(shapes, settings)
+    good &= shapes.boundary_step(dx, dy) >= settings.least_sharpness * shapes.mean(white.response)
+    kept = cv2.bitwise_or(kept, shapes.paint(good))
     found.append(_edges_around(kept, dx, dy, white.level, keep_part))
     uv = np.concatenate([edges.uv_px for edges in found])
     uv[:, 1] += top
@@ -130,17 +134,16 @@ def _edges_around(
     mask: np.ndarray, dx: np.ndarray, dy: np.ndarray, level: float, keep: np.ndarray | None
 ) -> EdgePixels:
     """Edges of a channel that belong to the components of a mask."""
-    edges = cv2.Canny(dx, dy, 0.25 * _SOBEL_GAIN * level, 0.5 * _SOBEL_GAIN * level, L2gradient=True)
+    edges = cv2.Canny(dx, dy, 0.25 * SOBEL_GAIN * level, 0.5 * SOBEL_GAIN * level, L2gradient=True)
     cv2.bitwise_and(edges, cv2.dilate(mask, _square(3)), dst=edges)
     return edge_pixels(_only(edges, keep), dx, dy, subpixel=True)
 
 
-def _yellow_strips(
-    part: np.ndarray, settings: ColourSettings, row_px: np.ndarray
-) -> tuple[_Strips, np.ndarray] | None:
-    """Find what is yellower than its surroundings; with Lab's b. None if nothing is.
+def _yellow_strips(part: np.ndarray, settings: ColourSettings, row_px: np.ndarray) -> _Strips | None:
+    """Find what is yellower than its surroundings, by Lab's b; None if nothing is.
 
-    The work is done at half the resolution: cameras and JPEG store colour no finer.
+    The work is done at half the resolution: cameras and JPEG store colour no finer. Only the mask is
+    brought back to the full one.
     """
     height, width = part.shape[:2]
     half = cv2.resize(part, ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA)
@@ -148,11 +151,8 @@ def _yellow_strips(
     strips = _strips(b_half, settings.yellow_floor, settings, "light", 0.5 * row_px[::2])
     if not cv2.countNonZero(strips.mask):
         return None
-    size = (width, height)
-    mask = cv2.resize(strips.mask, size, interpolation=cv2.INTER_NEAREST)
-    response = cv2.resize(strips.response, size, interpolation=cv2.INTER_LINEAR)
-    b_channel = cv2.resize(b_half, size, interpolation=cv2.INTER_LINEAR)
-    return _Strips(mask, response, strips.level), b_channel
+    mask = cv2.resize(strips.mask, (width, height), interpolation=cv2.INTER_NEAREST)
+    return replace(strips, mask=mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +160,13 @@ class _Strips:
     """What stands out from its surroundings and is thin.
 
     Attributes:
+        channel: Where they were looked for.
         mask: 255 where the response passes the threshold; may be empty.
         response: By how many levels a pixel stands out.
         level: The threshold.
     """
 
+    channel: np.ndarray
     mask: np.ndarray
     response: np.ndarray
     level: float
@@ -178,15 +180,16 @@ def _strips(
     counts = np.bincount(response[::3, ::3].ravel(), minlength=256).cumsum()
     strong = int(np.searchsorted(counts, 0.99 * counts[-1]))
     level = max(float(floor), settings.contrast_share * strong)
-    return _Strips(cv2.threshold(response, level, 255, cv2.THRESH_BINARY)[1], response, level)
+    mask = cv2.threshold(response, level, 255, cv2.THRESH_BINARY)[1]
+    return _Strips(channel, mask, response, level)
 
 
 def _thin_response(channel: np.ndarray, markings: str, row_px: np.ndarray) -> np.ndarray:
     """Top-hat (light), bottom-hat (dark) or the larger of both; the square grows with the road's scale."""
-    sides = np.asarray(_KERNELS_PX)[np.minimum(np.searchsorted(_KERNELS_PX, row_px), len(_KERNELS_PX) - 1)]
+    sides = np.asarray(_KERNELS_PX)[np.searchsorted(_KERNEL_LIMITS_PX, row_px)]
     response = np.zeros_like(channel)
-    starts = np.flatnonzero(np.diff(sides, prepend=-1))
-    for start, stop in zip(starts, [*starts[1:], len(sides)], strict=True):
+    starts = np.flatnonzero(np.diff(sides, prepend=-1)).tolist()
+    for start, stop in pairwise([*starts, len(sides)]):
         side = int(sides[start])
         above, below = max(0, start - side), min(len(sides), stop + side)
         band = channel[above:below]
@@ -200,96 +203,27 @@ def _thin_response(channel: np.ndarray, markings: str, row_px: np.ndarray) -> np
     return response
 
 
-@dataclass(frozen=True, eq=False)
-class _Shapes:
-    """Connected components of a mask and their measures; label 0 is the background.
-
-    Attributes:
-        shape: Of the mask.
-        inside: Flat indices of the components' pixels; ``of_inside`` their labels.
-        on_rim: Flat indices of the boundary pixels; ``of_rim`` their labels.
-        area: Pixels of each component.
-        rim: Boundary pixels of each component, without those on the picture's border, where a marking goes
-            on unseen.
-        outline: Boundary pixels with those on the border.
-        contrast: Mean response of each component, in levels.
-        thickness_cm: Thickness of each component on the road, [cm]; NaN where unknown.
-    """
-
-    shape: tuple[int, ...]
-    inside: np.ndarray
-    of_inside: np.ndarray
-    on_rim: np.ndarray
-    of_rim: np.ndarray
-    area: np.ndarray
-    rim: np.ndarray
-    outline: np.ndarray
-    contrast: np.ndarray
-    thickness_cm: np.ndarray
-
-    def gradient(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-        """Mean gradient on each component's boundary, as the step of so many levels has it."""
-        gx = dx.reshape(-1)[self.on_rim].astype(np.float32)
-        gy = dy.reshape(-1)[self.on_rim].astype(np.float32)
-        total = np.bincount(self.of_rim, np.sqrt(gx * gx + gy * gy), len(self.rim))
-        return total / (_SOBEL_GAIN * self.rim)
-
-    def good(self, sharpness: np.ndarray, settings: ColourSettings) -> np.ndarray:
-        """Tell which components are large, long, thin and sharp."""
-        # Corners count once in the boundary's pixels: four more make small squares and large ones alike.
-        elongation = (self.outline + 4.0) ** 2 / (4.0 * self.area)
-        good = (
-            (self.area >= settings.least_area_px)
-            & (elongation >= settings.least_elongation)
-            & (sharpness >= settings.least_sharpness)
-            & ~(self.thickness_cm > settings.thickest_cm)
-        )
-        good[0] = False
-        return good
-
-    def paint(self, chosen: np.ndarray) -> np.ndarray:
-        """Mask of the chosen components."""
-        mask = np.zeros(self.shape, np.uint8)
-        mask.reshape(-1)[self.inside[chosen[self.of_inside]]] = 255
-        return mask
-
-
-def _measure(mask: np.ndarray, response: np.ndarray, cm_per_px: np.ndarray | None) -> _Shapes:
-    """Label the components of a mask and measure them."""
-    kind = cv2.CV_16U if mask.size < 4 * 65535 else cv2.CV_32S
-    count, labels = cv2.connectedComponents(mask, connectivity=8, ltype=kind)
-    flat = labels.reshape(-1)
-    inside = np.flatnonzero(mask.reshape(-1) != 0)
-    of_inside = flat[inside]
-    # The background has no pixels here; one is put in, so that nothing is divided by zero.
-    area = np.maximum(np.bincount(of_inside, minlength=count), 1)
-    contrast = np.maximum(np.bincount(of_inside, response.reshape(-1)[inside], count), 1.0) / area
-    on_rim = np.flatnonzero(cv2.subtract(mask, cv2.erode(mask, _CROSS)).reshape(-1) != 0)
-    of_rim = flat[on_rim]
-    rim = np.maximum(np.bincount(of_rim, minlength=count), 1)
-    outline = rim.copy()
-    for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        outline += np.bincount(side, minlength=count)
-    thickness_cm = np.full(count, np.nan)
-    if cm_per_px is not None:
-        # A strip of length l and thickness t has the area l t and a boundary of about 2 l pixels.
-        scale = np.bincount(of_rim, cm_per_px.reshape(-1)[on_rim], count) / rim
-        thickness_cm = np.maximum(2.0 * area / rim, 1.0) * scale
-    return _Shapes(mask.shape, inside, of_inside, on_rim, of_rim, area, rim, outline, contrast, thickness_cm)
+def _marking_shaped(shapes: Components, settings: ColourSettings) -> np.ndarray:
+    """Tell which components are large, long and thin."""
+    return (
+        (shapes.area >= settings.least_area_px)
+        & (shapes.elongation >= settings.least_elongation)
+        & ~(shapes.thickness_cm > settings.thickest_cm)
+        & (np.arange(len(shapes.area)) > 0)
+    )
 
 
 def _thickest_px(thickest_cm: float, scale: PixelScale | None, height: int, width: int) -> np.ndarray:
-    """Pixels that the thickest marking spans in each row, with a margin for its slope."""
+    """Pixels that the thickest marking spans in each row."""
     if scale is None:
         return np.full(height, width / 8.0)
-    with np.errstate(invalid="ignore"):
-        return np.nan_to_num(1.25 * thickest_cm / scale.row_cm_per_px, nan=_KERNELS_PX[0])
+    return np.where(np.isfinite(scale.row_cm_per_px), thickest_cm / scale.row_cm_per_px, _KERNELS_PX[0])
 
 
-def _rows_in_use(keep: np.ndarray | None, height: int) -> tuple[int, int]:
+def _rows_in_use(keep: np.ndarray | None, scale: PixelScale | None, height: int) -> tuple[int, int]:
     if keep is None:
         return 0, height
-    rows = np.flatnonzero(keep.any(axis=1))
+    rows = np.flatnonzero(keep.any(axis=1) if scale is None else np.isfinite(scale.row_cm_per_px))
     if rows.size == 0:
         return 0, 0
     # A margin, so that the border's reflection does not reach the useful rows.

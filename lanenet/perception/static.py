@@ -61,8 +61,8 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
         used += 1
     if counts is None or used < _LEAST_FRAMES:
         raise DriveFormatError(
-            f"{used} of {seen} frames show something new, but {_LEAST_FRAMES} are needed to tell the car from "
-            "the road: give frames of a moving car"
+            f"{used} of {seen} frames show something new, but {_LEAST_FRAMES} are needed to tell the car "
+            "from the road: give frames of a moving car"
         )
     static = np.where(counts >= _STATIC_SHARE * used, 255, 0).astype(np.uint8)
     height = static.shape[0]
@@ -72,7 +72,7 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
 
 def _down_to_the_border(static: np.ndarray) -> np.ndarray:
     """Keep what reaches the lowest rows, with everything below it."""
-    height, width = static.shape
+    height = static.shape[0]
     # Gaps of a few pixels between the car's edges belong to it.
     reach = max(3, height // 24) | 1
     closed = cv2.morphologyEx(
