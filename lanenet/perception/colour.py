@@ -18,6 +18,8 @@ from lanenet.perception.edge_pixels import EdgePixels, edge_pixels, gradients
 #: Sides of the top-hat's square, [px]; each row takes the one nearest to the widest marking.
 _KERNELS_PX = (9, 17, 31, 59)
 _KERNEL_LIMITS_PX = np.sqrt(np.multiply(_KERNELS_PX[:-1], _KERNELS_PX[1:]))
+#: An edge has at least this share of the gradient of a sharp step as high as the threshold.
+_EDGE_SHARE = 0.5
 #: Lab's L (0-255) of a gray level; for colours, of their luma.
 _LIGHTNESS = cv2.cvtColor(np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3), cv2.COLOR_BGR2Lab)[
     ..., 0
@@ -107,7 +109,7 @@ def colour_edges(
         # Colour is blurred by the camera's and JPEG's half resolution: brightness places the edge better
         # wherever it shows the marking at all.
         shapes = measure_components(_only(yellow.mask, keep_part), cm_per_px)
-        shown = shapes.boundary_step(dx, dy) >= settings.least_sharpness * white.level
+        shown = shapes.boundary_step(dx, dy) >= _EDGE_SHARE * white.level
         good = _marking_shaped(shapes, settings)
         kept = shapes.paint(good & shown)
         if np.any(good & ~shown):
@@ -134,7 +136,8 @@ def _edges_around(
     mask: np.ndarray, dx: np.ndarray, dy: np.ndarray, level: float, keep: np.ndarray | None
 ) -> EdgePixels:
     """Edges of a channel that belong to the components of a mask."""
-    edges = cv2.Canny(dx, dy, 0.25 * SOBEL_GAIN * level, 0.5 * SOBEL_GAIN * level, L2gradient=True)
+    high = _EDGE_SHARE * SOBEL_GAIN * level
+    edges = cv2.Canny(dx, dy, 0.5 * high, high, L2gradient=True)
     cv2.bitwise_and(edges, cv2.dilate(mask, _square(3)), dst=edges)
     return edge_pixels(_only(edges, keep), dx, dy, subpixel=True)
 

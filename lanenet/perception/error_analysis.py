@@ -134,6 +134,23 @@ def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> 
     )
 
 
+def figures(analysis: ErrorAnalysis) -> list[tuple[str, str, str]]:
+    """Return rows of name, value and the paper's value for its camera, for a table."""
+    left, right = analysis.line_pixels
+    sideways = f"{10.0 * analysis.line_cm_per_px[0]:.1f}, {10.0 * analysis.line_cm_per_px[1]:.1f}"
+    degrees = math.degrees(analysis.steering_error_rad)
+    return [
+        (
+            f"pixels per {10.0 * analysis.settings.cell_cm:.1f} mm cell at L and R",
+            f"{left}, {right}",
+            "10, 24",
+        ),
+        ("mm per pixel, sideways, at L and R", sideways, "6"),
+        ("position error with the filter's grid, mm", f"{10.0 * analysis.position_error_cm:.1f}", "<= 10"),
+        (f"steering error at {analysis.settings.lookahead_cm:g} cm, degrees", f"{degrees:.1f}", "3.8"),
+    ]
+
+
 def _cells_of(points_cm: np.ndarray, cell_cm: float, half_columns: int) -> np.ndarray:
     """Row and column of the cell that holds each point."""
     row = np.floor(points_cm[:, 1] / cell_cm)
