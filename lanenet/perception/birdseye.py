@@ -126,7 +126,7 @@ class RoadTable:
         nearest = np.rint(edges.uv_px)
         nearest = np.minimum(np.maximum(nearest, 0.0), [self.width - 1.0, self.height - 1.0])
         at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
-        x, y, x_u, y_u, x_v, y_v = self._rows[at].T
+        x, y, x_u, y_u, x_v, y_v = np.ascontiguousarray(self._rows.take(at, axis=0).T)
         off_u, off_v = (edges.uv_px - nearest).T
         normal_u, normal_v = edges.normals.T
         points, across = np.empty((len(at), 2)), np.empty((len(at), 2))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16, Integer, UInt8
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 
 #: Sobel response of a step of one gray level, without blur.
 SOBEL_GAIN = 4.0
@@ -33,9 +33,9 @@ class Components:
 
     shape: tuple[int, int]
     inside: Int[np.ndarray, "p"]
-    of_inside: Integer[np.ndarray, "p"]
+    of_inside: Int[np.ndarray, "p"]
     on_rim: Int[np.ndarray, "b"]
-    of_rim: Integer[np.ndarray, "b"]
+    of_rim: Int[np.ndarray, "b"]
     area: Int[np.ndarray, "k"]
     rim: Int[np.ndarray, "k"]
     elongation: Float[np.ndarray, "k"]
@@ -43,19 +43,19 @@ class Components:
 
     def boundary_step(self, dx: Int16[np.ndarray, "h w"], dy: Int16[np.ndarray, "h w"]) -> np.ndarray:
         """Return the sharp step, in gray levels, whose gradient is each component's mean on its boundary."""
-        gx = dx.reshape(-1)[self.on_rim].astype(np.float32)
-        gy = dy.reshape(-1)[self.on_rim].astype(np.float32)
+        gx = dx.reshape(-1).take(self.on_rim).astype(np.float32)
+        gy = dy.reshape(-1).take(self.on_rim).astype(np.float32)
         total = np.bincount(self.of_rim, np.sqrt(gx * gx + gy * gy), len(self.rim))
         return total / (SOBEL_GAIN * self.rim)
 
     def mean(self, image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "k"]:
         """Return the mean of an image over each component."""
-        return np.bincount(self.of_inside, image.reshape(-1)[self.inside], len(self.area)) / self.area
+        return np.bincount(self.of_inside, image.reshape(-1).take(self.inside), len(self.area)) / self.area
 
     def paint(self, chosen: Bool[np.ndarray, "k"]) -> UInt8[np.ndarray, "h w"]:
         """Return a mask of the chosen components."""
         mask = np.zeros(self.shape, np.uint8)
-        mask.reshape(-1)[self.inside[chosen[self.of_inside]]] = 255
+        mask.reshape(-1)[self.inside[chosen.take(self.of_inside)]] = 255
         return mask
 
 
@@ -78,10 +78,10 @@ def measure_components(
     count, labels = cv2.connectedComponents(mask, connectivity=8, ltype=kind)
     flat = labels.reshape(-1)
     inside = np.flatnonzero(mask.reshape(-1) != 0)
-    of_inside = flat[inside]
+    of_inside = flat.take(inside).astype(np.intp)
     # The background has no pixels here; one is put in, so that nothing is divided by zero.
     area = np.maximum(np.bincount(of_inside, minlength=count), 1)
-    boundary = cv2.erode(mask, _CROSS).reshape(-1)[inside] == 0
+    boundary = cv2.erode(mask, _CROSS).reshape(-1).take(inside) == 0
     on_rim, of_rim = inside[boundary], of_inside[boundary]
     rim = np.maximum(np.bincount(of_rim, minlength=count), 1)
     border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])

@@ -62,7 +62,8 @@ def edge_pixels(
     at = np.flatnonzero(edges.reshape(-1) != 0)
     v = at // width
     u = at - v * width
-    gx, gy = dx.reshape(-1)[at].astype(np.float64), dy.reshape(-1)[at].astype(np.float64)
+    gx = dx.reshape(-1).take(at).astype(np.float64)
+    gy = dy.reshape(-1).take(at).astype(np.float64)
     strength = np.sqrt(gx * gx + gy * gy)
     shrink = 1.0 / np.maximum(strength, 1e-9)
     nu, nv = gx * shrink, gy * shrink
@@ -98,7 +99,7 @@ def _subpixel_offset(
         vv = np.minimum(np.maximum(vv, 0), height - 1)
         at = vv * width + np.minimum(np.maximum(uu, 0), width - 1)
         # Only what points the same way counts: the other edge of a thin line must not pull this one.
-        return np.maximum(flat_dx[at] * nu + flat_dy[at] * nv, 0.0)
+        return np.maximum(flat_dx.take(at) * nu + flat_dy.take(at) * nv, 0.0)
 
     before, after = magnitude(u - step_u, v - step_v), magnitude(u + step_u, v + step_v)
     curvature = before - 2.0 * strength + after
