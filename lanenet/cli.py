@@ -375,6 +375,29 @@ def bench(
     console.next_command("doctor")
 
 
+@app.command(epilog="Example: lanenet analyse camera.yaml --out density.png")
+def analyse(
+    camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="Picture of pixels per ground cell (.png).")] = None,
+) -> None:
+    """Tell how exactly a camera sees the road: cm per pixel and the worst steering error."""
+    from lanenet.data.camera_file import read_camera
+    from lanenet.data.files import atomic_file
+    from lanenet.data.png import png_bytes
+    from lanenet.perception.analysis_picture import draw_analysis
+    from lanenet.perception.error_analysis import analyse_errors, figures
+
+    if out is not None:
+        _check_ending(out, ".png")
+    analysis = analyse_errors(read_camera(camera))
+    console.show_table(str(camera), ("", "found", "paper"), figures(analysis))
+    if out is not None:
+        with atomic_file(out) as temporary:
+            temporary.write_bytes(png_bytes(draw_analysis(analysis)))
+        console.wrote(out)
+    console.next_command("doctor", "--camera", camera)
+
+
 @app.command(epilog="Example: lanenet doctor --camera camera.yaml")
 def doctor(camera: _CameraOption = None) -> None:
     """Check the installation, and a camera file if one is given."""

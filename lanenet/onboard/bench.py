@@ -9,7 +9,7 @@ from collections.abc import Callable
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -18,12 +18,14 @@ from jaxtyping import UInt8
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.edges import find_edges
+from lanenet.perception.edges import EdgeSettings, find_edges
 from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
 from lanenet.perception.network import NetworkDetector
 
 LANE_WIDTH_CM = 40.0
 _LINE_CM = 2.0
+#: Each is timed from the frame to points on the road.
+_EDGE_METHODS: tuple[Literal["canny", "directional", "colour"], ...] = ("canny", "directional", "colour")
 _WARM_UP = 20
 
 
@@ -35,7 +37,10 @@ def example_camera() -> Camera:
 
 
 def example_frames(camera: Camera, count: int, rng: np.random.Generator) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Paint frames of a gently curved lane with sensor noise, each seen from elsewhere in the lane."""
+    """Paint frames of a gently curved lane with sensor noise, each seen from elsewhere in the lane.
+
+    The left line is yellow and the right one white, so that detectors of colour have their full work.
+    """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     road = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 2)
     near = np.nan_to_num(road, nan=1e6)
@@ -45,7 +50,9 @@ def example_frames(camera: Camera, count: int, rng: np.random.Generator) -> list
         x = near[..., 0] - (shift + slope * near[..., 1] + bend * near[..., 1] ** 2)
         line = np.abs(np.abs(x) - 0.5 * LANE_WIDTH_CM) < 0.5 * _LINE_CM
         gray = np.where(line & (near[..., 1] < 200.0), 220.0, 70.0) + rng.normal(0.0, 4.0, u.shape)
-        frames.append(np.repeat(np.clip(gray, 0.0, 255.0).astype(np.uint8)[..., None], 3, axis=2))
+        frame = np.repeat(np.clip(gray, 0.0, 255.0).astype(np.uint8)[..., None], 3, axis=2)
+        frame[line & (x < 0.0), 0] //= 3
+        frames.append(frame)
     return frames
 
 
@@ -69,7 +76,8 @@ def time_stages(
         progress: Called with (frames done, frames).
 
     Returns:
-        ``stages``: for each its ``median_ms``, ``p99_ms`` and ``ratio_to_canny``; ``edge_points``, ``image``,
+        ``stages`` (``edge stage: METHOD`` is all from the frame to points on the road): for each its
+        ``median_ms``, ``p99_ms`` and ``ratio_to_canny``; ``edge_points``, ``image``,
         ``threads``, ``rounds`` and ``machine``.
 
     Raises:
@@ -95,6 +103,8 @@ def time_stages(
                     times_ms.setdefault(stage, []).append(value)
                 if progress is not None:
                     progress(i + 1 - _WARM_UP, rounds)
+        for method in _EDGE_METHODS:
+            times_ms[f"edge stage: {method}"] = _time_edge_stage(camera, method, frames, rounds)
     finally:
         cv2.setNumThreads(before)
     yardstick = float(np.median(times_ms["canny"]))
@@ -115,6 +125,22 @@ def time_stages(
     }
 
 
+def _time_edge_stage(
+    camera: Camera,
+    method: Literal["canny", "directional", "colour"],
+    frames: list[UInt8[np.ndarray, "h w 3"]],
+    rounds: int,
+) -> list[float]:
+    """Time from the frame to points on the road, one method alone as on a car, [ms]."""
+    extractor = RoadEdgeExtractor(camera, PerceptionSettings(edges=EdgeSettings(method=method)))
+    times_ms = []
+    for i in range(_WARM_UP + rounds):
+        begin = time.perf_counter()
+        extractor.extract(frames[i % len(frames)])
+        times_ms.append(1e3 * (time.perf_counter() - begin))
+    return times_ms[_WARM_UP:]
+
+
 def _time_frame(
     frame: UInt8[np.ndarray, "h w 3"],
     extractor: RoadEdgeExtractor,
@@ -130,7 +156,7 @@ def _time_frame(
 
     cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
     mark("canny")
-    pixels = find_edges(frame, extractor.settings.edges, extractor.table.keep)
+    pixels = find_edges(frame, extractor.settings.edges, extractor.table.keep, extractor.table.scale)
     mark("edges")
     road = extractor.table.lift(pixels)
     mark("lift")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
+from lanenet.perception.colour import PixelScale
 from lanenet.perception.edges import EdgePixels, EdgeSettings, find_edges
 
 
@@ -60,11 +62,14 @@ class RoadTable:
 
     Attributes:
         keep: uint8 mask of the pixels that see the useful part of the road.
+        scale: Road that a pixel spans sideways.
         points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
         jacobian: d(point)/d(pixel), [cm/px], height x width x 2 x 2 (row x, y; column u, v).
     """
 
-    def __init__(self, camera: Camera, range_settings: RangeSettings) -> None:
+    def __init__(
+        self, camera: Camera, range_settings: RangeSettings, mask: UInt8[np.ndarray, "h w"] | None = None
+    ) -> None:
         if range_settings.top_row + range_settings.bottom_rows >= camera.height:
             raise CalibrationError(
                 f"range: top_row {range_settings.top_row} and bottom_rows {range_settings.bottom_rows} leave "
@@ -73,10 +78,15 @@ class RoadTable:
         self.height, self.width = camera.height, camera.width
         v, u = np.mgrid[-1 : self.height + 1, -1 : self.width + 1].astype(np.float64)
         grid = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 2)
-        self.points_cm: Float[np.ndarray, "h w 2"] = grid[1:-1, 1:-1].copy()
         du = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
         dv = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
-        self.jacobian: Float[np.ndarray, "h w 2 2"] = np.stack([du, dv], axis=-1)
+        # A pixel's six numbers side by side, so that a lookup touches the memory once.
+        self._rows = np.concatenate([grid[1:-1, 1:-1], du, dv], axis=-1).reshape(-1, 6)
+        table = self._rows.reshape(self.height, self.width, 6)
+        self.points_cm: Float[np.ndarray, "h w 2"] = table[..., :2]
+        self.jacobian: Float[np.ndarray, "h w 2 2"] = (
+            table[..., 2:].reshape(self.height, self.width, 2, 2).swapaxes(-1, -2)
+        )
         x, y = self.points_cm[..., 0], self.points_cm[..., 1]
         with np.errstate(invalid="ignore"):
             coarse = np.maximum(np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1))
@@ -87,9 +97,22 @@ class RoadTable:
             )
         useful[: range_settings.top_row] = False
         useful[self.height - range_settings.bottom_rows :] = False
+        if mask is not None:
+            if mask.shape != useful.shape:
+                raise CalibrationError(
+                    f"mask of {mask.shape[1]}x{mask.shape[0]} px, but the camera is calibrated for "
+                    f"{camera.width}x{camera.height}"
+                )
+            useful &= mask == 0
         self.keep: UInt8[np.ndarray, "h w"] = np.where(useful, 255, 0).astype(np.uint8)
         if not useful.any():
             raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
+        across = np.linalg.norm(du, axis=-1)
+        with warnings.catch_warnings():
+            # Rows without a useful pixel have no median, which is what NaN says.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            per_row = np.nanmedian(np.where(useful, across, np.nan), axis=1)
+        self.scale = PixelScale(across, per_row)
 
     def lift(self, edges: EdgePixels) -> RoadEdges:
         """Move edge pixels to the road.
@@ -100,30 +123,45 @@ class RoadTable:
         Returns:
             Their points and directions on the road, [cm], frame car.
         """
-        nearest = np.rint(edges.uv_px).astype(np.intp)
-        u = np.clip(nearest[:, 0], 0, self.width - 1)
-        v = np.clip(nearest[:, 1], 0, self.height - 1)
-        jacobian = self.jacobian[v, u]
-        offset = edges.uv_px - np.stack([u, v], axis=1)
-        points = self.points_cm[v, u] + np.einsum("nij,nj->ni", jacobian, offset)
+        nearest = np.rint(edges.uv_px)
+        nearest = np.minimum(np.maximum(nearest, 0.0), [self.width - 1.0, self.height - 1.0])
+        at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
+        x, y, x_u, y_u, x_v, y_v = np.ascontiguousarray(self._rows.take(at, axis=0).T)
+        off_u, off_v = (edges.uv_px - nearest).T
+        normal_u, normal_v = edges.normals.T
+        points, across = np.empty((len(at), 2)), np.empty((len(at), 2))
+        points[:, 0] = x + (x_u * off_u + x_v * off_v)
+        points[:, 1] = y + (y_u * off_u + y_v * off_v)
         # A direction along the edge maps by the Jacobian; the normal is perpendicular to it, on the side to
-        # which the image gradient leads.
-        tangent = np.stack([-edges.normals[:, 1], edges.normals[:, 0]], axis=1)
-        along = np.einsum("nij,nj->ni", jacobian, tangent)
-        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        towards = np.einsum("nij,nj->ni", jacobian, edges.normals)
-        across *= np.sign(np.sum(across * towards, axis=1, keepdims=True))
-        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        # which the image gradient leads. Together: the cofactors, with the sign of the determinant.
+        side = np.sign(x_u * y_v - x_v * y_u)
+        across_x = side * (y_v * normal_u - y_u * normal_v)
+        across_y = side * (x_u * normal_v - x_v * normal_u)
+        shrink = 1.0 / np.maximum(np.sqrt(across_x * across_x + across_y * across_y), 1e-12)
+        across[:, 0] = across_x * shrink
+        across[:, 1] = across_y * shrink
         return RoadEdges(points, across)
 
 
 class RoadEdgeExtractor:
-    """Frame in, edge points on the road out; the one path for training and for driving."""
+    """Frame in, edge points on the road out; the one path for training and for driving.
 
-    def __init__(self, camera: Camera, settings: PerceptionSettings) -> None:
+    Attributes:
+        camera: Camera of the frames.
+        settings: Detector and range.
+        table: Its road table; a mask given to the extractor (nonzero on the car itself, as from
+            :func:`lanenet.perception.static.static_mask`) is taken out of the table's ``keep``.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        settings: PerceptionSettings,
+        mask: UInt8[np.ndarray, "h w"] | None = None,
+    ) -> None:
         self.camera = camera
         self.settings = settings
-        self.table = RoadTable(camera, settings.range)
+        self.table = RoadTable(camera, settings.range, mask)
 
     def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> RoadEdges:
         """Find a frame's edges and move them to the road.
@@ -137,7 +175,9 @@ class RoadEdgeExtractor:
                 f"frame of {width}x{height} px, but the camera is calibrated for "
                 f"{self.camera.width}x{self.camera.height}"
             )
-        edges = self.table.lift(find_edges(frame_bgr, self.settings.edges, self.table.keep))
-        good = np.isfinite(edges.points_cm).all(axis=1) & np.isfinite(edges.normals).all(axis=1)
+        pixels = find_edges(frame_bgr, self.settings.edges, self.table.keep, self.table.scale)
+        edges = self.table.lift(pixels)
         # The precision of the label files, so that a raster made from a file and one made on the car agree.
-        return RoadEdges(edges.points_cm[good].astype(np.float32), edges.normals[good].astype(np.float32))
+        points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
+        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
+        return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])

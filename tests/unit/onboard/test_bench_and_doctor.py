@@ -19,7 +19,8 @@ def test_bench_reports_every_stage_with_its_ratio() -> None:
     report = time_stages(example_camera(), rounds=10)
     assert cv2.getNumThreads() == before
     stages = report["stages"]
-    assert set(stages) == {"canny", "edges", "lift", "raster", "lane filter", "frame to lane"}
+    methods = {f"edge stage: {method}" for method in ("canny", "directional", "colour")}
+    assert set(stages) == methods | {"canny", "edges", "lift", "raster", "lane filter", "frame to lane"}
     for values in stages.values():
         assert 0.0 < values["median_ms"] <= values["p99_ms"]
         assert values["ratio_to_canny"] == pytest.approx(values["median_ms"] / stages["canny"]["median_ms"])

@@ -1,0 +1,179 @@
+"""How exactly a camera sees the road: pixels per ground cell, and the steering error that follows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import Field
+
+from lanenet.config import Settings
+from lanenet.errors import CalibrationError
+from lanenet.geometry.camera import Camera
+
+
+class AnalysisSettings(Settings):
+    """Grid and look-ahead of the analysis; the defaults are those of Kozlowski et al. 2024, section 2.3.
+
+    Attributes:
+        cell_cm: Side of a ground cell.
+        side_cm: The grid reaches so far to the left and to the right.
+        far_cm: And so far ahead of the front axle.
+        lookahead_cm: Distance at which the centre of the lane is taken.
+        lane_width_cm: Between the middles of the lane's lines, which lie half of it to either side there.
+        filter_grid_cm: Grid of the lane filter.
+    """
+
+    cell_cm: float = Field(default=5.26, gt=0.0)
+    side_cm: float = Field(default=50.0, gt=0.0)
+    far_cm: float = Field(default=100.0, gt=0.0)
+    lookahead_cm: float = Field(default=15.0, gt=0.0)
+    lane_width_cm: float = Field(default=40.0, gt=0.0)
+    filter_grid_cm: float = Field(default=0.2, ge=0.0)
+
+
+@dataclass(frozen=True)
+class ErrorAnalysis:
+    """What a camera's pixels allow.
+
+    Row 0 of the cells is the nearest one, column 0 the leftmost.
+
+    Attributes:
+        settings: Grid and look-ahead.
+        x_cm: Middle of each column, frame car.
+        y_cm: Middle of each row, frame car.
+        pixels: Pixel centres in each cell.
+        sideways_cm_per_px: Most that one pixel's step along a row or a column moves the road point sideways,
+            at the middle of each cell; NaN where the camera does not see it.
+        ahead_cm_per_px: The same along the direction of travel.
+        line_pixels: Pixel centres in the cells of the left and the right line's point at the look-ahead.
+        line_cm_per_px: Sideways, at these two points; NaN outside the picture.
+        position_error_cm: Worst sideways error of the lane's centre: a pixel and the filter's grid.
+        steering_error_rad: Steering error of that at the look-ahead.
+    """
+
+    settings: AnalysisSettings
+    x_cm: Float[np.ndarray, "c"]
+    y_cm: Float[np.ndarray, "r"]
+    pixels: Int[np.ndarray, "r c"]
+    sideways_cm_per_px: Float[np.ndarray, "r c"]
+    ahead_cm_per_px: Float[np.ndarray, "r c"]
+    line_pixels: tuple[int, int]
+    line_cm_per_px: tuple[float, float]
+    position_error_cm: float
+    steering_error_rad: float
+
+
+def steering_error_rad(position_error_cm: float, lookahead_cm: float) -> float:
+    """Return the steering error of a sideways error of the aim point, [rad].
+
+    Source:
+        Kozlowski et al. 2024, eq. 3 and section 2.3: 10 mm at 150 mm are 3.8 degrees.
+    """
+    return math.atan2(position_error_cm, lookahead_cm)
+
+
+def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> ErrorAnalysis:
+    """Count pixels per ground cell and derive the worst errors at the look-ahead.
+
+    Args:
+        camera: Camera with its mounting.
+        settings: Grid and look-ahead; None for the paper's.
+
+    Returns:
+        The densities and errors. Where the camera sees neither line at the look-ahead, the errors are NaN;
+        where it sees one, they are that one's.
+
+    Raises:
+        CalibrationError: If no pixel of the camera sees the grid.
+
+    Source:
+        Kozlowski et al. 2024, section 2.3 and figure 7. The paper takes one pixel at the sparser of the two
+        lines; here it is the larger sideways step to a neighbouring pixel, from the camera model.
+    """
+    chosen = AnalysisSettings() if settings is None else settings
+    # An even number of columns, so that the car's middle is a border between cells.
+    half_columns = max(1, round(chosen.side_cm / chosen.cell_cm))
+    rows, columns = max(1, round(chosen.far_cm / chosen.cell_cm)), 2 * half_columns
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    road = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1))
+    cells = _cells_of(road[np.isfinite(road).all(axis=1)], chosen.cell_cm, half_columns)
+    inside = ((cells >= 0) & (cells < [rows, columns])).all(axis=1)
+    if not inside.any():
+        raise CalibrationError(
+            f"camera: no pixel sees the road within {chosen.side_cm:g} cm to the side and {chosen.far_cm:g} "
+            "cm ahead; check height and pitch"
+        )
+    pixels = np.zeros((rows, columns), np.int64)
+    np.add.at(pixels, (cells[inside, 0], cells[inside, 1]), 1)
+
+    y_cm = (np.arange(rows) + 0.5) * chosen.cell_cm
+    x_cm = (np.arange(columns) - half_columns + 0.5) * chosen.cell_cm
+    centres = np.stack(np.meshgrid(x_cm, y_cm), axis=-1).reshape(-1, 2)
+    steps = _cm_per_px(camera, centres).reshape(rows, columns, 2)
+
+    half_lane = 0.5 * chosen.lane_width_cm
+    lines = np.array([[-half_lane, chosen.lookahead_cm], [half_lane, chosen.lookahead_cm]])
+    line_steps = _cm_per_px(camera, lines)[:, 0]
+    seen = line_steps[np.isfinite(line_steps)]
+    error_cm = float(seen.max()) + chosen.filter_grid_cm if seen.size else math.nan
+    left, right = (_count(pixels, cell) for cell in _cells_of(lines, chosen.cell_cm, half_columns))
+    return ErrorAnalysis(
+        chosen,
+        x_cm,
+        y_cm,
+        pixels,
+        steps[..., 0],
+        steps[..., 1],
+        (left, right),
+        (float(line_steps[0]), float(line_steps[1])),
+        error_cm,
+        steering_error_rad(error_cm, chosen.lookahead_cm),
+    )
+
+
+def figures(analysis: ErrorAnalysis) -> list[tuple[str, str, str]]:
+    """Return rows of name, value and the paper's value for its camera, for a table."""
+    left, right = analysis.line_pixels
+    sideways = f"{10.0 * analysis.line_cm_per_px[0]:.1f}, {10.0 * analysis.line_cm_per_px[1]:.1f}"
+    degrees = math.degrees(analysis.steering_error_rad)
+    return [
+        (
+            f"pixels per {10.0 * analysis.settings.cell_cm:.1f} mm cell at L and R",
+            f"{left}, {right}",
+            "10, 24",
+        ),
+        ("mm per pixel, sideways, at L and R", sideways, "6"),
+        ("position error with the filter's grid, mm", f"{10.0 * analysis.position_error_cm:.1f}", "<= 10"),
+        (f"steering error at {analysis.settings.lookahead_cm:g} cm, degrees", f"{degrees:.1f}", "3.8"),
+    ]
+
+
+def _cells_of(points_cm: np.ndarray, cell_cm: float, half_columns: int) -> np.ndarray:
+    """Row and column of the cell that holds each point."""
+    row = np.floor(points_cm[:, 1] / cell_cm)
+    column = np.floor(points_cm[:, 0] / cell_cm) + half_columns
+    return np.stack([row, column], axis=1).astype(np.int64)
+
+
+def _count(pixels: np.ndarray, cell: np.ndarray) -> int:
+    row, column = (int(i) for i in cell)
+    rows, columns = pixels.shape
+    return int(pixels[row, column]) if 0 <= row < rows and 0 <= column < columns else 0
+
+
+def _cm_per_px(camera: Camera, points_cm: np.ndarray) -> np.ndarray:
+    """Sideways and ahead: how far a step of one pixel, along u or v, moves a road point; NaN if unseen."""
+    at = camera.project_ground(points_cm)
+    half = 0.5
+    size = [camera.width - half, camera.height - half]
+    with np.errstate(invalid="ignore"):
+        visible = ((at >= -half) & (at <= size)).all(axis=1)
+    # Central differences over one pixel; a step that leaves the road is NaN and stays so.
+    along_u = camera.intersect_ground(at + [half, 0.0]) - camera.intersect_ground(at - [half, 0.0])
+    along_v = camera.intersect_ground(at + [0.0, half]) - camera.intersect_ground(at - [0.0, half])
+    steps = np.maximum(np.abs(along_u), np.abs(along_v))
+    steps[~visible] = np.nan
+    return steps
