@@ -11,12 +11,13 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c c
 # Shapes and types of arguments are checked at run time in tests, and only there.
 PYTEST := $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype
 
-.PHONY: help train env test test-slow check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take longer than about ten seconds each"
+	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
 	@echo "make bench        time the stages that run on the car, on this machine"
@@ -33,6 +34,10 @@ test: $(VENV)/.stamp-dev
 
 test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
+
+# What the car installs, in an empty environment; fetches packages.
+test-base-install: $(VENV)/.stamp-dev
+	$(PYTEST) -m slow tests/contracts/test_base_install.py
 
 check: format-check lint types imports test
 
@@ -54,7 +59,7 @@ imports: $(VENV)/.stamp-dev
 
 bench: $(VENV)/.stamp-train
 	mkdir -p runs
-	$(BIN)/lanenet bench --out runs/bench.json
+	$(BIN)/lanenet bench --model checkpoints/small/model.onnx --out runs/bench.json
 
 clean:
 	rm -rf runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -146,8 +146,9 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
             "folder": work_dir / "drives",
         }
         jobs.append((None, job))
-    if not jobs:
-        raise ConfigError("data: no drives; set data.synthetic.train or list data.drives")
+    for role in ("train", "validation"):
+        if not settings.drives and not getattr(settings.synthetic, role):
+            raise ConfigError(f"data: no {role} drives; set data.synthetic.{role} or list data.drives")
     workers = settings.workers or os.cpu_count() or 1
     results: dict[int, dict[Role, Path]] = {}
     if workers == 1 or len(jobs) == 1:
@@ -180,8 +181,8 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
 
 def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:
     """Camera file of the run's drives, if they share one: the simulation's, or the only recording's."""
-    if not settings.drives:
-        return next((work_dir / "synthetic" / "drives").glob("*/camera.yaml"), None)
+    if not settings.drives and settings.synthetic.train:
+        return work_dir / "synthetic" / "drives" / "train_00" / "camera.yaml"
     synthetic = settings.synthetic
     if len(settings.drives) == 1 and not (synthetic.train or synthetic.validation or synthetic.test):
         return work_dir / "drives" / "maps" / _recorded_name(settings.drives[0]) / "camera.yaml"
@@ -226,11 +227,14 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
     drive, drive_map = folder / "drives" / job["name"], folder / "maps" / job["name"]
     labels = folder / "labels" / f"{job['name']}.parquet"
     parts = [simulation.model_dump(mode="json"), job["role"], asdict(job["window"])]
-    if job["role"] != "test":
-        parts.append(job["map"].model_dump(mode="json"))
+    # The truth needs no map, but its edges are found in the same way.
+    mapping: MapSettings = job["map"]
+    parts.append((mapping.perception if job["role"] == "test" else mapping).model_dump(mode="json"))
     key = _key(parts)
     if _is_done(labels, key):
         return labels
+    # From here on, what lies there is neither the old labels nor the new ones.
+    _marker(labels).unlink(missing_ok=True)
     simulate_drive(simulation, drive)
     if job["role"] == "test":
         truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
@@ -306,6 +310,7 @@ def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder:
         role: folder / "labels" / f"{name}.{role}.parquet" for role in ("train", "validation", "test")
     }
     if not (_is_done(whole, key) and all(path.is_file() for path in parts.values())):
+        _marker(whole).unlink(missing_ok=True)
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
         label_map(drive_map, whole, perception=settings.map.perception, window=window)
         shares = (settings.train_share, settings.validation_share)

@@ -13,6 +13,9 @@ from datagen.slam.places import RevisitSettings
 from lanenet.config import Settings
 from lanenet.perception.birdseye import PerceptionSettings
 
+#: The resolved settings in a map's folder.
+SETTINGS_NAME = "settings.yaml"
+
 
 class MapSettings(Settings):
     """Everything that mapping a drive can be told; the defaults are meant to fit every drive."""

@@ -14,7 +14,7 @@ from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_figures, map_notes
-from datagen.map_settings import MapSettings
+from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.slam.calibrate import coarse_camera, with_known_scale
 from datagen.slam.scans import Progress
@@ -85,11 +85,12 @@ def map_drive(
     drive_map = _assemble(drive, drive_path, lane_width_cm, camera, parts, factor, known is None)
     figures |= map_figures(drive_map, parts, factor)
     notes += map_notes(drive_map, figures, known is not None)
+    figures["notes"] = notes
     index = {int(frame): i for i, frame in enumerate(drive.frames)}
     shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
-        write_text(folder / "settings.yaml", dump_settings(settings))
+        write_text(folder / SETTINGS_NAME, dump_settings(settings))
         scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
         draw_map(folder / "map.png", drive_map, scaled)
         numbers = [int(drive_map.frames[k]) for k in shown]

@@ -180,7 +180,9 @@ def train(
     publish(run_folder, checkpoint, settings.name, files, results)
     model = checkpoint / "model.onnx"
     console.wrote(checkpoint)
-    console.next_command("detect", "SOURCE", "--detector", "network", "--model", model, "--out", "lanes.csv")
+    words = ["detect", "SOURCE", "--detector", "network", "--model", model]
+    words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
+    console.next_command(*words, "--out", "lanes.csv")
 
 
 @app.command(epilog="Example: lanenet simulate configs/drive.yaml seed=3 --out drives/three")

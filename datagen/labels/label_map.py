@@ -10,8 +10,10 @@ from datagen.labels.project import FrameLines, lines_of_frame
 from datagen.labels.quality import frame_residual_cm, label_report
 from datagen.map_folder import DriveMap, read_map
 from datagen.map_report import Report
+from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet
 from datagen.slam.scans import Progress
+from lanenet.config import load_settings
 from lanenet.data.drive import open_drive
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
@@ -47,7 +49,7 @@ def label_map(
         out: Parquet file.
         progress: Called with (done, total).
         drive_path: Where the drive is now, if it has moved since it was mapped.
-        perception: How the network's edge points are found; the defaults are those of the car.
+        perception: How the network's edge points are found; None takes what the map was made with.
         window: The network's window.
     """
     drive_map = read_map(map_folder)
@@ -60,7 +62,8 @@ def label_map(
             f"{map_folder / 'camera.yaml'}: is for {drive_map.camera.width}x{drive_map.camera.height} px, "
             f"the images of {source} have {drive.width}x{drive.height}"
         )
-    perception = PerceptionSettings() if perception is None else perception
+    if perception is None:
+        perception = load_settings(MapSettings, map_folder / SETTINGS_NAME).perception
     window = BirdseyeWindow() if window is None else window
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
     index = {int(frame): i for i, frame in enumerate(drive.frames)}

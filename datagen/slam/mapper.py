@@ -14,6 +14,7 @@ from datagen.slam.scans import Progress, Scans
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import left_from_donkey
 
 _MAX_LAG = 10  # frames
 
@@ -76,9 +77,12 @@ def commands_of(drive: Drive, wheelbase_cm: float) -> CommandedMotion:
     if steering_rad is not None:
         turn = np.tan(steering_rad) / wheelbase_cm
     elif angle is not None:
-        turn = -angle
+        # The gain is found from the pictures, so that the unknown full lock does not matter.
+        turn = left_from_donkey(angle)
     elif yaw_rate_rad_s is not None and speed_cm_s is not None:
-        turn = yaw_rate_rad_s / np.maximum(speed_cm_s, 1.0)
+        # Standing still, a yaw rate says nothing of the curvature.
+        moving = np.abs(speed_cm_s) >= 1.0
+        turn = np.where(moving, yaw_rate_rad_s / np.where(moving, speed_cm_s, 1.0), 0.0)
     return CommandedMotion(distance, known, turn)
 
 

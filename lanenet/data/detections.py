@@ -123,8 +123,13 @@ def read_detections(path: Path) -> Detections:
     """
     if _ending(path) == ".csv":
         specs = {"frame": ColumnSpec("int"), "confidence": ColumnSpec()}
-        specs |= {name: ColumnSpec(allow_empty=True) for name in _OPEN_COLUMNS}
+        # A detector that does not know its doubt may leave the columns of it out.
+        specs |= {
+            name: ColumnSpec(required=name not in SIGMA_NAMES, allow_empty=True) for name in _OPEN_COLUMNS
+        }
         columns = read_csv(path, specs, LabelFormatError)
+        unknown = np.full(len(columns["frame"]), np.nan)
+        columns |= {name: unknown for name in SIGMA_NAMES if name not in columns}
     else:
         table = ParquetTable(path)
         if table.meta.get("format") != FORMAT:

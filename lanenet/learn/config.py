@@ -68,9 +68,9 @@ class LearnSettings(Settings):
         ema_decay: Of the running mean of the weights, which is what is evaluated and exported.
         huber_cm: Errors below this count squared, above it linearly.
         min_quality: Training frames whose labels have a lower quality are left out.
-        threads: Threads of the computation; 0 leaves the choice to torch. One thread gives the same weights on
-            any number of cores, and does not stall when other programs are busy; a second core prepares the
-            next batches meanwhile.
+        threads: Threads of the computation; 0 leaves the choice to torch. One thread gives the same weights
+            on any number of cores, and does not stall when other programs are busy; a second core prepares
+            the next batches meanwhile.
         checkpoint_every: Epochs between two writings of the state from which a stopped run goes on.
         augment: Changes of the samples.
         network: Size of the network.

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from lanenet.config import load_settings
+from lanenet.config import load_settings, read_yaml
 from lanenet.data.files import atomic_file
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
@@ -31,6 +31,8 @@ IR_VERSION = 9
 #: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
 TOLERANCE = 1e-3
 
+CHECKPOINT_FORMAT = "lanenet-checkpoint/1"
+MARKER_NAME = "checkpoint.yaml"
 CONFIG_NAME = "config.yaml"
 WEIGHTS_NAME = "weights.safetensors"
 MODEL_NAME = "model.onnx"
@@ -111,6 +113,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     """
     if not checkpoint.is_dir():
         raise CheckpointError(f"{checkpoint}: no such folder, expected a checkpoint")
+    check_marker(checkpoint)
     try:
         settings = load_settings(LearnSettings, checkpoint / CONFIG_NAME)
     except ConfigError as error:
@@ -135,6 +138,23 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         detail = " ".join(str(error).split())[:300]
         raise CheckpointError(f"{path}: weights do not fit {checkpoint / CONFIG_NAME} ({detail})") from None
     return network.eval(), meta
+
+
+def check_marker(checkpoint: Path) -> None:
+    """Refuse a published checkpoint of another format version; a run's own folder has no marker.
+
+    Raises:
+        CheckpointError: Naming the version found and the one expected.
+    """
+    marker = checkpoint / MARKER_NAME
+    if not marker.is_file():
+        return
+    try:
+        found = read_yaml(marker).get("format")
+    except ConfigError as error:
+        raise CheckpointError(str(error)) from None
+    if found != CHECKPOINT_FORMAT:
+        raise CheckpointError(f"{marker}: format is {found!r}, expected {CHECKPOINT_FORMAT!r}")
 
 
 def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:

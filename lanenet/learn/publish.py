@@ -10,10 +10,8 @@ import yaml
 
 from lanenet.data.files import atomic_folder, write_json, write_text
 from lanenet.errors import CheckpointError
+from lanenet.learn.export import CHECKPOINT_FORMAT, MARKER_NAME
 from lanenet.learn.run_state import METRICS_NAME, STATE_NAME
-
-FORMAT = "lanenet-checkpoint/1"
-_MARKER_NAME = "checkpoint.yaml"
 
 
 def publish(
@@ -50,5 +48,5 @@ def publish(
                 (folder / file_name).write_bytes(content)
         if results is not None:
             write_json(folder / "results.json", results)
-        marker = {"format": FORMAT, "name": name}
-        write_text(folder / _MARKER_NAME, yaml.safe_dump(marker, sort_keys=False))
+        marker = {"format": CHECKPOINT_FORMAT, "name": name}
+        write_text(folder / MARKER_NAME, yaml.safe_dump(marker, sort_keys=False))

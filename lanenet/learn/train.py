@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lanenet.data.label_set import read_labels
-from lanenet.errors import LanenetError
+from lanenet.errors import LabelFormatError, LanenetError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
 from lanenet.learn.evaluate import ErrorTable, point_errors
@@ -256,6 +256,11 @@ def _read_both(
 ) -> tuple[LaneSamples, LaneSamples]:
     train_sets = [read_labels(path) for path in train_paths]
     val_sets = [read_labels(path) for path in val_paths]
+    for path, labels in zip(train_paths, train_sets, strict=True):
+        if labels.meta.source != "map":
+            raise LabelFormatError(
+                f"{path}: labels from the {labels.meta.source}; a network learns from maps, truth only scores it"
+            )
     samples = LaneSamples(train_sets, [str(p) for p in train_paths], settings.min_quality)
     val = LaneSamples(val_sets, [str(p) for p in val_paths])
     check_same(train_sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))

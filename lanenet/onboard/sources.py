@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drive import open_drive
+from lanenet.data.recording import read_image
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.camera import Camera
 
@@ -99,10 +99,7 @@ def _is_photo(path: Path) -> bool:
 
 def _photos(path: Path, files: list[Path]) -> Source:
     def image(i: int) -> UInt8[np.ndarray, "h w 3"]:
-        frame = cv2.imread(str(files[i]), cv2.IMREAD_COLOR)
-        if frame is None:
-            raise DriveFormatError(f"{files[i]}: cannot be read as an image")
-        return np.asarray(frame)
+        return read_image(files[i])
 
     count = len(files)
     times = np.full(count, np.nan)

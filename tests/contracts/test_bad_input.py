@@ -162,7 +162,7 @@ def test_outputs_that_are_not_ours_are_kept(tmp_path, drive):
     assert result.exit_code == 1 and (keep / "thesis.txt").read_text() == "years of work"
 
 
-def test_noise_is_not_mapped(tmp_path, drive):
+def test_a_drive_that_shows_nothing_is_not_mapped(tmp_path, drive):
     shutil.rmtree(drive / "images")
     (drive / "images").mkdir()
     for k in range(70):

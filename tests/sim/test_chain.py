@@ -144,8 +144,10 @@ def test_a_killed_train_resumes(tmp_path, finished):
         while process.poll() is None and not ready():
             assert time.monotonic() < deadline
             time.sleep(0.02)
+        assert ready() and process.poll() is None
         process.send_signal(signal.SIGKILL)
         process.communicate()
+        assert process.returncode == -signal.SIGKILL
 
     labels = tmp_path / "work" / "synthetic" / "labels"
     kill_when(lambda: (labels / "train_00.parquet").is_file())

@@ -8,9 +8,12 @@ from hypothesis.extra import numpy as hnp
 
 from lanenet.geometry.frames import (
     car_from_map,
+    car_from_ros,
     donkey_angle_from_steering,
+    left_from_donkey,
     map_from_car,
     map_from_car_directions,
+    ros_from_car,
     steering_from_donkey_angle,
     wrap_angle,
 )
@@ -104,3 +107,18 @@ def test_donkeycar_angle_round_trip(angle: float, max_steering_rad: float) -> No
     assert donkey_angle_from_steering(steering_rad, max_steering_rad) == pytest.approx(angle, abs=1e-12)
     # Left is negative for Donkeycar and positive here.
     assert steering_rad * angle <= 0.0
+
+
+@given(
+    st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300)), min_size=1, max_size=5), st.floats(5, 60)
+)
+def test_ros_round_trip_and_axes(points, wheelbase_cm):
+    points_cm = np.array(points)
+    ros_m = ros_from_car(points_cm, wheelbase_cm)
+    np.testing.assert_allclose(car_from_ros(ros_m, wheelbase_cm), points_cm, atol=1e-9)
+    # One metre ahead of the front axle and 20 cm to the right of it.
+    np.testing.assert_allclose(ros_from_car(np.array([[20.0, 100.0]]), 26.0), [[1.26, -0.2]])
+
+
+def test_donkeycars_left_is_positive():
+    np.testing.assert_array_equal(left_from_donkey(np.array([-1.0, 0.25])), [1.0, -0.25])
