@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
@@ -175,19 +175,16 @@ def find_segments(binary: UInt8[np.ndarray, "r c"], settings: HoughLineSettings)
     if found is None:
         return []
     # OpenCV 4 answers (n, 1, 4), OpenCV 5 (n, 4).
-    ends = np.asarray(found).reshape(-1, 4)
-    return [
-        Segment.between((float(x1), float(y1)), (float(x2), float(y2)))
-        for x1, y1, x2, y2 in ends
-        if support((x1, y1, x2, y2), binary) >= settings.min_support
-    ]
+    segments = []
+    for x1, y1, x2, y2 in np.asarray(found).reshape(-1, 4).tolist():
+        if support((x1, y1, x2, y2), binary) >= settings.min_support:
+            segments.append(Segment.between((float(x1), float(y1)), (float(x2), float(y2))))
+    return segments
 
 
-def support(
-    ends: tuple[int, int, int, int] | Int[np.ndarray, "4"], binary: UInt8[np.ndarray, "r c"]
-) -> float:
+def support(ends: tuple[int, int, int, int], binary: UInt8[np.ndarray, "r c"]) -> float:
     """Return the share of a segment's pixels that are contour, ends included."""
-    x1, y1, x2, y2 = (int(v) for v in ends)
+    x1, y1, x2, y2 = ends
     steps = max(abs(x2 - x1), abs(y2 - y1)) + 1
     x = np.rint(np.linspace(x1, x2, steps)).astype(np.intp)
     y = np.rint(np.linspace(y1, y2, steps)).astype(np.intp)

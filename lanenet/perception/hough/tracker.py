@@ -190,19 +190,19 @@ class HoughTracker:
         edges = self.settings.edges
         sx, sy = frame_width / edges.width_px, frame_height / edges.height_px
 
-        def polyline(line: Line, top: float) -> Polyline | None:
-            # From the bottom of the region, or from where the line leaves it, up to its top.
+        def polyline(line: Line) -> Polyline | None:
+            # Straight through the whole region, as the paper takes it, or up to where the line leaves it.
             ends: list[Point] = []
-            for y in (float(edges.roi_height_px - 1), top):
+            for y in (edges.roi_height_px - 1.0, 0.0):
                 x = min(max(lines.x_at(line, y), 0.0), edges.width_px - 1.0)
                 y = line.m * x + line.b
                 ends.append(((x + 0.5) * sx - 0.5, (y + edges.roi_top_px + 0.5) * sy - 0.5))
             inside = all(-1.0 <= v <= frame_height for _, v in ends)
             return sample_segment(ends[0], ends[1]) if inside and ends[0] != ends[1] else None
 
-        memory = (polyline(line, 0.0) for line in (self.state.left, self.state.right) if line is not None)
+        memory = (polyline(line) for line in (self.state.left, self.state.right) if line is not None)
         return ImageLane(
-            None if left is None else polyline(left.line, left.y2),
-            None if right is None else polyline(right.line, right.y2),
+            None if left is None else polyline(left.line),
+            None if right is None else polyline(right.line),
             tuple(line for line in memory if line is not None),
         )
