@@ -20,8 +20,8 @@ from lanenet.perception.painter.painter import LanePainter, PainterSettings
 pytestmark = pytest.mark.slow
 LOG = logging.getLogger(__name__)
 
-#: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is a
-#: guess for the first, and for the others the median of what the painter measured with that camera.
+#: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
+#: a guess for the first, and for the others the median of what the painter measured with that camera.
 TUBS = {
     "donkey_circuit": (80.0, -0.03, 15.0, 59.0),
     "usi_mat": (105.0, -0.05, 18.0, 31.0),
