@@ -52,6 +52,8 @@ class DetectorName(StrEnum):
 
     NETWORK = "network"
     LANE_FILTER = "lane-filter"
+    HOUGH = "hough"
+    PAINTER = "painter"
 
 
 class _Group(TyperGroup):
@@ -306,11 +308,14 @@ def detect(
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and go on.")
     ] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML with the settings of hough or painter.", show_default=False)
+    ] = None,
 ) -> None:
-    """Run a detector over a photo, a video, a drive or a tub."""
+    """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
     from lanenet.data.camera_file import read_camera
     from lanenet.onboard.detect import run_detector
-    from lanenet.onboard.detectors import build_detector
+    from lanenet.onboard.detectors import WITHOUT_CAMERA, build_detector
     from lanenet.onboard.sources import open_source
 
     _check_ending(out, ".parquet", ".csv")
@@ -318,7 +323,7 @@ def detect(
     if frames is not None:
         opened = opened.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
-    if used_camera is None:
+    if used_camera is None and detector.value not in WITHOUT_CAMERA:
         raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
     chosen = build_detector(
         detector.value,
@@ -327,6 +332,7 @@ def detect(
         lane_width_cm=lane_width if lane_width is not None else opened.lane_width_cm,
         marking_cm=marking,
         any_camera=any_camera,
+        config=config,
     )
     with console.progress_bar(f"detect ({detector.value})") as progress:
         report = run_detector(
@@ -340,6 +346,7 @@ def detect(
     console.wrote(report.out, report.video)
     if report.video is None:
         options = {"--model": model, "--camera": camera, "--lane-width": lane_width, "--marking": marking}
+        options["--config"] = config
         given = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
         given += ["--any-camera"] if any_camera else []
         again = ("detect", source, "--detector", detector.value, *given, "--out", out)

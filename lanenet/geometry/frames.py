@@ -76,7 +76,7 @@ def map_from_car_directions(
 
 
 def ros_from_car(points_car_cm: Float[np.ndarray, "n 2"], wheelbase_cm: float) -> Float[np.ndarray, "n 2"]:
-    """Express points in ROS's ``base_link``: metres, x ahead, y to the left, origin at the rear axle (REP 103)."""
+    """Express points in ROS's ``base_link`` (REP 103): metres, x ahead, y left, origin at the rear axle."""
     ahead = points_car_cm[:, 1] + wheelbase_cm
     return np.stack([0.01 * ahead, -0.01 * points_car_cm[:, 0]], axis=1)
 

@@ -259,7 +259,8 @@ def _read_both(
     for path, labels in zip(train_paths, train_sets, strict=True):
         if labels.meta.source != "map":
             raise LabelFormatError(
-                f"{path}: labels from the {labels.meta.source}; a network learns from maps, truth only scores it"
+                f"{path}: labels from the {labels.meta.source}; a network learns from maps, "
+                "the truth only scores it"
             )
     samples = LaneSamples(train_sets, [str(p) for p in train_paths], settings.min_quality)
     val = LaneSamples(val_sets, [str(p) for p in val_paths])

@@ -20,6 +20,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.onboard.sources import Source
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.image_lane import ImageLane
 
 #: Annotated frames are enlarged to at least this width, so that the text can be read.
 VIDEO_WIDTH_PX = 640
@@ -55,7 +56,7 @@ class DetectReport:
 def run_detector(
     source: Source,
     detector: Detector,
-    camera: Camera,
+    camera: Camera | None,
     out: Path,
     video: Path | None = None,
     progress: Progress | None = None,
@@ -70,7 +71,7 @@ def run_detector(
     Args:
         source: The frames.
         detector: Any detector.
-        camera: Camera of the frames, for drawing.
+        camera: Camera of the frames, for drawing; None where the detector does without.
         out: Table of detections, ``.parquet`` or ``.csv``.
         video: Annotated video (mp4v), or None.
         progress: Called with (frames done, frames).
@@ -115,7 +116,8 @@ def run_detector(
             table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
             if writer is not None:
                 rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
-                writer.add(frame, estimate, f"{source.frames[i]}{rate}")
+                lane = getattr(detector, "last", None) if frame is not None else None
+                writer.add(frame, estimate, f"{source.frames[i]}{rate}", lane)
             if progress is not None:
                 progress(i + 1, len(source))
         if not times_s:
@@ -132,22 +134,63 @@ def run_detector(
 class _AnnotatedVideo:
     """Writes annotated frames to a temporary name; the stack moves the file into place or removes it."""
 
-    def __init__(self, stack: ExitStack, path: Path, camera: Camera, rate_hz: float) -> None:
-        self.path, self.camera = path, camera
-        self.scale = max(1, -(-VIDEO_WIDTH_PX // camera.width))
-        size = (camera.width * self.scale, camera.height * self.scale)
-        temporary = stack.enter_context(atomic_file(path))
-        self._writer: Any = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
+    def __init__(self, stack: ExitStack, path: Path, camera: Camera | None, rate_hz: float) -> None:
+        self.path, self.camera, self.rate_hz = path, camera, rate_hz
+        self._temporary = stack.enter_context(atomic_file(path))
+        self._writer: Any = None
+        #: Width and height of the frames; without a camera those of the first that can be read.
+        self._size: tuple[int, int] | None = None
+        #: Captions of the unreadable frames before that one.
+        self._waiting: list[str] = []
         # Released before the file is moved: the stack undoes in reverse.
-        stack.callback(self._writer.release)
+        stack.callback(self._release)
+        if camera is not None:
+            self._open(camera.width, camera.height)
+
+    def _open(self, width: int, height: int) -> None:
+        self._size = (width, height)
+        self.scale = max(1, -(-VIDEO_WIDTH_PX // width))
+        size = (width * self.scale, height * self.scale)
+        codec = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer = cv2.VideoWriter(str(self._temporary), codec, self.rate_hz, size)
         if not self._writer.isOpened():
-            raise DriveFormatError(f"{path}: OpenCV cannot write mp4v video of {size[0]}x{size[1]} here")
+            raise DriveFormatError(f"{self.path}: OpenCV cannot write mp4v video of {size[0]}x{size[1]} here")
+
+    def _release(self) -> None:
+        if self._writer is not None:
+            self._writer.release()
 
     def add(
-        self, frame_bgr: UInt8[np.ndarray, "h w *c"] | None, estimate: LaneEstimate, caption: str
+        self,
+        frame_bgr: UInt8[np.ndarray, "h w *c"] | None,
+        estimate: LaneEstimate,
+        caption: str,
+        image_lane: ImageLane | None = None,
     ) -> None:
         if frame_bgr is None:
-            # A black frame keeps the video in step with the table.
-            frame_bgr = np.zeros((self.camera.height, self.camera.width, 3), np.uint8)
             caption += "  unreadable"
-        self._writer.write(draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption))
+            if self._size is None:
+                self._waiting.append(caption)
+                return
+            # A black frame keeps the video in step with the table.
+            frame_bgr = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        if self._size is None:
+            self._open(frame_bgr.shape[1], frame_bgr.shape[0])
+            for text in self._waiting:
+                self._write(np.zeros_like(frame_bgr), LaneEstimate(), text, None)
+        self._write(frame_bgr, estimate, caption, image_lane)
+
+    def _write(
+        self,
+        frame_bgr: UInt8[np.ndarray, "h w *c"],
+        estimate: LaneEstimate,
+        caption: str,
+        image_lane: ImageLane | None,
+    ) -> None:
+        assert self._size is not None
+        picture = draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption, image_lane)
+        size = (self._size[0] * self.scale, self._size[1] * self.scale)
+        if (picture.shape[1], picture.shape[0]) != size:
+            # Photos of a folder may differ in size.
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+        self._writer.write(picture)

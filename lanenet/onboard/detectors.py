@@ -8,42 +8,59 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.config import check_settings
+from lanenet.config import check_settings, load_settings
 from lanenet.data.label_set import LabelSet
-from lanenet.errors import ConfigError
+from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector
+from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
 from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
 from lanenet.perception.network import NetworkDetector
+from lanenet.perception.painter.painter import LanePainter, PainterSettings
 
-DetectorName = Literal["network", "lane-filter"]
+DetectorName = Literal["network", "lane-filter", "hough", "painter"]
+#: These answer with lines of the image and a steering even without a camera.
+WITHOUT_CAMERA = ("hough", "painter")
 
 
 def build_detector(
     name: DetectorName,
-    camera: Camera,
+    camera: Camera | None,
     *,
     model: Path | None = None,
     lane_width_cm: float | None = None,
     marking_cm: float | None = None,
     any_camera: bool = False,
+    config: Path | None = None,
 ) -> Detector:
     """Build a detector for a camera.
 
     Args:
         name: Which one.
-        camera: Camera of the frames.
+        camera: Camera of the frames; ``hough`` and ``painter`` do without, but then know no centimetres.
         model: ONNX file, needed by ``network``.
         lane_width_cm: Between the middles of the two lines, needed by ``lane-filter``.
         marking_cm: Thickness of the tape for ``lane-filter``; None takes its default.
         any_camera: Accept a model that was trained with another camera.
+        config: YAML with the settings of ``hough`` or ``painter``; None takes the defaults.
 
     Raises:
         ConfigError: If something that the detector needs is missing or out of range.
         ModelMismatchError: If the model cannot be used with this camera.
         CalibrationError: If the camera sees no road.
     """
+    if config is not None and name not in WITHOUT_CAMERA:
+        raise ConfigError(f"detector {name}: takes no settings file, found {config}")
+    if name == "hough":
+        return HoughTracker(
+            camera, HoughSettings() if config is None else load_settings(HoughSettings, config)
+        )
+    if name == "painter":
+        painter = PainterSettings() if config is None else load_settings(PainterSettings, config)
+        return LanePainter(camera, painter)
+    if camera is None:
+        raise CalibrationError(f"detector {name}: expected a camera (--camera camera.yaml)")
     if name == "network":
         if model is None:
             raise ConfigError("detector network: expected a model (--model MODEL.onnx)")

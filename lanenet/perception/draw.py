@@ -11,9 +11,13 @@ from jaxtyping import Float, UInt8
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM, SIDES
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.image_lane import ImageLane, Polyline
 
 #: BGR; the left line is green, the right one orange, the steering arrow yellow.
 LEFT_BGR, RIGHT_BGR, ARROW_BGR, TEXT_BGR = (80, 220, 80), (40, 140, 255), (60, 230, 250), (255, 255, 255)
+#: Lines that a detector remembers from earlier frames are blue, as in Suto's video.
+MEMORY_BGR, FILL_BGR = (255, 120, 60), (60, 180, 60)
+_FILL_SHARE = 0.35
 FAR_CM = 40.0
 _SAMPLES = 41
 # OpenCV draws in fixed point: this many bits below a pixel.
@@ -23,24 +27,41 @@ _SHIFT = 4
 def draw_estimate(
     frame_bgr: UInt8[np.ndarray, "h w *c"],
     estimate: LaneEstimate,
-    camera: Camera,
+    camera: Camera | None = None,
     scale: int = 1,
     caption: str = "",
+    image_lane: ImageLane | None = None,
 ) -> UInt8[np.ndarray, "sh sw 3"]:
     """Draw the two parabolas (y = 0 to 40 cm), the six points and the steering target into a frame.
 
     Args:
         frame_bgr: Colour or gray frame; it is not changed.
         estimate: What a detector answered; what it does not know is not drawn.
-        camera: Camera of the frame.
+        camera: Camera of the frame; without one the points on the road are not drawn.
         scale: Whole factor by which the picture is enlarged, so that lines stay thin on small frames.
         caption: Text for the top left corner.
+        image_lane: Lines of the image, drawn under the rest.
 
     Returns:
         A new picture, ``scale`` times the frame's size.
     """
     picture = _enlarged(frame_bgr, scale)
     thickness = max(1, round(picture.shape[1] / 320))
+    if image_lane is not None:
+        _draw_image_lane(picture, image_lane, scale, 2 * thickness)
+        caption = f"{caption}  {image_lane.text}".strip()
+    if camera is not None:
+        _draw_road(picture, estimate, camera, scale, thickness)
+    _draw_arrow(picture, estimate.steering_rad, 2 * thickness)
+    if caption:
+        _draw_text(picture, caption, thickness)
+    return picture
+
+
+def _draw_road(
+    picture: UInt8[np.ndarray, "h w 3"], estimate: LaneEstimate, camera: Camera, scale: int, thickness: int
+) -> None:
+    """The parabolas and the six points."""
     y_cm = np.linspace(0.0, FAR_CM, _SAMPLES)
     for side, colour in enumerate((LEFT_BGR, RIGHT_BGR)):
         x_cm = np.polyval(estimate.parabolas[side], y_cm)
@@ -53,10 +74,24 @@ def draw_estimate(
             centre = _fixed(point)
             cv2.circle(picture, centre, (3 * thickness) << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
             cv2.circle(picture, centre, (3 * thickness) << _SHIFT, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
-    _draw_arrow(picture, estimate.steering_rad, 2 * thickness)
-    if caption:
-        _draw_text(picture, caption, thickness)
-    return picture
+
+
+def _draw_image_lane(
+    picture: UInt8[np.ndarray, "h w 3"], lane: ImageLane, scale: int, thickness: int
+) -> None:
+    def enlarged(line_px: Polyline) -> Polyline:
+        return np.asarray((line_px + 0.5) * scale - 0.5)
+
+    if lane.filled and lane.left_px is not None and lane.right_px is not None:
+        outline = enlarged(np.concatenate([lane.left_px, lane.right_px[::-1]]))
+        filled = picture.copy()
+        cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], FILL_BGR)
+        cv2.addWeighted(filled, _FILL_SHARE, picture, 1.0 - _FILL_SHARE, 0.0, dst=picture)
+    for line_px in lane.memory_px:
+        _draw_polyline(picture, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
+    for side_px, colour in ((lane.left_px, LEFT_BGR), (lane.right_px, RIGHT_BGR)):
+        if side_px is not None:
+            _draw_polyline(picture, enlarged(side_px), colour, thickness)
 
 
 def _enlarged(frame_bgr: UInt8[np.ndarray, "h w *c"], scale: int) -> UInt8[np.ndarray, "sh sw 3"]:

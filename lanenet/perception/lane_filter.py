@@ -31,6 +31,8 @@ class LaneFilterSettings(Settings):
             pixel (6 mm), so a single one seldom holds all four edges.
         row_tolerance_cm: How far from the wanted row a row is looked for when that one has no lane.
         look_ahead_cm: Distance of the point A that is steered at.
+        max_edge_share: With more edge points than this share of the pixels that see the road, every distance
+            occurs by chance, and a frame gives no lane.
     """
 
     lane_width_cm: float = Field(gt=0.0)
@@ -41,6 +43,7 @@ class LaneFilterSettings(Settings):
     row_cm: float = Field(default=0.6, gt=0.0)
     row_tolerance_cm: float = Field(default=2.4, ge=0.0)
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
+    max_edge_share: float = Field(default=0.15, gt=0.0, le=1.0)
 
 
 def find_row(
@@ -146,7 +149,11 @@ class LaneFilter:
         """
         if self.extractor is None:
             raise CalibrationError("lane filter: built without a camera, it takes edge points, not frames")
-        return self.estimate(self.extractor.extract(frame_bgr).points_cm)
+        points_cm = self.extractor.extract(frame_bgr).points_cm
+        if len(points_cm) > self.settings.max_edge_share * np.count_nonzero(self.extractor.table.keep):
+            self.reset()
+            return LaneEstimate()
+        return self.estimate(points_cm)
 
     def estimate(self, points_cm: Float[np.ndarray, "n 2"]) -> LaneEstimate:
         """Find the lane in the edge points of one frame.

@@ -222,3 +222,15 @@ def test_settings_need_the_lane_width() -> None:
         check_settings(LaneFilterSettings, {}, "test")
     with pytest.raises(ConfigError, match="marking_cm"):
         check_settings(LaneFilterSettings, {"lane_width_cm": 40.0, "marking_cm": 0.0}, "test")
+
+
+def test_eq_3_by_hand() -> None:
+    """L = -15, R = 25 and so A = 5 on the row 15 cm ahead: atan(5 / 15) to the right."""
+    x = np.array([-16.0, -14.0, 24.0, 26.0])
+    points = np.concatenate([np.stack([x, np.full(4, y)], axis=1) for y in (15.0, 30.0)])
+    estimate = LaneFilter(None, SETTINGS).estimate(points)
+    assert estimate.points_cm == pytest.approx([-15.0, -15.0, -15.0, 25.0, 25.0, 25.0])
+    assert estimate.steering_rad == pytest.approx(-0.3217506, abs=1e-6)
+    far = LaneFilter(None, SETTINGS.model_copy(update={"look_ahead_cm": 30.0})).estimate(points)
+    # atan(5 / 30)
+    assert far.steering_rad == pytest.approx(-0.1651487, abs=1e-6)

@@ -1,0 +1,1 @@
+"""Pentek's lane painter: contrast, V channel, Canny, trapezoid, Hough lines; then windows and curves."""

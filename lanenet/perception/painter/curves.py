@@ -1,0 +1,142 @@
+"""What Pentek wished for: sliding windows over the bird's-eye view, a polynomial, its radius of curvature.
+
+Edge points are moved to the plane; no image is warped. The plane is the road in cm where a camera is known,
+and otherwise the trapezoid stretched to the unit square. In both x points right and y ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from lanenet.config import Settings
+
+
+class CurveSettings(Settings):
+    """How a line of the plane is followed.
+
+    Attributes:
+        windows: Windows from the near to the far end.
+        min_points: Points that a window needs to move the next one.
+        min_span_share: Least part of the length over which a curve must have points.
+        half_width_share: Half the width of a window in the unit square.
+        half_width_heights: Half the width of a window on the road, in camera heights.
+    """
+
+    windows: int = Field(default=9, ge=3)
+    min_points: int = Field(default=4, ge=1)
+    min_span_share: float = Field(default=0.5, gt=0.0, le=1.0)
+    half_width_share: float = Field(default=0.05, gt=0.0)
+    half_width_heights: float = Field(default=0.3, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """x = a y^2 + b y + c between two rows of the plane.
+
+    Attributes:
+        a: Half the curvature on the axis.
+        b: Slope at y = 0.
+        c: x at y = 0.
+        near: Lowest y with points.
+        far: Highest y with points.
+    """
+
+    a: float
+    b: float
+    c: float
+    near: float
+    far: float
+
+    def sample(self, start: float | None = None, count: int = 31) -> Float[np.ndarray, "_ 2"]:
+        """Return points along the curve, near to far; from ``start`` to its near end along its tangent."""
+        first = self.near if start is None else min(start, self.near)
+        y = np.linspace(first, self.far, count)
+        on_curve = np.maximum(y, self.near)
+        x = (self.a * on_curve + self.b) * on_curve + self.c
+        x += (2.0 * self.a * self.near + self.b) * (y - on_curve)
+        return np.stack([x, y], axis=1)
+
+
+def slide_windows(
+    points: Float[np.ndarray, "n 2"],
+    guess: Float[np.ndarray, "m 2"],
+    half_width: float,
+    settings: CurveSettings,
+) -> Float[np.ndarray, "k 2"]:
+    """Collect the points of one line, window by window from near to far.
+
+    Each window lies on the guessed line, moved sideways by as much as the points in the window before lay
+    beside it, so that the windows follow a curve away from the straight line.
+
+    Args:
+        points: All edge points of the plane.
+        guess: The line that straight segments gave, in the plane, near to far.
+        half_width: Half the width of a window.
+        settings: Number of windows and points.
+
+    Returns:
+        The points that fell into the windows.
+
+    Source:
+        Pentek, section 2, fourth and fifth paper described there.
+    """
+    if len(points) == 0 or len(guess) < 2:
+        return np.empty((0, 2))
+    rows = np.linspace(guess[0, 1], guess[-1, 1], settings.windows + 1)
+    beside = points[:, 0] - np.interp(points[:, 1], guess[:, 1], guess[:, 0])
+    offset, chosen = 0.0, np.zeros(len(points), bool)
+    for low, high in pairwise(rows.tolist()):
+        inside = (points[:, 1] >= low) & (points[:, 1] <= high) & (np.abs(beside - offset) <= half_width)
+        chosen |= inside
+        if np.count_nonzero(inside) >= settings.min_points:
+            offset = float(beside[inside].mean())
+    return points[chosen]
+
+
+def fit_curve(points: Float[np.ndarray, "n 2"], length: float, settings: CurveSettings) -> Curve | None:
+    """Fit a parabola to the points of one line, or None if they cover too little of the length.
+
+    The rows are scaled to -1..1 for the fit, so that centimetres and shares are fitted alike.
+    """
+    if len(points) < 3 * settings.min_points:
+        return None
+    near, far = float(points[:, 1].min()), float(points[:, 1].max())
+    if far - near < settings.min_span_share * length:
+        return None
+    middle, half = 0.5 * (far + near), 0.5 * (far - near)
+    t = (points[:, 1] - middle) / half
+    if len(np.unique(t)) < 3:
+        return None
+    p, q, r = np.polyfit(t, points[:, 0], 2)
+    # x = p t^2 + q t + r with t = (y - middle) / half, written out in y.
+    a = p / half**2
+    b = q / half - 2.0 * a * middle
+    return Curve(float(a), float(b), float(r - q * middle / half + a * middle**2), near, far)
+
+
+def curvature_radius(curve: Curve, y: float) -> float:
+    """Return R = (1 + (2 a y + b)^2)^(3/2) / |2 a|, in the plane's unit; infinite for a straight line.
+
+    Source:
+        Radius of the osculating circle of a graph; tested with points of a circle.
+    """
+    if curve.a == 0.0:
+        return math.inf
+    return float((1.0 + (2.0 * curve.a * y + curve.b) ** 2) ** 1.5 / abs(2.0 * curve.a))
+
+
+def mean_curve(left: Curve, right: Curve) -> Curve:
+    """Return the middle between two curves, over the rows that either has."""
+    return Curve(
+        0.5 * (left.a + right.a),
+        0.5 * (left.b + right.b),
+        0.5 * (left.c + right.c),
+        min(left.near, right.near),
+        max(left.far, right.far),
+    )

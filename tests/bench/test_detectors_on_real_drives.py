@@ -1,0 +1,87 @@
+"""The three papers' detectors on real videos and tubs; run with ``-m slow -s`` to see the figures."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lanenet.data.drive import open_drive
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.onboard.detectors import build_detector
+from lanenet.onboard.sources import open_source
+from lanenet.perception.estimate import Detector
+from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
+from lanenet.perception.painter.painter import LanePainter, PainterSettings
+
+pytestmark = pytest.mark.slow
+LOG = logging.getLogger(__name__)
+
+#: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
+#: a guess for the first, and for the others the median of what the painter measured with that camera.
+TUBS = {
+    "donkey_circuit": (80.0, -0.03, 15.0, 59.0),
+    "usi_mat": (105.0, -0.05, 18.0, 31.0),
+    "garage_tape": (86.0, -0.07, 13.0, 41.0),
+}
+
+
+def rough_camera(tub: str) -> Camera:
+    focal, k1, pitch_deg, _ = TUBS[tub]
+    K = np.array([[focal, 0.0, 79.5], [0.0, focal, 59.5], [0.0, 0.0, 1.0]])
+    mounting = Mounting(17.0, float(np.deg2rad(pitch_deg)))
+    return Camera("fisheye", 160, 120, K, np.array([k1, 0.0, 0.0, 0.0]), mounting, 26.0)
+
+
+@pytest.mark.parametrize(("name", "least"), [("solidWhiteRight", 0.98), ("udacity_test_video", 0.9)])
+def test_painter_finds_both_lines_of_a_road(shared_data: Path, name: str, least: float) -> None:
+    source = open_source(shared_data / "road" / f"{name}.mp4")
+    painter = LanePainter()
+    both = np.array([painter.detect(source.image(i)).confidence == 1.0 for i in range(len(source))])
+    LOG.warning("painter, %s: both lines in %d of %d frames", name, both.sum(), both.size)
+    assert both.mean() >= least
+
+
+def test_painter_finds_both_lines_of_the_photos(shared_data: Path) -> None:
+    painter = LanePainter(None, PainterSettings(mode="photo"))
+    photos = sorted((shared_data / "road").glob("*photos/*.jpg"))
+    missed = [p.name for p in photos if painter.detect(cv2.imread(str(p))).confidence < 1.0]
+    LOG.warning("painter: both lines in %d of %d photos", len(photos) - len(missed), len(photos))
+    assert len(photos) == 14 and not missed
+
+
+@pytest.mark.parametrize("tub", TUBS)
+def test_steering_beside_the_drivers(shared_data: Path, tub: str) -> None:
+    drive = open_drive(shared_data / tub)
+    assert drive.commands.angle is not None
+    # Donkeycar's -1 is left.
+    driver = -drive.commands.angle
+    camera = rough_camera(tub)
+    value = HoughSettings.model_validate({"edges": {"channel": "value"}})
+    compared: dict[str, Detector] = {
+        "hough": HoughTracker(camera),
+        "hough, V channel": HoughTracker(camera, value),
+        "painter": LanePainter(camera),
+        "lane filter": build_detector("lane-filter", camera, lane_width_cm=TUBS[tub][3]),
+        "lane filter, 5 cm tape": build_detector(
+            "lane-filter", camera, lane_width_cm=TUBS[tub][3], marking_cm=5.08
+        ),
+    }
+    for name, detector in compared.items():
+        steering, confidence = np.full(len(drive), np.nan), np.zeros(len(drive))
+        for i in range(len(drive)):
+            if drive.breaks[i]:
+                detector.reset()
+            estimate = detector.detect(drive.image(i))
+            steering[i], confidence[i] = estimate.steering_rad, estimate.confidence
+        known = np.isfinite(steering) & np.isfinite(driver)
+        enough = known.sum() > 10 and np.std(steering[known]) > 0.0
+        r = np.corrcoef(steering[known], driver[known])[0, 1] if enough else float("nan")
+        LOG.warning(
+            "%s, %s: lane in %d, one line or row in %d, steering in %d of %d frames; r = %.2f",
+            *(tub, name, (confidence == 1.0).sum(), (confidence == 0.5).sum(), known.sum(), len(drive), r),
+        )
+        assert np.abs(steering[known]).max(initial=0.0) <= np.pi / 2.0
