@@ -185,7 +185,7 @@ def test_every_synthetic_drive_has_a_seed_of_its_own_that_stays(tmp_path):
 
 
 def test_a_run_without_drives_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no drives"):
+    with pytest.raises(ConfigError, match="no train drives"):
         prepare(DataSettings(), tmp_path)
     assert not any(tmp_path.iterdir())
 

@@ -20,7 +20,7 @@ def make_label_set(
     window: BirdseyeWindow = WINDOW,
     camera_hash: str = "cam0",
     wheelbase_cm: float = 26.0,
-    source: Literal["map", "truth"] = "truth",
+    source: Literal["map", "truth"] = "map",
 ) -> LabelSet:
     """Both edges of a 2 cm tape on each side of a 40 cm lane, seen from 8 cm ahead of the car."""
     rng = np.random.default_rng(seed)

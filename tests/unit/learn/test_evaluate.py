@@ -62,7 +62,7 @@ def test_without_answers_there_is_no_number():
 
 
 def test_detectors_are_compared_on_common_points():
-    sets = [make_label_set(5, 0), make_label_set(5, 1)]
+    sets = [make_label_set(5, 0, source="truth"), make_label_set(5, 1, source="truth")]
 
     def shy(labels):
         answer = labels.points_cm + 1.0

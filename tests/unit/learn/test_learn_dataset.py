@@ -15,7 +15,7 @@ def samples(n=50, seed=0):
 
 
 def test_frames_of_two_sets_stay_in_order(tmp_path):
-    a, b = make_label_set(3, 0), make_label_set(4, 1, camera_hash="cam1", source="map")
+    a, b = make_label_set(3, 0, source="truth"), make_label_set(4, 1, camera_hash="cam1", source="map")
     write_labels(tmp_path / "a.parquet", a)
     write_labels(tmp_path / "b.parquet", b)
     both = read_samples([tmp_path / "a.parquet", tmp_path / "b.parquet"])

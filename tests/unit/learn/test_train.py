@@ -95,7 +95,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     assert load_settings(LearnSettings, finished.folder / "config.yaml") == TINY
     metrics = json.loads((finished.folder / "metrics.json").read_text())
     assert metrics["val_rmse_cm"] == finished.val_rmse_cm
-    assert metrics["val"]["reference"] == "truth"
+    assert metrics["val"]["reference"] == "map"
     with (finished.folder / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["epoch"]) for row in rows] == [1, 2, 3]
@@ -184,3 +184,9 @@ def test_learning_rate_rises_and_falls():
     assert int(np.argmax(rates)) == 10 and rates[10] == 1.0
     assert (np.diff(rates[:11]) > 0).all() and (np.diff(rates[10:]) < 0).all()
     assert 0.0 < rates[0] < 0.2 and 0.0 < rates[-1] < 1e-3
+
+
+def test_a_network_does_not_learn_from_the_truth(tmp_path):
+    write_labels(tmp_path / "t.parquet", make_label_set(4, 0, source="truth"))
+    with pytest.raises(LabelFormatError, match=r"t\.parquet.*truth"):
+        train(LearnSettings(epochs=1), [tmp_path / "t.parquet"], [tmp_path / "t.parquet"], tmp_path / "run")

@@ -153,6 +153,9 @@ def test_photos_of_different_sizes_make_one_video(tmp_path: Path) -> None:
     (folder / "00.png").write_bytes(b"no picture")
     out, annotated = tmp_path / "l.csv", tmp_path / "l.mp4"
     words = ["detect", str(folder), "--detector", "painter", "--out", str(out), "--video", str(annotated)]
+    refused = CliRunner().invoke(cli.app, words)
+    assert refused.exit_code == 1 and "00.png" in refused.stderr and not out.exists()
+    words.append("--skip-unreadable")
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 0, result.output
     assert len(read_detections(out).frame) == 4
