@@ -205,7 +205,8 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
         "role": role,
         "name": name,
         "simulation": simulation,
-        "map": settings.map,
+        # The simulated camera does not see its car.
+        "map": settings.map.model_copy(update={"find_bumper": False}),
         "window": settings.window,
         "folder": work_dir / "synthetic",
     }
@@ -312,7 +313,7 @@ def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder:
     if not (_is_done(whole, key) and all(path.is_file() for path in parts.values())):
         _marker(whole).unlink(missing_ok=True)
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
-        label_map(drive_map, whole, perception=settings.map.perception, window=window)
+        label_map(drive_map, whole, window=window)
         shares = (settings.train_share, settings.validation_share)
         pieces = split_along_time(read_labels(whole), shares, settings.gap_frames)
         for path, piece in zip(parts.values(), pieces, strict=True):

@@ -18,9 +18,23 @@ SETTINGS_NAME = "settings.yaml"
 
 
 class MapSettings(Settings):
-    """Everything that mapping a drive can be told; the defaults are meant to fit every drive."""
+    """Everything that mapping a drive can be told; the defaults are meant to fit every drive.
+
+    Attributes:
+        seed: Of the particle filter.
+        find_bumper: Look for the car's own parts at the bottom of the picture and leave those rows out,
+            unless ``perception.range.bottom_rows`` says how many they are.
+        perception: How edge points are found.
+        guess: First guess of an unknown camera.
+        filter: Particle filter.
+        motion: How the car may move.
+        revisits: What counts as the same place.
+        trace: How lane lines are looked for.
+        fit: Cubics through them.
+    """
 
     seed: int = Field(default=0, ge=0)
+    find_bumper: bool = True
     perception: PerceptionSettings = PerceptionSettings()
     guess: GuessSettings = GuessSettings()
     filter: FilterSettings = FilterSettings()

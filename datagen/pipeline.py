@@ -23,12 +23,15 @@ from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
 from lanenet.data.files import atomic_folder, write_text
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
+from lanenet.perception.static import static_mask
 
 __all__ = ["MapSettings", "Report", "label_map", "map_drive"]
 
 _MIN_SEGMENT = 60  # frames
+_BUMPER_FRAMES = 150
+_MAX_BUMPER_SHARE = 0.2
 
 
 def map_drive(
@@ -59,6 +62,7 @@ def map_drive(
     segments = split_segments(drive)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
     notes: list[str] = list(drive.problems)
+    settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:
         _check_size(known, drive, camera_path)
@@ -100,6 +104,31 @@ def map_drive(
         ]
         draw_contact_sheet(folder / "frames.png", tiles, camera)
     return Report(tuple(notes), figures)
+
+
+def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSettings:
+    """Return the settings with the rows left out in which the car sees itself, and note it.
+
+    The rows become part of the perception settings, so that labels, model and car leave out the same ones.
+    """
+    if not settings.find_bumper or settings.perception.range.bottom_rows:
+        return settings
+    step = max(1, len(drive) // _BUMPER_FRAMES)
+    try:
+        mask = static_mask(drive.image(k) for k in range(0, len(drive), step))
+    except DriveFormatError:  # too few frames of a moving car to tell it from the road
+        return settings
+    rows = np.flatnonzero(mask.any(axis=1))
+    if not rows.size:
+        return settings
+    hidden = drive.height - int(rows[0])
+    if hidden > _MAX_BUMPER_SHARE * drive.height:
+        notes.append(f"something in the lowest {hidden} rows never moves; set bottom_rows if it is the car")
+        return settings
+    notes.append(f"the car sees itself in the lowest {hidden} rows, which are left out")
+    limits = settings.perception.range.model_copy(update={"bottom_rows": hidden})
+    perception = settings.perception.model_copy(update={"range": limits})
+    return settings.model_copy(update={"perception": perception})
 
 
 def split_segments(drive: Drive) -> list[slice]:

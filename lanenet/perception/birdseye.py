@@ -62,6 +62,7 @@ class RoadTable:
 
     Attributes:
         keep: uint8 mask of the pixels that see the useful part of the road.
+        useful_pixels: Number of them.
         scale: Road that a pixel spans sideways.
         points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
         jacobian: d(point)/d(pixel), [cm/px], height x width x 2 x 2 (row x, y; column u, v).
@@ -105,6 +106,7 @@ class RoadTable:
                 )
             useful &= mask == 0
         self.keep: UInt8[np.ndarray, "h w"] = np.where(useful, 255, 0).astype(np.uint8)
+        self.useful_pixels = int(np.count_nonzero(useful))
         if not useful.any():
             raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
         across = np.linalg.norm(du, axis=-1)
@@ -162,6 +164,13 @@ class RoadEdgeExtractor:
         self.camera = camera
         self.settings = settings
         self.table = RoadTable(camera, settings.range, mask)
+
+    def is_crowded(self, edges: RoadEdges, max_share: float) -> bool:
+        """Tell whether more than this share of the pixels that see the road are edges.
+
+        A frame of noise has an edge everywhere, and any lane can be found in it.
+        """
+        return len(edges.points_cm) > max_share * self.table.useful_pixels
 
     def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> RoadEdges:
         """Find a frame's edges and move them to the road.

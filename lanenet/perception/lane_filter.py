@@ -149,11 +149,11 @@ class LaneFilter:
         """
         if self.extractor is None:
             raise CalibrationError("lane filter: built without a camera, it takes edge points, not frames")
-        points_cm = self.extractor.extract(frame_bgr).points_cm
-        if len(points_cm) > self.settings.max_edge_share * np.count_nonzero(self.extractor.table.keep):
+        edges = self.extractor.extract(frame_bgr)
+        if self.extractor.is_crowded(edges, self.settings.max_edge_share):
             self.reset()
             return LaneEstimate()
-        return self.estimate(points_cm)
+        return self.estimate(edges.points_cm)
 
     def estimate(self, points_cm: Float[np.ndarray, "n 2"]) -> LaneEstimate:
         """Find the lane in the edge points of one frame.

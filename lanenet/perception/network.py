@@ -30,6 +30,8 @@ _SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positiv
 
 #: Edge points in the window from which on the number of points no longer limits the confidence.
 _ENOUGH_POINTS = 120
+#: A frame with more edges than this share of its road pixels is noise.
+_MAX_EDGE_SHARE = 0.15
 #: Standard deviation of the lane width that the confidence expects, as a share of the width.
 _WIDTH_TOLERANCE = 0.15
 
@@ -217,13 +219,15 @@ class NetworkDetector:
 
         Returns:
             All six points, with the model's validation errors as their standard deviations; an empty
-            estimate of confidence 0 if no edge lies in the window.
+            estimate of confidence 0 if no edge lies in the window, or if the frame is all edges.
 
         Raises:
             CalibrationError: If the frame's size is not the camera's.
         """
-        edges_cm = self._extractor.extract(frame_bgr).points_cm
-        return self.detect_raster(self.meta.window.rasterise(edges_cm, out=self._raster[0, 0]))
+        edges = self._extractor.extract(frame_bgr)
+        if self._extractor.is_crowded(edges, _MAX_EDGE_SHARE):
+            return LaneEstimate()
+        return self.detect_raster(self.meta.window.rasterise(edges.points_cm, out=self._raster[0, 0]))
 
     def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
         """Find the lane in a bird's-eye raster of 0 and 255."""

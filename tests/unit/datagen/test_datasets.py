@@ -198,7 +198,7 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
     ) -> None:
         made.append("map")
 
-    def label_map(drive_map: Path, out: Path, perception: object, window: BirdseyeWindow) -> None:
+    def label_map(drive_map: Path, out: Path, window: BirdseyeWindow) -> None:
         write_labels(out, _labels(np.arange(400)))
 
     monkeypatch.setattr("datagen.datasets.map_drive", map_drive)

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.pipeline import _check_size, split_segments
+from datagen.map_settings import MapSettings
+from datagen.pipeline import _check_size, hide_bumper, split_segments
 from datagen.slam.calibrate import GuessSettings, guessed_camera
 from datagen.slam.places import Revisit
 from datagen.slam.segment import count_laps
+from lanenet.data.drive import open_drive
 from lanenet.data.recording import Commands, Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 
@@ -88,3 +90,14 @@ def test_a_camera_of_another_size_is_refused():
     _check_size(guessed_camera(160, 120, 80.0, 0.2, GuessSettings()), drive, None)
     with pytest.raises(CalibrationError, match=r"320x240.*160x120"):
         _check_size(guessed_camera(320, 240, 80.0, 0.2, GuessSettings()), drive, Path("camera.yaml"))
+
+
+def test_rows_in_which_the_car_sees_itself_are_left_out(shared_data: Path) -> None:
+    """garage_tape shows the car's bumper in its lowest rows; the other drive shows no part of the car."""
+    notes: list[str] = []
+    settings = hide_bumper(open_drive(shared_data / "garage_tape"), MapSettings(), notes)
+    assert 5 <= settings.perception.range.bottom_rows <= 9 and "sees itself" in notes[0]
+    same = hide_bumper(open_drive(shared_data / "donkey_circuit"), MapSettings(), notes)
+    assert same == MapSettings() and len(notes) == 1
+    given = MapSettings(find_bumper=False)
+    assert hide_bumper(open_drive(shared_data / "garage_tape"), given, notes) == given

@@ -170,3 +170,9 @@ def test_confidence_measures_the_width_across_the_lane(turn, shift):
     lane = np.concatenate([side / math.cos(turn) + shift + rows * math.tan(turn) for side in (-20.0, 20.0)])
     assert confidence(lane, 500, 40.0) == pytest.approx(1.0)
     assert confidence(mirror_points(lane), 500, 40.0) == pytest.approx(1.0)
+
+
+def test_a_frame_of_noise_gives_no_lane(model_path):
+    noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
+    estimate = NetworkDetector(model_path, CAMERA).detect(noise)
+    assert not estimate.mask.any() and estimate.confidence == 0.0
