@@ -7,7 +7,6 @@ the car has neither torch nor numba.
 from __future__ import annotations
 
 import functools
-from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,9 +15,10 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console
+from lanenet import calibrate_cli, console, onboard_cli
 from lanenet.config import Settings, dump_settings, load_settings
-from lanenet.errors import CalibrationError, ConfigError, LanenetError
+from lanenet.errors import LanenetError
+from lanenet.onboard_cli import MarkingOption, check_ending
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,10 +34,6 @@ _Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
 ]
 _CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAML.", show_default=False)]
-_MarkingOption = Annotated[
-    float | None, typer.Option("--marking", help="Thickness of the tape for the lane filter, cm.")
-]
-
 #: Packages of the extras, for the message when one is missing.
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "torchvision", "onnx", "onnxscript", "safetensors", "tensorboard"), "train"),
@@ -45,15 +41,6 @@ _EXTRA_OF = {
     "matplotlib": "viz",
     **dict.fromkeys(("smbus2", "serial"), "car"),
 }
-
-
-class DetectorName(StrEnum):
-    """Detectors of ``lanenet detect``."""
-
-    NETWORK = "network"
-    LANE_FILTER = "lane-filter"
-    HOUGH = "hough"
-    PAINTER = "painter"
 
 
 class _Group(TyperGroup):
@@ -88,6 +75,7 @@ app = typer.Typer(
 
 
 app.add_typer(calibrate_cli.app, name="calibrate")
+app.add_typer(onboard_cli.app)
 
 
 def main() -> None:
@@ -152,7 +140,7 @@ def _options(
 def train(
     config: _Config,
     overrides: _Overrides = None,
-    marking: _MarkingOption = None,
+    marking: MarkingOption = None,
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
@@ -233,7 +221,7 @@ def label(
     """Project a map's lane lines into each frame: six labels per frame, and a report of their quality."""
     from datagen.pipeline import label_map
 
-    _check_ending(out, ".parquet")
+    check_ending(out, ".parquet")
     with console.progress_bar("label") as progress:
         report = label_map(map_folder, out, progress)
     console.show_lines(report.lines)
@@ -250,7 +238,7 @@ def val(
     out: Annotated[
         Path | None, typer.Option(help="Also write the table as .json and .md under this name.")
     ] = None,
-    marking: _MarkingOption = None,
+    marking: MarkingOption = None,
 ) -> None:
     """Show a model's errors in cm on label sets, beside the baselines on the same frames."""
     from lanenet.data.files import write_json, write_text
@@ -280,147 +268,6 @@ def export(
     console.next_command("bench", "--model", path)
 
 
-@app.command(
-    epilog="Example: lanenet detect data/tub --detector lane-filter --camera camera.yaml --out l.csv"
-)
-def detect(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SOURCE", help="Photo, folder of photos, video, drive or tub.", show_default=False
-        ),
-    ],
-    detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
-    model: Annotated[Path | None, typer.Option(help="ONNX model, for --detector network.")] = None,
-    camera: _CameraOption = None,
-    video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
-    lane_width: Annotated[
-        float | None, typer.Option(min=1.0, help="Lane width for the lane filter, cm; default: the drive's.")
-    ] = None,
-    marking: _MarkingOption = None,
-    any_camera: Annotated[
-        bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
-    ] = False,
-    frames: Annotated[
-        str | None, typer.Option(help="Only these frame numbers, FIRST:LAST.", metavar="FIRST:LAST")
-    ] = None,
-    skip_unreadable: Annotated[
-        bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and go on.")
-    ] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML with the settings of hough or painter.", show_default=False)
-    ] = None,
-) -> None:
-    """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
-    from lanenet.data.camera_file import read_camera
-    from lanenet.onboard.detect import run_detector
-    from lanenet.onboard.detectors import WITHOUT_CAMERA, build_detector
-    from lanenet.onboard.sources import open_source
-
-    _check_ending(out, ".parquet", ".csv")
-    opened = open_source(source)
-    if frames is not None:
-        opened = opened.numbered(*_frame_range(frames))
-    used_camera = read_camera(camera) if camera is not None else opened.camera
-    if used_camera is None and detector.value not in WITHOUT_CAMERA:
-        raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
-    chosen = build_detector(
-        detector.value,
-        used_camera,
-        model=model,
-        lane_width_cm=lane_width if lane_width is not None else opened.lane_width_cm,
-        marking_cm=marking,
-        any_camera=any_camera,
-        config=config,
-    )
-    with console.progress_bar(f"detect ({detector.value})") as progress:
-        report = run_detector(
-            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
-        )
-    console.show_problems(report.problems)
-    typer.echo(
-        f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
-        f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
-    )
-    console.wrote(report.out, report.video)
-    if report.video is None:
-        options = {"--model": model, "--camera": camera, "--lane-width": lane_width, "--marking": marking}
-        options["--config"] = config
-        given = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
-        given += ["--any-camera"] if any_camera else []
-        again = ("detect", source, "--detector", detector.value, *given, "--out", out)
-        console.next_command(*again, "--video", out.with_suffix(".mp4"))
-    else:
-        console.next_command("bench")
-
-
-@app.command(epilog="Example: lanenet bench --model checkpoints/small/model.onnx --out bench.json")
-def bench(
-    model: Annotated[Path | None, typer.Option(help="ONNX model to time as well.")] = None,
-    camera: _CameraOption = None,
-    rounds: Annotated[int, typer.Option(min=10, help="Frames to time.")] = 300,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of OpenCV and onnxruntime.")] = 1,
-    out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
-) -> None:
-    """Time the onboard stages on this machine: median and 99th percentile."""
-    from lanenet.data.camera_file import read_camera
-    from lanenet.data.files import write_json
-    from lanenet.onboard.bench import example_camera, time_stages
-
-    used_camera = example_camera() if camera is None else read_camera(camera)
-    with console.progress_bar("bench") as progress:
-        report = time_stages(used_camera, model, rounds, threads, progress)
-    rows = [
-        [stage, *(f"{v[key]:.3f}" for key in ("median_ms", "p99_ms")), f"{v['ratio_to_canny']:.2f}"]
-        for stage, v in report["stages"].items()
-    ]
-    machine = report["machine"]
-    title = f"{machine['processor']}, {threads} thread(s), {report['image']} px, {rounds} frames"
-    console.show_table(title, ("stage", "median ms", "p99 ms", "x canny"), rows)
-    if out is not None:
-        write_json(out, report)
-        console.wrote(out)
-    console.next_command("doctor")
-
-
-@app.command(epilog="Example: lanenet analyse camera.yaml --out density.png")
-def analyse(
-    camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.", show_default=False)],
-    out: Annotated[Path | None, typer.Option(help="Picture of pixels per ground cell (.png).")] = None,
-) -> None:
-    """Tell how exactly a camera sees the road: cm per pixel and the worst steering error."""
-    from lanenet.data.camera_file import read_camera
-    from lanenet.data.files import atomic_file
-    from lanenet.data.png import png_bytes
-    from lanenet.perception.analysis_picture import draw_analysis
-    from lanenet.perception.error_analysis import analyse_errors, figures
-
-    if out is not None:
-        _check_ending(out, ".png")
-    analysis = analyse_errors(read_camera(camera))
-    console.show_table(str(camera), ("", "found", "paper"), figures(analysis))
-    if out is not None:
-        with atomic_file(out) as temporary:
-            temporary.write_bytes(png_bytes(draw_analysis(analysis)))
-        console.wrote(out)
-    console.next_command("doctor", "--camera", camera)
-
-
-@app.command(epilog="Example: lanenet doctor --camera camera.yaml")
-def doctor(camera: _CameraOption = None) -> None:
-    """Check the installation, and a camera file if one is given."""
-    from lanenet.onboard.doctor import run_checks
-
-    checks = run_checks(camera)
-    for check in checks:
-        typer.echo(f"{check.state:8s}{check.name}: {check.text}")
-    problems = sum(check.state == "problem" for check in checks)
-    if problems:
-        raise LanenetError(f"{problems} problem(s) found, see above")
-    console.next_command("train", "configs/small.yaml")
-
-
 def _evaluate(
     labels: list[Path], predictors: dict[str, Predictor], marking_cm: float | None
 ) -> tuple[str, dict[str, Any]]:
@@ -441,16 +288,3 @@ def _evaluate(
     Console().print(table)
     sets = [path.name for path in labels]
     return markdown, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}}
-
-
-def _frame_range(text: str) -> tuple[int, int]:
-    first, colon, last = text.partition(":")
-    if not (colon and first.strip().isdigit() and last.strip().isdigit()):
-        raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
-    return int(first), int(last)
-
-
-def _check_ending(path: Path, *endings: str) -> None:
-    """Refuse an output before the work starts, not after it."""
-    if path.suffix.lower() not in endings:
-        raise ConfigError(f"{path}: expected a name that ends in {' or '.join(endings)}")
