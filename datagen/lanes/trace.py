@@ -29,9 +29,9 @@ class TraceSettings(Settings):
     min_side: float = Field(default=0.75, gt=0.0, lt=1.0)
     tape_heights: tuple[float, float] = (0.05, 0.6)
     lane_heights: tuple[float, float] = (1.2, 6.5)
-    smoothness: float = Field(default=0.08, gt=0.0)
+    smoothness: float = Field(default=0.04, gt=0.0)
     second_line: float = Field(default=0.3, gt=0.0, le=1.0)
-    min_support: float = Field(default=0.08, gt=0.0)
+    min_support: float = Field(default=0.2, gt=0.0)
 
 
 @dataclass(frozen=True)
