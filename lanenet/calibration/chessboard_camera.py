@@ -32,8 +32,9 @@ _HOPELESS_RATIO = 30.0
 _FOLD_COST = 20.0
 _MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.02, 0.03
 _MIN_NORMAL_SPREAD_DEG = 10.0
-#: Largest believable RMS as a share of the image's diagonal.
-_MAX_RMS = 0.004
+#: Largest believable RMS as a share of the image's diagonal, but never below half a pixel. A pinhole forced
+#: on a fisheye, or two lenses in one set of views, can be bent to fit within twice as much.
+_MAX_RMS, _LEAST_LIMIT_PX = 0.0015, 0.5
 
 
 @dataclass(frozen=True)
@@ -240,11 +241,12 @@ def _impossible(fit: LensFit, views: Sequence[BoardView]) -> str | None:
 
 
 def _check_sound(fit: LensFit, camera: Camera) -> None:
-    diagonal = float(np.hypot(camera.width, camera.height))
-    if fit.rms_px > _MAX_RMS * diagonal:
+    limit_px = max(_LEAST_LIMIT_PX, _MAX_RMS * float(np.hypot(camera.width, camera.height)))
+    if fit.rms_px > limit_px:
         raise CalibrationError(
             f"the best lens misses the corners by {fit.rms_px:.2f} px RMS, expected below "
-            f"{_MAX_RMS * diagonal:.2f} px; is the board flat, its size right, the focus fixed?"
+            f"{limit_px:.2f} px; is the board flat, its size right, the focus fixed, the lens model the "
+            "right one, and are all views of one lens?"
         )
     normals = np.array([rotation_from_vector(pose[:3])[:, 2] for pose in fit.poses])
     normals *= np.sign(np.sum(normals * fit.poses[:, 3:], axis=1, keepdims=True))

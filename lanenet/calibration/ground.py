@@ -20,6 +20,8 @@ _ROBUST_SCALE_PX = 1.0
 #: A point is left out beyond this multiple of the others' spread, and beyond the floor.
 _OUTLIER_RATIO, _OUTLIER_FLOOR_PX = 5.0, 2.0
 _SUBSET, _MAX_STARTS = 4, 60
+#: A lens lower than this would lie on the road: the points are in metres.
+_LEAST_HEIGHT_CM = 1.0
 _MAX_RMS_SHARE, _MAX_HEIGHT_SIGMA = 0.02, 0.15
 #: Narrower than this share of their length, points are a line.
 _MIN_FLATNESS = 0.02
@@ -259,6 +261,11 @@ def _check_answer(answer: GroundCalibration) -> None:
         raise CalibrationError(
             "the points are mirrored: they fit only a camera below the ground; expected x_cm to the right "
             "and y_cm ahead of the car"
+        )
+    if mounting.height_cm < _LEAST_HEIGHT_CM:
+        raise CalibrationError(
+            f"the camera would be {mounting.height_cm:.2g} cm above the ground; are the points in "
+            "centimetres?"
         )
     limit = _MAX_RMS_SHARE * camera.width
     if 2 * answer.used.sum() < len(answer.used) + 1 or not answer.rms_px <= limit:

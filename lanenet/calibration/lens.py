@@ -1,8 +1,8 @@
 """A lens as a vector of numbers, with the derivatives that the solver needs.
 
 The vector is fx, fy, cx, cy, then D in OpenCV's order. Projections equal those of
-:class:`lanenet.geometry.camera.Camera` (checked in ``tests/unit/calibration/test_lens.py``), except that
-nothing is cut off at the largest angle: a solver on its way needs a smooth function.
+:class:`lanenet.geometry.camera.Camera` (checked in ``tests/unit/calibration/test_lens_and_pose.py``), except
+that nothing is cut off at the largest angle: a solver on its way needs a smooth function.
 """
 
 from __future__ import annotations

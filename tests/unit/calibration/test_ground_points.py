@@ -123,3 +123,9 @@ def test_the_cloth_of_a_real_fisheye_becomes_square(shared_data: Path, name: str
     distance = np.linalg.norm(found.residuals_px, axis=1)
     assert np.median(distance) < 1.0
     assert 60.0 < found.camera.mounting.height_cm < 110.0
+
+
+def test_points_in_metres_are_refused() -> None:
+    camera, pixels = camera_and_points()
+    with pytest.raises(CalibrationError, match="in centimetres"):
+        calibrate_ground(lens_only(camera), 0.01 * GRID_CM, pixels)
