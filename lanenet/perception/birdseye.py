@@ -13,7 +13,7 @@ from lanenet.config import Settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.colour import PixelScale
-from lanenet.perception.edges import EdgePixels, EdgeSettings, find_edges
+from lanenet.perception.edges import EdgePixels, EdgeSettings, check_frame, find_edges
 
 
 class RangeSettings(Settings):
@@ -177,8 +177,9 @@ class RoadEdgeExtractor:
 
         Raises:
             CalibrationError: If the frame's size is not the camera's.
+            DriveFormatError: If the array is no image.
         """
-        height, width = frame_bgr.shape[:2]
+        height, width = check_frame(frame_bgr).shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise CalibrationError(
                 f"frame of {width}x{height} px, but the camera is calibrated for "

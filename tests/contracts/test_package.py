@@ -108,3 +108,12 @@ def test_constraints_pin_the_direct_dependencies_exactly() -> None:
     ]
     names = {re.match(r"[A-Za-z0-9_.-]+", requirement)[0].lower() for requirement in wanted}  # type: ignore[index]
     assert names - {"lanenet"} <= pinned
+
+
+def test_no_document_has_a_figure_left_open():
+    documents = [REPO / "README.md", REPO / "CONTRIBUTING.md", REPO / "checkpoints" / "README.md"]
+    for document in [*documents, *(REPO / "docs").glob("*.md")]:
+        text = document.read_text(encoding="utf-8")
+        assert not re.search(r"@[A-Z]_|lead fills|TODO", text), document
+        for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+            assert (document.parent / picture).is_file(), f"{document}: {picture}"
