@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
+from datagen.slam.places import path_lengths
 from datagen.slam.scans import Scans
 from lanenet.errors import TrackingLostError
 
@@ -57,7 +58,7 @@ def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: flo
         TrackingLostError: If the car hardly moves.
     """
     smooth = gaussian_filter1d(poses[:, :2], 2.0, axis=0, mode="nearest")
-    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
+    distance = path_lengths(smooth)
     # Standing still gives several frames at one place; interpolation needs a strictly growing argument.
     s = distance + np.arange(len(distance)) * 1e-6
     if s[-1] < max(_SHORTEST_CM, 3.0 * step_cm):

@@ -6,7 +6,7 @@ Scale is not observable: the camera's height is nominal until the lane width set
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -177,8 +177,7 @@ def next_yaw(tried: list[tuple[float, float]]) -> float:
 
 def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Camera:
     """Scale a guessed camera; the wheelbase is the car's own and stays, so that the lever arm scales."""
-    m = camera.mounting
-    lever = factor * (camera.wheelbase_cm + m.ahead_of_front_axle_cm)
-    return camera.with_mounting(
-        height_cm=factor * m.height_cm, ahead_of_front_axle_cm=lever - guess.wheelbase_cm
-    )
+    scaled = camera.scaled_lengths(factor)
+    lever = scaled.wheelbase_cm + scaled.mounting.ahead_of_front_axle_cm
+    kept = replace(scaled, wheelbase_cm=guess.wheelbase_cm)
+    return kept.with_mounting(ahead_of_front_axle_cm=lever - guess.wheelbase_cm)

@@ -129,8 +129,8 @@ def propose_revisits(
     return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda p: p[2])]
 
 
-def path_lengths(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Length of the path up to each pose, [cm]."""
+def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:
+    """Length of the path up to each pose or point, [cm]."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
