@@ -1,6 +1,6 @@
-"""A usable camera from the drive alone: focal length and pitch by match score, yaw by closing the lap.
+"""A coarse camera from the drive alone: focal length and pitch by match score at held speed.
 
-This finds a coarse camera. The lens is taken as an equidistant fisheye with its axis in the image's middle.
+This is a start for the bundle adjustment. The lens is taken as an equidistant fisheye with its axis in the image's middle.
 Scale is not observable: the camera's height is nominal until the lane width sets it.
 """
 
@@ -12,14 +12,12 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from datagen.slam.filter import FilterSettings, run_filter
-from datagen.slam.motion import MotionModel
-from datagen.slam.places import Revisit
-from datagen.slam.scans import Progress, pack_scans
+from datagen.slam.scans import Progress, scans_of
+from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadEdges, RoadTable
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 from lanenet.perception.edges import EdgePixels, find_edges
 
 
@@ -33,7 +31,6 @@ class GuessSettings(Settings):
         lever_heights: Camera ahead of the rear axle.
         wheelbase_cm: Distance between the axles, which sets where y = 0 lies under the car.
         frames: Frames that the search looks at.
-        refine_yaw: Whether the yaw is found by closing laps.
     """
 
     focal_px: tuple[float, ...] = (65.0, 80.0, 95.0, 110.0)
@@ -42,20 +39,21 @@ class GuessSettings(Settings):
     lever_heights: float = Field(default=0.9, gt=0.0)
     wheelbase_cm: float = Field(default=17.0, gt=0.0)
     frames: int = Field(default=250, ge=50)
-    refine_yaw: bool = True
 
 
+#: Steps tried with each camera, relative to the one that suits the camera in the middle of the grid.
+_AROUND = np.array([0.75, 1.0, 1.33])
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 
 
 def guessed_camera(
-    width: int, height: int, focal_px: float, pitch_rad: float, guess: GuessSettings
+    width: int, height: int, focal_px: float, pitch_deg: float, guess: GuessSettings
 ) -> Camera:
     """Build a fisheye camera of nominal height, ``lever_heights`` ahead of the rear axle."""
     K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     ahead = guess.lever_heights * NOMINAL_HEIGHT_CM - guess.wheelbase_cm
-    mounting = Mounting(NOMINAL_HEIGHT_CM, pitch_down_rad=pitch_rad, ahead_of_front_axle_cm=ahead)
+    mounting = Mounting(NOMINAL_HEIGHT_CM, pitch_down_rad=float(np.deg2rad(pitch_deg)), ahead_of_front_axle_cm=ahead)
     return Camera(
         "fisheye", width, height, K, np.array([guess.k1, 0.0, 0.0, 0.0]), mounting, guess.wheelbase_cm
     )
@@ -70,10 +68,11 @@ def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One camera of the search and its mean matched share."""
+    """One camera of the search, with its best step, in camera heights, and mean matched share."""
 
     focal_px: float
     pitch_deg: float
+    step_heights: float
     match: float
 
 
@@ -84,7 +83,7 @@ def coarse_camera(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Camera, list[Candidate]]:
-    """Search focal length and pitch for the highest mean match of a short run of the filter.
+    """Search focal length and pitch for the highest mean match of a short run of the filter at held speed.
 
     Returns:
         The camera, and all candidates for the report.
@@ -93,86 +92,54 @@ def coarse_camera(
     start = max(0, (len(drive) - count) // 3)
     pixels = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
     scale = drive.width / 160.0
-    # Two rounds: the given grid, then half its steps around the best.
     seed = int(rng.integers(2**31))
-    tried: dict[tuple[float, float], float] = {}
+    tried: dict[tuple[float, float], Candidate] = {}
     grid = [(f * scale, p) for f in guess.focal_px for p in guess.pitch_deg]
-    total = len(grid) + 8
+    total = len(grid) + 9
+    middle = guessed_camera(
+        drive.width, drive.height, *(float(np.median(v)) for v in zip(*grid, strict=True)), guess
+    )
+    steps = np.array(STEPS_HEIGHTS)
+    usual, _ = _best_step(pixels, middle, perception, steps, seed)
+    # Two rounds: the given grid, then half its steps around the best.
     for round_index in range(2):
         for focal, pitch in grid:
             if (focal, pitch) not in tried:
-                camera = guessed_camera(drive.width, drive.height, focal, np.deg2rad(pitch), guess)
-                tried[focal, pitch] = _match(pixels, camera, perception, np.random.default_rng(seed))
+                camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
+                step, match = _best_step(pixels, camera, perception, usual * _AROUND, seed)
+                tried[focal, pitch] = Candidate(focal, pitch, step, match)
             if progress is not None:
                 progress(min(len(tried), total), total)
-        best = max(tried, key=lambda key: tried[key])
+        best = max(tried.values(), key=lambda candidate: candidate.match)
+        usual = best.step_heights
         if round_index == 0:
             df = 0.5 * _spacing(guess.focal_px) * scale
             dp = 0.5 * _spacing(guess.pitch_deg)
-            grid = [(best[0] + i * df, best[1] + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    candidates = [Candidate(f, p, match) for (f, p), match in tried.items()]
-    return guessed_camera(drive.width, drive.height, best[0], np.deg2rad(best[1]), guess), candidates
+            grid = [
+                (best.focal_px + i * df, best.pitch_deg + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)
+            ]
+    camera = guessed_camera(drive.width, drive.height, best.focal_px, best.pitch_deg, guess)
+    return camera, list(tried.values())
 
 
 def _spacing(values: tuple[float, ...]) -> float:
     return float(np.min(np.diff(np.sort(values)))) if len(values) > 1 else 0.1 * values[0]
 
 
-def _match(
-    pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, rng: np.random.Generator
-) -> float:
-    """Mean matched share of a small filter that knows nothing of the commands."""
+def _best_step(
+    pixels: list[EdgePixels],
+    camera: Camera,
+    perception: PerceptionSettings,
+    steps_heights: Float[np.ndarray, "k"],
+    seed: int,
+) -> tuple[float, float]:
+    """Step per frame, in camera heights, that matches best with this camera, and its match."""
     height = camera.mounting.height_cm
-    table = RoadTable(camera, mapping_range(height, perception.range))
-    scans = pack_scans([_lift(table, edges) for edges in pixels], height)
-    step = 0.2 * height
-    n = len(scans)
-    motion = MotionModel(
-        distance_cm=np.ones(n),
-        curvature_per_cm=np.zeros(n),
-        factor_start=(step, 0.5 * step),
-        factor_walk=0.01 * height,
-        factor_pull=0.01,
-        distance_noise=0.02,
-        offset_walk_per_cm=0.012 / height,
-        offset_decay=0.0,
-        curvature_noise_per_cm=0.02 / height,
-        max_curvature_per_cm=0.8 / height,
+    scans = scans_of(pixels, camera, mapping_range(height, perception.range))
+    profile = profile_speed(
+        scans, np.ones(len(scans)), height * steps_heights, height, camera.wheelbase_cm, seed
     )
-    settings = FilterSettings(particles=120, max_points=150)
-    trajectory = run_filter(scans, motion, settings, height, camera.wheelbase_cm, rng)
-    return float(np.nanmean(trajectory.match))
-
-
-def _lift(table: RoadTable, edges: EdgePixels) -> RoadEdges:
-    nearest = np.rint(edges.uv_px).astype(np.intp)
-    keep = table.keep[nearest[:, 1], nearest[:, 0]] > 0
-    return table.lift(EdgePixels(edges.uv_px[keep], edges.normals[keep]))
-
-
-def heading_error_per_lap(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> float:
-    """Median heading that an open-loop trajectory misses from one visit of a place to the next, [rad].
-
-    A closed lap turns by a multiple of 2 pi; what is left over is drift, and most of it is camera yaw.
-    """
-    errors = []
-    for revisit in revisits:
-        turned = poses[revisit.later, 2] - poses[revisit.earlier, 2] - revisit.relative[2]
-        errors.append(turned - 2.0 * np.pi * np.round(turned / (2.0 * np.pi)))
-    return float(np.median(errors))
-
-
-def next_yaw(tried: list[tuple[float, float]]) -> float:
-    """Return the yaw to try after (yaw, heading error) pairs: a secant step, bounded to three degrees.
-
-    The first step takes the usual sensitivity: one degree of yaw turns a lap by about 30 degrees.
-    """
-    yaw, error = tried[-1]
-    slope = 30.0
-    if len(tried) > 1 and abs(yaw - tried[-2][0]) > 1e-4:
-        measured = (error - tried[-2][1]) / (yaw - tried[-2][0])
-        slope = measured if abs(measured) > 5.0 else slope
-    return float(yaw - np.clip(error / slope, -0.052, 0.052))
+    return profile.step_cm / height, float(np.max(profile.match))
 
 
 def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Camera:

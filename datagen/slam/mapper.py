@@ -11,24 +11,26 @@ from pydantic import Field
 from datagen.slam.filter import FilterSettings, Trajectory, run_filter
 from datagen.slam.motion import MotionModel
 from datagen.slam.scans import Progress, Scans
+from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import left_from_donkey
 
 _MAX_LAG = 10  # frames
+#: Factors to try on a recorded speed, whose gain is not known exactly.
+_GAINS = np.array([0.75, 0.82, 0.9, 1.0, 1.1, 1.21, 1.33])
 
 
 class MotionSettings(Settings):
     """How far the car may stray from what the commands predict; lengths in camera heights.
 
-    The defaults come from real drives with a throttle only, where speed is a slow, unknown state: a wider
-    walk lets the filter stand still wherever mirrored lamps travel with the car.
+    The defaults come from real drives with a throttle only, where speed is a slow, unknown state about the
+    usual one that :mod:`datagen.slam.speed` finds: a wider walk or a weaker pull lets the filter creep.
     """
 
-    first_step_heights: float = Field(default=0.2, gt=0.0)
     factor_walk_heights: float = Field(default=0.006, gt=0.0)
-    factor_pull: float = Field(default=0.05, ge=0.0, lt=1.0)
+    factor_pull: float = Field(default=0.1, ge=0.0, lt=1.0)
     distance_noise: float = Field(default=0.02, gt=0.0)
     curvature_noise_heights: float = Field(default=0.01, gt=0.0)
     max_curvature_heights: float = Field(default=0.8, gt=0.0)
@@ -104,49 +106,44 @@ def track(
 ) -> tuple[Trajectory, SteeringFit | None]:
     """Estimate all poses without closing loops.
 
-    The first pass knows nothing of speed (where it was not recorded) and steering. It gives the usual step
-    and how curvature answers to the command: gain, trim and delay. The second pass uses both as prediction.
+    First the usual step is found, with the speed held. The first pass knows nothing of the steering and gives
+    how curvature answers to the command: gain, trim and delay. The second pass uses that as prediction.
     """
     height = camera.mounting.height_cm
-    n = len(scans)
+    n, m = len(scans), motion_settings
 
     def run(motion: MotionModel, offset: int) -> Trajectory:
         report = None if progress is None else lambda k, _: progress(offset + k, 2 * n)
         return run_filter(scans, motion, filter_settings, height, camera.wheelbase_cm, rng, report)
 
-    m = motion_settings
-    step = m.first_step_heights * height
-    first = MotionModel(
-        distance_cm=commands.distance_cm,
-        curvature_per_cm=np.zeros(n),
-        factor_start=(1.0, 0.15) if commands.speed_known else (step, 0.5 * step),
-        factor_walk=0.01 if commands.speed_known else 0.01 * height,
-        factor_pull=0.02 if commands.speed_known else 0.0,
-        distance_noise=m.distance_noise,
-        offset_walk_per_cm=0.012 / height,
-        offset_decay=0.0,
-        curvature_noise_per_cm=2.0 * m.curvature_noise_heights / height,
-        max_curvature_per_cm=m.max_curvature_heights / height,
-    )
-    trajectory = run(first, 0)
+    steps = _GAINS if commands.speed_known else height * np.array(STEPS_HEIGHTS)
+    seed = int(rng.integers(2**31))
+    speed = profile_speed(scans, commands.distance_cm, steps, height, camera.wheelbase_cm, seed)
+
+    def motion(curvature_per_cm: Float[np.ndarray, "n"], predicted: bool) -> MotionModel:
+        step = speed.step_cm
+        noise = (1.0 if predicted else 2.0) * m.curvature_noise_heights / height
+        return MotionModel(
+            distance_cm=commands.distance_cm,
+            curvature_per_cm=curvature_per_cm,
+            factor_start=(step, 0.05 * step),
+            factor_walk=0.005 if commands.speed_known else m.factor_walk_heights * height,
+            factor_pull=m.factor_pull,
+            distance_noise=m.distance_noise,
+            offset_walk_per_cm=(0.004 if predicted else 0.012) / height,
+            offset_decay=0.02 if predicted else 0.0,
+            curvature_noise_per_cm=noise,
+            max_curvature_per_cm=m.max_curvature_heights / height,
+        )
+
+    trajectory = run(motion(np.zeros(n), False), 0)
     fit = fit_steering(trajectory, commands, height)
-    usual = float(np.median(trajectory.factor[trajectory.factor > 0.1 * np.median(trajectory.factor)]))
-    predicted = np.zeros(n)
-    if fit is not None and commands.turn is not None:
-        predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    second = MotionModel(
-        distance_cm=commands.distance_cm,
-        curvature_per_cm=predicted,
-        factor_start=(usual, 0.1 * usual if commands.speed_known else 0.3 * usual),
-        factor_walk=0.005 if commands.speed_known else m.factor_walk_heights * height,
-        factor_pull=m.factor_pull,
-        distance_noise=m.distance_noise,
-        offset_walk_per_cm=(0.004 if fit is not None else 0.012) / height,
-        offset_decay=0.02 if fit is not None else 0.0,
-        curvature_noise_per_cm=m.curvature_noise_heights / height,
-        max_curvature_per_cm=m.max_curvature_heights / height,
-    )
-    return run(second, n), fit
+    if fit is None or commands.turn is None:
+        if progress is not None:
+            progress(2 * n, 2 * n)
+        return trajectory, None
+    predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
+    return run(motion(predicted, True), n), fit
 
 
 def delayed(values: Float[np.ndarray, "n"], frames: int) -> Float[np.ndarray, "n"]:

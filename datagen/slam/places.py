@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,9 +26,10 @@ class RevisitSettings(Settings):
     Attributes:
         min_gap_heights: Path between the two visits at least.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
-        max_drift_share: Two frames can only be one place if the open-loop trajectory has them closer than
-            this share of the path between: rooms repeat, and one false revisit bends a whole map.
-        max_turn_drift_rad: Likewise for the heading, up to whole turns.
+        max_drift_rad: Heading that the open loop may miss on the way from one visit to the next. Revisits
+            that no common drift per length explains are not believed: rooms repeat, and one false revisit
+            bends a whole map.
+        drift_tolerance_rad: What a revisit may miss of the common drift.
         min_revisits: Fewer revisits than this are not believed.
         min_match: Matched share of the edges once aligned.
         max_pairs: Pairs to verify at most, spread over the drive.
@@ -40,8 +41,8 @@ class RevisitSettings(Settings):
 
     min_gap_heights: float = Field(default=20.0, gt=0.0)
     min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
-    max_drift_share: float = Field(default=0.3, gt=0.0, lt=1.0)
-    max_turn_drift_rad: float = Field(default=1.2, gt=0.0)
+    max_drift_rad: float = Field(default=2.6, gt=0.0)
+    drift_tolerance_rad: float = Field(default=0.45, gt=0.0)
     min_revisits: int = Field(default=3, ge=1)
     min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
     max_pairs: int = Field(default=60, ge=1)
@@ -57,12 +58,14 @@ class Revisit:
     Attributes:
         relative: Pose of the later frame in the rear-axle frame of the earlier (x ahead, y left).
         match: Matched share of the later frame's edges.
+        turns: Whole turns to the left between the two.
     """
 
     earlier: int
     later: int
     relative: Float[np.ndarray, "3"]
     match: float
+    turns: int = 0
 
 
 def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarray, "n d"]:
@@ -91,7 +94,7 @@ def propose_revisits(
     camera_height_cm: float,
     settings: RevisitSettings,
 ) -> list[tuple[int, int]]:
-    """Propose pairs (earlier, later) that look alike and that the trajectory could have brought together.
+    """Propose pairs (earlier, later) that look alike and have a stretch of road between them.
 
     Similarity is averaged along the diagonal, so that a pair counts when its neighbours agree, and allows
     a sideways shift of the picture, because the car comes back with another heading.
@@ -110,7 +113,9 @@ def propose_revisits(
         np.maximum(similarity, thumbs @ shifted.T, out=similarity)
     kernel = np.eye(9, dtype=np.float32) / 9.0
     similarity = cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE)
-    similarity[~_could_be_one_place(poses, camera_height_cm, settings)] = -1.0
+    path = path_lengths(poses)
+    apart = path[None, :] - path[:, None]
+    similarity[apart < settings.min_gap_heights * camera_height_cm] = -1.0
     pairs: list[tuple[float, int, int]] = []
     for later in range(n):
         earlier = int(similarity[:, later].argmax())
@@ -134,19 +139,39 @@ def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
-def _could_be_one_place(
-    poses: Float[np.ndarray, "n 3"], camera_height_cm: float, settings: RevisitSettings
-) -> np.ndarray:
-    """Tell for each (earlier, later) whether drift alone could explain what lies between them."""
+def consistent_revisits(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], settings: RevisitSettings
+) -> tuple[list[Revisit], float]:
+    """Keep the revisits that one drift of the heading explains, and count their whole turns.
+
+    The open loop misses heading in proportion to its length, nearly: most of it is a camera that looks a
+    little to the side, or a speed that is a little off. The drift that most revisits agree on, up to whole
+    turns, is found by trying all; of equal ones the smallest counts.
+
+    Args:
+        poses: Open-loop trajectory, heading unwrapped.
+        revisits: Candidates.
+        settings: Bounds.
+
+    Returns:
+        The revisits kept, with their turns, and the drift, [rad/cm].
+    """
+    if not revisits:
+        return [], 0.0
     path = path_lengths(poses)
-    between = path[None, :] - path[:, None]
-    apart = np.hypot(poses[None, :, 0] - poses[:, None, 0], poses[None, :, 1] - poses[:, None, 1])
-    turned = np.abs(wrap_angle(poses[None, :, 2] - poses[:, None, 2]))
-    return (
-        (between >= settings.min_gap_heights * camera_height_cm)
-        & (apart <= settings.max_drift_share * between)
-        & (turned <= settings.max_turn_drift_rad)
-    )
+    earlier, later = (np.array([getattr(r, name) for r in revisits]) for name in ("earlier", "later"))
+    between = path[later] - path[earlier]
+    missed = poses[later, 2] - poses[earlier, 2] - np.array([r.relative[2] for r in revisits])
+    lap_cm = float(np.median(between))
+    rates = np.linspace(-settings.max_drift_rad, settings.max_drift_rad, 521) / lap_cm
+    rest = wrap_angle(missed - rates[:, None] * between)
+    votes = np.sum(np.exp(-0.5 * (rest / (0.5 * settings.drift_tolerance_rad)) ** 2), axis=1)
+    # A hundredth of the votes settles ties towards less drift.
+    best = int(np.argmax(votes - 0.01 * len(revisits) * np.abs(rates) / rates[-1]))
+    turns = np.rint((missed - rates[best] * between) / (2.0 * np.pi)).astype(int)
+    good = np.abs(rest[best]) <= settings.drift_tolerance_rad
+    kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, turns, good, strict=True) if ok]
+    return kept, float(rates[best])
 
 
 def match_places(

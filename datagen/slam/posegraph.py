@@ -45,7 +45,7 @@ def close_loops(
 
 
 def _solve_headings(heading: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Float[np.ndarray, "n"]:
-    """Headings that keep the turns between neighbours and meet the revisits up to whole turns."""
+    """Headings that keep the turns between neighbours and meet the revisits with their whole turns."""
     n = len(heading)
     turn_sigma, revisit_sigma = 0.01, 0.05
     rows, columns, values, targets = [0], [0], [1e3], [1e3 * heading[0]]
@@ -55,12 +55,10 @@ def _solve_headings(heading: Float[np.ndarray, "n"], revisits: list[Revisit]) ->
         values += [-1.0 / turn_sigma, 1.0 / turn_sigma]
         targets.append((heading[k + 1] - heading[k]) / turn_sigma)
     for i, revisit in enumerate(revisits):
-        measured = heading[revisit.later] - heading[revisit.earlier]
-        turns = np.round((measured - revisit.relative[2]) / (2.0 * np.pi))
         rows += [n + i, n + i]
         columns += [revisit.earlier, revisit.later]
         values += [-1.0 / revisit_sigma, 1.0 / revisit_sigma]
-        targets.append((revisit.relative[2] + 2.0 * np.pi * turns) / revisit_sigma)
+        targets.append((revisit.relative[2] + 2.0 * np.pi * revisit.turns) / revisit_sigma)
     entries = (np.array(values), (np.array(rows), np.array(columns)))
     a = coo_matrix(entries, shape=(n + len(revisits), n)).tocsc()
     return np.asarray(spsolve((a.T @ a).tocsc(), a.T @ np.array(targets)))

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lanenet.data.drive import Drive
-from lanenet.perception.birdseye import RoadEdgeExtractor, RoadEdges
+from lanenet.geometry.camera import Camera
+from lanenet.perception.birdseye import RangeSettings, RoadEdges, RoadTable
+from lanenet.perception.edges import EdgePixels, EdgeSettings, find_edges
 
 Progress = Callable[[int, int], None]
 
@@ -37,20 +39,73 @@ class Scans:
         """Return the slice of frame k's points."""
         return slice(int(self.starts[k]), int(self.starts[k + 1]))
 
+    def cut(self, frames: slice) -> Scans:
+        """Return a stretch of the drive."""
+        starts = self.starts[frames.start : frames.stop + 1]
+        points = slice(int(starts[0]), int(starts[-1]))
+        return Scans(
+            self.points_cm[points], self.normals[points], self.weights[points], starts - starts[0]
+        )
+
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:
         """Frame index of every point."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
 
-def scan_drive(drive: Drive, extractor: RoadEdgeExtractor, progress: Progress | None = None) -> Scans:
-    """Extract the edge points of every frame of a drive."""
-    frames: list[RoadEdges] = []
+def edges_of_drive(
+    drive: Drive, settings: EdgeSettings, table: RoadTable, progress: Progress | None = None
+) -> list[EdgePixels]:
+    """Find the edge pixels of every frame that see the road."""
+    frames: list[EdgePixels] = []
     for k in range(len(drive)):
-        frames.append(extractor.extract(drive.image(k)))
+        frames.append(find_edges(drive.image(k), settings, table.keep, table.scale))
         if progress is not None:
             progress(k + 1, len(drive))
-    return pack_scans(frames, extractor.camera.mounting.height_cm)
+    return frames
+
+
+def scans_of(
+    edges: list[EdgePixels],
+    camera: Camera,
+    range_settings: RangeSettings,
+    tilt_rad: Float[np.ndarray, "n 2"] | None = None,
+) -> Scans:
+    """Move the edge pixels of all frames to the road.
+
+    Args:
+        edges: Edge pixels per frame.
+        camera: The camera.
+        range_settings: Which part of the road counts.
+        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for none.
+    """
+    table = RoadTable(camera, range_settings)
+    frames = []
+    for k, pixels in enumerate(edges):
+        nearest = np.rint(pixels.uv_px).astype(np.intp)
+        seen = table.keep[nearest[:, 1], nearest[:, 0]] > 0
+        kept = EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
+        frames.append(table.lift(kept) if tilt_rad is None else _lift_tilted(kept, camera, tilt_rad[k]))
+    return pack_scans(frames, camera.mounting.height_cm)
+
+
+def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
+    """Lift with the camera as it nodded in this frame."""
+    m = camera.mounting
+    nodded = camera.with_mounting(
+        pitch_down_rad=m.pitch_down_rad + float(tilt_rad[0]), roll_rad=m.roll_rad + float(tilt_rad[1])
+    )
+    n = len(pixels.uv_px)
+    along = np.stack([-pixels.normals[:, 1], pixels.normals[:, 0]], axis=1)
+    ends = np.concatenate([pixels.uv_px, pixels.uv_px + 0.5 * along, pixels.uv_px + 0.5 * pixels.normals])
+    road = nodded.intersect_ground(ends).reshape(3, n, 2)
+    tangent, towards = road[1] - road[0], road[2] - road[0]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    # Of the two normals the one on the brighter side.
+    normal *= np.where(np.sum(normal * towards, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    good = np.isfinite(road[0]).all(axis=1) & np.isfinite(normal).all(axis=1)
+    return RoadEdges(road[0][good], normal[good])
 
 
 def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:

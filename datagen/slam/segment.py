@@ -1,4 +1,4 @@
-"""One uninterrupted stretch of a drive: tracked, its loops closed, its laps counted."""
+"""One uninterrupted stretch of a drive: tracked, its loops closed, adjusted, its laps counted."""
 
 from __future__ import annotations
 
@@ -8,42 +8,57 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.map_settings import MapSettings
-from datagen.slam.calibrate import heading_error_per_lap, mapping_range, next_yaw
+from datagen.slam.bundle import BundleResult, adjust
+from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import SteeringFit, commands_of, track
-from datagen.slam.places import Revisit, match_places, path_lengths, propose_revisits, thumbnails
+from datagen.slam.places import (
+    Revisit,
+    consistent_revisits,
+    match_places,
+    path_lengths,
+    propose_revisits,
+    thumbnails,
+)
 from datagen.slam.posegraph import close_loops
-from datagen.slam.scans import Progress, Scans, scan_drive
+from datagen.slam.scans import Progress, Scans, edges_of_drive, scans_of
 from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import RoadEdgeExtractor
+from lanenet.perception.birdseye import RoadTable
 
-_YAW_ROUNDS = 3
-_YAW_GOOD_ENOUGH_RAD = 0.02  # of heading per lap
+#: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
+_OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
+_CLOSED_LOOP = ("focal", "cx", "cy", "k1", *_OPEN_LOOP)
+#: Where around a revisit more pairs of frames show the same place, in frames.
+_BESIDE_REVISIT = range(-12, 13, 4)
 
 
 @dataclass(frozen=True)
 class SolvedSegment:
-    """A tracked and closed segment, in the scale of its camera.
+    """A tracked, closed and adjusted segment, in the scale of its camera.
 
     Attributes:
-        scans: Edge points per frame.
-        trajectory: Open-loop trajectory.
+        camera: The camera, adjusted where it was not known.
+        scans: Edge points per frame, with the camera as it nodded in each.
+        trajectory: Open-loop trajectory of the particle filter.
         poses: Rear-axle poses after closing loops, frame map.
         steering: How curvature answers to the command, where it does.
         revisits: Places seen twice.
         residuals: What each revisit misses after closing: ahead, left, heading.
-        heading_drift_rad: Heading that the open loop misses per lap; None without a revisit.
+        drift_rad_per_cm: Heading that the open loop missed per length; None without a revisit.
+        bundle: The adjustment.
     """
 
+    camera: Camera
     scans: Scans
     trajectory: Trajectory
     poses: Float[np.ndarray, "n 3"]
     steering: SteeringFit | None
     revisits: list[Revisit]
     residuals: Float[np.ndarray, "r 3"]
-    heading_drift_rad: float | None
+    drift_rad_per_cm: float | None
+    bundle: BundleResult
 
     @property
     def path_cm(self) -> Float[np.ndarray, "n"]:
@@ -57,14 +72,27 @@ class SolvedSegment:
 
 
 def solve_segment(
-    drive: Drive, camera: Camera, settings: MapSettings, rng: np.random.Generator, progress: Progress | None
+    drive: Drive,
+    camera: Camera,
+    settings: MapSettings,
+    rng: np.random.Generator,
+    progress: Progress | None,
+    find_camera: bool = False,
 ) -> SolvedSegment:
-    """Track one segment and close its loops."""
+    """Track one segment, close its loops, and adjust all of it together.
+
+    Args:
+        drive: The segment.
+        camera: Its camera, or a coarse guess of it.
+        settings: Settings of all stages.
+        rng: Source of randomness.
+        progress: Called with (done, total).
+        find_camera: Adjust the camera too.
+    """
     height = camera.mounting.height_cm
-    perception = settings.perception.model_copy(
-        update={"range": mapping_range(height, settings.perception.range)}
-    )
-    scans = scan_drive(drive, RoadEdgeExtractor(camera, perception))
+    limits = mapping_range(height, settings.perception.range)
+    edges = edges_of_drive(drive, settings.perception.edges, RoadTable(camera, limits))
+    scans = scans_of(edges, camera, limits)
     if len(scans.points_cm) < 20 * len(scans):
         raise TrackingLostError(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
@@ -72,39 +100,44 @@ def solve_segment(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
-    pairs = propose_revisits(thumbnails(drive), trajectory.poses, height, settings.revisits)
+    bundle = adjust(
+        edges, trajectory.poses, camera, settings.bundle, rng, free=_OPEN_LOOP if find_camera else ()
+    )
+    scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
+    pairs = propose_revisits(thumbnails(drive), bundle.poses, height, settings.revisits)
     found = [
-        match_places(scans, trajectory.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
+        match_places(scans, bundle.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
         for pair in pairs
     ]
-    revisits = [revisit for revisit in found if revisit is not None]
+    matched = [revisit for revisit in found if revisit is not None]
+    revisits, drift = consistent_revisits(bundle.poses, matched, settings.revisits)
     if len(revisits) < settings.revisits.min_revisits:
         revisits = []
-    poses, residuals = close_loops(trajectory.poses, revisits, height)
-    drift = heading_error_per_lap(trajectory.poses, revisits) if revisits else None
-    return SolvedSegment(scans, trajectory, poses, steering, revisits, residuals, drift)
-
-
-def refine_yaw(
-    drive: Drive, camera: Camera, settings: MapSettings, rng: np.random.Generator, progress: Progress | None
-) -> Camera:
-    """Turn the camera until laps close in heading; without a revisit it stays as it is."""
-    # A camera whose yaw is off by a few degrees drifts by a good part of the lap.
-    wide = {"max_drift_share": 0.6, "max_turn_drift_rad": 2.5}
-    settings = settings.model_copy(update={"revisits": settings.revisits.model_copy(update=wide)})
-    tried: list[tuple[float, float]] = []
-    best = camera
-    for _ in range(_YAW_ROUNDS):
-        solved = solve_segment(drive, camera, settings, rng, progress)
-        if solved.heading_drift_rad is None:
-            return camera
-        tried.append((camera.mounting.yaw_rad, solved.heading_drift_rad))
-        if abs(solved.heading_drift_rad) <= min(abs(error) for _, error in tried):
-            best = camera
-        if abs(solved.heading_drift_rad) < _YAW_GOOD_ENOUGH_RAD:
-            break
-        camera = camera.with_mounting(yaw_rad=next_yaw(tried))
-    return best
+    poses, residuals = close_loops(bundle.poses, revisits, height)
+    if revisits:
+        loops = [
+            (r.earlier + d, r.later + d)
+            for r in revisits
+            for d in _BESIDE_REVISIT
+            if 0 <= r.earlier + d and r.later + d < len(drive)
+        ]
+        for free in (_OPEN_LOOP, _CLOSED_LOOP) if find_camera else ((),):
+            bundle = adjust(
+                edges, poses, bundle.camera, settings.bundle, rng, free, loops=loops, tilt=bundle.tilt
+            )
+            poses = bundle.poses
+        scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
+    return SolvedSegment(
+        bundle.camera,
+        scans,
+        trajectory,
+        poses,
+        steering,
+        revisits,
+        residuals,
+        drift if revisits else None,
+        bundle,
+    )
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:
