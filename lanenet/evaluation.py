@@ -184,16 +184,9 @@ def _answer(
         if progress is not None:
             progress(source.path.name, done, total)
 
-    answered = answer_frames(frames, detectors, report)
+    answers = answer_frames(frames, detectors, report)
     kind = "simulated drive" if frames.reference == "truth" else "map"
-    return SourceAnswers(
-        name,
-        kind,
-        frames.reference,
-        frames.points_cm,
-        {key: answer.points_cm for key, answer in answered.items()},
-        {key: answer.times_ms for key, answer in answered.items()},
-    )
+    return SourceAnswers(name, kind, frames.reference, frames.points_cm, answers)
 
 
 def _answer_labels(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from lanenet.learn.evaluate import ErrorStats, ErrorTable, error_stats, point_er
 
 FORMAT = "lanenet-evaluation/1"
 
-_UNITS = {"*_cm": "centimetre", "*_ms": "millisecond", "coverage": "share of the labelled points, 0 to 1"}
+_UNITS = {"*_cm": "centimetre", "coverage": "share of the labelled points, 0 to 1"}
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,6 @@ class SourceAnswers:
         reference: Where the labels come from: ``truth`` or ``map``.
         truth_cm: Six labels per frame; NaN where there is none.
         answers_cm: By detector, six points per frame; NaN where it has no answer.
-        times_ms: By detector, its time for each frame; empty where it was not measured.
     """
 
     name: str
@@ -35,7 +34,6 @@ class SourceAnswers:
     reference: str
     truth_cm: Float[np.ndarray, "n 6"]
     answers_cm: Mapping[str, Float[np.ndarray, "_ 6"]]
-    times_ms: Mapping[str, Float[np.ndarray, "_"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,6 @@ class Comparison:
         shared: By detector but the first: it and the first on the points that both answered. Detectors that
             answer only what is easy look good on their own answers.
         sources: The errors by source.
-        median_ms: Median time per frame by detector, where it was measured.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
     """
 
@@ -88,7 +85,6 @@ class Comparison:
     tables: dict[str, ErrorTable]
     shared: dict[str, SharedErrors]
     sources: tuple[SourceErrors, ...]
-    median_ms: dict[str, float]
     errors_cm: dict[str, Float[np.ndarray, "n 6"]]
 
     @property
@@ -103,7 +99,6 @@ class Comparison:
             shared = self.shared.get(name)
             detectors[name] = {
                 **table.as_dict(),
-                "median_ms": self.median_ms.get(name),
                 "shared_with": None if shared is None else self.first,
                 "shared": None if shared is None else shared.own.as_dict(),
                 "first_on_shared": None if shared is None else shared.first.as_dict(),
@@ -171,7 +166,6 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         tables={name: point_errors(answer, truth, reference) for name, answer in answers.items()},
         shared=shared,
         sources=tuple(_source_errors(source) for source in sources),
-        median_ms=_median_ms(sources),
         errors_cm=errors,
     )
 
@@ -179,11 +173,3 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
 def _source_errors(source: SourceAnswers) -> SourceErrors:
     stats = {name: point_errors(answer, source.truth_cm).all for name, answer in source.answers_cm.items()}
     return SourceErrors(source.name, source.kind, source.reference, len(source.truth_cm), stats)
-
-
-def _median_ms(sources: Sequence[SourceAnswers]) -> dict[str, float]:
-    times: dict[str, list[Float[np.ndarray, "_"]]] = {}
-    for source in sources:
-        for name, measured in source.times_ms.items():
-            times.setdefault(name, []).append(measured)
-    return {name: float(np.median(np.concatenate(parts))) for name, parts in times.items()}

@@ -87,9 +87,6 @@ def _by_point(comparison: Comparison) -> TextTable:
         f"{counts.pop()} labelled points of {frames} frames; the columns are the line and the distance ahead "
         "in cm"
     )
-    if comparison.median_ms:
-        times = ", ".join(f"{name} {ms:.2f}" for name, ms in comparison.median_ms.items())
-        note += f"; median time per frame in ms: {times}"
     return TextTable(
         title=f"Errors in cm against the {comparison.reference}",
         header=["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -27,19 +25,6 @@ COMPARED: tuple[ComparedName, ...] = ("network", "lane-filter", "hough", "hough-
 ON_LABEL_SETS: tuple[ComparedName, ...] = ("network", "lane-filter")
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class FrameAnswers:
-    """What one detector said about a source.
-
-    Attributes:
-        points_cm: Six points per frame, frame car; NaN where there is no answer.
-        times_ms: Time of the detector for each frame, without reading the image.
-    """
-
-    points_cm: Float[np.ndarray, "n 6"]
-    times_ms: Float[np.ndarray, "n"]
 
 
 def choose_names(text: str) -> tuple[ComparedName, ...]:
@@ -96,7 +81,7 @@ def build_compared(
 
 def answer_frames(
     frames: LabelledFrames, detectors: Mapping[str, Detector], progress: Progress | None = None
-) -> dict[str, FrameAnswers]:
+) -> dict[str, Float[np.ndarray, "n 6"]]:
     """Run detectors over every frame in order; all forget what they saw where the source is interrupted.
 
     Args:
@@ -105,14 +90,14 @@ def answer_frames(
         progress: Called with (frames done, frames).
 
     Returns:
-        The answers by name.
+        Six points per frame by name, [cm], frame car; NaN where a detector has no answer.
 
     Raises:
         DriveFormatError: If a frame cannot be read; names it.
         CalibrationError: If a frame does not fit the camera; names it.
     """
     n = len(frames)
-    answers = {name: FrameAnswers(np.full((n, N_POINTS), np.nan), np.full(n, np.nan)) for name in detectors}
+    answers = {name: np.full((n, N_POINTS), np.nan) for name in detectors}
     for i in range(n):
         try:
             image = frames.image(i)
@@ -121,13 +106,10 @@ def answer_frames(
         for name, detector in detectors.items():
             if i == 0 or frames.starts[i]:
                 detector.reset()
-            start_s = time.perf_counter()
             try:
-                estimate = detector.detect(image)
+                answers[name][i] = detector.detect(image).points_cm
             except CalibrationError as error:
                 raise CalibrationError(f"{frames.name}, frame {frames.frames[i]}: {error}") from None
-            answers[name].times_ms[i] = 1e3 * (time.perf_counter() - start_s)
-            answers[name].points_cm[i] = estimate.points_cm
         if progress is not None:
             progress(i + 1, n)
     return answers

