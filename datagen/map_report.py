@@ -85,7 +85,10 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
                     "across_cm": factor * float(np.median(residual[:, 1])) if len(residual) else None,
                     "heading_rad": float(np.median(residual[:, 2])) if len(residual) else None,
                 },
-                "heading_drift_per_lap_rad": solved.heading_drift_rad,
+                "heading_drift_rad_per_m": None
+                if solved.drift_rad_per_cm is None
+                else 100.0 * solved.drift_rad_per_cm / factor,
+                "reprojection_robust_sd_px": solved.bundle.robust_sd_px,
                 "steering": None if solved.steering is None else vars(solved.steering),
                 "lane_cm": factor * lane.lane_cm,
                 "tape_cm": factor * lane.tape_cm,

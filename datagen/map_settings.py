@@ -6,6 +6,7 @@ from pydantic import Field
 
 from datagen.lanes.fit import FitSettings
 from datagen.lanes.trace import TraceSettings
+from datagen.slam.bundle import BundleSettings
 from datagen.slam.calibrate import GuessSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import MotionSettings
@@ -28,6 +29,7 @@ class MapSettings(Settings):
         guess: First guess of an unknown camera.
         filter: Particle filter.
         motion: How the car may move.
+        bundle: Adjustment of poses and camera together.
         revisits: What counts as the same place.
         trace: How lane lines are looked for.
         fit: Cubics through them.
@@ -39,6 +41,7 @@ class MapSettings(Settings):
     guess: GuessSettings = GuessSettings()
     filter: FilterSettings = FilterSettings()
     motion: MotionSettings = MotionSettings()
+    bundle: BundleSettings = BundleSettings()
     revisits: RevisitSettings = RevisitSettings()
     trace: TraceSettings = TraceSettings()
     fit: FitSettings = FitSettings()

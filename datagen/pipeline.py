@@ -19,7 +19,7 @@ from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.slam.calibrate import coarse_camera, with_known_scale
 from datagen.slam.scans import Progress
-from datagen.slam.segment import refine_yaw, solve_segment
+from datagen.slam.segment import SolvedSegment, solve_segment
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
@@ -69,20 +69,23 @@ def map_drive(
         _check_size(known, drive, camera_path)
         camera, how = known, "given"
     else:
-        longest = drive.subset(max(segments, key=lambda s: s.stop - s.start))
+        longest_rows = max(segments, key=lambda s: s.stop - s.start)
+        longest = drive.subset(longest_rows)
         camera, candidates = coarse_camera(longest, settings.perception, settings.guess, rng, progress)
-        how = (
-            "from the drive: focal length and pitch by match score, yaw by closing laps, scale by lane width"
-        )
-        figures["calibration"] = {"candidates": [vars(c) for c in candidates]}
-        if settings.guess.refine_yaw:
-            camera = refine_yaw(longest, camera, settings, rng, progress)
-    parts = [
-        _map_segment(
-            drive, rows, camera, lane_width_cm if known is not None else None, settings, rng, progress
-        )
-        for rows in segments
-    ]
+        how = "from the drive: coarse by match score, then bundle adjustment, scale by lane width"
+        solved = solve_segment(longest, camera, settings, rng, progress, find_camera=True)
+        camera = solved.camera
+        figures["calibration"] = {
+            "candidates": [vars(c) for c in candidates],
+            "sigma": solved.bundle.sigma,
+            "closed": bool(solved.revisits),
+        }
+    width = lane_width_cm if known is not None else None
+    parts = []
+    for rows in segments:
+        if known is not None or rows != longest_rows:
+            solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
+        parts.append(_find_lane(rows, solved, width, settings))
     factor = 1.0
     if known is None:
         factor = lane_width_cm / float(np.median([part.lane.lane_cm for part in parts]))
@@ -156,20 +159,13 @@ def _check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
         )
 
 
-def _map_segment(
-    drive: Drive,
-    rows: slice,
-    camera: Camera,
-    lane_width_cm: float | None,
-    settings: MapSettings,
-    rng: np.random.Generator,
-    progress: Progress | None,
+def _find_lane(
+    rows: slice, solved: SolvedSegment, lane_width_cm: float | None, settings: MapSettings
 ) -> MappedSegment:
-    """Track a segment, close its loops and find its lane lines, in the scale of the camera."""
-    height = camera.mounting.height_cm
-    solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
+    """Find a solved segment's lane lines, in the scale of its camera."""
+    height = solved.camera.mounting.height_cm
     path = path_of_poses(solved.poses, 0.12 * height, 5.0 * height)
-    edges = edges_along_path(path, solved.scans, solved.poses, camera.wheelbase_cm, 3.5 * height)
+    edges = edges_along_path(path, solved.scans, solved.poses, solved.camera.wheelbase_cm, 3.5 * height)
     lane = trace_lane(path, edges, height, lane_width_cm, settings.trace)
     return MappedSegment(rows, solved, path.s_frames_cm, lane, fit_lines(path, lane, height, settings.fit))
 

@@ -79,6 +79,8 @@ class BundleResult:
         camera: The adjusted camera.
         sigma: Standard deviation of each of the camera's numbers (see ``CAMERA_NAMES``; focal relative).
         residual_px: Residuals of the last round.
+        misfit: Mean robust loss over all points that were moved; one that met no edge counts as if it had
+            met one at the rim of its search. The lower, the better the frames agree.
         pairs: Number of pairs of frames.
     """
 
@@ -87,6 +89,7 @@ class BundleResult:
     camera: Camera
     sigma: dict[str, float]
     residual_px: Float[np.ndarray, "r"]
+    misfit: float
     pairs: int
 
     @property
@@ -141,12 +144,16 @@ def adjust(
             else:
                 damping *= 10.0
     sigma = problem.camera_sigma(normal)
+    lost = problem.moved_points - len(residual)
+    at_rim, seen = (np.log1p((v / settings.cauchy_px) ** 2) for v in (gate_px, residual))
+    misfit = (lost * at_rim + float(np.nansum(seen))) / max(problem.moved_points, 1)
     return BundleResult(
         poses=state.poses * [height, height, 1.0],
         tilt=state.tilt,
         camera=problem.camera_of(state),
         sigma=dict(zip(CAMERA_NAMES, sigma.tolist(), strict=True)),
         residual_px=residual[np.isfinite(residual)],
+        misfit=float(misfit),
         pairs=len(problem.pairs),
     )
 
@@ -199,10 +206,13 @@ class _Problem:
         for lag in settings.lags:
             i = np.arange(self.n - lag)
             i = i[segment[i] == segment[i + lag]]
-            pairs += [np.stack([i, i + lag], axis=1), np.stack([i + lag, i], axis=1)]
+            # Back and forth in turn: points that leave the view one way are seen the other way.
+            back = i % 2 == 1
+            pairs.append(np.where(back[:, None], np.stack([i + lag, i], 1), np.stack([i, i + lag], 1)))
         both = [(a, b) for a, b in loops] + [(b, a) for a, b in loops]
         pairs.append(np.array(both, dtype=np.int64).reshape(-1, 2))
         self.pairs = np.concatenate(pairs).astype(np.int64)
+        self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         weight = 1.0 / settings.pixel_sigma**2
         self.weight = np.full(len(self.uv), weight)
@@ -242,19 +252,41 @@ class _Problem:
         out, normal = np.empty((len(self.uv), 2)), np.empty((len(self.uv), 2))
         by = np.empty((len(self.uv), N_CAMERA, 2))
         lift_points(
-            self.fisheye, state.lens, state.mount, state.tilt, self.frame, self.uv, self.normals, _STEPS,
-            out, by, normal,
+            self.fisheye,
+            state.lens,
+            state.mount,
+            state.tilt,
+            self.frame,
+            self.uv,
+            self.normals,
+            _STEPS,
+            out,
+            by,
+            normal,
         )
         return out, by, normal
 
     def associate(self, state: _State, gate_px: float) -> _Links:
         lifted, _, normal = self._lift(state)
-        room = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
-        point, edge, pair = (np.empty(room, np.int64) for _ in range(3))
+        point, edge, pair = (np.empty(self.moved_points, np.int64) for _ in range(3))
         count = associate(
-            self.fisheye, state.lens, state.mount, state.tilt, state.poses, self.pairs, self.point_starts,
-            lifted, normal, self.edge_starts, self.edge_uv, self.edge_normals,
-            gate_px * self.camera.width / 160.0, 0.8, point, edge, pair,
+            self.fisheye,
+            state.lens,
+            state.mount,
+            state.tilt,
+            state.poses,
+            self.pairs,
+            self.point_starts,
+            lifted,
+            normal,
+            self.edge_starts,
+            self.edge_uv,
+            self.edge_normals,
+            gate_px * self.camera.width / 160.0,
+            0.8,
+            point,
+            edge,
+            pair,
         )
         starts = np.searchsorted(pair[:count], np.arange(len(self.pairs) + 1))
         return _Links(point[:count], edge[:count], starts.astype(np.int64))
@@ -265,9 +297,25 @@ class _Problem:
         blocks, rhs = np.zeros((len(self.pairs), size, size)), np.zeros((len(self.pairs), size))
         residual = np.empty(len(links.point))
         cost = accumulate(
-            self.fisheye, state.lens, state.mount, state.tilt, state.poses, self.pairs, links.pair_starts,
-            links.point, links.edge, lifted, by, self.edge_uv, self.edge_normals, self.weight, _STEPS,
-            self.settings.cauchy_px, blocks, rhs, residual,
+            self.fisheye,
+            state.lens,
+            state.mount,
+            state.tilt,
+            state.poses,
+            self.pairs,
+            links.pair_starts,
+            links.point,
+            links.edge,
+            lifted,
+            by,
+            self.edge_uv,
+            self.edge_normals,
+            self.weight,
+            _STEPS,
+            self.settings.cauchy_px,
+            blocks,
+            rhs,
+            residual,
         )
         unknowns = N_FRAME * self.n + N_CAMERA
         i, j = (N_FRAME * self.pairs[:, k, None] + np.arange(N_FRAME) for k in (0, 1))
@@ -321,9 +369,14 @@ class _Problem:
         follows = np.flatnonzero(j[:-1] == i[1:])
         a, b = follows, follows + 1
         add(
-            along[b] - along[a], s.speed_change,
-            (xj[b], cm[b]), (yj[b], sm[b]), (xi[b], -cm[b] - cm[a]), (yi[b], -sm[b] - sm[a]),
-            (xi[a], cm[a]), (yi[a], sm[a]),
+            along[b] - along[a],
+            s.speed_change,
+            (xj[b], cm[b]),
+            (yj[b], sm[b]),
+            (xi[b], -cm[b] - cm[a]),
+            (yi[b], -sm[b] - sm[a]),
+            (xi[a], cm[a]),
+            (yi[a], sm[a]),
         )
         add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
         # The first pose stays; camera priors, hard where a number is not free.

@@ -148,8 +148,23 @@ def lift_points(fisheye, lens, mount, tilt, frame, uv, normals, steps, out, out_
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def associate(
-    fisheye, lens, mount, tilt, poses, pairs, point_starts, lifted, lifted_normal,
-    edge_starts, edge_uv, edge_normals, gate_px, min_dot, out_point, out_edge, out_pair,
+    fisheye,
+    lens,
+    mount,
+    tilt,
+    poses,
+    pairs,
+    point_starts,
+    lifted,
+    lifted_normal,
+    edge_starts,
+    edge_uv,
+    edge_normals,
+    gate_px,
+    min_dot,
+    out_point,
+    out_edge,
+    out_pair,
 ):
     """Find for every point of frame i the nearest edge of frame j that brightens the same way.
 
@@ -197,8 +212,25 @@ def associate(
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def accumulate(
-    fisheye, lens, mount, tilt, poses, pairs, pair_starts, points, edges,
-    lifted, lifted_by, edge_uv, edge_normals, point_weight, steps, cauchy_px, blocks, rhs, residual,
+    fisheye,
+    lens,
+    mount,
+    tilt,
+    poses,
+    pairs,
+    pair_starts,
+    points,
+    edges,
+    lifted,
+    lifted_by,
+    edge_uv,
+    edge_normals,
+    point_weight,
+    steps,
+    cauchy_px,
+    blocks,
+    rhs,
+    residual,
 ):
     """Sum the normal equations of all point-to-line residuals, a block per pair of frames.
 

@@ -53,7 +53,9 @@ def guessed_camera(
     """Build a fisheye camera of nominal height, ``lever_heights`` ahead of the rear axle."""
     K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     ahead = guess.lever_heights * NOMINAL_HEIGHT_CM - guess.wheelbase_cm
-    mounting = Mounting(NOMINAL_HEIGHT_CM, pitch_down_rad=float(np.deg2rad(pitch_deg)), ahead_of_front_axle_cm=ahead)
+    mounting = Mounting(
+        NOMINAL_HEIGHT_CM, pitch_down_rad=float(np.deg2rad(pitch_deg)), ahead_of_front_axle_cm=ahead
+    )
     return Camera(
         "fisheye", width, height, K, np.array([guess.k1, 0.0, 0.0, 0.0]), mounting, guess.wheelbase_cm
     )
@@ -96,9 +98,8 @@ def coarse_camera(
     tried: dict[tuple[float, float], Candidate] = {}
     grid = [(f * scale, p) for f in guess.focal_px for p in guess.pitch_deg]
     total = len(grid) + 9
-    middle = guessed_camera(
-        drive.width, drive.height, *(float(np.median(v)) for v in zip(*grid, strict=True)), guess
-    )
+    focal, pitch = (float(np.median(values)) for values in zip(*grid, strict=True))
+    middle = guessed_camera(drive.width, drive.height, focal, pitch, guess)
     steps = np.array(STEPS_HEIGHTS)
     usual, _ = _best_step(pixels, middle, perception, steps, seed)
     # Two rounds: the given grid, then half its steps around the best.
@@ -115,9 +116,7 @@ def coarse_camera(
         if round_index == 0:
             df = 0.5 * _spacing(guess.focal_px) * scale
             dp = 0.5 * _spacing(guess.pitch_deg)
-            grid = [
-                (best.focal_px + i * df, best.pitch_deg + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)
-            ]
+            grid = [(best.focal_px + i * df, best.pitch_deg + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     camera = guessed_camera(drive.width, drive.height, best.focal_px, best.pitch_deg, guess)
     return camera, list(tried.values())
 

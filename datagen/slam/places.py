@@ -18,6 +18,8 @@ from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_
 from lanenet.perception.edges import to_gray
 
 _THUMB_WIDTH, _THUMB_HEIGHT = 24, 18
+#: Explanations of the drift that are worth a map of their own.
+_MAX_DRIFTS, _MIN_VOTE_SHARE = 2, 0.5
 
 
 class RevisitSettings(Settings):
@@ -41,7 +43,7 @@ class RevisitSettings(Settings):
 
     min_gap_heights: float = Field(default=20.0, gt=0.0)
     min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
-    max_drift_rad: float = Field(default=2.6, gt=0.0)
+    max_drift_rad: float = Field(default=3.8, gt=0.0)
     drift_tolerance_rad: float = Field(default=0.45, gt=0.0)
     min_revisits: int = Field(default=3, ge=1)
     min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
@@ -141,12 +143,13 @@ def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:
 
 def consistent_revisits(
     poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], settings: RevisitSettings
-) -> tuple[list[Revisit], float]:
-    """Keep the revisits that one drift of the heading explains, and count their whole turns.
+) -> list[tuple[list[Revisit], float]]:
+    """Group the revisits by the drift of the heading that explains them, and count their whole turns.
 
     The open loop misses heading in proportion to its length, nearly: most of it is a camera that looks a
-    little to the side, or a speed that is a little off. The drift that most revisits agree on, up to whole
-    turns, is found by trying all; of equal ones the smallest counts.
+    little to the side, or a speed that is a little off. All drifts are tried, up to whole turns; where two
+    explain the revisits about as well, a lap that turns once and one that turns twice or not at all are both
+    possible, and only the map that each gives can tell.
 
     Args:
         poses: Open-loop trajectory, heading unwrapped.
@@ -154,24 +157,30 @@ def consistent_revisits(
         settings: Bounds.
 
     Returns:
-        The revisits kept, with their turns, and the drift, [rad/cm].
+        The possible sets of revisits, with their turns and their drift, [rad/cm]; likeliest first.
     """
-    if not revisits:
-        return [], 0.0
+    if len(revisits) < settings.min_revisits:
+        return []
     path = path_lengths(poses)
     earlier, later = (np.array([getattr(r, name) for r in revisits]) for name in ("earlier", "later"))
     between = path[later] - path[earlier]
     missed = poses[later, 2] - poses[earlier, 2] - np.array([r.relative[2] for r in revisits])
-    lap_cm = float(np.median(between))
-    rates = np.linspace(-settings.max_drift_rad, settings.max_drift_rad, 521) / lap_cm
+    limit = settings.max_drift_rad / float(np.median(between))
+    rates = np.linspace(-limit, limit, 521)
     rest = wrap_angle(missed - rates[:, None] * between)
     votes = np.sum(np.exp(-0.5 * (rest / (0.5 * settings.drift_tolerance_rad)) ** 2), axis=1)
-    # A hundredth of the votes settles ties towards less drift.
-    best = int(np.argmax(votes - 0.01 * len(revisits) * np.abs(rates) / rates[-1]))
-    turns = np.rint((missed - rates[best] * between) / (2.0 * np.pi)).astype(int)
-    good = np.abs(rest[best]) <= settings.drift_tolerance_rad
-    kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, turns, good, strict=True) if ok]
-    return kept, float(rates[best])
+    found: list[tuple[list[Revisit], float]] = []
+    left = votes.copy()
+    while len(found) < _MAX_DRIFTS and left.max() >= _MIN_VOTE_SHARE * votes.max():
+        best = int(np.argmax(left))
+        turns = np.rint((missed - rates[best] * between) / (2.0 * np.pi)).astype(int)
+        good = np.abs(rest[best]) <= settings.drift_tolerance_rad
+        kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, turns, good, strict=True) if ok]
+        if len(kept) >= settings.min_revisits:
+            found.append((kept, float(rates[best])))
+        # Another count of turns is half a turn per lap away, at least.
+        left[np.abs(rates - rates[best]) * np.median(between) < 0.5 * np.pi] = 0.0
+    return found
 
 
 def match_places(

@@ -43,9 +43,7 @@ class Scans:
         """Return a stretch of the drive."""
         starts = self.starts[frames.start : frames.stop + 1]
         points = slice(int(starts[0]), int(starts[-1]))
-        return Scans(
-            self.points_cm[points], self.normals[points], self.weights[points], starts - starts[0]
-        )
+        return Scans(self.points_cm[points], self.normals[points], self.weights[points], starts - starts[0])
 
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleResult, adjust
+from datagen.slam.bundle import CAMERA_NAMES, BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import SteeringFit, commands_of, track
@@ -29,7 +29,6 @@ from lanenet.perception.birdseye import RoadTable
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
-_CLOSED_LOOP = ("focal", "cx", "cy", "k1", *_OPEN_LOOP)
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
 
@@ -110,34 +109,54 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    revisits, drift = consistent_revisits(bundle.poses, matched, settings.revisits)
-    if len(revisits) < settings.revisits.min_revisits:
-        revisits = []
-    poses, residuals = close_loops(bundle.poses, revisits, height)
+    revisits: list[Revisit] = []
+    residuals, drift = np.empty((0, 3)), None
+    open_bundle = bundle
+    for kept, rate in consistent_revisits(bundle.poses, matched, settings.revisits):
+        poses, missed = close_loops(open_bundle.poses, kept, height)
+        closed = adjust(
+            edges,
+            poses,
+            open_bundle.camera,
+            settings.bundle,
+            rng,
+            free=_OPEN_LOOP if find_camera else (),
+            loops=_loops(kept, len(drive)),
+            tilt=open_bundle.tilt,
+        )
+        if not revisits or closed.misfit < bundle.misfit:
+            bundle, revisits, residuals, drift = closed, kept, missed, rate
+    if revisits and find_camera:
+        loops = _loops(revisits, len(drive))
+        bundle = adjust(
+            edges,
+            bundle.poses,
+            bundle.camera,
+            settings.bundle,
+            rng,
+            free=CAMERA_NAMES,
+            loops=loops,
+            tilt=bundle.tilt,
+        )
     if revisits:
-        loops = [
-            (r.earlier + d, r.later + d)
-            for r in revisits
-            for d in _BESIDE_REVISIT
-            if 0 <= r.earlier + d and r.later + d < len(drive)
-        ]
-        for free in (_OPEN_LOOP, _CLOSED_LOOP) if find_camera else ((),):
-            bundle = adjust(
-                edges, poses, bundle.camera, settings.bundle, rng, free, loops=loops, tilt=bundle.tilt
-            )
-            poses = bundle.poses
         scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
     return SolvedSegment(
         bundle.camera,
         scans,
         trajectory,
-        poses,
+        bundle.poses,
         steering,
         revisits,
         residuals,
-        drift if revisits else None,
+        drift,
         bundle,
     )
+
+
+def _loops(revisits: list[Revisit], frames: int) -> list[tuple[int, int]]:
+    """Pairs of frames around each revisit that show the same place."""
+    pairs = [(r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
+    return [(a, b) for a, b in pairs if a >= 0 and b < frames]
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:
