@@ -29,8 +29,29 @@ def read_camera_file(path: Path) -> Any:
     return read_camera(path)
 
 
+def read_detector_file(path: Path) -> Any:
+    # A file is named after its detector, and after what is special about it.
+    from lanenet.onboard.detectors import lane_filter_settings
+
+    if path.stem.startswith("lane_filter"):
+        return lane_filter_settings(path, drive_lane_width_cm=40.0)
+    if path.stem.startswith("hough"):
+        from lanenet.perception.hough.tracker import HoughSettings
+
+        return load_settings(HoughSettings, path)
+    from lanenet.perception.painter.painter import PainterSettings
+
+    assert path.stem.startswith("painter"), path
+    return load_settings(PainterSettings, path)
+
+
 #: What reads the YAML files of each folder below configs/.
-READERS = {".": read_training_run, "drives": read_simulation, "cameras": read_camera_file}
+READERS = {
+    ".": read_training_run,
+    "drives": read_simulation,
+    "cameras": read_camera_file,
+    "detectors": read_detector_file,
+}
 
 
 def test_the_config_of_the_readme_ships() -> None:
@@ -48,6 +69,17 @@ def test_every_shipped_config_loads(path: Path) -> None:
 def test_a_training_run_is_named_after_its_file(path: Path) -> None:
     # checkpoints/<name>/ then tells which config made it, and two configs never share a folder.
     assert read_training_run(path).name == path.stem
+
+
+def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
+    from lanenet.perception.birdseye import PerceptionSettings
+    from lanenet.perception.lane_filter import PAPER, LaneFilterSettings
+
+    default = read_detector_file(CONFIGS / "detectors" / "lane_filter.yaml")
+    assert default == (LaneFilterSettings(lane_width_cm=40.0), PerceptionSettings())
+    filter_, perception = read_detector_file(CONFIGS / "detectors" / "lane_filter_paper.yaml")
+    assert filter_ == LaneFilterSettings(lane_width_cm=40.0, **PAPER)
+    assert perception.edges.method == "canny"
 
 
 def test_a_misspelt_key_is_named() -> None:
