@@ -87,6 +87,33 @@ def test_lines_of_a_lane_are_parallel() -> None:
     assert row(leaning(0.4), **PAPER) is not None
 
 
+def test_edges_of_a_marking_are_parallel() -> None:
+    # The right edge of the left marking turned by 40 degrees against the other one.
+    points, normals = together(line(-20.0), line(20.0))
+    turned = normals.copy()
+    right_edge = points[:, 0] == -19.0
+    angle = math.radians(140.0)
+    turned[right_edge] = [math.cos(angle), math.sin(angle)]
+    assert row((points, turned)) is None
+    assert row((points, turned), parallel_rad=0.8) is not None
+    assert row((points, turned), **PAPER) == pytest.approx((-20.0, 20.0))
+
+
+def test_thickness_is_measured_across_the_line() -> None:
+    # At 50 degrees a marking of 2 cm is 3.1 cm along the row.
+    slope = math.tan(math.radians(50.0))
+    half = 20.0 * math.hypot(1.0, slope)
+    edges = together(line(-half - 15.0 * slope, slope), line(half - 15.0 * slope, slope))
+    assert row(edges, marking_tolerance_cm=0.3) == pytest.approx((-half, half), abs=0.3)
+    assert row(edges, marking_tolerance_cm=0.3, marking_cm=3.1) is None
+
+
+def test_one_edge_is_no_marking() -> None:
+    # A tolerance wider than the marking must not pair a point with another of the same place.
+    points = np.repeat([[-20.0, 15.0], [20.0, 15.0]], 2, axis=0)
+    assert find_row(points, 15.0, settings(marking_cm=1.0, marking_tolerance_cm=2.0, **PAPER)) is None
+
+
 def test_an_oblique_lane_is_measured_across_its_lines() -> None:
     # At 40 degrees the lane is 52 cm wide along the row, which the paper's filter refuses.
     slope = math.tan(math.radians(40.0))
@@ -117,6 +144,9 @@ def test_lines_have_to_go_on() -> None:
     assert row(short(14.0, 17.0), agreement_share=0.0) is not None
     assert row(short(14.0, 17.0), **PAPER) is not None
     assert row(short(10.0, 20.0), agreement_share=0.8) is None
+    # A dark line that goes on where the bright one ends is another line.
+    changed = together(short(14.0, 17.0), line(-20.0, sides=DARK, start_cm=0.0, end_cm=13.9))
+    assert row(together(changed, line(-20.0, sides=DARK, start_cm=17.1))) is None
     # What goes on elsewhere does not count.
     apart = together(short(14.0, 17.0), line(-26.0, start_cm=0.0, end_cm=13.0))
     assert row(apart) is None
@@ -133,6 +163,13 @@ def test_a_lane_is_empty_between_its_lines() -> None:
         edges = together(lane, clutter)
         assert (row(edges) is not None) == found
         assert row(edges, clear_share=0.0) == pytest.approx((-20.0, 20.0), abs=0.5)
+    # The same along an oblique lane: what lies beside it is not taken for its inside.
+    slope, half = 1.5, 20.0 * math.hypot(1.0, 1.5)
+    oblique = together(line(-half - 15.0 * slope, slope), line(half - 15.0 * slope, slope))
+    y = rng.uniform(7.0, 10.0, 300)
+    outside = np.stack([half + 5.0 + slope * (y - 15.0) + rng.uniform(0.0, 2.0, 300), y], axis=1)
+    level = np.tile([0.0, 1.0], (300, 1))
+    assert row(together(oblique, (outside, level))) == pytest.approx((-half, half), abs=0.5)
     # What lies beside the lane does not matter.
     beside = rng.uniform([26.0, 7.0], [60.0, 23.0], (700, 2)), clutter[1]
     assert row(together(lane, beside)) == pytest.approx((-20.0, 20.0), abs=0.5)
