@@ -20,6 +20,8 @@ from lanenet.perception.painter.painter import LanePainter, PainterSettings
 pytestmark = pytest.mark.slow
 LOG = logging.getLogger(__name__)
 
+HOUGH_VALUE = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "hough_value.yaml"
+
 #: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
 #: a guess for the first, and for the others the median of what the painter measured with that camera.
 TUBS = {
@@ -64,6 +66,7 @@ def test_steering_beside_the_drivers(shared_data: Path, tub: str) -> None:
     compared: dict[str, Detector] = {
         "hough": HoughTracker(camera),
         "hough, V channel": HoughTracker(camera, value),
+        "hough, hough_value.yaml": build_detector("hough", camera, config=HOUGH_VALUE),
         "painter": LanePainter(camera),
         "lane filter": build_detector("lane-filter", camera, lane_width_cm=TUBS[tub][3]),
         "lane filter, 5 cm tape": build_detector(

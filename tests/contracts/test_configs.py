@@ -29,8 +29,20 @@ def read_camera_file(path: Path) -> Any:
     return read_camera(path)
 
 
+def read_detector_settings(path: Path) -> Any:
+    from lanenet.onboard.detectors import build_detector
+
+    # The detector's name comes first in the file's.
+    return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
+
+
 #: What reads the YAML files of each folder below configs/.
-READERS = {".": read_training_run, "drives": read_simulation, "cameras": read_camera_file}
+READERS = {
+    ".": read_training_run,
+    "drives": read_simulation,
+    "cameras": read_camera_file,
+    "detectors": read_detector_settings,
+}
 
 
 def test_the_config_of_the_readme_ships() -> None:
