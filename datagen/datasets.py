@@ -108,6 +108,8 @@ class PreparedData:
         train: To learn from.
         validation: To choose the epoch by.
         test: To score the result.
+        validation_frames: For each of ``validation`` the map that it was made of.
+        test_frames: For each of ``test`` the simulated drive, whose truth it holds, or the map.
         camera: Camera file, where all drives share one camera.
         example: A frame of a synthetic test drive, to try the model on.
     """
@@ -115,6 +117,8 @@ class PreparedData:
     train: list[Path]
     validation: list[Path]
     test: list[Path]
+    validation_frames: list[Path]
+    test_frames: list[Path]
     camera: Path | None
     example: Path | None
 
@@ -170,13 +174,30 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
                 pool.shutdown(cancel_futures=True)
                 raise
     parts: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
-    for i in range(len(jobs)):
+    frames: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
+    for i, (_, job) in enumerate(jobs):
         for role, path in results[i].items():
             parts[role].append(path)
+            frames[role].append(_frames_of(job))
     camera = _shared_camera(settings, work_dir)
     pictures = sorted((work_dir / "synthetic" / "drives" / "test_00" / "images").glob("*.jpg"))
     example = pictures[len(pictures) // 2] if pictures and settings.synthetic.test else None
-    return PreparedData(parts["train"], parts["validation"], parts["test"], camera, example)
+    return PreparedData(
+        parts["train"],
+        parts["validation"],
+        parts["test"],
+        frames["validation"],
+        frames["test"],
+        camera,
+        example,
+    )
+
+
+def _frames_of(job: dict[str, Any]) -> Path:
+    """Folder that leads to the frames of a job's label sets: a drive with truth, or a map."""
+    if job["kind"] == "recorded":
+        return Path(job["folder"]) / "maps" / _recorded_name(job["settings"])
+    return Path(job["folder"]) / ("drives" if job["role"] == "test" else "maps") / job["name"]
 
 
 def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.labels.label_map import label_map, lines_at
+from datagen.labels.label_map import label_map
+from datagen.labels.mapped_drive import lines_at
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane

@@ -1,7 +1,7 @@
 """The command line: one verb per thing people do, each a thin shell over a Python function.
 
-The only file that knows both ``datagen`` and ``lanenet.learn``. They are imported inside the commands, since
-the car has neither torch nor numba.
+Only this file and :mod:`lanenet.evaluation` know both ``datagen`` and ``lanenet.learn``. They are imported
+inside the commands, since the car has neither torch nor numba.
 """
 
 from __future__ import annotations
@@ -9,23 +9,16 @@ from __future__ import annotations
 import functools
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, onboard_cli
+from lanenet import calibrate_cli, console, onboard_cli, val_cli
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption, check_ending
-
-if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float
-
-    from lanenet.data.label_set import LabelSet
-    from lanenet.learn.evaluate import Predictor
 
 _Config = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
@@ -76,6 +69,7 @@ app = typer.Typer(
 
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
+app.add_typer(val_cli.app)
 
 
 def main() -> None:
@@ -144,7 +138,7 @@ def train(
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
-    from lanenet.learn.evaluate import network_predictor
+    from lanenet.evaluation import default_names, evaluate, open_tests
     from lanenet.learn.publish import publish
     from lanenet.learn.run_state import hash_run
     from lanenet.learn.train import train as train_network
@@ -160,14 +154,25 @@ def train(
         train_network(settings.learn, data.train, data.validation, run_folder, progress)
     if not data.test:
         console.show_problems(["the data has no test part: the table is over the validation labels"])
-    predictors = {"network": network_predictor(run_folder / "model.onnx")}
-    markdown, results = _evaluate(data.test or data.validation, predictors, marking)
-    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), "results.md": markdown}
+    sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
+    with console.progress_bar("test") as progress:
+        evaluation = evaluate(
+            sources,
+            default_names(sources, with_model=True),
+            run_folder / "model.onnx",
+            marking_cm=marking,
+            # Which camera made which test drive is settled by the config.
+            any_camera=True,
+            progress=progress,
+        )
+    val_cli.show(evaluation.comparison)
+    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings)}
+    files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
     if data.camera is not None:
         files["camera.yaml"] = data.camera.read_bytes()
     if data.example is not None:
         files[f"example{data.example.suffix}"] = data.example.read_bytes()
-    publish(run_folder, checkpoint, settings.name, files, results)
+    publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
     model = checkpoint / "model.onnx"
     console.wrote(checkpoint)
     words = ["detect", "SOURCE", "--detector", "network", "--model", model]
@@ -229,30 +234,6 @@ def label(
     console.next_command("val", "MODEL", out)
 
 
-@app.command(epilog="Example: lanenet val checkpoints/small labels/tub.parquet")
-def val(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL", help="Model (.onnx) or checkpoint folder.", show_default=False)
-    ],
-    labels: Annotated[list[Path], typer.Argument(metavar="LABELS", help="Label sets.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(help="Also write the table as .json and .md under this name.")
-    ] = None,
-    marking: MarkingOption = None,
-) -> None:
-    """Show a model's errors in cm on label sets, beside the baselines on the same frames."""
-    from lanenet.data.files import write_json, write_text
-    from lanenet.learn.evaluate import network_predictor
-
-    path = model / "model.onnx" if model.is_dir() else model
-    markdown, results = _evaluate(labels, {"network": network_predictor(path)}, marking)
-    if out is not None:
-        write_json(Path(f"{out}.json"), results)
-        write_text(Path(f"{out}.md"), markdown)
-        console.wrote(Path(f"{out}.json"), Path(f"{out}.md"))
-    console.next_command("detect", "SOURCE", "--detector", "network", "--model", path, "--out", "lanes.csv")
-
-
 @app.command(epilog="Example: lanenet export checkpoints/small --out small.onnx")
 def export(
     checkpoint: Annotated[
@@ -266,25 +247,3 @@ def export(
     path = export_checkpoint(checkpoint, out)
     console.wrote(path)
     console.next_command("bench", "--model", path)
-
-
-def _evaluate(
-    labels: list[Path], predictors: dict[str, Predictor], marking_cm: float | None
-) -> tuple[str, dict[str, Any]]:
-    """Compare detectors with the lane filter and show the table; returned as Markdown and as data."""
-    from rich.console import Console
-
-    from lanenet.data.label_set import read_labels
-    from lanenet.learn.evaluate import evaluate_detectors, format_table
-    from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
-
-    def lane_filter(labels: LabelSet) -> Float[np.ndarray, "n 6"]:
-        width_cm = labels.meta.marking_cm if marking_cm is None else marking_cm
-        return lane_filter_points_cm(labels, filter_settings(labels.meta.lane_width_cm, width_cm))
-
-    beside = {**predictors, "lane filter": lane_filter}
-    tables = evaluate_detectors([read_labels(path) for path in labels], beside)
-    table, markdown = format_table(tables)
-    Console().print(table)
-    sets = [path.name for path in labels]
-    return markdown, {"label_sets": sets, "detectors": {k: t.as_dict() for k, t in tables.items()}}

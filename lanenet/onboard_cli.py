@@ -113,6 +113,8 @@ def detect(
         f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
         f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
+    if hint := getattr(chosen, "hint", ""):
+        typer.echo(f"hint: {hint}")
     console.wrote(report.out, report.video)
     if report.video is None:
         options: dict[str, Path | float | str | None] = {

@@ -6,28 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.labels.project import FrameLines, lines_of_frame
+from datagen.labels.mapped_drive import (
+    DELETED,
+    NO_LINE,
+    UNCERTAIN,
+    label_frame,
+    lines_at,
+    open_mapped_drive,
+)
 from datagen.labels.quality import frame_residual_cm, label_report
-from datagen.map_folder import DriveMap, read_map
 from datagen.map_report import Report
-from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet
 from datagen.slam.scans import Progress
-from lanenet.config import load_settings
-from lanenet.data.drive import open_drive
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
-from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
+from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-
-_MIN_MATCH = 0.15
-
-
-def lines_at(drive_map: DriveMap, k: int) -> FrameLines:
-    """Return the lane of the map's k-th frame."""
-    lines = drive_map.lines[int(drive_map.segment[k])]
-    return lines_of_frame(lines, drive_map.poses[k], float(drive_map.s_cm[k]), drive_map.camera.wheelbase_cm)
 
 
 def label_map(
@@ -41,8 +36,7 @@ def label_map(
 ) -> Report:
     """Project a map's lines into each frame and write the label set, its report and a contact sheet.
 
-    A frame gets no labels where its pose is uncertain (few edges match the map) or the driver has deleted
-    it; a point is masked where the map does not support the line, or where it lies beside the window.
+    Which frames and points get labels is decided by :func:`label_frame`.
 
     Args:
         map_folder: Folder that :func:`map_drive` wrote.
@@ -52,43 +46,23 @@ def label_map(
         perception: How the network's edge points are found; None takes what the map was made with.
         window: The network's window.
     """
-    drive_map = read_map(map_folder)
-    source = drive_path if drive_path is not None else Path(drive_map.meta.drive)
-    if not source.exists():
-        raise DriveFormatError(f"{source}: the drive of {map_folder} is not there")
-    drive = open_drive(source)
-    if (drive_map.camera.width, drive_map.camera.height) != (drive.width, drive.height):
-        raise CalibrationError(
-            f"{map_folder / 'camera.yaml'}: is for {drive_map.camera.width}x{drive_map.camera.height} px, "
-            f"the images of {source} have {drive.width}x{drive.height}"
-        )
-    if perception is None:
-        perception = load_settings(MapSettings, map_folder / SETTINGS_NAME).perception
+    mapped = open_mapped_drive(map_folder, drive_path)
+    drive_map, drive = mapped.drive_map, mapped.drive
+    perception = mapped.perception if perception is None else perception
     window = BirdseyeWindow() if window is None else window
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
-    index = {int(frame): i for i, frame in enumerate(drive.frames)}
     rows: list[int] = []
     edges, lines, points, residuals = [], [], [], []
-    skipped = {"deleted": 0, "pose uncertain": 0, "no line in the window": 0}
-    for k, frame in enumerate(drive_map.frames):
+    skipped = {DELETED: 0, UNCERTAIN: 0, NO_LINE: 0}
+    for k in range(len(drive_map.frames)):
         if progress is not None:
             progress(k + 1, len(drive_map.frames))
-        i = index.get(int(frame))
-        if i is None:
-            raise DriveFormatError(f"{source}: frame {int(frame)} of {map_folder} is not in it")
-        if drive.deleted[i]:
-            skipped["deleted"] += 1
+        labelled = label_frame(mapped, k, window)
+        if isinstance(labelled, str):
+            skipped[labelled] += 1
             continue
-        # The first frame of a segment has no map to match yet, so that its match is NaN.
-        if drive_map.match[k] < _MIN_MATCH:
-            skipped["pose uncertain"] += 1
-            continue
-        seen = lines_at(drive_map, k)
-        visible = window.labelled(seen.points_cm)
-        if not np.isfinite(visible).any():
-            skipped["no line in the window"] += 1
-            continue
-        road = extractor.extract(drive.image(i))
+        seen, visible = labelled
+        road = extractor.extract(drive.image(int(mapped.rows[k])))
         rows.append(k)
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
         lines.append((seen.left_cm, seen.right_cm))
@@ -130,7 +104,7 @@ def label_map(
             temporary,
             [
                 (
-                    drive.image(index[int(labels.frame[j])]),
+                    drive.image(int(mapped.rows[rows[j]])),
                     lines_at(drive_map, rows[j]),
                     int(labels.frame[j]),
                 )

@@ -13,10 +13,13 @@ from lanenet.geometry.lane import ROWS_CM, SIDES
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.image_lane import ImageLane, Polyline
 
+Bgr = tuple[int, int, int]
 #: BGR; the left line is green, the right one orange, the steering arrow yellow.
 LEFT_BGR, RIGHT_BGR, ARROW_BGR, TEXT_BGR = (80, 220, 80), (40, 140, 255), (60, 230, 250), (255, 255, 255)
 #: Lines that a detector remembers from earlier frames are blue, as in Suto's video.
 MEMORY_BGR, FILL_BGR = (255, 120, 60), (60, 180, 60)
+#: What should have been answered.
+TRUTH_BGR = (255, 60, 255)
 _FILL_SHARE = 0.35
 FAR_CM = 40.0
 _SAMPLES = 41
@@ -31,6 +34,7 @@ def draw_estimate(
     scale: int = 1,
     caption: str = "",
     image_lane: ImageLane | None = None,
+    truth_cm: Float[np.ndarray, "6"] | None = None,
 ) -> UInt8[np.ndarray, "sh sw 3"]:
     """Draw the two parabolas (y = 0 to 40 cm), the six points and the steering target into a frame.
 
@@ -41,6 +45,7 @@ def draw_estimate(
         scale: Whole factor by which the picture is enlarged, so that lines stay thin on small frames.
         caption: Text for the top left corner.
         image_lane: Lines of the image, drawn under the rest.
+        truth_cm: Six points to compare with, drawn in magenta under the estimate.
 
     Returns:
         A new picture, ``scale`` times the frame's size.
@@ -51,7 +56,9 @@ def draw_estimate(
         _draw_image_lane(picture, image_lane, scale, 2 * thickness)
         caption = f"{caption}  {image_lane.text}".strip()
     if camera is not None:
-        _draw_road(picture, estimate, camera, scale, thickness)
+        if truth_cm is not None:
+            _draw_road(picture, LaneEstimate(truth_cm), camera, scale, thickness, (TRUTH_BGR, TRUTH_BGR))
+        _draw_road(picture, estimate, camera, scale, thickness, (LEFT_BGR, RIGHT_BGR))
     _draw_arrow(picture, estimate.steering_rad, 2 * thickness)
     if caption:
         _draw_text(picture, caption, thickness)
@@ -59,18 +66,23 @@ def draw_estimate(
 
 
 def _draw_road(
-    picture: UInt8[np.ndarray, "h w 3"], estimate: LaneEstimate, camera: Camera, scale: int, thickness: int
+    picture: UInt8[np.ndarray, "h w 3"],
+    estimate: LaneEstimate,
+    camera: Camera,
+    scale: int,
+    thickness: int,
+    colours: tuple[Bgr, Bgr],
 ) -> None:
     """The parabolas and the six points."""
     y_cm = np.linspace(0.0, FAR_CM, _SAMPLES)
-    for side, colour in enumerate((LEFT_BGR, RIGHT_BGR)):
+    for side, colour in enumerate(colours):
         x_cm = np.polyval(estimate.parabolas[side], y_cm)
         _draw_polyline(picture, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
     rows_cm = np.tile(ROWS_CM, len(SIDES))
     points = _pixels(np.stack([estimate.points_cm, rows_cm], axis=1), camera, scale)
     for index, point in enumerate(points):
         if np.isfinite(point).all():
-            colour = LEFT_BGR if index < len(ROWS_CM) else RIGHT_BGR
+            colour = colours[index // len(ROWS_CM)]
             centre = _fixed(point)
             cv2.circle(picture, centre, (3 * thickness) << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
             cv2.circle(picture, centre, (3 * thickness) << _SHIFT, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)

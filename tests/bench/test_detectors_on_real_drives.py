@@ -22,6 +22,8 @@ pytestmark = pytest.mark.slow
 PAPER = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "lane_filter_paper.yaml"
 LOG = logging.getLogger(__name__)
 
+HOUGH_VALUE = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "hough_value.yaml"
+
 #: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
 #: a guess for the first, and for the others the median of what the painter measured with that camera.
 TUBS = {
@@ -66,6 +68,7 @@ def test_steering_beside_the_drivers(shared_data: Path, tub: str) -> None:
     compared: dict[str, Detector] = {
         "hough": HoughTracker(camera),
         "hough, V channel": HoughTracker(camera, value),
+        "hough, hough_value.yaml": build_detector("hough", camera, config=HOUGH_VALUE),
         "painter": LanePainter(camera),
     }
     mask, told = find_mask(open_source(shared_data / tub))

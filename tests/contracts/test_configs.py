@@ -29,20 +29,13 @@ def read_camera_file(path: Path) -> Any:
     return read_camera(path)
 
 
-def read_detector_file(path: Path) -> Any:
-    # A file is named after its detector, and after what is special about it.
-    from lanenet.onboard.detectors import lane_filter_settings
+def read_detector_settings(path: Path) -> Any:
+    from lanenet.onboard.detectors import build_detector, lane_filter_settings
 
+    # The detector's name comes first in the file's.
     if path.stem.startswith("lane_filter"):
         return lane_filter_settings(path, drive_lane_width_cm=40.0)
-    if path.stem.startswith("hough"):
-        from lanenet.perception.hough.tracker import HoughSettings
-
-        return load_settings(HoughSettings, path)
-    from lanenet.perception.painter.painter import PainterSettings
-
-    assert path.stem.startswith("painter"), path
-    return load_settings(PainterSettings, path)
+    return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
 
 
 #: What reads the YAML files of each folder below configs/.
@@ -50,7 +43,7 @@ READERS = {
     ".": read_training_run,
     "drives": read_simulation,
     "cameras": read_camera_file,
-    "detectors": read_detector_file,
+    "detectors": read_detector_settings,
 }
 
 
@@ -75,9 +68,9 @@ def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
     from lanenet.perception.birdseye import PerceptionSettings
     from lanenet.perception.lane_filter import PAPER, LaneFilterSettings
 
-    default = read_detector_file(CONFIGS / "detectors" / "lane_filter.yaml")
+    default = read_detector_settings(CONFIGS / "detectors" / "lane_filter.yaml")
     assert default == (LaneFilterSettings(lane_width_cm=40.0), PerceptionSettings())
-    filter_, perception = read_detector_file(CONFIGS / "detectors" / "lane_filter_paper.yaml")
+    filter_, perception = read_detector_settings(CONFIGS / "detectors" / "lane_filter_paper.yaml")
     assert filter_ == LaneFilterSettings(lane_width_cm=40.0, **PAPER)
     assert perception.edges.method == "canny"
 

@@ -63,7 +63,9 @@ def test_train_leaves_a_checkpoint_that_is_complete(finished):
     assert names >= {"model.onnx", "weights.safetensors", "metrics.json", "run.yaml", "camera.yaml"}
     assert names >= {"results.json", "results.md", "checkpoint.yaml", "curve.csv", "example.jpg"}
     assert "last.pt" not in names
-    assert "network" in output and "lane filter" in output and "against the truth" in output
+    for name in ("network", "lane-filter", "hough-value", "painter", "against the truth"):
+        assert name in output
+    assert names >= {"results.png", "results-worst.jpg"}
     results = json.loads((folder / "ck" / "tiny" / "results.json").read_text())
     for group in ("all", *POINT_NAMES):
         figures = results["detectors"]["network"]["groups"][group]
@@ -90,9 +92,10 @@ def test_a_second_run_does_nothing_again(finished):
     made = sorted((folder / "work").rglob("*.parquet"))
     before = [path.stat().st_mtime_ns for path in made]
     weights = (folder / "ck" / "tiny" / "weights.safetensors").read_bytes()
-    begin = time.monotonic()
+    # Time of the processor: on a busy machine the clock says little.
+    begin = time.process_time()
     invoke("train", config)
-    assert time.monotonic() - begin < 20.0
+    assert time.process_time() - begin < 20.0
     assert [path.stat().st_mtime_ns for path in made] == before
     assert (folder / "ck" / "tiny" / "weights.safetensors").read_bytes() == weights
 
@@ -126,6 +129,16 @@ def test_the_steps_one_by_one(finished):
     model = folder / "ck" / "tiny" / "model.onnx"
     output = invoke("val", model, folder / "labels.parquet", "--out", folder / "table")
     assert "against the map" in output and (folder / "table.md").is_file()
+    # The same map with its frames: the same network on the same edges, and the other detectors too.
+    output = invoke("val", model, folder / "map", drive, "--out", folder / "frames")
+    assert "against the map and truth" in output
+    on_labels, on_frames = (
+        json.loads((folder / f"{name}.json").read_text())["sources"][0]["detectors"]
+        for name in ("table", "frames")
+    )
+    for name in ("network", "lane-filter"):
+        assert on_frames[name]["rmse_cm"] == pytest.approx(on_labels[name]["rmse_cm"], rel=0.02)
+    assert on_frames["painter"]["count"] > 0
     exported = folder / "again.onnx"
     invoke("export", folder / "ck" / "tiny", "--out", exported)
     assert exported.stat().st_size == pytest.approx(model.stat().st_size, rel=0.01)

@@ -17,6 +17,7 @@ from datagen.datasets import (
     RecordedSettings,
     SyntheticSettings,
     _fingerprint,
+    _frames_of,
     _is_done,
     _key,
     _mark_done,
@@ -188,6 +189,16 @@ def test_a_run_without_drives_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no train drives"):
         prepare(DataSettings(), tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_test_drives_lead_to_their_frames(tmp_path):
+    data = DataSettings(synthetic=SyntheticSettings(train=1, test=1))
+    folders = [_frames_of(_synthetic_job(data, role, 0, tmp_path)) for role in ("test", "validation")]
+    # The truth of a test drive lies with the drive; the labels of the others come from its map.
+    assert folders == [tmp_path / "synthetic/drives/test_00", tmp_path / "synthetic/maps/validation_00"]
+    recorded = RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0)
+    job = {"kind": "recorded", "settings": recorded, "folder": tmp_path / "drives"}
+    assert _frames_of(job).parent == tmp_path / "drives/maps" and _frames_of(job).name.startswith("tub-")
 
 
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):

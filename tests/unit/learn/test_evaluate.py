@@ -1,16 +1,11 @@
-import io
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from rich.console import Console
-from synthetic_labels import make_label_set
 
-from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import mirror_points
-from lanenet.learn.evaluate import evaluate_detectors, format_table, point_errors
+from lanenet.learn.evaluate import point_errors
 
 NAN = float("nan")
 
@@ -61,44 +56,14 @@ def test_without_answers_there_is_no_number():
     assert np.isnan(nothing.all.rmse_cm) and np.isnan(nothing.all.coverage)
 
 
-def test_detectors_are_compared_on_common_points():
-    sets = [make_label_set(5, 0, source="truth"), make_label_set(5, 1, source="truth")]
-
-    def shy(labels):
-        answer = labels.points_cm + 1.0
-        answer[:, 3:] = NAN
-        return answer
-
-    def bold(labels):
-        answer = labels.points_cm + 2.0
-        answer[:, 3:] += 8.0
-        return answer
-
-    tables = evaluate_detectors(sets, {"shy": shy, "bold": bold})
-    assert tables["shy"].all.coverage == 0.5 and tables["bold"].all.coverage == 1.0
-    assert tables["bold"].all.rmse_cm == pytest.approx(np.sqrt((4 + 100) / 2))
-    assert tables["shy"].common_rmse_cm == pytest.approx(1.0)
-    assert tables["bold"].common_rmse_cm == pytest.approx(2.0)
-    assert tables["bold"].common_count == 30
-    rich_table, markdown = format_table(tables)
-    assert "against the truth" in markdown and "against the truth" in str(rich_table.title)
-    lines = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert len({line.count("|") for line in lines}) == 1 and len(lines) == 2 + 2 * 6
-    assert lines[2].split("|")[1:4] == [" shy ", " RMSE ", " 1.00 "]
-    assert lines[6].split("|")[1:5] == ["  ", " answered ", " 50% ", " 100% "]
-    console = Console(width=200, record=True, file=io.StringIO())
-    console.print(rich_table)
-    assert "bold" in console.export_text()
-
-
-def test_the_reference_is_named():
-    tables = evaluate_detectors([make_label_set(2, 0, source="map")], {"a": lambda s: s.points_cm})
-    assert tables["a"].reference == "map" and tables["a"].as_dict()["reference"] == "map"
-    assert "against the map" in format_table(tables)[1]
-
-
-def test_wrong_answers_are_refused():
-    with pytest.raises(LabelFormatError, match=r"'bad'.*\(1, 6\).*\(3, 6\)"):
-        evaluate_detectors([make_label_set(3, 0)], {"bad": lambda s: s.points_cm[:1]})
-    with pytest.raises(LabelFormatError, match="no label set"):
-        evaluate_detectors([], {})
+def test_plain_values_carry_units_and_the_reference():
+    data = point_errors(np.zeros((2, 6)), np.ones((2, 6)), "map").as_dict()
+    assert data["reference"] == "map"
+    assert data["groups"]["left_15_cm"] == {
+        "rmse_cm": 1.0,
+        "median_cm": 1.0,
+        "p95_cm": 1.0,
+        "worst_cm": 1.0,
+        "count": 2,
+        "coverage": 1.0,
+    }

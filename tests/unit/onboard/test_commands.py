@@ -247,20 +247,76 @@ def tiny_labels(path: Path) -> LabelSet:
     return labels
 
 
-def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny_labels(tmp_path / "l.parquet")
+def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """A checkpoint whose model is a centimetre off; returns a list of the models that will be opened."""
+    folder.mkdir()
+    (folder / "model.onnx").write_bytes(b"")
     opened: list[Path] = []
 
     def network_predictor(path: Path) -> Any:
         opened.append(path)
         return lambda labels: labels.points_cm + 1.0
 
+    @dataclass(frozen=True)
+    class Meta:
+        window: BirdseyeWindow
+
     monkeypatch.setattr("lanenet.learn.evaluate.network_predictor", network_predictor)
-    (tmp_path / "checkpoint").mkdir()
+    monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: Meta(BirdseyeWindow()))
+    return opened
+
+
+def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny_labels(tmp_path / "l.parquet")
+    opened = fake_checkpoint(tmp_path / "checkpoint", monkeypatch)
     result = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--out", tmp_path / "table")
     assert result.exit_code == 0, result.output
     assert opened == [tmp_path / "checkpoint" / "model.onnx"]
-    detectors = json.loads((tmp_path / "table.json").read_text())["detectors"]
+    report = json.loads((tmp_path / "table.json").read_text())
+    assert report["format"] == "lanenet-evaluation/1" and report["reference"] == "truth"
+    detectors = report["detectors"]
     assert detectors["network"]["groups"]["all"]["rmse_cm"] == pytest.approx(1.0)
-    assert detectors["lane filter"]["groups"]["all"]["rmse_cm"] < 0.2
+    assert detectors["lane-filter"]["groups"]["all"]["rmse_cm"] < 0.2
+    assert detectors["lane-filter"]["first_on_shared"]["rmse_cm"] == pytest.approx(1.0)
     assert "| network |" in (tmp_path / "table.md").read_text()
+    assert (tmp_path / "table.png").stat().st_size > 1000
+    # A label set holds no frames: nothing to draw, and nothing for the others to look at.
+    assert not (tmp_path / "table-worst.jpg").exists()
+    assert list(detectors) == ["network", "lane-filter"] and "hold no frames" in result.stderr
+    alone = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--no-baselines")
+    assert alone.exit_code == 0 and "lane-filter" not in alone.output
+
+
+def test_val_runs_all_detectors_on_the_frames_of_a_drive(tmp_path: Path) -> None:
+    config = tmp_path / "drive.yaml"
+    config.write_text("seed: 4\n")
+    assert run("simulate", config, "frames=8", "--out", tmp_path / "d").exit_code == 0
+    result = run("val", tmp_path / "d", "--out", tmp_path / "t")
+    assert result.exit_code == 0, result.output
+    assert "against the truth" in result.stdout
+    report = json.loads((tmp_path / "t.json").read_text())
+    # Without a model there is no network.
+    assert list(report["detectors"]) == ["lane-filter", "hough", "hough-value", "painter"]
+    assert report["detectors"]["painter"]["groups"]["all"]["count"] > 0
+    assert [(s["kind"], s["reference"], s["frames"]) for s in report["sources"]] == [
+        ("simulated drive", "truth", 8)
+    ]
+    for ending in (".md", ".png", "-worst.jpg"):
+        assert (tmp_path / f"t{ending}").stat().st_size > 500, ending
+    one = run("val", tmp_path / "d", "--detectors", "painter")
+    assert one.exit_code == 0 and "painter" in one.stdout and "hough" not in one.stdout
+
+
+def test_val_says_what_does_not_go_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels, checkpoint = tmp_path / "l.parquet", tmp_path / "checkpoint"
+    tiny_labels(labels)
+    fake_checkpoint(checkpoint, monkeypatch)
+    assert "expected a SOURCE" in error_of(run("val", checkpoint))
+    assert "none: no such model or source" in error_of(run("val", tmp_path / "none", labels))
+    assert "l.parquet is a label set" in error_of(run("val", labels, "--detectors", "hough"))
+    assert "expected a model" in error_of(run("val", labels, "--detectors", "network"))
+    assert "expected a model" in error_of(run("val", labels, "--no-baselines"))
+    assert "found 'eagle'" in error_of(run("val", labels, "--detectors", "eagle"))
+    both = run("val", checkpoint, labels, "--no-baselines", "--detectors", "network")
+    assert "one of the two" in error_of(both)
+    assert "not a drive" in error_of(run("val", tmp_path))

@@ -1,0 +1,134 @@
+"""A map together with the drive that it was made of: the lane of each frame, and where it counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datagen.labels.project import FrameLines, lines_of_frame
+from datagen.map_folder import DriveMap, read_map
+from datagen.map_settings import SETTINGS_NAME, MapSettings
+from lanenet.config import load_settings
+from lanenet.data.drive import Drive, open_drive
+from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import N_POINTS
+from lanenet.perception.birdseye import PerceptionSettings
+
+_MIN_MATCH = 0.15
+#: Why a frame gets no labels.
+DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
+
+
+@dataclass(frozen=True, eq=False)
+class MappedDrive:
+    """A map and its drive.
+
+    Attributes:
+        drive_map: The map.
+        drive: The drive.
+        rows: Position in the drive of each of the map's frames.
+        perception: How the map's edge points were found.
+    """
+
+    drive_map: DriveMap
+    drive: Drive
+    rows: Int[np.ndarray, "n"]
+    perception: PerceptionSettings
+
+
+def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> MappedDrive:
+    """Open a map folder and the drive that it names.
+
+    Args:
+        map_folder: Folder that :func:`datagen.pipeline.map_drive` wrote.
+        drive_path: Where the drive is now, if it has moved since it was mapped.
+
+    Raises:
+        MapFormatError: If the map cannot be read.
+        DriveFormatError: If the drive is not there, or lacks a frame of the map.
+        CalibrationError: If the map's camera is for images of another size.
+    """
+    drive_map = read_map(map_folder)
+    source = drive_path if drive_path is not None else Path(drive_map.meta.drive)
+    if not source.exists():
+        raise DriveFormatError(f"{source}: the drive of {map_folder} is not there")
+    drive = open_drive(source)
+    if (drive_map.camera.width, drive_map.camera.height) != (drive.width, drive.height):
+        raise CalibrationError(
+            f"{map_folder / 'camera.yaml'}: is for {drive_map.camera.width}x{drive_map.camera.height} px, "
+            f"the images of {source} have {drive.width}x{drive.height}"
+        )
+    missing = np.setdiff1d(drive_map.frames, drive.frames)
+    if missing.size:
+        raise DriveFormatError(f"{source}: frame {int(missing[0])} of {map_folder} is not in it")
+    perception = load_settings(MapSettings, map_folder / SETTINGS_NAME).perception
+    return MappedDrive(drive_map, drive, np.searchsorted(drive.frames, drive_map.frames), perception)
+
+
+def lines_at(drive_map: DriveMap, k: int) -> FrameLines:
+    """Return the lane of the map's k-th frame."""
+    lines = drive_map.lines[int(drive_map.segment[k])]
+    return lines_of_frame(lines, drive_map.poses[k], float(drive_map.s_cm[k]), drive_map.camera.wheelbase_cm)
+
+
+def label_frame(
+    mapped: MappedDrive, k: int, window: BirdseyeWindow
+) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:
+    """Return the lane of the map's k-th frame and its six labels, or why it gets none.
+
+    A frame gets no labels where its pose is uncertain (few edges match the map) or the driver has deleted
+    it; a point is masked where the map does not support the line, or where it lies beside the window.
+    """
+    if mapped.drive.deleted[mapped.rows[k]]:
+        return DELETED
+    # The first frame of a segment has no map to match yet, so that its match is NaN.
+    if mapped.drive_map.match[k] < _MIN_MATCH:
+        return UNCERTAIN
+    seen = lines_at(mapped.drive_map, k)
+    visible = window.labelled(seen.points_cm)
+    return (seen, visible) if np.isfinite(visible).any() else NO_LINE
+
+
+def read_map_frames(
+    map_folder: Path, window: BirdseyeWindow | None = None, drive_path: Path | None = None
+) -> LabelledFrames:
+    """Read the frames of a mapped drive with the labels that the map gives them.
+
+    The labels are those of :func:`datagen.labels.label_map.label_map`; frames that get none are kept.
+
+    Args:
+        map_folder: Folder of the map.
+        window: Points beside this bird's-eye window have no label; None takes the default.
+        drive_path: Where the drive is now, if it has moved since it was mapped.
+
+    Raises:
+        LanenetError: As :func:`open_mapped_drive`.
+    """
+    mapped = open_mapped_drive(map_folder, drive_path)
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    window = BirdseyeWindow() if window is None else window
+    points = np.full((len(rows), N_POINTS), np.nan)
+    for k in range(len(rows)):
+        labelled = label_frame(mapped, k, window)
+        if not isinstance(labelled, str):
+            points[k] = labelled[1]
+    # Stretches that were too short to map are left out of the map, so that their neighbours do not touch.
+    starts = drive.breaks[rows] | (np.diff(rows, prepend=rows[0] - 2) != 1)
+    starts |= np.diff(drive_map.segment, prepend=drive_map.segment[0]) != 0
+    return LabelledFrames(
+        name=str(map_folder),
+        reference="map",
+        camera=drive_map.camera,
+        lane_width_cm=drive_map.meta.lane_width_cm,
+        marking_cm=drive_map.meta.tape_cm,
+        perception=mapped.perception,
+        frames=drive_map.frames,
+        starts=starts,
+        points_cm=points,
+        image=lambda i: drive.image(int(rows[i])),
+    )

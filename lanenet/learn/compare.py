@@ -1,0 +1,175 @@
+"""Several detectors on the same frames: their errors in cm, overall, on shared points and by source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.errors import LabelFormatError
+from lanenet.geometry.lane import ROWS_CM
+from lanenet.learn.evaluate import ErrorStats, ErrorTable, error_stats, point_errors
+
+FORMAT = "lanenet-evaluation/1"
+
+_UNITS = {"*_cm": "centimetre", "coverage": "share of the labelled points, 0 to 1"}
+
+
+@dataclass(frozen=True)
+class SourceAnswers:
+    """What the detectors said about one drive, map or label set.
+
+    Attributes:
+        name: The path, as people know it.
+        kind: ``simulated drive``, ``map`` or ``label set``.
+        reference: Where the labels come from: ``truth`` or ``map``.
+        truth_cm: Six labels per frame; NaN where there is none.
+        answers_cm: By detector, six points per frame; NaN where it has no answer.
+    """
+
+    name: str
+    kind: str
+    reference: str
+    truth_cm: Float[np.ndarray, "n 6"]
+    answers_cm: Mapping[str, Float[np.ndarray, "_ 6"]]
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """Errors of two detectors on the points that both answered.
+
+    Attributes:
+        own: Of the one.
+        first: Of the other, which is the first of the comparison.
+    """
+
+    own: ErrorStats
+    first: ErrorStats
+
+
+@dataclass(frozen=True)
+class SourceErrors:
+    """Errors on one source.
+
+    Attributes:
+        name: The path, as people know it.
+        kind: As in :class:`SourceAnswers`.
+        reference: As in :class:`SourceAnswers`.
+        frames: Frames that the detectors saw.
+        detectors: Errors over all points, by detector.
+    """
+
+    name: str
+    kind: str
+    reference: str
+    frames: int
+    detectors: dict[str, ErrorStats]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Detectors beside each other.
+
+    Attributes:
+        reference: What the errors are against: ``truth``, ``map`` or ``map and truth``.
+        tables: Errors by detector, over all sources together.
+        shared: By detector but the first: it and the first on the points that both answered. Detectors that
+            answer only what is easy look good on their own answers.
+        sources: The errors by source.
+        errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
+    """
+
+    reference: str
+    tables: dict[str, ErrorTable]
+    shared: dict[str, SharedErrors]
+    sources: tuple[SourceErrors, ...]
+    errors_cm: dict[str, Float[np.ndarray, "n 6"]]
+
+    @property
+    def first(self) -> str:
+        """Name of the detector that the others are held against."""
+        return next(iter(self.tables))
+
+    def as_dict(self) -> dict[str, object]:
+        """Return plain values for JSON, with the version of their layout."""
+        detectors = {}
+        for name, table in self.tables.items():
+            shared = self.shared.get(name)
+            detectors[name] = {
+                **table.as_dict(),
+                "shared_with": None if shared is None else self.first,
+                "shared": None if shared is None else shared.own.as_dict(),
+                "first_on_shared": None if shared is None else shared.first.as_dict(),
+            }
+        sources = [
+            {
+                "name": source.name,
+                "kind": source.kind,
+                "reference": source.reference,
+                "frames": source.frames,
+                "detectors": {name: stats.as_dict() for name, stats in source.detectors.items()},
+            }
+            for source in self.sources
+        ]
+        return {
+            "format": FORMAT,
+            "units": _UNITS,
+            "rows_cm": list(ROWS_CM),
+            "reference": self.reference,
+            "sources": sources,
+            "detectors": detectors,
+        }
+
+
+def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
+    """Compare detectors that answered the same frames.
+
+    Args:
+        sources: Labels and answers; the errors are over all of them together.
+
+    Raises:
+        LabelFormatError: If there is no source or no detector, two sources were answered by different
+            detectors, or a detector answered in another shape than that of the labels.
+    """
+    if not sources:
+        raise LabelFormatError("no source to compare on, expected at least one")
+    names = list(sources[0].answers_cm)
+    if not names:
+        raise LabelFormatError(f"{sources[0].name}: no detector has answered, expected at least one")
+    for source in sources:
+        if list(source.answers_cm) != names:
+            raise LabelFormatError(
+                f"{source.name}: answered by {', '.join(source.answers_cm)}, expected {', '.join(names)}"
+            )
+        for name, answer in source.answers_cm.items():
+            if answer.shape != source.truth_cm.shape:
+                raise LabelFormatError(
+                    f"{source.name}, detector {name!r}: answered shape {answer.shape}, expected "
+                    f"{source.truth_cm.shape}"
+                )
+    reference = " and ".join(sorted({source.reference for source in sources}))
+    truth = np.concatenate([source.truth_cm for source in sources]).astype(np.float64)
+    answers = {
+        name: np.concatenate([source.answers_cm[name] for source in sources]).astype(np.float64)
+        for name in names
+    }
+    errors = {name: np.abs(answer - truth) for name, answer in answers.items()}
+    labelled, first = np.isfinite(truth), errors[names[0]]
+    shared = {}
+    for name in names[1:]:
+        both = np.isfinite(first) & np.isfinite(errors[name])
+        shared[name] = SharedErrors(*(error_stats(e, both, labelled) for e in (errors[name], first)))
+    return Comparison(
+        reference=reference,
+        tables={name: point_errors(answer, truth, reference) for name, answer in answers.items()},
+        shared=shared,
+        sources=tuple(_source_errors(source) for source in sources),
+        errors_cm=errors,
+    )
+
+
+def _source_errors(source: SourceAnswers) -> SourceErrors:
+    stats = {name: point_errors(answer, source.truth_cm).all for name, answer in source.answers_cm.items()}
+    return SourceErrors(source.name, source.kind, source.reference, len(source.truth_cm), stats)

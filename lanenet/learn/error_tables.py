@@ -1,0 +1,145 @@
+"""A comparison as tables, for a terminal and for a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich import box
+from rich.table import Table
+
+from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
+from lanenet.learn.compare import Comparison
+from lanenet.learn.evaluate import ErrorStats
+
+_STATS = ("RMSE", "median", "p95", "worst")
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of words.
+
+    Attributes:
+        title: What it shows.
+        header: One word or more per column.
+        lines: Cells.
+        note: What has to be known to read it.
+        texts: How many columns, from the left, are text and not figures.
+        last_of_group: A line whose cell in the second column is this ends a group; empty for no groups.
+    """
+
+    title: str
+    header: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    note: str
+    texts: int = 1
+    last_of_group: str = ""
+
+    def as_markdown(self) -> str:
+        """Return title, table and note as Markdown."""
+        figures = len(self.header) - self.texts
+        rule = [*["---"] * self.texts, *["---:"] * figures]
+        rows = "\n".join("| " + " | ".join(line) + " |" for line in [self.header, rule, *self.lines])
+        return f"{self.title}\n\n{rows}\n\n{self.note}\n"
+
+    def as_rich(self) -> Table:
+        """Return a table narrow enough for a terminal of 80 columns."""
+        table = Table(
+            title=self.title, title_justify="left", caption=self.note, box=box.SIMPLE, pad_edge=False
+        )
+        for i, name in enumerate(self.header):
+            justify = "left" if i < self.texts else "right"
+            table.add_column(name.replace(" ", "\n"), justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        for line in self.lines:
+            ends = self.last_of_group and line[1] == self.last_of_group
+            table.add_row(*line, end_section=bool(ends))
+        return table
+
+
+def lay_out(comparison: Comparison) -> list[TextTable]:
+    """Lay out a comparison: by point, on shared points, by source (of several); lengths in cm."""
+    tables = [_by_point(comparison)]
+    if comparison.shared:
+        tables.append(_on_shared_points(comparison))
+    if len(comparison.sources) > 1:
+        tables.append(_by_source(comparison))
+    return tables
+
+
+def as_markdown(comparison: Comparison) -> str:
+    """Return all tables of a comparison as Markdown."""
+    return "\n".join(table.as_markdown() for table in lay_out(comparison))
+
+
+def _by_point(comparison: Comparison) -> TextTable:
+    lines = []
+    for name, table in comparison.tables.items():
+        groups = [table.groups[group] for group in ("all", *POINT_NAMES)]
+        values = zip(*(_values(stats) for stats in groups), strict=True)
+        rows = [[label, *map(_cm, row)] for label, row in zip(_STATS, values, strict=True)]
+        rows.append(["answered", *map(_percent, groups)])
+        lines += [[name if i == 0 else "", *row] for i, row in enumerate(rows)]
+    counts = {table.all.truth_count for table in comparison.tables.values()}
+    frames = sum(source.frames for source in comparison.sources)
+    note = (
+        f"{counts.pop()} labelled points of {frames} frames; the columns are the line and the distance ahead "
+        "in cm"
+    )
+    return TextTable(
+        title=f"Errors in cm against the {comparison.reference}",
+        header=["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)],
+        lines=lines,
+        note=note,
+        texts=2,
+        last_of_group="answered",
+    )
+
+
+def _on_shared_points(comparison: Comparison) -> TextTable:
+    first = comparison.first
+    lines = []
+    for name, shared in comparison.shared.items():
+        for label, stats in ((name, shared.own), (first, shared.first)):
+            share = _percent(stats) if label == name else ""
+            lines.append([label, share, *map(_cm, _values(stats))])
+    return TextTable(
+        title=f"Each detector and {first} on the points that both answered, in cm",
+        header=["detector", "shared", *_STATS],
+        lines=lines,
+        note=f"two lines each: a detector, and {first} on the same points; shared: of the labelled points",
+    )
+
+
+def _by_source(comparison: Comparison) -> TextTable:
+    names = list(comparison.tables)
+    mixed = len({source.reference for source in comparison.sources}) > 1
+    lines = []
+    for source in comparison.sources:
+        cells = (source.detectors[name] for name in names)
+        shown = [f"{_cm(s.rmse_cm)} {_percent(s)}" for s in cells]
+        # Where all sources are alike, the title of the first table says it.
+        name = Path(source.name).name + (f" ({source.reference})" if mixed else "")
+        lines.append([name, *shown])
+    return TextTable(
+        title="RMSE in cm by source, with the share of points that were answered",
+        header=["source", *names],
+        lines=lines,
+        note="a detector that answers less may show a smaller error",
+    )
+
+
+def _values(stats: ErrorStats) -> tuple[float, float, float, float]:
+    return stats.rmse_cm, stats.median_cm, stats.p95_cm, stats.worst_cm
+
+
+def _percent(stats: ErrorStats) -> str:
+    return f"{100.0 * stats.coverage:.0f}%" if stats.truth_count else "-"
+
+
+def _cm(value: float) -> str:
+    """Three digits or so: a tenth of a millimetre says nothing about an error of a metre."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"

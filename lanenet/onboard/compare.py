@@ -1,0 +1,115 @@
+"""Every detector over the same labelled frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
+from lanenet.geometry.lane import N_POINTS
+from lanenet.onboard.detectors import build_detector, filter_settings
+from lanenet.perception.birdseye import RoadEdgeExtractor
+from lanenet.perception.estimate import Detector
+from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
+from lanenet.perception.lane_filter import LaneFilter
+
+ComparedName = Literal["network", "lane-filter", "hough", "hough-value", "painter"]
+#: All that can be compared, in the order of the tables; what the others are held against comes first.
+COMPARED: tuple[ComparedName, ...] = ("network", "lane-filter", "hough", "hough-value", "painter")
+#: These look at edge points only, so that a label set, which has no frames, will do.
+ON_LABEL_SETS: tuple[ComparedName, ...] = ("network", "lane-filter")
+
+Progress = Callable[[int, int], None]
+
+
+def choose_names(text: str) -> tuple[ComparedName, ...]:
+    """Read a list of detectors, as in ``network,painter``; they come back in the order of the tables.
+
+    Raises:
+        ConfigError: If a name is unknown, or there is none.
+    """
+    wanted = [part.strip() for part in text.split(",") if part.strip()]
+    unknown = [name for name in wanted if name not in COMPARED]
+    if unknown or not wanted:
+        found = repr(unknown[0]) if unknown else "no detector"
+        raise ConfigError(f"--detectors {text!r}: found {found}, known: {', '.join(COMPARED)}")
+    return tuple(name for name in COMPARED if name in wanted)
+
+
+def build_compared(
+    names: Sequence[ComparedName],
+    frames: LabelledFrames,
+    *,
+    model: Path | None = None,
+    marking_cm: float | None = None,
+    any_camera: bool = False,
+) -> dict[str, Detector]:
+    """Build detectors for the camera, the lane and the markings of a source.
+
+    Args:
+        names: Which ones.
+        frames: Where they will be run.
+        model: ONNX file, needed by ``network``.
+        marking_cm: Thickness of the tape for ``lane-filter``; None takes the source's, or the default.
+        any_camera: Accept a model that was trained with another camera.
+
+    Raises:
+        ConfigError: If something that a detector needs is missing or out of range.
+        ModelMismatchError: If the model cannot be used with this camera.
+        CalibrationError: If the camera sees no road.
+    """
+    detectors: dict[str, Detector] = {}
+    for name in names:
+        if name == "hough-value":
+            # On most floors the paper's hue is noise, while the brightness shows the lines.
+            brightness = HoughSettings.model_validate({"edges": {"channel": "value"}})
+            detectors[name] = HoughTracker(frames.camera, brightness)
+        elif name == "lane-filter":
+            # The perception is the source's: it leaves out the rows in which a car sees itself.
+            thickness_cm = frames.marking_cm if marking_cm is None else marking_cm
+            settings = filter_settings(frames.lane_width_cm, thickness_cm)
+            detectors[name] = LaneFilter(RoadEdgeExtractor(frames.camera, frames.perception), settings)
+        else:
+            detectors[name] = build_detector(name, frames.camera, model=model, any_camera=any_camera)
+    return detectors
+
+
+def answer_frames(
+    frames: LabelledFrames, detectors: Mapping[str, Detector], progress: Progress | None = None
+) -> dict[str, Float[np.ndarray, "n 6"]]:
+    """Run detectors over every frame in order; all forget what they saw where the source is interrupted.
+
+    Args:
+        frames: The source; each image is read once.
+        detectors: By name.
+        progress: Called with (frames done, frames).
+
+    Returns:
+        Six points per frame by name, [cm], frame car; NaN where a detector has no answer.
+
+    Raises:
+        DriveFormatError: If a frame cannot be read; names it.
+        CalibrationError: If a frame does not fit the camera; names it.
+    """
+    n = len(frames)
+    answers = {name: np.full((n, N_POINTS), np.nan) for name in detectors}
+    for i in range(n):
+        try:
+            image = frames.image(i)
+        except DriveFormatError as error:
+            raise DriveFormatError(f"{frames.name}: {error}") from None
+        for name, detector in detectors.items():
+            if i == 0 or frames.starts[i]:
+                detector.reset()
+            try:
+                answers[name][i] = detector.detect(image).points_cm
+            except CalibrationError as error:
+                raise CalibrationError(f"{frames.name}, frame {frames.frames[i]}: {error}") from None
+        if progress is not None:
+            progress(i + 1, n)
+    return answers

@@ -1,0 +1,131 @@
+"""``lanenet val``: a thin shell over :mod:`lanenet.evaluation`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lanenet import console
+from lanenet.errors import ConfigError
+from lanenet.evaluation import Opened, default_names, evaluate, open_source
+from lanenet.onboard_cli import MarkingOption
+
+if TYPE_CHECKING:
+    from lanenet.learn.compare import Comparison
+    from lanenet.onboard.compare import ComparedName
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet val checkpoints/small runs/drive7 runs/my_map --out runs/errors")
+def val(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[MODEL] SOURCE...",
+            help="Model (.onnx) or checkpoint folder; simulated drives, maps, or label sets (.parquet).",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Also write the report under this name: .md, .json, .png and -worst.jpg."),
+    ] = None,
+    detectors: Annotated[
+        str | None,
+        typer.Option(
+            help="Which to compare, as in network,painter; all: network, lane-filter, hough, "
+            "hough-value, painter. Default: all that the sources allow.",
+            show_default=False,
+        ),
+    ] = None,
+    no_baselines: Annotated[bool, typer.Option("--no-baselines", help="The network only.")] = False,
+    marking: MarkingOption = None,
+    any_camera: Annotated[
+        bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
+    ] = False,
+) -> None:
+    """Show errors in cm of a model and of the other detectors on the same frames.
+
+    Simulated drives are compared with their truth, maps and the label sets made of them with the map. Label
+    sets hold no frames, so that hough and painter cannot be run on them. Without the network no MODEL is
+    needed.
+    """
+    from lanenet.data.files import atomic_file, write_json, write_text
+    from lanenet.geometry.birdseye import BirdseyeWindow
+    from lanenet.perception.network import read_model_meta
+
+    model, source_paths = _split_paths(paths)
+    window = BirdseyeWindow() if model is None else read_model_meta(model).window
+    sources = [open_source(path, window) for path in source_paths]
+    names = _chosen(detectors, no_baselines, model, sources)
+    if detectors is None and not no_baselines and any(source.frames is None for source in sources):
+        console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
+    with console.progress_bar("val") as progress:
+        evaluation = evaluate(
+            sources, names, model, marking_cm=marking, any_camera=any_camera, progress=progress
+        )
+    show(evaluation.comparison)
+    if out is not None:
+        write_json(Path(f"{out}.json"), evaluation.comparison.as_dict())
+        console.wrote(Path(f"{out}.json"))
+        for ending, content in evaluation.files.items():
+            path = Path(f"{out}{ending}")
+            if isinstance(content, str):
+                write_text(path, content)
+            else:
+                with atomic_file(path) as temporary:
+                    temporary.write_bytes(content)
+            console.wrote(path)
+        if ".png" not in evaluation.files:
+            console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
+    best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
+    shown = "network" if "network" in names else best
+    words: list[str | Path] = ["detect", "SOURCE", "--detector", shown.removesuffix("-value")]
+    words += ["--model", model] if model is not None and shown == "network" else []
+    console.next_command(*words, "--out", "lanes.csv")
+
+
+def show(comparison: Comparison) -> None:
+    """Print the tables of a comparison."""
+    from rich.console import Console
+
+    from lanenet.learn.error_tables import lay_out
+
+    for table in lay_out(comparison):
+        Console().print(table.as_rich())
+
+
+def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
+    """The model, if the first path is one, and the sources."""
+    first = paths[0]
+    folder = (first / "model.onnx").is_file() or (first / "checkpoint.yaml").is_file()
+    if not (folder or first.suffix.lower() == ".onnx"):
+        return None, paths
+    if not paths[1:]:
+        raise ConfigError(f"{first}: expected a SOURCE after the model: a simulated drive, map or label set")
+    return first / "model.onnx" if folder else first, paths[1:]
+
+
+def _chosen(
+    text: str | None, no_baselines: bool, model: Path | None, sources: Sequence[Opened]
+) -> tuple[ComparedName, ...]:
+    from lanenet.onboard.compare import ON_LABEL_SETS, choose_names
+
+    if no_baselines and text is not None:
+        raise ConfigError("--no-baselines: is the same as --detectors network, expected one of the two")
+    names = default_names(sources, model is not None) if text is None else choose_names(text)
+    names = ("network",) if no_baselines else names
+    if "network" in names and model is None:
+        raise ConfigError("detector network: expected a model before the sources (lanenet val MODEL SOURCE)")
+    without_frames = [source.path for source in sources if source.frames is None]
+    refused = [name for name in names if without_frames and name not in ON_LABEL_SETS]
+    if refused:
+        raise ConfigError(
+            f"detector {refused[0]}: needs frames, but {without_frames[0]} is a label set; give the "
+            "simulated drive or the map that it was made of"
+        )
+    return names

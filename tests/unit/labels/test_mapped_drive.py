@@ -1,0 +1,154 @@
+"""A straight road on a map, and the drive that it was made of."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.labels.label_map import label_map
+from datagen.labels.mapped_drive import DELETED, UNCERTAIN, label_frame, open_mapped_drive, read_map_frames
+from datagen.lanes.fit import LaneLine, Side
+from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
+from datagen.map_settings import SETTINGS_NAME, MapSettings
+from lanenet.config import dump_settings
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.label_set import read_labels, write_labels
+from lanenet.errors import CalibrationError, DriveFormatError, MapFormatError
+from lanenet.evaluation import open_tests
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
+
+N = 30
+K = np.array([[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera("fisheye", 64, 48, K, np.zeros(4), Mounting(15.0, 0.4), 20.0)
+HIDDEN = PerceptionSettings(range=RangeSettings(bottom_rows=4))
+#: Frames of the map; the drive has 0 to 29, of which 12 to 15 were not mapped.
+MAPPED = np.concatenate([np.arange(12), np.arange(16, N)])
+
+
+def straight_line(side: Side, y_cm: float) -> LaneLine:
+    knots = np.concatenate([np.full(3, -100.0), np.linspace(-100.0, 400.0, 11), np.full(3, 400.0)])
+    # At the means of three knots a cubic spline's control points lie on the straight line itself.
+    s = np.array([knots[i + 1 : i + 4].mean() for i in range(13)])
+    supported = np.array([[-100.0, 400.0 if side == "left" else 60.0]])
+    return LaneLine(side, knots, np.column_stack([s, np.full(13, y_cm)]), supported, 0.1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The car drives along +x, 2 cm to the left of the middle of the lane."""
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive", lane_width_cm=40.0) as writer:
+        for k in range(N):
+            writer.add(rng.integers(0, 255, (48, 64, 3)).astype(np.uint8), 0.05 * k, speed_cm_s=20.0)
+    n = len(MAPPED)
+    s_cm = 1.0 * MAPPED
+    match = np.full(n, 0.6)
+    match[[0, 12]] = np.nan
+    match[5] = 0.05
+    lines = [straight_line("left", 18.0), straight_line("right", -22.0)]
+    drive_map = DriveMap(
+        meta=MapMeta(
+            format=FORMAT,
+            drive=str(tmp_path / "drive"),
+            lane_width_cm=40.0,
+            mapped_lane_cm=40.1,
+            tape_cm=2.3,
+            scale_from="camera",
+            laps=0,
+        ),
+        camera=CAMERA,
+        frames=MAPPED,
+        t_s=0.05 * MAPPED,
+        poses=np.column_stack([s_cm, np.zeros(n), np.zeros(n)]),
+        lap=np.zeros(n, np.int64),
+        segment=np.repeat([0, 1], [12, n - 12]),
+        s_cm=s_cm,
+        match=match,
+        lines={0: lines, 1: lines},
+    )
+    out = tmp_path / "map"
+    out.mkdir()
+    write_map(out, drive_map, {"frame_index": np.arange(2)}, {}, "given")
+    (out / SETTINGS_NAME).write_text(dump_settings(MapSettings(perception=HIDDEN)))
+    return out
+
+
+def test_the_map_gives_labels_and_keeps_the_frames_without(folder):
+    frames = read_map_frames(folder)
+    assert (frames.reference, frames.lane_width_cm, frames.marking_cm) == ("map", 40.0, 2.3)
+    # The rows in which the car sees itself stay hidden.
+    assert frames.perception == HIDDEN and frames.camera.hash == CAMERA.hash
+    np.testing.assert_array_equal(frames.frames, MAPPED)
+    assert np.isnan(frames.points_cm[5]).all()
+    others = np.delete(frames.points_cm, 5, axis=0)
+    np.testing.assert_allclose(others[:, :3], -18.0, atol=1e-6)
+    # The right line is supported up to s = 60 cm: 30 cm ahead of the front axle only at first.
+    np.testing.assert_allclose(others[:, 3], 22.0, atol=1e-6)
+    seen_far = np.isfinite(np.delete(frames.points_cm, 5, axis=0)[:, 5])
+    assert seen_far[:5].all() and not seen_far[-10:].any()
+
+
+def test_frames_after_an_unmapped_stretch_start_afresh(folder):
+    frames = read_map_frames(folder)
+    assert list(np.flatnonzero(frames.starts)) == [0, 12]
+    drive = open_mapped_drive(folder).drive
+    np.testing.assert_array_equal(frames.image(12), drive.image(16))
+
+
+def test_labels_are_those_of_the_label_set(folder, tmp_path):
+    label_map(folder, tmp_path / "l.parquet")
+    labels, frames = read_labels(tmp_path / "l.parquet"), read_map_frames(folder)
+    rows = np.searchsorted(frames.frames, labels.frame)
+    np.testing.assert_array_equal(frames.points_cm[rows], labels.points_cm)
+    left_out = np.delete(frames.points_cm, rows, axis=0)
+    assert len(left_out) == 1 and np.isnan(left_out).all()
+
+
+def test_a_test_part_is_opened_with_its_own_frames_only(folder, tmp_path):
+    label_map(folder, tmp_path / "whole.parquet", perception=PerceptionSettings())
+    part = tmp_path / "part.parquet"
+    write_labels(part, read_labels(tmp_path / "whole.parquet").subset(slice(18, None)))
+    (opened,) = open_tests([part], [folder])
+    assert opened.path == folder and opened.frames is not None
+    labels = read_labels(part)
+    np.testing.assert_array_equal(opened.frames.frames, labels.frame)
+    np.testing.assert_array_equal(opened.frames.points_cm, labels.points_cm)
+    # Edges are found as the label set's were, which is how the model was trained.
+    assert opened.frames.perception == PerceptionSettings()
+    (without,) = open_tests([part], [tmp_path / "gone"])
+    assert without.path == part and without.frames is None
+
+
+def test_why_a_frame_gets_no_labels(folder):
+    mapped = open_mapped_drive(folder)
+    window = BirdseyeWindow()
+    assert label_frame(mapped, 5, window) == UNCERTAIN
+    assert not isinstance(label_frame(mapped, 0, window), str)
+    assert label_frame(mapped, 3, BirdseyeWindow(left_cm=100.0)) == "no line in the window"
+    deleted = replace(mapped.drive, deleted=np.arange(N) == 16)
+    # Frame 16 of the drive is the 12th of the map.
+    assert label_frame(replace(mapped, drive=deleted), 12, window) == DELETED
+    assert not isinstance(label_frame(replace(mapped, drive=deleted), 13, window), str)
+
+
+def test_a_drive_that_does_not_fit_is_refused(folder, tmp_path):
+    with pytest.raises(MapFormatError, match="is not a map"):
+        read_map_frames(tmp_path / "drive")
+    with DriveWriter(tmp_path / "short") as writer:
+        for k in range(10):
+            writer.add(np.zeros((48, 64, 3), np.uint8), 0.05 * k)
+    with pytest.raises(DriveFormatError, match=r"short: frame 10 of .*map is not in it"):
+        read_map_frames(folder, drive_path=tmp_path / "short")
+    with DriveWriter(tmp_path / "large") as writer:
+        writer.add(np.zeros((96, 128, 3), np.uint8), 0.0)
+    with pytest.raises(CalibrationError, match=r"64x48 px.*128x96"):
+        read_map_frames(folder, drive_path=tmp_path / "large")
+    shutil.rmtree(tmp_path / "drive")
+    with pytest.raises(DriveFormatError, match=r"drive of .*map is not there"):
+        read_map_frames(folder)
