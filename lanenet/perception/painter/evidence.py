@@ -51,7 +51,9 @@ class EvidenceSettings(Settings):
         strong_contrast: As ``min_contrast``.
         strong_extent: As ``min_extent``.
         alone_support: As ``min_support``, for a line without a partner.
-        known_share: A line that the frame before had needs only this share of the first three ``min`` figures.
+        known_share: Share of the first three ``min`` figures that is enough for a line of the frame before.
+        curve_share: A curve is taken instead of its straight line from this share of the latter's score on.
+        inner_share: A narrower lane is taken instead of a wider one from this share of the latter's score on.
         max_width_ratio: The lane's width at its far end may differ by this factor from that at its near end.
         max_width_heights: With a camera: the widest lane, in camera heights.
     """
@@ -66,13 +68,15 @@ class EvidenceSettings(Settings):
     min_contrast: float = Field(default=2.5, ge=0.0)
     min_extent: float = Field(default=0.5, ge=0.0, le=1.0)
     min_pair_score: float = Field(default=0.42, ge=0.0, le=2.0)
-    clear_contrast: float = Field(default=9.0, ge=0.0)
+    clear_contrast: float = Field(default=11.0, ge=0.0)
     strong_aligned: float = Field(default=0.7, ge=0.0, le=1.0)
     strong_support: float = Field(default=0.45, ge=0.0, le=1.0)
     strong_contrast: float = Field(default=8.0, ge=0.0)
     strong_extent: float = Field(default=0.3, ge=0.0, le=1.0)
     alone_support: float = Field(default=0.58, ge=0.0, le=1.0)
     known_share: float = Field(default=0.7, ge=0.0, le=1.0)
+    curve_share: float = Field(default=0.8, ge=0.0)
+    inner_share: float = Field(default=0.75, gt=0.0, le=1.0)
     max_width_ratio: float = Field(default=2.5, gt=1.0)
     max_width_heights: float = Field(default=6.0, gt=0.0)
 

@@ -110,10 +110,10 @@ def join_side(
             score = score + score.max() * _agree(ends, known, tolerance)
         chosen = near[int(np.argmax(score))]
         total = float(length[chosen].sum())
-        if total < settings.min_support_share * (rows_px[0] - rows_px[1]):
-            break
-        bottom, top = (length[chosen] / total) @ ends[chosen]
-        lines.append(SolidLine(float(bottom), float(top)))
+        # Too short where the line before was, perhaps, but not elsewhere: go on with the others.
+        if total >= settings.min_support_share * (rows_px[0] - rows_px[1]):
+            bottom, top = (length[chosen] / total) @ ends[chosen]
+            lines.append(SolidLine(float(bottom), float(top)))
         ends, length, near = ends[~chosen], length[~chosen], near[~chosen][:, ~chosen]
     return lines
 

@@ -41,6 +41,9 @@ class Marking:
     known: bool = False
 
 
+#: A pair that leaves out a neighbouring lane is narrower than this share of the pair that holds both.
+_INNER_WIDTH = 0.75
+
 Pair = tuple[Marking | None, Marking | None]
 
 
@@ -87,13 +90,18 @@ def follow_line(
 def weigh(
     straight: Marking, curved: Marking | None, edges: EdgeField, known: bool, settings: EvidenceSettings
 ) -> Marking:
-    """Return whichever of the two has more edges along it, with its evidence."""
-    weighed = [
+    """Return the curve where it has about as many edges along it as the straight line, with its evidence.
+
+    The curve is fitted to both edges of the marking, so that it lies on its middle.
+    """
+    first, *second = (
         Marking(m.line, m.curve, m.line_px, m.points, measure_evidence(m.line_px, edges, settings), known)
-        for m in (curved, straight)
+        for m in (straight, curved)
         if m is not None
-    ]
-    return max(weighed, key=lambda marking: marking.evidence.score)
+    )
+    if second and second[0].evidence.score >= settings.curve_share * first.evidence.score:
+        return second[0]
+    return first
 
 
 def choose_lane(
@@ -104,7 +112,10 @@ def choose_lane(
     lines: PainterLineSettings,
     settings: EvidenceSettings,
 ) -> Pair:
-    """Choose the most convincing pair; without one the most convincing line that can stand alone.
+    """Choose the lane that the car is in; without one the most convincing line that can stand alone.
+
+    A much narrower pair that convinces about as much as the best one is the car's lane: the wider one reaches
+    over the neighbouring lane.
 
     Args:
         lefts: Lines of the left side.
@@ -114,41 +125,57 @@ def choose_lane(
         lines: Tolerances of straight lines.
         settings: What is asked for.
     """
+    pairs = [
+        (left, right)
+        for left in lefts
+        for right in rights
+        if are_apart(left.line, right.line, trapezoid_px, lines)
+        and _is_lane(left, right, camera_height_cm, settings)
+        and _is_convincing(left, right, settings)
+    ]
+    if pairs:
+        whole = max(pairs, key=_score)
+        inner = [
+            pair
+            for pair in pairs
+            if _score(pair) >= settings.inner_share * _score(whole)
+            and _width_px(pair) <= _INNER_WIDTH * _width_px(whole)
+        ]
+        return max(inner, key=_score) if inner else whole
     best: Pair = (None, None)
     best_score = 0.0
-    for left in lefts:
-        for right in rights:
-            score = left.evidence.score + right.evidence.score
-            if (
-                score > best_score
-                and _is_lane(left, right, camera_height_cm, settings)
-                and are_apart(left.line, right.line, trapezoid_px, lines)
-                and _is_convincing(left, right, settings)
-            ):
-                best, best_score = (left, right), score
-    if best_score > 0.0:
-        return best
     for side, markings in enumerate((lefts, rights)):
         for marking in markings:
             evidence = marking.evidence
             alone = evidence.is_strong(settings) and evidence.support >= settings.alone_support
             # A line that was answered in the frame before needs less.
-            alone = alone or (marking.known and evidence.is_likely(settings, True))
+            alone = alone or (marking.known and evidence.is_likely(settings))
             if alone and marking.evidence.score > best_score:
                 best = (marking, None) if side == 0 else (None, marking)
                 best_score = marking.evidence.score
     return best
 
 
+def _width_px(pair: tuple[Marking, Marking]) -> float:
+    return pair[1].line.bottom_px - pair[0].line.bottom_px
+
+
+def _score(pair: tuple[Marking, Marking]) -> float:
+    return pair[0].evidence.score + pair[1].evidence.score
+
+
 def _is_convincing(left: Marking, right: Marking, settings: EvidenceSettings) -> bool:
     pair = (left, right)
     if not all(m.evidence.is_likely(settings, m.known) for m in pair):
         return False
-    scored = sum(m.evidence.score for m in pair) >= settings.min_pair_score
+    scored = all(m.known for m in pair) or _score(pair) >= settings.min_pair_score
     if not scored and any(m.evidence.contrast < settings.clear_contrast for m in pair):
         return False
-    sure = [m.known or m.evidence.is_strong(settings) for m in pair]
-    return any(sure) or all(m.evidence.extent >= settings.min_extent for m in pair)
+    sure = any(m.known or m.evidence.is_strong(settings) for m in pair)
+    return sure or all(
+        m.evidence.extent >= settings.min_extent or m.evidence.contrast >= settings.clear_contrast
+        for m in pair
+    )
 
 
 def _is_lane(
