@@ -54,8 +54,8 @@ def _in_rows(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]
     if 2 * len(turned) > len(views):
         name, what = next(iter(turned.items()))
         raise CalibrationError(
-            f"the views do not fit one board: the corners of {len(turned)} of {len(views)} views, {name} among "
-            f"them, {what} (columns x rows)"
+            f"the views do not fit one board: the corners of {len(turned)} of {len(views)} views, {name} "
+            f"among them, {what} (columns x rows)"
         )
     dropped.update({name: f"its corners {what}" for name, what in turned.items()})
     return [view for view in views if view.name not in turned]
