@@ -47,7 +47,6 @@ class ChessboardCalibration:
         dropped: Views that were not used, each with the reason.
         notes: Further findings that a user should read.
         seen_angle_rad: Largest angle from the axis at which a corner was seen.
-        bic: Evidence for each model that was tried; the lowest is best.
     """
 
     camera: Camera
@@ -56,7 +55,6 @@ class ChessboardCalibration:
     dropped: dict[str, str]
     notes: list[str]
     seen_angle_rad: float
-    bic: dict[str, float]
 
     @property
     def residuals(self) -> dict[str, float]:
@@ -107,7 +105,7 @@ def calibrate_lens(
     if not fits:
         tried = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         raise CalibrationError(f"the views do not fit one board: no lens explains them ({tried}); {_ASK}")
-    _check_one_lens(min(fits.values(), key=lambda fit: fit.bic), kept)
+    _check_one_lens(min(fits.values(), key=lambda fit: fit.robust_cost), kept)
     chosen, used_views, fits = judged_fits(fits, kept)
     notes = [f"not considered: {name}: {reason}" for name, reason in reasons.items() if model == "auto"]
     if model != "auto" and model != chosen:
@@ -134,7 +132,6 @@ def calibrate_lens(
         dropped=dropped,
         notes=[*notes, *_notes(camera, used_views, seen_rad, fit.rms_px)],
         seen_angle_rad=seen_rad,
-        bic={name: candidate.bic for name, candidate in fits.items()},
     )
 
 

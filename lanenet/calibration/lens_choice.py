@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.calibration.bundle import LensFit, free_numbers, poses_of_views, refine, start_fit
+from lanenet.calibration.bundle import (
+    LensFit,
+    free_numbers,
+    neighbour_correlation,
+    poses_of_views,
+    refine,
+    start_fit,
+)
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens
 from lanenet.calibration.pose import moved_points
@@ -101,7 +108,8 @@ def judged_fits(
         if not current:
             # Only views that the lens cannot see at all end here; the first fits speak for the rest.
             break
-        chosen = min(current, key=lambda name: _cost(current[name], [views[k] for k in used]))
+        best = best_supported(list(current.values()), subset)
+        chosen = next(name for name, fit in current.items() if fit is best)
         good = _consistent(current[chosen], subset, _BAD_VIEW_FLOOR_PX)
         if len(good) == len(used) or len(good) < MIN_VIEWS:
             return chosen, subset, current
@@ -179,13 +187,22 @@ def _best_step(model: CameraModel, start: LensFit, views: Sequence[BoardView]) -
         fits.append(fit)
         lens, poses = fit.lens, fit.poses
     believable = [fit for fit in fits if _impossible(fit, views) is None]
-    return min(believable or fits, key=lambda fit: _cost(fit, views))
+    return best_supported(believable or fits, views)
 
 
-def _cost(fit: LensFit, views: Sequence[BoardView]) -> float:
-    """Evidence against a lens; one that folds back inside the image needs clear evidence for itself."""
+def best_supported(fits: Sequence[LensFit], views: Sequence[BoardView]) -> LensFit:
+    """The fit with the most evidence; a lens that folds back inside the image needs clear evidence.
+
+    What the best of the fits leaves tells how alike neighbouring residuals are.
+    """
     size = (views[0].width, views[0].height)
-    return fit.bic + (_FOLD_COST if folds_inside(camera_of_lens(fit.model, fit.lens, size)) else 0.0)
+    alike = neighbour_correlation(views, min(fits, key=lambda fit: fit.robust_cost).residuals_px)
+
+    def cost(fit: LensFit) -> float:
+        folds = folds_inside(camera_of_lens(fit.model, fit.lens, size))
+        return fit.bic(alike) + (_FOLD_COST if folds else 0.0)
+
+    return min(fits, key=cost)
 
 
 def folds_inside(camera: Camera) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lanenet.calibration.bundle import LensFit
+from lanenet.calibration.bundle import LensFit, neighbour_correlation
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import project_points
 from lanenet.calibration.pose import moved_points
@@ -30,7 +30,6 @@ _BREATHING = 0.01
 #: Smallest difference that counts, and the evidence that is needed for it. Over subsets of the real and drawn
 #: views of one lens the evidence stayed below 18, for two lenses of drawn views it was above 25.
 _MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 18.0
-_MAX_CORRELATION = 0.8
 #: Twice the log likelihood ratio per view that the best cut through normal numbers gains.
 _BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
 #: After its own focal length a view that misses its corners by this multiple of the others is simply bad.
@@ -137,7 +136,7 @@ def focal_scales(fit: LensFit, views: Sequence[BoardView]) -> FocalScales | None
         poses = poses + move[n_lens:first_scale].reshape(-1, 6)
         log_scale = log_scale + move[first_scale:]
     squares = np.bincount(owner, np.sum(errors**2, axis=1)) / np.bincount(owner)
-    shared = _neighbour_correlation(views, np.split(errors, np.flatnonzero(np.diff(owner)) + 1))
+    shared = neighbour_correlation(views, np.split(errors, np.flatnonzero(np.diff(owner)) + 1))
     covariance = inverse[first_scale:, first_scale:] * ((1.0 + shared) / (1.0 - shared)) ** 2
     if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()):
         return None
@@ -190,21 +189,6 @@ def best_split(scales: FocalScales) -> LensSplit | None:
         difference=float(np.expm1(difference)),
         evidence=float(ratio),
     )
-
-
-def _neighbour_correlation(
-    views: Sequence[BoardView], errors_px: Sequence[Float[np.ndarray, "_ 2"]]
-) -> float:
-    """Correlation of the residuals of neighbouring corners, between 0 and the largest that is believed."""
-    product = square = 0.0
-    for view, errors in zip(views, errors_px, strict=True):
-        distance = np.linalg.norm(view.points_cm[:, None] - view.points_cm[None], axis=2)
-        np.fill_diagonal(distance, np.inf)
-        first, second = np.nonzero(np.triu(distance < 1.2 * distance.min()))
-        centred = errors - errors.mean(axis=0)
-        product += float(np.mean(np.sum(centred[first] * centred[second], axis=1)))
-        square += float(np.mean(np.sum(centred**2, axis=1)))
-    return min(max(product / max(square, 1e-12), 0.0), _MAX_CORRELATION)
 
 
 def _known(covariance: Float[np.ndarray, "v v"], rms_px: Float[np.ndarray, "v"]) -> Bool[np.ndarray, "v"]:

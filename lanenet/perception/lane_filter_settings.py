@@ -65,7 +65,7 @@ class LaneFilterSettings(Settings):
     row_cm: float = Field(default=0.6, gt=0.0)
     row_tolerance_cm: float = Field(default=2.4, ge=0.0)
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
-    max_edge_share: float = Field(default=0.15, gt=0.0, le=1.0)
+    max_edge_share: float = Field(default=0.10, gt=0.0, le=1.0)
     polarity: Literal["any", "bright", "dark", "ignored"] = "any"
     parallel_rad: float = Field(default=0.5, gt=0.0, lt=1.57)
     agreement_cm: float = Field(default=8.0, gt=0.0, le=60.0)
