@@ -111,9 +111,9 @@ def fit_curve(points: Float[np.ndarray, "n 2"], length: float, settings: CurveSe
         return None
     middle, half = 0.5 * (far + near), 0.5 * (far - near)
     t = (points[:, 1] - middle) / half
-    if len(np.unique(t)) < 3:
+    if not np.any((points[:, 1] > near) & (points[:, 1] < far)):
         return None
-    p, q, r = np.polyfit(t, points[:, 0], 2)
+    p, q, r = np.linalg.lstsq(np.stack([t * t, t, np.ones_like(t)], axis=1), points[:, 0], rcond=None)[0]
     # x = p t^2 + q t + r with t = (y - middle) / half, written out in y.
     a = p / half**2
     b = q / half - 2.0 * a * middle

@@ -94,9 +94,10 @@ def value_channel(
     Source:
         Pentek, section 3, image preprocessing.
     """
-    stronger = cv2.convertScaleAbs(frame_bgr, alpha=settings.contrast, beta=0.0)
-    # V of HSV is the largest of the three channels.
-    return np.asarray(stronger.max(axis=2))
+    # V of HSV is the largest of the three channels, and stays that when all are raised alike.
+    blue, green, red = cv2.split(frame_bgr)
+    largest = cv2.max(cv2.max(blue, green), red)
+    return np.asarray(cv2.convertScaleAbs(largest, alpha=settings.contrast, beta=0.0))
 
 
 def find_painter_edges(

@@ -20,8 +20,8 @@ from lanenet.config import Settings
 from lanenet.perception.image_lane import Polyline
 from lanenet.perception.painter.edges import PainterEdgeSettings, value_channel
 
-#: Where clutter is counted: parallel strips, so many half widths beside the line.
-_BESIDE = (-8.0, -6.0, -4.0, 4.0, 6.0, 8.0)
+#: Places of the strips, in half widths beside the line: its own, and those where clutter is counted.
+_STRIPS = np.array([0.0, -8.0, -6.0, -4.0, 4.0, 6.0, 8.0])
 #: Keeps the contrast of a line without any clutter beside it finite.
 _LEAST_CLUTTER = 0.02
 
@@ -204,16 +204,18 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
     along = cosine >= math.cos(settings.max_angle_rad)
     beside = (u - np.interp(v, v_line, u_line)) / half_width
 
-    def rows_with(chosen: Float[np.ndarray, "k"]) -> float:
-        return len(np.unique(chosen)) / len(visible)
-
     near = np.abs(beside) <= 1.0
     supported = v[near & along]
     if len(supported) == 0:
         return LineEvidence()
+    # Rows with an edge, for the line's own strip and for each one beside it.
+    strip, k = np.nonzero(np.abs(beside[along] - _STRIPS[:, None]) <= 1.0)
+    filled = np.zeros((len(_STRIPS), len(rows)), bool)
+    filled[strip, (v[along][k] - rows[0]).astype(np.intp)] = True
+    shares = filled.sum(axis=1) / len(visible)
     return LineEvidence(
-        support=min(rows_with(supported), 1.0),
-        clutter=float(np.mean([rows_with(v[(np.abs(beside - k) <= 1.0) & along]) for k in _BESIDE])),
+        support=min(float(shares[0]), 1.0),
+        clutter=float(shares[1:].mean()),
         aligned=len(supported) / int(np.count_nonzero(near)),
         extent=min(float(np.ptp(supported)) / (len(visible) - 1), 1.0),
     )
