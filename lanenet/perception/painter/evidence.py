@@ -193,16 +193,18 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
     u, v = field.points_px.T
     on_rows = (v >= rows[0]) & (v <= rows[-1])
     u, v, across = u[on_rows], v[on_rows], field.across[on_rows]
-    share = (v - top) / max(bottom - top, 1.0)
+    # Edges are pixels: what depends on the row alone is found once per row.
+    row = (v - rows[0]).astype(np.intp)
+    share = (rows - top) / max(bottom - top, 1.0)
     half_width = (
         settings.half_width_top + (settings.half_width_bottom - settings.half_width_top) * share
     ) * (field.trapezoid_px[2, 0] - field.trapezoid_px[3, 0])
     # At least one pixel beside the line on small frames.
     half_width = np.maximum(half_width, 1.0)
-    slope = np.interp(v, v_line, np.gradient(u_line, v_line))
-    cosine = np.abs(across[:, 0] - slope * across[:, 1]) / np.hypot(1.0, slope)
-    along = cosine >= math.cos(settings.max_angle_rad)
-    beside = (u - np.interp(v, v_line, u_line)) / half_width
+    slope = np.interp(rows, v_line, np.gradient(u_line, v_line))
+    least = math.cos(settings.max_angle_rad) * np.hypot(1.0, slope)
+    along = np.abs(across[:, 0] - slope[row] * across[:, 1]) >= least[row]
+    beside = (u - u_rows[row]) / half_width[row]
 
     near = np.abs(beside) <= 1.0
     supported = v[near & along]
@@ -211,7 +213,7 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
     # Rows with an edge, for the line's own strip and for each one beside it.
     strip, k = np.nonzero(np.abs(beside[along] - _STRIPS[:, None]) <= 1.0)
     filled = np.zeros((len(_STRIPS), len(rows)), bool)
-    filled[strip, (v[along][k] - rows[0]).astype(np.intp)] = True
+    filled[strip, row[along][k]] = True
     shares = filled.sum(axis=1) / len(visible)
     return LineEvidence(
         support=min(float(shares[0]), 1.0),
