@@ -47,7 +47,7 @@ class Mounting:
         """Optical centre, [cm], frame car with z up."""
         return np.array([self.right_of_centre_cm, self.ahead_of_front_axle_cm, self.height_cm])
 
-    @property
+    @cached_property
     def camera_from_car(self) -> Float[np.ndarray, "3 3"]:
         """Rotation that turns vectors of the car frame (z up) into the camera frame."""
         cy, sy = np.cos(self.yaw_rad), np.sin(self.yaw_rad)

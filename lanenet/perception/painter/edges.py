@@ -95,8 +95,7 @@ def value_channel(
         Pentek, section 3, image preprocessing.
     """
     # V of HSV is the largest of the three channels, and stays that when all are raised alike.
-    blue, green, red = cv2.split(frame_bgr)
-    largest = cv2.max(cv2.max(blue, green), red)
+    largest = np.maximum(np.maximum(frame_bgr[..., 0], frame_bgr[..., 1]), frame_bgr[..., 2])
     return np.asarray(cv2.convertScaleAbs(largest, alpha=settings.contrast, beta=0.0))
 
 

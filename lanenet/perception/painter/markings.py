@@ -80,9 +80,7 @@ def follow_lines(
     if settings is None:
         return [(marking, None) for marking in straight]
     found = [_find_curve(guess, edge_points, half_width, settings) for guess in guesses]
-    paths = [
-        curve.sample(float(guess[0, 1])) for curve, guess in zip(found, guesses, strict=True) if curve
-    ]
+    paths = [curve.sample(float(guess[0, 1])) for curve, guess in zip(found, guesses, strict=True) if curve]
     paths_px = iter(move_lines(plane.to_image, paths))
     both: list[tuple[Marking, Marking | None]] = []
     for marking, curve in zip(straight, found, strict=True):

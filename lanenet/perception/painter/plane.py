@@ -40,7 +40,9 @@ class RoadPlane:
             CalibrationError: If no pixel sees the road.
         """
         self._camera = camera
-        self._table = RoadTable(camera, RangeSettings())
+        table = RoadTable(camera, RangeSettings())
+        self._keep = table.keep
+        self._points_cm = table.points_cm.reshape(-1, 2)
 
     def from_image(self, pixels_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """See :class:`Plane`."""
@@ -48,7 +50,7 @@ class RoadPlane:
 
     def edge_points(self, edges: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
         """See :class:`Plane`."""
-        return self._table.points_cm[(edges > 0) & (self._table.keep > 0)]
+        return self._points_cm[np.flatnonzero((edges & self._keep) > 0)]
 
     def to_image(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """See :class:`Plane`."""
