@@ -20,8 +20,8 @@ from lanenet.config import Settings
 from lanenet.perception.image_lane import Polyline
 from lanenet.perception.painter.edges import PainterEdgeSettings, value_channel
 
-#: Where clutter is counted: parallel strips, so many half widths beside the line.
-_BESIDE = (-8.0, -6.0, -4.0, 4.0, 6.0, 8.0)
+#: Places of the strips, in half widths beside the line: its own, and those where clutter is counted.
+_STRIPS = np.array([0.0, -8.0, -6.0, -4.0, 4.0, 6.0, 8.0])
 #: Keeps the contrast of a line without any clutter beside it finite.
 _LEAST_CLUTTER = 0.02
 
@@ -86,7 +86,7 @@ class EdgeField:
     """The edge pixels of the region with their directions.
 
     Attributes:
-        points_px: Pixels (u, v), frame image.
+        points_px: Pixels (u, v), row by row from the top, frame image.
         across: Unit gradient of V at each.
         trapezoid_px: The region, clockwise from the top left.
         width_px: Width of the frame.
@@ -151,10 +151,11 @@ def find_edge_field(
 ) -> EdgeField:
     """Find the direction of each edge pixel from the gradient that Canny saw."""
     height, width = edges.shape
-    v, u = np.nonzero(edges)
-    points = np.stack([u, v], axis=1).astype(np.float64)
-    if len(u) == 0:
-        return EdgeField(points, np.empty((0, 2)), trapezoid_px, width)
+    found = cv2.findNonZero(edges)
+    if found is None or len(found) == 0:
+        return EdgeField(np.empty((0, 2)), np.empty((0, 2)), trapezoid_px, width)
+    points = found.reshape(-1, 2)
+    u, v = points.T
     # Only the rows that hold edges, with a margin for the kernels.
     first, last = max(0, int(v.min()) - settings.blur_px), min(height, int(v.max()) + settings.blur_px + 1)
     value = value_channel(np.ascontiguousarray(frame_bgr[first:last]), settings)
@@ -163,7 +164,7 @@ def find_edge_field(
         [cv2.Sobel(blurred, cv2.CV_16S, *order)[v - first, u] for order in ((1, 0), (0, 1))], axis=1
     ).astype(np.float64)
     length = np.maximum(np.hypot(gradient[:, 0], gradient[:, 1]), 1e-9)
-    return EdgeField(points, gradient / length[:, None], trapezoid_px, width)
+    return EdgeField(points.astype(np.float64), gradient / length[:, None], trapezoid_px, width)
 
 
 def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSettings) -> LineEvidence:
@@ -190,30 +191,41 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
     visible = rows[(u_rows >= 0.0) & (u_rows <= field.width_px - 1.0)]
     if len(visible) < 2:
         return LineEvidence()
-    u, v = field.points_px.T
-    on_rows = (v >= rows[0]) & (v <= rows[-1])
-    u, v, across = u[on_rows], v[on_rows], field.across[on_rows]
-    share = (v - top) / max(bottom - top, 1.0)
+    first, last = np.searchsorted(field.points_px[:, 1], (rows[0], rows[-1] + 1))
+    (u, v), across = field.points_px[first:last].T, field.across[first:last]
+    # Edges are pixels: what depends on the row alone is found once per row.
+    row = (v - rows[0]).astype(np.intp)
+    share = (rows - top) / max(bottom - top, 1.0)
     half_width = (
         settings.half_width_top + (settings.half_width_bottom - settings.half_width_top) * share
     ) * (field.trapezoid_px[2, 0] - field.trapezoid_px[3, 0])
     # At least one pixel beside the line on small frames.
     half_width = np.maximum(half_width, 1.0)
-    slope = np.interp(v, v_line, np.gradient(u_line, v_line))
-    cosine = np.abs(across[:, 0] - slope * across[:, 1]) / np.hypot(1.0, slope)
-    along = cosine >= math.cos(settings.max_angle_rad)
-    beside = (u - np.interp(v, v_line, u_line)) / half_width
-
-    def rows_with(chosen: Float[np.ndarray, "k"]) -> float:
-        return len(np.unique(chosen)) / len(visible)
+    slope = np.interp(rows, v_line, _slope(u_line, v_line))
+    least = math.cos(settings.max_angle_rad) * np.hypot(1.0, slope)
+    along = np.abs(across[:, 0] - slope[row] * across[:, 1]) >= least[row]
+    beside = (u - u_rows[row]) / half_width[row]
 
     near = np.abs(beside) <= 1.0
     supported = v[near & along]
     if len(supported) == 0:
         return LineEvidence()
+    # Rows with an edge, for the line's own strip and for each one beside it.
+    strip, k = np.nonzero(np.abs(beside[along] - _STRIPS[:, None]) <= 1.0)
+    filled = np.zeros((len(_STRIPS), len(rows)), bool)
+    filled[strip, row[along][k]] = True
+    shares = filled.sum(axis=1) / len(visible)
     return LineEvidence(
-        support=min(rows_with(supported), 1.0),
-        clutter=float(np.mean([rows_with(v[(np.abs(beside - k) <= 1.0) & along]) for k in _BESIDE])),
+        support=min(float(shares[0]), 1.0),
+        clutter=float(shares[1:].mean()),
         aligned=len(supported) / int(np.count_nonzero(near)),
         extent=min(float(np.ptp(supported)) / (len(visible) - 1), 1.0),
     )
+
+
+def _slope(u: Float[np.ndarray, "n"], v: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """du/dv at each point, as ``np.gradient`` gives it at a third of its time."""
+    step = v[1:] - v[:-1]
+    secant = (u[1:] - u[:-1]) / step
+    inner = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / (step[1:] + step[:-1])
+    return np.concatenate([secant[:1], inner, secant[-1:]])

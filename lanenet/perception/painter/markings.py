@@ -17,7 +17,7 @@ from lanenet.perception.painter.evidence import (
     measure_evidence,
 )
 from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, are_apart
-from lanenet.perception.painter.plane import Plane
+from lanenet.perception.painter.plane import Plane, move_lines
 
 
 @dataclass(frozen=True)
@@ -53,38 +53,58 @@ def straight_px(line: SolidLine, trapezoid_px: Float[np.ndarray, "4 2"]) -> Poly
     return sample_segment(near, (line.top_px, float(trapezoid_px[0, 1])))
 
 
-def follow_line(
-    line: SolidLine,
+def follow_lines(
+    lines: Sequence[SolidLine],
     plane: Plane,
     trapezoid_px: Float[np.ndarray, "4 2"],
     edge_points: Float[np.ndarray, "n 2"],
     half_width: float,
     settings: CurveSettings | None,
-) -> tuple[Marking, Marking | None]:
-    """Return the straight line as a marking, and the curve that windows along it find, if they find one.
+) -> list[tuple[Marking, Marking | None]]:
+    """Return each straight line as a marking, and the curve that windows along it find, if they find one.
 
     Args:
-        line: A joined line.
+        lines: Joined lines.
         plane: Where curves are followed.
         trapezoid_px: The region.
         edge_points: All edges in the plane.
         half_width: Half the width of a window in the plane.
         settings: Of the curves; None leaves the line straight.
     """
-    line_px = straight_px(line, trapezoid_px)
-    guess = plane.from_image(line_px)
-    straight = Marking(line, None, line_px, _rising(guess))
-    if settings is None or len(guess) < 2 or not np.all(np.diff(guess[:, 1]) > 0.0):
-        return straight, None
+    lines_px = [straight_px(line, trapezoid_px) for line in lines]
+    guesses = move_lines(plane.from_image, lines_px)
+    straight = [
+        Marking(line, None, line_px, _rising(guess))
+        for line, line_px, guess in zip(lines, lines_px, guesses, strict=True)
+    ]
+    if settings is None:
+        return [(marking, None) for marking in straight]
+    found = [_find_curve(guess, edge_points, half_width, settings) for guess in guesses]
+    paths = [curve.sample(float(guess[0, 1])) for curve, guess in zip(found, guesses, strict=True) if curve]
+    paths_px = iter(move_lines(plane.to_image, paths))
+    both: list[tuple[Marking, Marking | None]] = []
+    for marking, curve in zip(straight, found, strict=True):
+        curved = None
+        if curve is not None and len(curve_px := next(paths_px)) >= 2:
+            curved = Marking(marking.line, curve, curve_px, curve.sample())
+        both.append((marking, curved))
+    return both
+
+
+def _find_curve(
+    guess: Float[np.ndarray, "m 2"],
+    edge_points: Float[np.ndarray, "n 2"],
+    half_width: float,
+    settings: CurveSettings,
+) -> Curve | None:
+    """The parabola through the edges along a straight line of the plane, if there are enough of them."""
+    if len(guess) < 2 or not np.all(np.diff(guess[:, 1]) > 0.0):
+        return None
     seen = edge_points[:, 1].max() if len(edge_points) else guess[-1, 1]
     length = float(min(guess[-1, 1], seen) - guess[0, 1])
     if length <= 0.0:
-        return straight, None
-    curve = fit_curve(slide_windows(edge_points, guess, half_width, settings), length, settings)
-    curve_px = None if curve is None else plane.to_image(curve.sample(float(guess[0, 1])))
-    if curve is None or curve_px is None or len(curve_px) < 2:
-        return straight, None
-    return straight, Marking(line, curve, curve_px, curve.sample())
+        return None
+    return fit_curve(slide_windows(edge_points, guess, half_width, settings), length, settings)
 
 
 def weigh(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -33,12 +34,12 @@ from lanenet.perception.painter.markings import (
     Marking,
     Pair,
     choose_lane,
-    follow_line,
+    follow_lines,
     straight_px,
     weigh,
 )
 from lanenet.perception.painter.measure import PaintedLane, find_aim_cm, measure_lane
-from lanenet.perception.painter.plane import Plane, RoadPlane, SquarePlane
+from lanenet.perception.painter.plane import Plane, RoadPlane, SquarePlane, finite_rows
 
 #: Smaller frames hold no line that could be told from chance.
 _MIN_SIDE_PX = 48
@@ -153,28 +154,27 @@ class LanePainter:
             half_width = chosen.curve.half_width_heights * height_cm
         curve = chosen.curve if chosen.curves else None
 
-        def follow(line: SolidLine) -> tuple[Marking, Marking | None]:
-            return follow_line(line, plane, trapezoid_px, points, half_width, curve)
+        def follow(lines: Sequence[SolidLine]) -> dict[SolidLine, tuple[Marking, Marking | None]]:
+            ways = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
+            return dict(zip(lines, ways, strict=True))
 
         if not chosen.evidence.required:
-            pair = [
-                None if line is None else follow(line)
-                for line in find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
-            ]
-            left, right = (None if both is None else both[1] or both[0] for both in pair)
+            pair = find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
+            ways = follow([line for line in pair if line is not None])
+            left, right = (None if line is None else ways[line][1] or ways[line][0] for line in pair)
             return left, right
         field = find_edge_field(frame_bgr, edges, trapezoid_px, chosen.edges)
         tolerance = agree_px(trapezoid_px, chosen.lines)
+        both_sides = find_side_lines(
+            segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates
+        )
+        ways = follow([*both_sides[0], *both_sides[1]])
         sides = []
-        for lines, before in zip(
-            find_side_lines(segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates),
-            earlier,
-            strict=True,
-        ):
+        for lines, before in zip(both_sides, earlier, strict=True):
             known = [before is not None and are_close(line, before, tolerance) for line in lines]
             sides.append(
                 [
-                    weigh(*follow(line), field, again, chosen.evidence)
+                    weigh(*ways[line], field, again, chosen.evidence)
                     for line, again in zip(lines, known, strict=True)
                 ]
             )
@@ -202,7 +202,7 @@ class LanePainter:
                 line_px = straight_px(line, trapezoid_px)
                 points = marking.points
                 if self._road is not None:
-                    points = self._road.from_image(line_px)
+                    points = finite_rows(self._road.from_image(line_px))
                     points = points[np.argsort(points[:, 1], kind="stable")]
                 marking = replace(marking, line=line, line_px=line_px, points=points)
             smooth.append(marking)

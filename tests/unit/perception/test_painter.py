@@ -37,7 +37,7 @@ from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, fin
 from lanenet.perception.painter.markings import Marking, choose_lane, straight_px
 from lanenet.perception.painter.measure import find_aim_cm, measure_lane
 from lanenet.perception.painter.painter import LanePainter, PainterSettings
-from lanenet.perception.painter.plane import SquarePlane
+from lanenet.perception.painter.plane import RoadPlane, SquarePlane, finite_rows, move_lines
 
 TRAPEZOID = np.array([[120.0, 100.0], [200.0, 100.0], [320.0, 200.0], [0.0, 200.0]])
 LINES = PainterLineSettings()
@@ -128,6 +128,22 @@ def test_the_plane_is_the_trapezoid_stretched_to_a_square() -> None:
     assert plane.to_image(corners) == pytest.approx(TRAPEZOID, abs=1e-4)
 
 
+def test_lines_moved_together_are_those_moved_one_by_one() -> None:
+    plane = RoadPlane(CAMERA)
+    # The second line begins above the horizon, of the third nothing is on the road.
+    lines = [
+        np.array([[100.0, 200.0], [120.0, 160.0]]),
+        np.array([[200.0, 0.0], [210.0, 150.0], [220.0, 220.0]]),
+        np.array([[10.0, 0.0]]),
+    ]
+    moved = move_lines(plane.from_image, lines)
+    assert [len(line) for line in moved] == [2, 2, 0] and move_lines(plane.from_image, []) == []
+    for line, together in zip(lines, moved, strict=True):
+        assert together == pytest.approx(finite_rows(plane.from_image(line)), abs=1e-9)
+        # And back to where they came from.
+        assert plane.to_image(together) == pytest.approx(line[len(line) - len(together) :], abs=1e-6)
+
+
 @given(st.floats(-0.004, 0.004), st.floats(-0.3, 0.3), st.floats(-30.0, 30.0))
 def test_windows_follow_a_curve_and_the_fit_returns_it(a: float, b: float, c: float) -> None:
     y = np.linspace(10.0, 100.0, 200)
@@ -154,6 +170,8 @@ def test_too_few_points_are_no_curve() -> None:
     assert fit_curve(points, 100.0, CurveSettings()) is None
     assert fit_curve(points[:5], 40.0, CurveSettings()) is None
     assert len(slide_windows(np.empty((0, 2)), points, 5.0, CurveSettings())) == 0
+    # However many points: two rows do not bend.
+    assert fit_curve(np.tile([[0.0, 0.0], [1.0, 40.0]], (30, 1)), 40.0, CurveSettings()) is None
 
 
 def test_radius_of_a_circle() -> None:
