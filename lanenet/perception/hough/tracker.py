@@ -99,7 +99,7 @@ class HoughTracker:
         self.settings = HoughSettings() if settings is None else settings
         self.last = ImageLane()
         self.state = HoughState()
-        self._frames = self._frames_with_line = 0
+        self._frames = self._frames_steered = 0
 
     def reset(self) -> None:
         """Forget lines and steering of earlier frames."""
@@ -108,11 +108,11 @@ class HoughTracker:
 
     @property
     def hint(self) -> str:
-        """What to try where the frames so far, across resets, showed nearly no line; else empty."""
-        if self.settings.edges.channel != "hue" or self._frames_with_line >= _FEW * self._frames:
+        """What to try where the frames so far, across resets, gave nearly no steering; else empty."""
+        if self.settings.edges.channel != "hue" or self._frames_steered >= _FEW * self._frames:
             return ""
         return (
-            f"hough found a line in {self._frames_with_line} of {self._frames} frames; the hue says little "
+            f"hough steers in {self._frames_steered} of {self._frames} frames; the hue says little "
             "about white lines and gray floors: --config configs/detectors/hough_value.yaml looks at the "
             "brightness"
         )
@@ -129,7 +129,7 @@ class HoughTracker:
         left, right = self.find_lines(frame)
         steered = self.track(left, right)
         self._frames += 1
-        self._frames_with_line += left is not None or right is not None
+        self._frames_steered += steered is not None
         self.last = self._image_lane(left, right, frame.shape[1], frame.shape[0])
         points = np.full((2, N_POINTS // 2), np.nan)
         if self.camera is not None:

@@ -28,16 +28,6 @@ class PaintedLane:
     offset_cm: float = float("nan")
 
     @property
-    def radius_m(self) -> float:
-        """The radius in metres, for full-size roads."""
-        return 0.01 * self.radius_cm
-
-    @property
-    def offset_m(self) -> float:
-        """The offset in metres, for full-size roads."""
-        return 0.01 * self.offset_cm
-
-    @property
     def text(self) -> str:
         """Both figures for people; empty where neither is known."""
         parts = []

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from boards import BOARD, MOUNTING, fisheye_of
@@ -41,7 +43,7 @@ def lens_only(camera: Camera) -> Camera:
 def test_exact_points_give_the_exact_mounting() -> None:
     camera, pixels = camera_and_points()
     found = calibrate_ground(lens_only(camera), GRID_CM, pixels)
-    for name, value in vars(MOUNTING).items():
+    for name, value in dataclasses.asdict(MOUNTING).items():
         assert getattr(found.camera.mounting, name) == pytest.approx(value, abs=1e-5), name
     assert found.rms_px < 1e-6 and found.used.all()
 
@@ -49,7 +51,7 @@ def test_exact_points_give_the_exact_mounting() -> None:
 def test_noise_stays_within_the_stated_uncertainty() -> None:
     camera, pixels = camera_and_points(0.3)
     found = calibrate_ground(lens_only(camera), GRID_CM, pixels)
-    for name, value in vars(MOUNTING).items():
+    for name, value in dataclasses.asdict(MOUNTING).items():
         assert abs(getattr(found.camera.mounting, name) - value) < 4.0 * found.sigma[name], name
     assert found.sigma["height_cm"] < 0.5
     assert 0.2 < found.rms_px < 0.6

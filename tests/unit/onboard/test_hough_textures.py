@@ -84,6 +84,6 @@ def test_detect_prints_the_hint_where_the_hue_shows_nothing(tmp_path: Path) -> N
     words = ["detect", str(source), "--detector", "hough", "--out", str(out)]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 0, result.output
-    assert "hint: hough found a line in 0 of 1 frames" in " ".join(result.output.split())
+    assert "hint: hough steers in 0 of 1 frames" in " ".join(result.output.split())
     helped = CliRunner().invoke(cli.app, [*words, "--config", str(SHIPPED_FILE)])
     assert helped.exit_code == 0 and "hint:" not in helped.output

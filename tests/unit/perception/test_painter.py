@@ -199,7 +199,6 @@ def test_lane_on_the_road(centre: float, slope: float, bend: float) -> None:
     assert estimate.steering_rad == pytest.approx(math.atan2(-aim, 70.0), abs=0.03)
     assert estimate.offset_cm == pytest.approx(-centre, abs=3.0)
     assert (painter.lane.offset_cm, painter.lane.radius_cm) == (estimate.offset_cm, estimate.radius_cm)
-    assert painter.lane.radius_m == 0.01 * estimate.radius_cm
     if bend:
         assert estimate.radius_cm == pytest.approx(1.0 / (2.0 * bend), rel=0.3)
     else:
@@ -330,7 +329,7 @@ def test_without_a_camera_the_image_lines_lie_on_the_markings() -> None:
     )
     estimate = painter.detect(lane_frame(0.0))
     assert estimate.confidence == 1.0 and not estimate.mask.any()
-    assert abs(estimate.steering_rad) < 0.05 and math.isnan(painter.lane.radius_m)
+    assert abs(estimate.steering_rad) < 0.05 and math.isnan(painter.lane.radius_cm)
     for side, line in ((-20.0, painter.last.left_px), (20.0, painter.last.right_px)):
         assert line is not None
         for y in (30.0, 60.0):
