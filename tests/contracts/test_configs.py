@@ -23,6 +23,12 @@ def read_simulation(path: Path) -> Any:
     return load_settings(SimulationSettings, path)
 
 
+def read_track(path: Path) -> Any:
+    from datagen.world.track import load_track
+
+    return load_track(path)
+
+
 def read_camera_file(path: Path) -> Any:
     from lanenet.data.camera_file import read_camera
 
@@ -30,7 +36,12 @@ def read_camera_file(path: Path) -> Any:
 
 
 #: What reads the YAML files of each folder below configs/.
-READERS = {".": read_training_run, "drives": read_simulation, "cameras": read_camera_file}
+READERS = {
+    ".": read_training_run,
+    "drives": read_simulation,
+    "tracks": read_track,
+    "cameras": read_camera_file,
+}
 
 
 def test_the_config_of_the_readme_ships() -> None:
