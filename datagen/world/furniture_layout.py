@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from datagen.world.furniture import (
     Arrow,
+    Colour,
     Furniture,
     FurnitureRates,
     Junction,
@@ -23,7 +24,8 @@ from datagen.world.road import Track
 from lanenet.errors import ConfigError
 
 _TRIES = 15
-_APART_CM = 10.0  # least gap between random things along the road
+_APART_CM = 30.0  # least gap between random things along the road
+_BESIDE_CM = 10.0  # and beside it
 _OUTLINE_CM = 5.0  # spacing of the points that are compared
 _BEND_RAD = 0.1  # how much the road may turn over a junction
 
@@ -55,6 +57,7 @@ def random_furniture(
     rates: FurnitureRates,
     taken: Sequence[Furniture],
     line_width_cm: float,
+    colour: Colour,
     rng: np.random.Generator,
 ) -> list[Painted]:
     """Draw things where there is room; what finds none is left out.
@@ -64,6 +67,7 @@ def random_furniture(
         rates: How many.
         taken: Things that are there already.
         line_width_cm: Width of the tape.
+        colour: Of the paint.
         rng: Source of randomness; each kind of thing has its own child.
     """
     occupied = [(item.value.at_cm, extent_cm(item)) for item in taken]
@@ -83,12 +87,13 @@ def random_furniture(
         for _ in range(kind_rng.poisson(expected)):
             for _ in range(_TRIES):
                 at_cm = float(kind_rng.uniform(0.0, track.length_cm))
-                item = Furniture(**{kind: _random_thing(track, kind, at_cm, kind_rng)})
+                thing = _random_thing(track, kind, at_cm, kind_rng).model_copy(update={"colour": colour})
+                item = Furniture(**{kind: thing})
                 if not _is_free(track, item, occupied) or _misplaced(track, item) is not None:
                     continue
                 painted = paint_furniture(track, item, line_width_cm)
                 outline = _outline(painted.boxes)
-                if any(_meets(outline, other, _APART_CM) for other in outlines):
+                if any(_meets(outline, other, _BESIDE_CM) for other in outlines):
                     continue
                 if _on_the_road(track, item, painted) is None:
                     outlines.append(outline)

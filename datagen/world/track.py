@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.world.centre_line import CentreLine, comes_near_itself, open_centre_line
-from datagen.world.furniture import COLOURS
+from datagen.world.furniture import COLOURS, Colour
 from datagen.world.furniture_layout import listed_furniture, random_furniture
 from datagen.world.furniture_paint import Painted
 from datagen.world.paint import cut, interrupt, paint_dashes, paint_solid, wear_off
@@ -78,7 +78,9 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
     )
     width_cm, items = settings.line_width_cm, settings.furniture
     things = listed_furniture(track, items, width_cm, settings.origin)
-    things += random_furniture(track, settings.random_furniture, items, width_cm, furniture_rng)
+    # Of the same paint as the line on the right, except that a yellow road has white bars.
+    colour: Colour = "black" if settings.right.colour == "black" else "white"
+    things += random_furniture(track, settings.random_furniture, items, width_cm, colour, furniture_rng)
     markings = [
         marking
         for name in settings.lines
