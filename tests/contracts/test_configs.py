@@ -23,6 +23,12 @@ def read_simulation(path: Path) -> Any:
     return load_settings(SimulationSettings, path)
 
 
+def read_track(path: Path) -> Any:
+    from datagen.world.track import load_track
+
+    return load_track(path)
+
+
 def read_camera_file(path: Path) -> Any:
     from lanenet.data.camera_file import read_camera
 
@@ -42,6 +48,7 @@ def read_detector_settings(path: Path) -> Any:
 READERS = {
     ".": read_training_run,
     "drives": read_simulation,
+    "tracks": read_track,
     "cameras": read_camera_file,
     "detectors": read_detector_settings,
 }
