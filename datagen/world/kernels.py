@@ -20,6 +20,37 @@ from datagen.world.ground import FAR, NOT_FLOOR, TEXTURE_CELL_CM, TEXTURE_LEVELS
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
+def fold(width_a, width_b, width_c):
+    """Turn three widths, of either sign, into two, the larger first: the third goes in by its variance."""
+    a, b, c = abs(width_a), abs(width_b), abs(width_c)
+    if a < b:
+        a, b = b, a
+    if c > 0.0:
+        if a < c:
+            a, c = c, a
+        b = np.sqrt(b * b + c * c)
+        if a < b:
+            a, b = b, a
+    return a, b
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def inner_share(distance, a, b):
+    """Share of a pixel on the inner side of an edge, by its folded widths across the edge."""
+    half = 0.5 * (a + b)
+    d = abs(distance)
+    if d >= half:
+        outside = 0.0
+    elif d <= 0.5 * (a - b):
+        outside = 0.5 - d / a
+    else:
+        outside = (half - d) * (half - d) / (2.0 * a * b)
+    return 1.0 - outside if distance > 0.0 else outside
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
 def box_share(distance, width_a, width_b, width_c=0.0):
     """Share of a parallelogram on the inner side of an edge.
 
@@ -35,32 +66,18 @@ def box_share(distance, width_a, width_b, width_c=0.0):
     Returns:
         0..1.
     """
-    a, b, c = abs(width_a), abs(width_b), abs(width_c)
-    if a < b:
-        a, b = b, a
-    if c > 0.0:
-        if a < c:
-            a, c = c, a
-        b = np.sqrt(b * b + c * c)
-        if a < b:
-            a, b = b, a
-    half = 0.5 * (a + b)
-    d = abs(distance)
-    if d >= half:
-        outside = 0.0
-    elif d <= 0.5 * (a - b):
-        outside = 0.5 - d / a
-    else:
-        outside = (half - d) * (half - d) / (2.0 * a * b)
-    return 1.0 - outside if distance > 0.0 else outside
+    a, b = fold(width_a, width_b, width_c)
+    return inner_share(distance, a, b)
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def strip_share(distance, half, width_a, width_b, width_c):
     """Share of a pixel on a strip of half width ``half``, by the distance to its middle."""
-    inner = box_share(distance + half, width_a, width_b, width_c)
-    return inner - box_share(distance - half, width_a, width_b, width_c)
+    a, b = fold(width_a, width_b, width_c)
+    if abs(distance) >= half + 0.5 * (a + b):
+        return 0.0
+    return inner_share(distance + half, a, b) - inner_share(distance - half, a, b)
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,7 +127,8 @@ def locate(x, y, nodes, closed, start):
 @no_type_check
 def painted_share(s, width_a, width_b, width_c, stretches, first, last):
     """Share of a pixel that lies on painted stretches along the road (rows first..last, ascending)."""
-    half = 0.5 * (abs(width_a) + abs(width_b) + abs(width_c))
+    a, b = fold(width_a, width_b, width_c)
+    half = 0.5 * (a + b)
     low, high = first, last
     while low < high:  # the first stretch that ends beyond the pixel's start
         middle = (low + high) // 2
@@ -120,8 +138,7 @@ def painted_share(s, width_a, width_b, width_c, stretches, first, last):
             low = middle + 1
     share = 0.0
     while low < last and stretches[low, 0] < s + half:
-        share += box_share(s - stretches[low, 0], width_a, width_b, width_c)
-        share -= box_share(s - stretches[low, 1], width_a, width_b, width_c)
+        share += inner_share(s - stretches[low, 0], a, b) - inner_share(s - stretches[low, 1], a, b)
         low += 1
     return min(max(share, 0.0), 1.0)
 
@@ -160,7 +177,9 @@ def rectangle_share(x, y, ux, uy, vx, vy, mx, my, reach, boxes, q):
     if abs(along) >= boxes[q, 4] + reach or abs(across) >= boxes[q, 5] + reach:
         return 0.0
     alpha = strip_share(along, boxes[q, 4], ux * c + uy * s, vx * c + vy * s, mx * c + my * s)
-    return alpha * strip_share(across, boxes[q, 5], uy * c - ux * s, vy * c - vx * s, my * c - mx * s)
+    if alpha > 0.0:
+        alpha *= strip_share(across, boxes[q, 5], uy * c - ux * s, vy * c - vx * s, my * c - mx * s)
+    return alpha
 
 
 @njit(cache=True, error_model="numpy")
@@ -207,6 +226,8 @@ def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road
     tile_boxes, tile_clutter = np.empty_like(all_boxes), np.empty_like(all_clutter)
     near_boxes, near_clutter = np.empty_like(all_boxes), np.empty_like(all_clutter)
     origin_x, origin_y = origin[0], origin[1]
+    per_cell = 1.0 / frame[2]
+    per_joint_u, per_joint_v = 1.0 / max(settings[5], 1e-9), 1.0 / max(settings[6], 1e-9)
     base_side = int(np.sqrt(starts[1]) + 0.5)
     for tile in range(tiles.shape[0]):
         if tiles[tile, 0] > tiles[tile, 2]:
@@ -259,8 +280,8 @@ def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road
                 c, sn, k_road, s_road = 1.0, 0.0, 0.0, 0.0
                 verge = borders[2]
                 if near:
-                    column = int(np.floor((x - frame[0]) / frame[2]))
-                    row = int(np.floor((y - frame[1]) / frame[2]))
+                    column = int(np.floor((x - frame[0]) * per_cell))
+                    row = int(np.floor((y - frame[1]) * per_cell))
                     on_grid = (
                         0 <= row < grid.shape[0] and 0 <= column < grid.shape[1] and grid[row, column] >= 0
                     )
@@ -301,14 +322,14 @@ def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road
                         shade = texture_level * sample(texture, start, side, shrink, a, b)
                 if settings[5] > 0.0:
                     d = along - settings[3]
-                    d -= settings[5] * np.floor(d / settings[5] + 0.5)
+                    d -= settings[5] * np.floor(d * per_joint_u + 0.5)
                     if abs(d) < 0.5 * settings[7] + reach:
                         shade -= settings[8] * strip_share(
                             d, 0.5 * settings[7], ux * cj + uy * sj, vx * cj + vy * sj, mx * cj + my * sj
                         )
                 if settings[6] > 0.0:
                     d = across - settings[4]
-                    d -= settings[6] * np.floor(d / settings[6] + 0.5)
+                    d -= settings[6] * np.floor(d * per_joint_v + 0.5)
                     if abs(d) < 0.5 * settings[7] + reach:
                         shade -= settings[8] * strip_share(
                             d, 0.5 * settings[7], uy * cj - ux * sj, vy * cj - vx * sj, my * cj - mx * sj

@@ -236,6 +236,8 @@ def _paint_row(out, depth, rays, start, shake, rows, v, eye, way, turn, solid, b
     # How the eye moves while the pixel is exposed, and how far beyond an edge a pixel may still see of it.
     move_x, move_y = way * c - turn * ahead_y, way * s + turn * ahead_x
     edge = _WIDEST_PX_RAD + abs(turn) + (abs(move_x) + abs(move_y)) / min(band[at, 6], band[at, 7])
+    left_move = (band[at, 0] * move_x + band[at, 1] * move_y) / band[at, 6]
+    right_move = (band[at, 3] * move_x + band[at, 4] * move_y) / band[at, 7]
     # From the camera's shaken axes (right, ahead, up) to the map's, in one step.
     m00, m10, m20 = shake[1, 0] * c + shake[0, 0] * s, shake[1, 0] * s - shake[0, 0] * c, shake[2, 0]
     m01, m11, m21 = shake[1, 1] * c + shake[0, 1] * s, shake[1, 1] * s - shake[0, 1] * c, shake[2, 1]
@@ -260,16 +262,17 @@ def _paint_row(out, depth, rays, start, shake, rows, v, eye, way, turn, solid, b
         i = start + j
         a, b, d = n[j], n[TILE + j], n[2 * TILE + j]
         rx, ry, rz = m00 * a + m01 * b + m02 * d, m10 * a + m11 * b + m12 * d, m20 * a + m21 * b + m22 * d
-        a, b, d = n[3 * TILE + j], n[4 * TILE + j], n[5 * TILE + j]
-        ux, uy, uz = m00 * a + m01 * b + m02 * d, m10 * a + m11 * b + m12 * d, m20 * a + m21 * b + m22 * d
-        a, b, d = n[6 * TILE + j], n[7 * TILE + j], n[8 * TILE + j]
-        vx, vy, vz = m00 * a + m01 * b + m02 * d, m10 * a + m11 * b + m12 * d, m20 * a + m21 * b + m22 * d
+        ua, ub, ud = n[3 * TILE + j], n[4 * TILE + j], n[5 * TILE + j]
+        va, vb, vd = n[6 * TILE + j], n[7 * TILE + j], n[8 * TILE + j]
         alpha = 1.0
-        for p in range(0, 6, 3):
-            px, py, pz = band[at, p], band[at, p + 1], band[at, p + 2]
-            du, dv = px * ux + py * uy + pz * uz, px * vx + py * vy + pz * vz
-            dm = (px * move_x + py * move_y) / band[at, 6 + p // 3] + turn * (py * rx - px * ry)
-            alpha *= soft(left if p == 0 else right, np.sqrt(du * du + dv * dv + dm * dm))
+        if left < edge:
+            du, dv = left_a * ua + left_b * ub + left_d * ud, left_a * va + left_b * vb + left_d * vd
+            dm = left_move + turn * (band[at, 1] * rx - band[at, 0] * ry)
+            alpha = soft(left, np.sqrt(du * du + dv * dv + dm * dm))
+        if right < edge:
+            du, dv = right_a * ua + right_b * ub + right_d * ud, right_a * va + right_b * vb + right_d * vd
+            dm = right_move + turn * (band[at, 4] * rx - band[at, 3] * ry)
+            alpha *= soft(right, np.sqrt(du * du + dv * dv + dm * dm))
         if alpha <= 0.0:
             continue
         enter, leave, nx, ny = pierce(solid, ex, ey, eye[2], rx, ry, rz)
@@ -277,7 +280,7 @@ def _paint_row(out, depth, rays, start, shake, rows, v, eye, way, turn, solid, b
             continue
         z_enter, z_leave = eye[2] + enter * rz, eye[2] + leave * rz
         flat = max(np.sqrt(rx * rx + ry * ry), 0.05)
-        size = np.sqrt(0.5 * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
+        size = np.sqrt(0.5 * (ua * ua + ub * ub + ud * ud + va * va + vb * vb + vd * vd))
         # A step of one pixel up or down, at the solid, and what the approach adds to it.
         width = enter * size / flat + abs(rz) * abs(way) / flat
         bottom, top = (z_enter, z_leave) if rz < 0.0 else (z_leave, z_enter)
