@@ -28,7 +28,11 @@ def moved(rows: Float[np.ndarray, "n k"], frame: int) -> Float[np.ndarray, "n k"
 
 
 def mirror_lamps(
-    lamps: Float[np.ndarray, "n 4"], eye_cm: Float[np.ndarray, "3"], level: float, near_cm: float
+    lamps: Float[np.ndarray, "n 4"],
+    eye_cm: Float[np.ndarray, "3"],
+    level: float,
+    near_cm: float,
+    streak: float = 1.0,
 ) -> Float[np.ndarray, "m 7"]:
     """Find where the floor mirrors the lamps into the camera: they wander along as it moves.
 
@@ -37,6 +41,7 @@ def mirror_lamps(
         eye_cm: Optical centre, frame map.
         level: Brightness of their middle.
         near_cm: Mirror images further away than this are left out.
+        streak: How much longer the images are than an even mirror would have them.
 
     Returns:
         x, y, cos and sin of the view, widths along and across it, level.
@@ -49,14 +54,14 @@ def mirror_lamps(
     slant = np.hypot(distance, eye_cm[2])
     direction = towards / np.maximum(distance, 1e-9)[:, None]
     # A round glow in the image is longer on the floor, along the view, the flatter the view.
-    along_cm = size_rad * slant**2 / eye_cm[2]
-    levels = np.full(len(distance), level)
+    along_cm = streak * size_rad * slant**2 / eye_cm[2]
+    levels = np.full(len(distance), level / np.sqrt(streak))
     return np.column_stack([eye_cm[:2] + towards, direction, along_cm, size_rad * slant, levels])
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps):
+def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps, lamp_edge):
     """Darken and brighten every pixel that sees the floor, in place.
 
     Args:
@@ -68,6 +73,7 @@ def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps):
         origin: Rear-axle centre x and y.
         shadows: x, y, cos and sin of the direction, half length, half width, softness, depth.
         lamps: See :func:`mirror_lamps`.
+        lamp_edge: How hard their border is, from 1 on.
     """
     f = np.float32
     columns, height = width // TILE, level.shape[0] // width
@@ -110,7 +116,7 @@ def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps):
                         # Shadows of one light do not add up.
                         row[k] = max(row[k], share)
             else:
-                per_a, per_b, glow = f(1.0 / thing[4]), f(1.0 / thing[5]), f(thing[6])
+                per_a, per_b, glow, edge = f(1.0 / thing[4]), f(1.0 / thing[5]), f(thing[6]), f(lamp_edge)
                 for r in range(rows):
                     n, row = numbers[8 * ((top + r) * width + left) :], bright[r * TILE :]
                     for k in range(TILE):
@@ -119,7 +125,7 @@ def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps):
                         # Close to exp(-r^2 / 2), and it ends.
                         fade = max(f(1.0) - (a * a + b * b) * f(1.0 / _LAMP_REACH**2), f(0.0))
                         fade = fade * fade * fade
-                        row[k] += glow * fade * fade
+                        row[k] += glow * min(edge * fade * fade, f(1.0))
         if touched:
             for r in range(rows):
                 for k in range(TILE):

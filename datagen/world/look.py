@@ -31,6 +31,8 @@ class LookSettings(Settings):
         line_wear: 0: fresh; 1: about half of the paint is worn off, in patches.
         lamps_per_m: Lamps mirrored in the floor, per metre of road.
         lamp_level: Brightness of their middle.
+        lamp_streak: How much longer than a mirror's the lamps' images are, as on an uneven floor.
+        lamp_edge: How hard their border is; 1: as soft as can be.
         clutter_per_m: Tape, paper and other things on the floor, per metre of road.
         wall_level: Contrast of the room around; 0: an even wall.
         exposure: Factor on all colours.
@@ -67,6 +69,8 @@ class LookSettings(Settings):
     line_wear: float = Field(default=0.0, ge=0.0, le=1.0)
     lamps_per_m: float = Field(default=0.0, ge=0.0)
     lamp_level: float = Field(default=120.0, ge=0.0)
+    lamp_streak: float = Field(default=1.0, ge=1.0, le=10.0)
+    lamp_edge: float = Field(default=1.0, ge=1.0, le=20.0)
     clutter_per_m: float = Field(default=0.0, ge=0.0)
     wall_level: float = Field(default=0.0, ge=0.0)
     exposure: float = Field(default=1.0, gt=0.0)
@@ -109,9 +113,9 @@ def random_look(
         **_random_floor(rng),
         "line_brightness": rng.uniform(0.85, 1.08),
         "line_wear": max(0.0, rng.uniform(-0.4, 0.5)),
-        "lamps_per_m": max(0.0, rng.uniform(-0.3, 0.7)),
+        "lamps_per_m": max(0.0, rng.uniform(-0.6, 1.4)),
         "lamp_level": rng.uniform(40.0, 190.0),
-        "clutter_per_m": max(0.0, rng.uniform(-0.5, 2.5)),
+        "clutter_per_m": max(0.0, rng.uniform(-0.5, 4.0)),
         "wall_level": rng.uniform(10.0, 45.0),
         "exposure": float(np.exp(rng.uniform(np.log(0.7), np.log(1.2)))),
         "white_balance": tuple(float(v) for v in rng.uniform(0.9, 1.1, 3)),
@@ -144,24 +148,27 @@ def _random_motion(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _random_surroundings(rng: np.random.Generator) -> dict[str, Any]:
-    """Things around the road on two drives of three, shadows on every other."""
+    """Things around the road on three drives of four, shadows on every other; how floors mirror lamps."""
     return {
-        "objects_per_m": max(0.0, rng.uniform(-0.6, 1.2)),
+        "objects_per_m": max(0.0, rng.uniform(-0.6, 2.0)),
         "objects_on_road": rng.uniform(0.0, 0.25),
         "shadows_per_m": max(0.0, rng.uniform(-0.4, 0.4)),
         "shadow_depth": rng.uniform(0.15, 0.6),
+        "lamp_streak": rng.uniform(1.0, 2.0),
+        "lamp_edge": float(np.exp(rng.uniform(0.0, np.log(5.0)))),
     }
 
 
 def _other_floor(rng: np.random.Generator) -> dict[str, Any]:
-    """On two drives of five a carpet, a printed mat or grass instead of the first floor."""
+    """On two drives of five a carpet, a printed mat or grass instead; carpet and grass are no mirrors."""
     kind, brightness, tint, texture = rng.random(4)
     hue = rng.uniform(0.75, 1.25, 3)
     verge = rng.uniform(40.0, 180.0, 3)
     if kind < 0.15:  # carpet: any colour
         gray = 40.0 + 85.0 * brightness
         colour = (gray * float(hue[0]), gray * float(hue[1]), gray * float(hue[2]))
-        return _floor("carpet", colour, 3.0 + 6.0 * texture, 0.4, 1.0, 0.0, 0.0)
+        dull = {"lamp_level": 15.0 * (1.0 + tint)}
+        return _floor("carpet", colour, 3.0 + 6.0 * texture, 0.4, 1.0, 0.0, 0.0) | dull
     if kind < 0.3:  # printed mat: a gray road on another colour
         gray = 50.0 + 60.0 * brightness
         floor = _floor(
@@ -171,7 +178,8 @@ def _other_floor(rng: np.random.Generator) -> dict[str, Any]:
     if kind < 0.4:  # artificial grass
         gray = 50.0 + 50.0 * brightness
         colour = (gray * 0.6, gray * 1.25, gray * (0.75 + 0.2 * tint))
-        return _floor("grass", colour, 5.0 + 8.0 * texture, 0.4, 1.0, 0.0, 0.0)
+        dull = {"lamp_level": 15.0 * (1.0 + tint)}
+        return _floor("grass", colour, 5.0 + 8.0 * texture, 0.4, 1.0, 0.0, 0.0) | dull
     return {}
 
 

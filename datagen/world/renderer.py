@@ -169,10 +169,13 @@ class Renderer:
             things,
         )
         shadows = moved(self._shadows.at(x, y)[0], frame)[:, :8]
-        if self.look.shadow_depth == 0.0:
+        look = self.look
+        if look.shadow_depth == 0.0:
             shadows = shadows[:0]
-        lamps = mirror_lamps(self._lamps.at(x, y)[0], self._eye_map_cm(pose), self.look.lamp_level, NEAR_CM)
-        light_floor(self._light, width, numbers, level, tiles, origin, shadows, lamps)
+        lamps = mirror_lamps(
+            self._lamps.at(x, y)[0], self._eye_map_cm(pose), look.lamp_level, NEAR_CM, look.lamp_streak
+        )
+        light_floor(self._light, width, numbers, level, tiles, origin, shadows, lamps, look.lamp_edge)
 
     def _paint_solids(
         self,
