@@ -32,8 +32,11 @@ class Steps:
         """Draw ``count`` functions that all step at the same frames, every so many."""
         self._count, self._every = count, every_frames
         self._seed, self._phase = int(rng.integers(2**62)), float(rng.random())
+        self._last: tuple[int, Float[np.ndarray, "count"]] | None = None  # neighbouring frames share it
 
     def at(self, frame: int) -> Float[np.ndarray, "count"]:
         """Return the values at a frame."""
         block = int(np.floor(frame / self._every + self._phase))
-        return np.random.default_rng((self._seed, block)).standard_normal(self._count)
+        if self._last is None or self._last[0] != block:
+            self._last = (block, np.random.default_rng((self._seed, block)).standard_normal(self._count))
+        return self._last[1]
