@@ -71,6 +71,7 @@ class Renderer:
         self._shake = Wander(2, *_SHAKE_FRAMES, shake_rng)
         self._scene = build_scene(track, look, scene_rng)
         self._ground = PixelGround.of(camera) if ground is None else ground
+        self._grid = nearest_sample_grid(track)
         self._road = _road_tables(track, look)
         self._floor_bgr = np.array(
             [*look.floor_bgr, *(look.verge_bgr or look.floor_bgr), *PATTERN_BGR[look.floor]]
@@ -155,6 +156,7 @@ class Renderer:
         )
         bound_tiles(width, numbers, level, tiles)
         origin = np.array([x, y])
+        road = (*self._grid, *self._road)
         things = (*self._boxes.at(x, y), *self._clutter.at(x, y))
         paint_floor(
             self._light,
@@ -165,7 +167,7 @@ class Renderer:
             origin,
             self._floor_bgr,
             self._patterns,
-            self._road,
+            road,
             things,
         )
         shadows = moved(self._shadows.at(x, y)[0], frame)[:, :8]
@@ -242,8 +244,7 @@ def _road_tables(track: Track, look: LookSettings) -> tuple[Any, ...]:
     left = max(offsets)
     right = min(offsets) if len(offsets) > 1 else -left
     borders = np.array([left, right, 0.0 if look.verge_bgr is None else 1.0])
-    grid, frame = nearest_sample_grid(track)
-    return grid, frame, nodes, track.closed, markings, np.concatenate(stretches), borders
+    return nodes, track.closed, markings, np.concatenate(stretches), borders
 
 
 def _pattern_tables(scene: Scene, look: LookSettings) -> tuple[Any, ...]:
