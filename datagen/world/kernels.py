@@ -323,14 +323,18 @@ def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road
                 if settings[5] > 0.0:
                     d = along - settings[3]
                     d -= settings[5] * np.floor(d * per_joint_u + 0.5)
-                    if abs(d) < 0.5 * settings[7] + reach:
+                    if reach > settings[5]:  # a far pixel covers several of them
+                        shade -= settings[8] * settings[7] * per_joint_u
+                    elif abs(d) < 0.5 * settings[7] + reach:
                         shade -= settings[8] * strip_share(
                             d, 0.5 * settings[7], ux * cj + uy * sj, vx * cj + vy * sj, mx * cj + my * sj
                         )
                 if settings[6] > 0.0:
                     d = across - settings[4]
                     d -= settings[6] * np.floor(d * per_joint_v + 0.5)
-                    if abs(d) < 0.5 * settings[7] + reach:
+                    if reach > settings[6]:
+                        shade -= settings[8] * settings[7] * per_joint_v
+                    elif abs(d) < 0.5 * settings[7] + reach:
                         shade -= settings[8] * strip_share(
                             d, 0.5 * settings[7], uy * cj - ux * sj, vy * cj - vx * sj, my * cj - mx * sj
                         )

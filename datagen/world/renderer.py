@@ -194,9 +194,12 @@ class Renderer:
         if not len(near):
             return
         solids = moved(near, frame)[:, :SOLID_COLUMNS]
+        gap = solids[:, :2] - self._eye_map_cm(pose)[:2]
+        distance = np.hypot(gap[:, 0], gap[:, 1])
+        order = np.argsort(-distance, kind="stable")
+        # What stands beyond the walls is not seen.
+        order = order[distance[order] < WALL_CM + np.hypot(solids[order, 4], solids[order, 5])]
         solids[:, :2] -= pose[:2]
-        gap = solids[:, :2] - (self._eye_map_cm(pose)[:2] - pose[:2])
-        order = np.argsort(-np.hypot(gap[:, 0], gap[:, 1]), kind="stable")
         ground, light = self._ground, self._scene.objects.light
         paint_solids(
             self._light, self._depth, self._rays, ground.stride, ground.width, rotation, rows, ground.eye_cm,

@@ -18,6 +18,7 @@ BOX, CYLINDER, CONE = 0.0, 1.0, 2.0
 #: twice), bottom, top, shape, colour (3), colour of a band (3), bottom and top of the band.
 SOLID_COLUMNS = 17
 _WIDEST_PX_RAD = 0.04  # half a pixel, of the coarsest cameras
+_CURVED_RAD = 0.03  # by how much an outline may bend between a tile's corners
 _TOP_GAIN, _SIDE_GAIN = 1.12, 0.22  # how much brighter tops are, and sides that face the light
 
 
@@ -140,22 +141,27 @@ def soft(distance, width):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def touches(lattice, j, k, planes, low, high, margin):
-    """Whether the rays at a tile's four corners leave room for a solid between them.
+def mark_outside(lattice, planes, low, high, margin, marks):
+    """Mark on which sides of a solid's outline the rays at the tiles' corners lie.
 
-    ``low`` and ``high`` are the slopes of the solid's lower and upper end.
+    Args:
+        lattice: Rays at the corners, and the length of their horizontal part.
+        planes: See :func:`outline`.
+        low: Slope of the solid's lower end.
+        high: Slope of its upper end.
+        margin: By how much a ray must lie outside, [rad].
+        marks: Filled, a bit per side. A tile whose corners share one does not see the solid; a corner that
+            the lens does not see has none.
     """
-    left, right, below, above = 0, 0, 0, 0
-    for m in range(4):
-        row, column = j + (m & 1), k + (m >> 1)
-        x, y, z = lattice[row, column, 0], lattice[row, column, 1], lattice[row, column, 2]
-        flat = np.sqrt(x * x + y * y)
-        # None of these holds for a corner that the lens does not see.
-        left += x * planes[0] + y * planes[1] + z * planes[2] < -margin
-        right += x * planes[3] + y * planes[4] + z * planes[5] < -margin
-        below += z + margin * (1.0 + abs(low)) < low * flat
-        above += z - margin * (1.0 + abs(high)) > high * flat
-    return max(max(left, right), max(below, above)) < 4
+    lower, higher = margin * (1.0 + abs(low)), margin * (1.0 + abs(high))
+    for j in range(lattice.shape[0]):
+        for k in range(lattice.shape[1]):
+            x, y, z, flat = lattice[j, k, 0], lattice[j, k, 1], lattice[j, k, 2], lattice[j, k, 3]
+            mark = np.uint8(x * planes[0] + y * planes[1] + z * planes[2] < -margin)
+            mark |= np.uint8(x * planes[3] + y * planes[4] + z * planes[5] < -margin) << 1
+            mark |= np.uint8(z + lower < low * flat) << 2
+            mark |= np.uint8(z - higher > high * flat) << 3
+            marks[j, k] = mark
 
 
 @njit(cache=True, error_model="numpy")
@@ -184,7 +190,8 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
     band, planes, inner = np.empty((TILE, 8)), np.empty(8), np.empty(2 * TILE, np.float32)
     c, s = rows[height // 2, 2], rows[height // 2, 3]
     mid_x, mid_y = eye[1] * c + eye[0] * s, eye[1] * s - eye[0] * c
-    lattice = np.empty((tile_rows + 1, tile_columns + 1, 3))
+    lattice = np.empty((tile_rows + 1, tile_columns + 1, 4))
+    marks = np.empty((tile_rows + 1, tile_columns + 1), np.uint8)
     for j in range(tile_rows + 1):
         for k in range(tile_columns + 1):
             i = min(j * TILE, height - 1) * width + min(k * TILE, image_width - 1)
@@ -194,6 +201,7 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
             b = shake[1, 0] * right + shake[1, 1] * ahead + shake[1, 2] * up
             lattice[j, k, 0], lattice[j, k, 1] = b * c + a * s, b * s - a * c
             lattice[j, k, 2] = shake[2, 0] * right + shake[2, 1] * ahead + shake[2, 2] * up
+            lattice[j, k, 3] = np.hypot(a, b)
     for q in range(solids.shape[0]):
         solid = solids[q]
         nearest, farthest = outline(solid, mid_x, mid_y, eye[2], planes)
@@ -201,12 +209,13 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
             continue
         low = (solid[6] - eye[2]) / (nearest if solid[6] < eye[2] else farthest)
         high = (solid[7] - eye[2]) / (nearest if solid[7] > eye[2] else farthest)
-        margin = 0.03 + slack + abs(turn) + abs(way) / nearest
+        margin = _CURVED_RAD + slack + abs(turn) + abs(way) / nearest
+        mark_outside(lattice, planes, low, high, margin, marks)
         for j in range(tile_rows):
             top, bottom = j * TILE, min(j * TILE + TILE, height)
             known = False
             for k in range(tile_columns):
-                if not touches(lattice, j, k, planes, low, high, margin):
+                if marks[j, k] & marks[j, k + 1] & marks[j + 1, k] & marks[j + 1, k + 1]:
                     continue
                 if not known:
                     known = True
