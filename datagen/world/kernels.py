@@ -305,14 +305,19 @@ def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road
                 along, across = x * cj + y * sj, y * cj - x * sj
                 shade = 0.0
                 if texture_level > 0.0:
-                    # Drawn out by a motion of more than a cell: two samples, of cells not much smaller.
-                    blurred, motion2 = fits, (mx * mx + my * my) / (9.0 * TEXTURE_CELL_CM * TEXTURE_CELL_CM)
-                    while motion2 * shrink * shrink > 1.0 and blurred < TEXTURE_LEVELS - 1:
+                    # Drawn out by the motion: up to a few cells the next level's, which are twice as large,
+                    # will do; beyond, two samples of a level whose cells are not much smaller than it.
+                    blurred, motion2 = fits, (mx * mx + my * my) / (TEXTURE_CELL_CM * TEXTURE_CELL_CM)
+                    twice = motion2 * shrink * shrink > 9.0
+                    most = 9.0 if twice else 1.0
+                    while motion2 * shrink * shrink > most and blurred < TEXTURE_LEVELS - 1:
                         blurred += 1
                         shrink *= 0.5
+                        if not twice:
+                            break
                     start, side = starts[blurred], base_side >> blurred
                     a, b = along / TEXTURE_CELL_CM, across / TEXTURE_CELL_CM
-                    if 9.0 * motion2 * shrink * shrink > 1.0:
+                    if twice:
                         step_a = 0.25 * (mx * cj + my * sj) / TEXTURE_CELL_CM
                         step_b = 0.25 * (my * cj - mx * sj) / TEXTURE_CELL_CM
                         shade = sample(texture, start, side, shrink, a - step_a, b - step_b)
