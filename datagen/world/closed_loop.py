@@ -85,8 +85,13 @@ class ClosedLoop:
         self._frame += 1
         return LoopFrame(state, image, math.isfinite(wished_rad), self.s_cm, offset_cm)
 
-    def put_back(self) -> None:
-        """Lift the car to the middle of the lane where it is now, along the road; the pilot starts anew."""
+    def put_back(self, ahead_cm: float = 0.0) -> None:
+        """Lift the car to the middle of the lane; the pilot starts anew.
+
+        Args:
+            ahead_cm: How much further along the road than where it is now.
+        """
+        self.s_cm += ahead_cm
         self._world.car.place(self._world.driver.pose_at(self.s_cm), self._speed_cm_s)
         self._pilot.reset()
         self._lost.reset()

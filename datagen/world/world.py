@@ -112,9 +112,7 @@ def assemble_world(
     donkey = draw_donkey(settings.donkey, donkey_rng)
     settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
     camera = settings.camera.build(settings.car.wheelbase_cm)
-    track = random_track(settings.track, track_rng)
-    if settings.driver.direction == "backward":
-        track = _reversed(track)
+    track = _drawn_track(settings, track_rng)
     start_cm = 0.0 if track.closed else _START_CM
     driver = Driver(settings.driver, track, start_cm, settings.car, settings.rate_hz, driver_rng)
     car = Car(settings.car, driver.start_pose(), car_rng)
@@ -124,6 +122,15 @@ def assemble_world(
     renderer = Renderer(camera, track, look, scene_rng, ground)
     commands = DonkeyCommands(donkey) if settings.recording == "donkeycar" else None
     return World(settings, track, camera, renderer, driver, car, commands)
+
+
+def draw_track(settings: SimulationSettings) -> Track:
+    """Draw the road alone, as it is in the world of these settings.
+
+    Raises:
+        ConfigError: If there is no such road.
+    """
+    return _drawn_track(settings, np.random.default_rng(settings.seed).spawn(1)[0])
 
 
 def resolve_length(settings: SimulationSettings) -> SimulationSettings:
@@ -149,7 +156,10 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     return settings.model_copy(update={"track": track})
 
 
-def _reversed(track: Track) -> Track:
+def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
+    track = random_track(settings.track, rng)
+    if settings.driver.direction == "forward":
+        return track
     turned: Callable[[], Track] | None = getattr(track, "reversed", None)
     if turned is None:
         raise ConfigError("driver: direction backward needs a road that can be driven the other way")
