@@ -74,7 +74,9 @@ class ClosedLoop:
         pose, moving = car.pose, (car.speed_cm_s, car.yaw_rate_rad_s)
         front_cm = map_from_car(np.zeros((1, 2)), pose, self._wheelbase_cm)[0]
         self.s_cm, offset_cm = place_on_track(world.track, front_cm, self.s_cm)
-        image = render_frame(world.renderer, pose, frame, *moving) if self._pilot.needs_image else None
+        image = None
+        if self._pilot.needs_image:
+            image = render_frame(world.renderer, pose, frame, *moving)
         seen = image if image is None or self._jpeg_quality is None else _as_jpeg(image, self._jpeg_quality)
         wished_rad = self._pilot.steer(Sight(seen, pose, self.s_cm))
         speed_cm_s, steering_rad = obeyed(world, *self._lost.command(wished_rad, self._speed_cm_s))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -13,7 +14,7 @@ from datagen.world.car import Car, CarSettings
 from datagen.world.donkey import DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.driver import Driver
 from datagen.world.look import LookSettings, random_look
-from datagen.world.renderer import PixelGround, Renderer
+from datagen.world.renderer import Renderer
 from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings
 from datagen.world.track import Track, TrackSettings, random_track
@@ -64,19 +65,24 @@ class World:
         settings: The same settings with the road's length and the look resolved; they give the same drive.
         track: The road, in the direction in which it is driven.
         camera: The camera on the car.
-        renderer: Draws the frames.
         driver: At the start.
         car: At the start.
+        build_renderer: Makes the renderer, once.
         donkey: Set when throttle and angle are recorded.
     """
 
     settings: SimulationSettings
     track: Track
     camera: Camera
-    renderer: Renderer
     driver: Driver
     car: Car
+    build_renderer: Callable[[], Renderer]
     donkey: DonkeyCommands | None = None
+
+    @functools.cached_property
+    def renderer(self) -> Renderer:
+        """Draws the frames; built when it is asked for, since poses alone do not need it."""
+        return self.build_renderer()
 
 
 def build_world(settings: SimulationSettings, compress: bool = True) -> World:
@@ -92,15 +98,12 @@ def build_world(settings: SimulationSettings, compress: bool = True) -> World:
     return assemble_world(resolve_length(settings), compress)
 
 
-def assemble_world(
-    settings: SimulationSettings, compress: bool = True, ground: PixelGround | None = None
-) -> World:
+def assemble_world(settings: SimulationSettings, compress: bool = True) -> World:
     """Build a world whose road is as long as it is, whatever the number of frames.
 
     Args:
         settings: The drive.
         compress: Whether the renderer applies the camera's JPEG compression.
-        ground: What the camera's pixels see, when it is known already.
 
     Raises:
         ConfigError: If the settings contradict each other.
@@ -119,9 +122,9 @@ def assemble_world(
     car.place(car.pose, settings.driver.chosen_speed_cm_s(settings.rate_hz))
     if not compress:
         look = look.model_copy(update={"jpeg_quality": None})
-    renderer = Renderer(camera, track, look, scene_rng, ground)
+    build_renderer = functools.partial(Renderer, camera, track, look, scene_rng)
     commands = DonkeyCommands(donkey) if settings.recording == "donkeycar" else None
-    return World(settings, track, camera, renderer, driver, car, commands)
+    return World(settings, track, camera, driver, car, build_renderer, commands)
 
 
 def draw_track(settings: SimulationSettings) -> Track:
