@@ -184,3 +184,14 @@ def test_the_verb_refuses_what_it_does_not_know(tmp_path: Path, words: list[str]
     assert result.exit_code == 1
     assert message in " ".join(result.stderr.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_detector_at_the_wheel_records_a_drive(tmp_path: Path) -> None:
+    config = tmp_path / "drive.yaml"
+    config.write_text("seed: 1\nframes: 4\ncamera: {width: 48, height: 36}\n")
+    command = ["simulate", str(config), "--detector", "painter", "--out", str(tmp_path / "d")]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert len((tmp_path / "d" / "frames.csv").read_text().splitlines()) == 5
+    unknown = CliRunner().invoke(app, [*command[:3], "nobody", *command[4:]])
+    assert unknown.exit_code == 1 and "'nobody'" in unknown.stderr
