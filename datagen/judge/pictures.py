@@ -13,7 +13,7 @@ from datagen.judge.run import RunResult, Trajectory
 from datagen.world.track import Marking, Track
 
 _SIDE_PX = 1100  # of the longer side of the road
-_MARGIN_CM = 60.0
+_MARGIN_CM = 50.0
 _ROW_PX = 26
 _SHIFT = 4  # OpenCV draws in fixed point: this many bits below a pixel
 _GROUND_BGR, _ROAD_BGR, _TEXT_BGR = (225, 228, 225), (120, 120, 120), (30, 30, 30)
@@ -55,16 +55,19 @@ def draw_top_view(
         runs: Results and trajectories, in the order of their colours.
         title: For the top left corner.
     """
-    low_cm = track.xy_cm.min(axis=0) - track.lane_width_cm - _MARGIN_CM
-    high_cm = track.xy_cm.max(axis=0) + track.lane_width_cm + _MARGIN_CM
+    # Markings reach beyond the driven lane where the road has another one.
+    half_cm = 0.5 * track.lane_width_cm
+    sides_cm = [-half_cm, half_cm, *(marking.offset_cm for marking in track.markings)]
+    reach_cm = max(abs(side_cm) for side_cm in sides_cm) + _MARGIN_CM
+    low_cm, high_cm = track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm
     size_cm = high_cm - low_cm
     scale = _SIDE_PX / float(size_cm.max())
     header_px = _ROW_PX * (len(runs) + 1) + 12
     width, height = max(760, round(size_cm[0] * scale)), round(size_cm[1] * scale) + header_px
     picture = np.full((height, width, 3), _GROUND_BGR, np.uint8)
     view = _View(np.array([low_cm[0], high_cm[1]]), scale, header_px)
-    road_px = max(1, round(scale * (track.lane_width_cm + 6.0)))
-    points = view.fixed(track.xy_cm)
+    road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
+    points = view.fixed(_beside(track, 0.5 * (max(sides_cm) + min(sides_cm))))
     cv2.polylines(picture, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, _SHIFT)
     for marking in track.markings:
         _draw_marking(picture, track, marking, view)
@@ -72,7 +75,7 @@ def draw_top_view(
         # Later ones are thinner, so that those who drove the same way stay visible below.
         thickness = min(2 + len(runs) - 1 - index, 7)
         _draw_run(picture, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, view)
-    _draw_start(picture, track, view)
+    _draw_start(picture, track, max(sides_cm) + 18.0, view)
     _write(picture, title, 0, _TEXT_BGR)
     for index, (result, _) in enumerate(runs):
         text = (
@@ -84,9 +87,13 @@ def draw_top_view(
     return picture
 
 
-def _draw_marking(picture: UInt8[np.ndarray, "h w 3"], track: Track, marking: Marking, view: _View) -> None:
+def _beside(track: Track, offset_cm: float) -> Float[np.ndarray, "n 2"]:
     normal = np.stack([-np.sin(track.heading_rad), np.cos(track.heading_rad)], axis=1)
-    line_cm = track.xy_cm + marking.offset_cm * normal
+    return track.xy_cm + offset_cm * normal
+
+
+def _draw_marking(picture: UInt8[np.ndarray, "h w 3"], track: Track, marking: Marking, view: _View) -> None:
+    line_cm = _beside(track, marking.offset_cm)
     colour = tuple(int(v) for v in marking.colour_bgr)
     thickness = max(1, round(view.px_per_cm * marking.width_cm))
     n = len(line_cm)
@@ -116,11 +123,11 @@ def _draw_run(
         cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_TILTED_CROSS, 14, 3)
 
 
-def _draw_start(picture: UInt8[np.ndarray, "h w 3"], track: Track, view: _View) -> None:
+def _draw_start(picture: UInt8[np.ndarray, "h w 3"], track: Track, offset_cm: float, view: _View) -> None:
     """An arrow beside the start, in the direction of travel."""
     heading = float(track.heading_rad[0])
     ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    tail_cm = track.xy_cm[0] + (0.5 * track.lane_width_cm + 18.0) * left
+    tail_cm = track.xy_cm[0] + offset_cm * left
     tail, tip = (view.fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> _SHIFT).tolist()
     cv2.arrowedLine(picture, tail, tip, _TEXT_BGR, 2, cv2.LINE_AA, tipLength=0.35)
 
