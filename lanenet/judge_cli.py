@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 _MODEL = Path("checkpoints/small")
+_BESIDE = 5  # detectors in a table on the screen
 _DETECTORS = "truth,network,lane-filter,hough,painter"
 
 
@@ -122,10 +123,11 @@ def judge(
     _try_out(settings, entrants)
     with console.progress_bar("judge") as progress:
         results = run_contest(settings, entrants, out, workers, progress)
-    for kind, table in tables(results).items():
-        # Turned round: there are more measures than detectors, and a terminal is narrow.
-        headers, *rows = zip(*table, strict=True)
-        console.show_table(table_title(settings, kind), headers, rows)
+    for kind, (measures, *table) in tables(results).items():
+        # Turned round, a few detectors at a time: there are more measures, and a terminal is narrow.
+        for first in range(0, len(table), _BESIDE):
+            headers, *rows = zip(measures, *table[first : first + _BESIDE], strict=True)
+            console.show_table(table_title(settings, kind), headers, rows)
     paths = write_report(out, settings, results)
     console.wrote(*paths, _draw_pictures(settings, entrants, results, out))
     console.next_command("judge", "--law", "own", "--out", "DIR")
