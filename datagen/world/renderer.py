@@ -18,7 +18,7 @@ from datagen.world.light import light_floor, mirror_lamps, moved
 from datagen.world.look import LookSettings
 from datagen.world.motion import row_poses, shake_rotation
 from datagen.world.nearby import Nearby
-from datagen.world.nearest_grid import nearest_sample_grid
+from datagen.world.nearest_grid import NearestGrid
 from datagen.world.scene import Scene, build_scene
 from datagen.world.sensor import corner_falloff, develop, paint_room
 from datagen.world.solids import SOLID_COLUMNS, paint_solids
@@ -71,13 +71,13 @@ class Renderer:
         self._shake = Wander(2, *_SHAKE_FRAMES, shake_rng)
         self._scene = build_scene(track, look, scene_rng)
         self._ground = PixelGround.of(camera) if ground is None else ground
-        self._grid = nearest_sample_grid(track)
+        self._grid = NearestGrid(track)
         self._road = _road_tables(track, look)
         self._floor_bgr = np.array(
             [*look.floor_bgr, *(look.verge_bgr or look.floor_bgr), *PATTERN_BGR[look.floor]]
         )
         self._patterns = _pattern_tables(self._scene, look)
-        boxes = np.asarray(getattr(track, "boxes", np.empty((0, 9))), dtype=np.float64)
+        boxes = track.boxes
         boxes = np.column_stack([boxes[:, :6], np.minimum(boxes[:, 6:] * look.line_brightness, 255.0)])
         objects = self._scene.objects
         self._boxes, self._clutter = _nearby_things(boxes), _nearby_things(self._scene.clutter)
@@ -156,7 +156,7 @@ class Renderer:
         )
         bound_tiles(width, numbers, level, tiles)
         origin = np.array([x, y])
-        road = (*self._grid, *self._road)
+        road = (*self._grid.around(origin - 2.0 * NEAR_CM, origin + 2.0 * NEAR_CM), *self._road)
         things = (*self._boxes.at(x, y), *self._clutter.at(x, y))
         paint_floor(
             self._light,
