@@ -26,13 +26,12 @@ from lanenet.data.drive import Drive, open_drive
 from lanenet.data.files import atomic_folder, write_text
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.static import static_mask
+from lanenet.perception.static import MAX_CAR_SHARE, hidden_rows, static_mask
 
 __all__ = ["MapSettings", "Report", "label_map", "map_drive"]
 
 _MIN_SEGMENT = 60  # frames
 _BUMPER_FRAMES = 150
-_MAX_BUMPER_SHARE = 0.2
 
 
 def map_drive(
@@ -114,6 +113,8 @@ def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSet
     """Return the settings with the rows left out in which the car sees itself, and note it.
 
     The rows become part of the perception settings, so that labels, model and car leave out the same ones.
+    Whole rows, not pixels: two drives of one car give masks that differ in a pixel here and there, and label
+    sets whose edge points were found differently are not trained on together.
     """
     if not settings.find_bumper or settings.perception.range.bottom_rows:
         return settings
@@ -122,11 +123,10 @@ def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSet
         mask = static_mask(drive.image(k) for k in range(0, len(drive), step))
     except DriveFormatError:  # too few frames of a moving car to tell it from the road
         return settings
-    rows = np.flatnonzero(mask.any(axis=1))
-    if not rows.size:
+    hidden = hidden_rows(mask)
+    if not hidden:
         return settings
-    hidden = drive.height - int(rows[0])
-    if hidden > _MAX_BUMPER_SHARE * drive.height:
+    if hidden > MAX_CAR_SHARE * drive.height:
         notes.append(f"something in the lowest {hidden} rows never moves; set bottom_rows if it is the car")
         return settings
     notes.append(f"the car sees itself in the lowest {hidden} rows, which are left out")

@@ -205,7 +205,7 @@ def _board_points(
     image: Path | None, frame: np.ndarray | None, board: str, square_cm: float, near_left: str | None
 ) -> tuple[np.ndarray, np.ndarray]:
     from lanenet.calibration.chessboard import find_view, parse_board
-    from lanenet.calibration.ground import points_of_floor_board
+    from lanenet.calibration.ground_points import points_of_floor_board
 
     if frame is None or near_left is None:
         raise ConfigError("a board on the floor needs --image PHOTO and --near-left X,Y")
@@ -296,7 +296,12 @@ def _show_mounting(result: GroundCalibration, points_cm: np.ndarray, pixels_px: 
     console.show_lines([*lines, f"{'worst point':20s}{worst:8.2f} cm off on the ground"])
     console.show_problems(
         [
-            f"left out point {k + 1}: {np.linalg.norm(result.residuals_px[k]):.1f} px off"
+            f"left out point {k + 1}: "
+            + (
+                "behind the camera or out of its sight"
+                if result.behind[k]
+                else f"{np.linalg.norm(result.residuals_px[k]):.1f} px off"
+            )
             for k in np.flatnonzero(~result.used)
         ]
     )

@@ -15,7 +15,7 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, onboard_cli, val_cli
+from lanenet import calibrate_cli, console, judge_cli, onboard_cli, val_cli, world_cli
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption, check_ending
@@ -70,6 +70,8 @@ app = typer.Typer(
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
 app.add_typer(val_cli.app)
+app.add_typer(world_cli.app)
+app.add_typer(judge_cli.app)
 
 
 def main() -> None:
@@ -185,13 +187,19 @@ def simulate(
     config: _Config,
     out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],
     overrides: _Overrides = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that draw the frames.")] = 1,
+    detector: Annotated[
+        str | None, typer.Option(help="Who steers instead of the scripted driver.", show_default=False)
+    ] = None,
+    model: Annotated[Path | None, typer.Option(help="Model or checkpoint folder of the network.")] = None,
 ) -> None:
-    """Make a synthetic drive with ground truth."""
+    """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
     from datagen.world.simulate import SimulationSettings, simulate_drive
 
     settings = load_settings(SimulationSettings, config, overrides)
+    pilot = None if detector is None else judge_cli.pilot_builder(detector, model)
     with console.progress_bar("simulate") as progress:
-        drive = simulate_drive(settings, out, progress)
+        drive = simulate_drive(settings, out, progress, workers=workers, pilot=pilot)
     console.wrote(drive)
     console.next_command("map", drive, "--lane-width", f"{settings.track.lane_width_cm:g}", "--out", "MAP")
 

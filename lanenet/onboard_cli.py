@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lanenet import console
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import UInt8
+
+    from lanenet.onboard.sources import Source
 
 app = typer.Typer()
 
@@ -44,7 +50,10 @@ def detect(
     camera: _CameraOption = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
-        float | None, typer.Option(min=1.0, help="Lane width for the lane filter, cm; default: the drive's.")
+        float | None,
+        typer.Option(
+            min=1.0, help="Lane width for the lane filter, cm; default: the settings file's or the drive's."
+        ),
     ] = None,
     marking: MarkingOption = None,
     any_camera: Annotated[
@@ -57,7 +66,19 @@ def detect(
         bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and go on.")
     ] = False,
     config: Annotated[
-        Path | None, typer.Option(help="YAML with the settings of hough or painter.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="YAML with the settings of lane-filter (filter, perception), hough or painter.",
+            show_default=False,
+        ),
+    ] = None,
+    mask: Annotated[
+        str | None,
+        typer.Option(
+            help="Leave out the car itself, for lane-filter and network: 'auto' finds what never moves, a "
+            "PNG shows it (black elsewhere).",
+            metavar="auto|FILE.png",
+        ),
     ] = None,
 ) -> None:
     """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
@@ -67,9 +88,8 @@ def detect(
     from lanenet.onboard.sources import open_source
 
     check_ending(out, ".parquet", ".csv")
-    opened = open_source(source)
-    if frames is not None:
-        opened = opened.numbered(*_frame_range(frames))
+    whole = open_source(source)
+    opened = whole if frames is None else whole.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is None and detector.value not in WITHOUT_CAMERA:
         raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
@@ -77,10 +97,12 @@ def detect(
         detector.value,
         used_camera,
         model=model,
-        lane_width_cm=lane_width if lane_width is not None else opened.lane_width_cm,
+        lane_width_cm=lane_width,
+        drive_lane_width_cm=opened.lane_width_cm,
         marking_cm=marking,
         any_camera=any_camera,
         config=config,
+        mask=_mask_of(mask, whole, detector),
     )
     with console.progress_bar(f"detect ({detector.value})") as progress:
         report = run_detector(
@@ -91,10 +113,18 @@ def detect(
         f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
         f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
+    if hint := getattr(chosen, "hint", ""):
+        typer.echo(f"hint: {hint}")
     console.wrote(report.out, report.video)
     if report.video is None:
-        options = {"--model": model, "--camera": camera, "--lane-width": lane_width, "--marking": marking}
-        options["--config"] = config
+        options: dict[str, Path | float | str | None] = {
+            "--model": model,
+            "--camera": camera,
+            "--lane-width": lane_width,
+            "--marking": marking,
+            "--config": config,
+            "--mask": mask,
+        }
         given = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
         given += ["--any-camera"] if any_camera else []
         again = ("detect", source, "--detector", detector.value, *given, "--out", out)
@@ -167,6 +197,21 @@ def doctor(camera: _CameraOption = None) -> None:
     if problems:
         raise LanenetError(f"{problems} problem(s) found, see above")
     console.next_command("train", "configs/small.yaml")
+
+
+def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:
+    """Find or read the mask that was asked for, and say what became of it."""
+    from lanenet.onboard.detectors import refuse_mask
+    from lanenet.onboard.masks import find_mask, read_mask
+
+    if mask is None:
+        return None
+    refuse_mask(detector.value)
+    if mask != "auto":
+        return read_mask(Path(mask))
+    found, told = find_mask(source)
+    typer.echo(told)
+    return found
 
 
 def _frame_range(text: str) -> tuple[int, int]:

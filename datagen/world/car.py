@@ -1,7 +1,8 @@
-"""A car that does not quite do what it is told: kinematic bicycle with a servo and errors."""
+"""A car that does not quite do what it is told: bicycle with a servo, a motor, slip and errors."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -11,6 +12,8 @@ from pydantic import Field
 from lanenet.config import Settings
 
 _NOISE_TIME_S = 0.7  # how long a deviation of speed or steering lasts
+_STEP_S = 0.01  # longest step of the motion; the deviations are drawn once per step
+_SAME_TIME_S = 1e-9
 
 
 class CarSettings(Settings):
@@ -22,10 +25,15 @@ class CarSettings(Settings):
         steering_gain: Angle of the wheels per commanded angle.
         steering_trim_rad: Angle of the wheels when told to go straight.
         servo_rate_rad_s: How fast the servo turns.
-        delay_frames: Frames between a command and its effect.
+        delay_s: Time between a command and its effect.
         speed_gain: Speed per commanded speed.
+        speed_lag_s: Time constant with which the speed follows.
         speed_noise: Standard deviation of the relative deviation of speed, which varies slowly.
         steering_noise_rad: Standard deviation of the deviation of the wheels, which varies slowly.
+        understeer_speed_cm_s: Characteristic speed: at it the car turns half as tightly as its wheels point.
+            None: it turns as they point at any speed.
+        grip_cm_s2: Largest lateral acceleration; beyond it the car slides on along a wider circle.
+        rear_slip_rad_s2_per_cm: Angle by which the rear axle slides outwards, per lateral acceleration.
     """
 
     wheelbase_cm: float = Field(default=26.0, gt=0.0)
@@ -33,10 +41,14 @@ class CarSettings(Settings):
     steering_gain: float = Field(default=0.95, gt=0.0)
     steering_trim_rad: float = 0.015
     servo_rate_rad_s: float = Field(default=4.0, gt=0.0)
-    delay_frames: int = Field(default=1, ge=0)
+    delay_s: float = Field(default=0.05, ge=0.0)
     speed_gain: float = Field(default=0.94, gt=0.0)
+    speed_lag_s: float = Field(default=0.15, ge=0.0)
     speed_noise: float = Field(default=0.03, ge=0.0)
     steering_noise_rad: float = Field(default=0.005, ge=0.0)
+    understeer_speed_cm_s: float | None = Field(default=400.0, gt=0.0)
+    grip_cm_s2: float = Field(default=500.0, gt=0.0)
+    rear_slip_rad_s2_per_cm: float = Field(default=1e-4, ge=0.0)
 
 
 def advance(
@@ -56,24 +68,96 @@ def advance(
     Source:
         Kozlowski et al. 2024, eq. 4-6, integrated exactly over the step instead of by Euler's rule.
     """
-    turn = distance_cm * np.tan(steering_rad) / wheelbase_cm
-    # The chord of the arc, half the turn away from the old heading; sinc(0) = 1 covers the straight.
-    chord_cm = distance_cm * np.sinc(0.5 * turn / np.pi)
-    direction = pose[2] + 0.5 * turn
-    return pose + np.array([chord_cm * np.cos(direction), chord_cm * np.sin(direction), turn])
+    return advance_along(pose, distance_cm, math.tan(steering_rad) / wheelbase_cm)
+
+
+def advance_along(
+    pose: Float[np.ndarray, "3"], distance_cm: float, curvature_per_cm: float, slip_rad: float = 0.0
+) -> Float[np.ndarray, "3"]:
+    """Move the rear axle along a circle.
+
+    Args:
+        pose: Rear-axle centre x, y and heading, [cm], [cm], [rad], frame map.
+        distance_cm: Way of the rear axle, positive forwards.
+        curvature_per_cm: Turn per way, positive left.
+        slip_rad: Angle from the way to the heading: positive where the rear axle slides to the right.
+
+    Returns:
+        The new pose; the heading is not wrapped.
+    """
+    turn = distance_cm * curvature_per_cm
+    # The chord of the arc, half the turn away from the old heading.
+    chord_cm = distance_cm * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
+    direction = float(pose[2]) + 0.5 * turn - slip_rad
+    return pose + np.array([chord_cm * math.cos(direction), chord_cm * math.sin(direction), turn])
+
+
+def driven_curvature_per_cm(wheels_rad: float, speed_cm_s: float, settings: CarSettings) -> float:
+    """Return the curvature that a car drives, [1/cm], positive left.
+
+    The kinematic tan(wheels) / wheelbase, lowered by understeer to the share 1 / (1 + (v / v_ch)^2), and
+    limited to what the tyres hold.
+
+    Args:
+        wheels_rad: Angle of the front wheels, positive left.
+        speed_cm_s: Speed.
+        settings: The car.
+
+    Source:
+        Characteristic speed: Gillespie 1992, "Fundamentals of Vehicle Dynamics", ch. 6 (steady cornering).
+    """
+    curvature = math.tan(wheels_rad) / settings.wheelbase_cm
+    if settings.understeer_speed_cm_s is not None:
+        curvature /= 1.0 + (speed_cm_s / settings.understeer_speed_cm_s) ** 2
+    if abs(curvature) * speed_cm_s**2 > settings.grip_cm_s2:
+        curvature = math.copysign(settings.grip_cm_s2 / speed_cm_s**2, curvature)
+    return curvature
 
 
 class Car:
-    """State of a simulated car."""
+    """State of a simulated car.
+
+    It moves in steps of at most 10 ms, and its deviations are drawn on that clock: the frame rate decides
+    when it is told what, and nothing else.
+
+    Attributes:
+        settings: The car.
+        pose: True rear-axle centre x, y and heading (unwrapped), frame map.
+        wheels_rad: Angle to which the servo has turned the wheels, without their deviation.
+    """
 
     def __init__(self, settings: CarSettings, pose: Float[np.ndarray, "3"], rng: np.random.Generator) -> None:
         """Put the car at a pose (rear axle, frame map), wheels as trimmed."""
-        self.settings, self.pose = settings, np.array(pose, dtype=np.float64)
-        self.wheels_rad = settings.steering_trim_rad
-        self._pending: deque[tuple[float, float]] = deque()
+        self.settings = settings
         self._speed_rng, self._steering_rng = rng.spawn(2)
-        self._speed_noise = self._speed_rng.standard_normal()
-        self._steering_noise = self._steering_rng.standard_normal()
+        self._speed_noise = float(self._speed_rng.standard_normal())
+        self._steering_noise = float(self._steering_rng.standard_normal())
+        self._ticks, self._t_s = 0, 0.0
+        self.place(pose)
+
+    def place(self, pose: Float[np.ndarray, "3"], told_cm_s: float | None = None) -> None:
+        """Lift the car to a pose; what it was told before is forgotten.
+
+        Args:
+            pose: Rear-axle centre x, y and heading, frame map.
+            told_cm_s: Commanded speed with which it rolls, wheels ahead, until a command arrives; None: that
+                of the next command.
+        """
+        self.pose = np.array(pose, dtype=np.float64)
+        self.wheels_rad = self.settings.steering_trim_rad
+        self._pending: deque[tuple[float, float, float]] = deque()
+        self._told: tuple[float, float] | None = None if told_cm_s is None else (told_cm_s, 0.0)
+        self._motor_cm_s = 0.0 if told_cm_s is None else told_cm_s * self.settings.speed_gain
+
+    @property
+    def speed_cm_s(self) -> float:
+        """True speed at this moment."""
+        return self._motor_cm_s * (1.0 + self.settings.speed_noise * self._speed_noise)
+
+    @property
+    def yaw_rate_rad_s(self) -> float:
+        """True rate of turn at this moment, positive left."""
+        return self.speed_cm_s * self._curvature_per_cm(self.wheels_rad)
 
     def step(self, speed_cm_s: float, steering_rad: float, interval_s: float) -> Float[np.ndarray, "3"]:
         """Give a command and let time pass.
@@ -81,30 +165,62 @@ class Car:
         Args:
             speed_cm_s: Commanded speed.
             steering_rad: Commanded steering, positive left.
-            interval_s: Time until the next frame.
+            interval_s: Time until the next command.
 
         Returns:
             The new pose.
         """
-        car = self.settings
-        self._pending.append((speed_cm_s, steering_rad))
-        # Until the first command arrives, the car rolls as it would with that command, wheels ahead.
-        arrived = len(self._pending) > car.delay_frames
-        speed_cm_s, steering_rad = self._pending.popleft() if arrived else (speed_cm_s, 0.0)
-        wanted = car.steering_gain * steering_rad + car.steering_trim_rad
-        wanted = float(np.clip(wanted, -car.max_steering_rad, car.max_steering_rad))
-        swing = car.servo_rate_rad_s * interval_s
-        before = self.wheels_rad
-        self.wheels_rad = before + float(np.clip(wanted - before, -swing, swing))
-        self._drift(interval_s)
-        speed = speed_cm_s * car.speed_gain * (1.0 + car.speed_noise * self._speed_noise)
-        wheels = self.wheels_rad + car.steering_noise_rad * self._steering_noise
-        self.pose = advance(self.pose, speed * interval_s, wheels, car.wheelbase_cm)
+        if self._told is None:
+            # Until the first command arrives, the car rolls as it will with that command.
+            self._told = (speed_cm_s, 0.0)
+            self._motor_cm_s = speed_cm_s * self.settings.speed_gain
+        self._pending.append((self._t_s + self.settings.delay_s, speed_cm_s, steering_rad))
+        end_s = self._t_s + interval_s
+        while self._t_s < end_s - _SAME_TIME_S:
+            while self._pending and self._pending[0][0] <= self._t_s + _SAME_TIME_S:
+                self._told = self._pending.popleft()[1:]
+            if self._ticks * _STEP_S <= self._t_s + _SAME_TIME_S:
+                self._drift()
+                self._ticks += 1
+            until_s = min(end_s, self._ticks * _STEP_S)
+            if self._pending:
+                until_s = min(until_s, self._pending[0][0])
+            self._move(*self._told, until_s - self._t_s)
+            self._t_s = until_s
         return self.pose
 
-    def _drift(self, interval_s: float) -> None:
+    def _move(self, speed_cm_s: float, steering_rad: float, step_s: float) -> None:
+        """Let servo, motor and car go on for a short while."""
+        car = self.settings
+        wanted = car.steering_gain * steering_rad + car.steering_trim_rad
+        wanted = min(max(wanted, -car.max_steering_rad), car.max_steering_rad)
+        swing = car.servo_rate_rad_s * step_s
+        before_rad = self.wheels_rad
+        self.wheels_rad += min(max(wanted - before_rad, -swing), swing)
+        # The servo turns evenly and may arrive before the step is over.
+        turned_rad = self.wheels_rad - before_rad
+        mean_rad = self.wheels_rad - 0.5 * turned_rad * abs(turned_rad) / swing
+        target_cm_s, before_cm_s = speed_cm_s * car.speed_gain, self._motor_cm_s
+        kept = math.exp(-step_s / car.speed_lag_s) if car.speed_lag_s > 0.0 else 0.0
+        self._motor_cm_s = target_cm_s + kept * (before_cm_s - target_cm_s)
+        # Way of the motor over the step: the mean of the exponential.
+        way_cm = target_cm_s * step_s + (before_cm_s - target_cm_s) * car.speed_lag_s * (1.0 - kept)
+        way_cm *= 1.0 + car.speed_noise * self._speed_noise
+        speed = way_cm / step_s
+        curvature = self._curvature_per_cm(mean_rad, speed)
+        slip_rad = car.rear_slip_rad_s2_per_cm * speed * speed * curvature
+        self.pose = advance_along(self.pose, way_cm, curvature, slip_rad)
+
+    def _curvature_per_cm(self, wheels_rad: float, speed_cm_s: float | None = None) -> float:
+        wheels_rad += self.settings.steering_noise_rad * self._steering_noise
+        speed_cm_s = self.speed_cm_s if speed_cm_s is None else speed_cm_s
+        return driven_curvature_per_cm(wheels_rad, speed_cm_s, self.settings)
+
+    def _drift(self) -> None:
         """Let both deviations wander with unit variance (Ornstein-Uhlenbeck)."""
-        keep = float(np.exp(-interval_s / _NOISE_TIME_S))
-        fresh = float(np.sqrt(1.0 - keep * keep))
-        self._speed_noise = keep * self._speed_noise + fresh * self._speed_rng.standard_normal()
-        self._steering_noise = keep * self._steering_noise + fresh * self._steering_rng.standard_normal()
+        keep = math.exp(-_STEP_S / _NOISE_TIME_S)
+        fresh = math.sqrt(1.0 - keep * keep)
+        self._speed_noise = keep * self._speed_noise + fresh * float(self._speed_rng.standard_normal())
+        self._steering_noise = keep * self._steering_noise + fresh * float(
+            self._steering_rng.standard_normal()
+        )

@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from datagen.world.clearance import nearest_approach
 from lanenet.errors import ConfigError
 
 _SAMPLE_CM = 1.0
 _CHECK_CM = 5.0  # spacing of the points compared for clearance
 _PIECE_TRIES = 30
 _RETREATS = 60
-_LOOP_TRIES = 400
+_RETREAT_PIECES = 5
+
+#: Smallest radius of left and of right bends, [cm].
+Radii = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -47,133 +51,104 @@ def integrate_curvature(curvature_per_cm: Float[np.ndarray, "n"], step_cm: float
     return CentreLine(np.stack([z.real, z.imag], axis=1), heading, curvature_per_cm, step_cm)
 
 
-def comes_near_itself(line: CentreLine, separation_cm: float, closed: bool, after_cm: float = 0.0) -> bool:
-    """Tell whether two stretches of a curve lie closer together than they should.
+def comes_near_itself(
+    line: CentreLine, separation_cm: float, closed: bool, after_cm: float = 0.0, middle_cm: float = 0.0
+) -> tuple[float, float, float] | None:
+    """Find two stretches of a road that lie closer together than they should.
 
     Args:
-        line: The curve.
-        separation_cm: Least distance of points that are far apart along the curve. Far apart is more than
-            pi/2 times this, so that a bend of radius 2/3 ``separation_cm`` is not taken for a near miss.
+        line: The centre line.
+        separation_cm: See :func:`~datagen.world.clearance.nearest_approach`.
         closed: Whether the end joins the start.
         after_cm: Only points further along than this are compared with the whole curve.
+        middle_cm: Offset of the road's middle, of which the distance is taken.
+
+    Returns:
+        The two places along the road and their distance, [cm]; None where it keeps clear.
     """
     stride = max(1, round(_CHECK_CM / line.step_cm))
-    points = line.xy_cm[::stride]
-    s = np.arange(len(line.xy_cm))[::stride] * line.step_cm
-    late = s >= after_cm
-    gap = np.abs(s[late][:, None] - s[None, :])
-    if closed:
-        gap = np.minimum(gap, len(line.xy_cm) * line.step_cm - gap)
-    distance = np.linalg.norm(points[late][:, None] - points[None, :], axis=2)
+    heading = line.heading_rad[::stride]
+    points = line.xy_cm[::stride] + middle_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    s_cm = np.arange(len(line.xy_cm))[::stride] * line.step_cm
     # Points of the check may straddle the nearest ones by half a stride on both curves.
-    near: Bool[np.ndarray, "a b"] = distance < separation_cm + 0.25 * stride * line.step_cm
-    return bool((near & (gap > 0.5 * np.pi * separation_cm)).any())
+    separation_cm += 0.25 * stride * line.step_cm
+    lap_cm = len(line.xy_cm) * line.step_cm if closed else None
+    return nearest_approach(points, s_cm, separation_cm, lap_cm, after_cm)
 
 
 def open_centre_line(
-    length_cm: float, min_radius_cm: float, separation_cm: float, rng: np.random.Generator
+    length_cm: float, min_radius_cm: Radii, separation_cm: float, middle_cm: float, rng: np.random.Generator
 ) -> CentreLine:
     """Draw a random open road of straights, bends and S-bends joined by clothoids.
 
     A piece that comes near the road so far is drawn again; when that does not help, the last pieces go too.
+
+    Args:
+        length_cm: Length of the centre line.
+        min_radius_cm: Smallest radius of left and of right bends.
+        separation_cm: Least distance of the middles of two stretches of road.
+        middle_cm: Offset of the road's middle from the centre line.
+        rng: Source of randomness.
 
     Raises:
         ConfigError: If no road of this length fits.
     """
     target = int(np.ceil(length_cm / _SAMPLE_CM)) + 1
     pieces = [np.zeros(30)]
-    for _ in range(_RETREATS):
+    line = integrate_curvature(pieces[0])
+    furthest, depth = 0, _RETREAT_PIECES
+    for _ in range(_RETREATS + target // 100):
         failed = 0
-        while failed < _PIECE_TRIES and sum(map(len, pieces)) < target:
-            so_far = np.concatenate(pieces)
-            piece = _random_piece(float(so_far[-1]), min_radius_cm, rng)
-            trial = integrate_curvature(np.concatenate([so_far, piece])[:target])
-            if comes_near_itself(trial, separation_cm, closed=False, after_cm=len(so_far) * _SAMPLE_CM):
+        while failed < _PIECE_TRIES and len(line.xy_cm) < target:
+            piece = _random_piece(float(line.curvature_per_cm[-1]), min_radius_cm, rng)
+            trial = _continue(line, piece[: target - len(line.xy_cm)])
+            after_cm = len(line.xy_cm) * _SAMPLE_CM
+            if comes_near_itself(trial, separation_cm, False, after_cm, middle_cm) is not None:
                 failed += 1
             else:
                 pieces.append(piece)
+                line = trial
         if failed < _PIECE_TRIES:
             return integrate_curvature(np.concatenate(pieces)[:target])
-        del pieces[max(1, len(pieces) - 5) :]
+        # Back further and further where the road has run into a trap.
+        depth = _RETREAT_PIECES if len(pieces) > furthest else 2 * depth
+        furthest = max(furthest, len(pieces))
+        del pieces[max(1, len(pieces) - depth) :]
+        line = integrate_curvature(np.concatenate(pieces))
     raise ConfigError(
-        f"track: no open road of {length_cm:.0f} cm with bends of {min_radius_cm:.0f} cm found that keeps "
-        "clear of itself; choose a shorter length_cm"
+        f"track: no open road of {length_cm:.0f} cm with bends of {min(min_radius_cm):.0f} cm found that "
+        "keeps clear of itself; choose a shorter length_cm"
+    )
+
+
+def _continue(line: CentreLine, curvature_per_cm: Float[np.ndarray, "n"]) -> CentreLine:
+    """Append samples to a curve, without integrating all of it again."""
+    more = integrate_curvature(np.concatenate([line.curvature_per_cm[-1:], curvature_per_cm]))
+    c, s = np.cos(line.heading_rad[-1]), np.sin(line.heading_rad[-1])
+    xy = line.xy_cm[-1] + more.xy_cm[1:] @ np.array([[c, s], [-s, c]])
+    return CentreLine(
+        np.concatenate([line.xy_cm, xy]),
+        np.concatenate([line.heading_rad, line.heading_rad[-1] + more.heading_rad[1:]]),
+        np.concatenate([line.curvature_per_cm, curvature_per_cm]),
+        line.step_cm,
     )
 
 
 def _random_piece(
-    curvature_before: float, min_radius_cm: float, rng: np.random.Generator
+    curvature_before: float, min_radius_cm: Radii, rng: np.random.Generator
 ) -> Float[np.ndarray, "n"]:
     """Curvature of one more piece: a linear change to a new value, then that value for a while."""
     straight = rng.random() < 0.25
-    radius_cm = min_radius_cm * 4.0 ** rng.random()
+    share = rng.random()
     # Turning the other way is likelier, so that roads wind rather than curl up.
     sign = -np.sign(curvature_before) if rng.random() < 0.65 else np.sign(curvature_before)
     if sign == 0.0:
         sign = 1.0 if rng.random() < 0.5 else -1.0
+    smallest_cm = min_radius_cm[0] if sign > 0.0 else min_radius_cm[1]
+    radius_cm = smallest_cm * 4.0**share
     hold_cm = rng.uniform(20.0, 120.0) if straight else radius_cm * rng.uniform(0.3, 1.8)
     after = 0.0 if straight else float(sign) / radius_cm
-    ramp_cm = rng.uniform(30.0, 60.0) * max(0.3, abs(after - curvature_before) * min_radius_cm)
+    ramp_cm = rng.uniform(30.0, 60.0) * max(0.3, abs(after - curvature_before) * smallest_cm)
     n_ramp, n_hold = max(5, round(ramp_cm / _SAMPLE_CM)), round(hold_cm / _SAMPLE_CM)
     ramp = curvature_before + (after - curvature_before) * np.arange(1, n_ramp + 1) / n_ramp
     return np.concatenate([ramp, np.full(n_hold, after)])
-
-
-def closed_centre_line(
-    length_cm: float, min_radius_cm: float, separation_cm: float, rng: np.random.Generator
-) -> CentreLine:
-    """Draw a random closed road: a circle whose radius swings by a few harmonics.
-
-    Raises:
-        ConfigError: If no loop of this length keeps to the smallest radius and clear of itself.
-    """
-    direction = 1.0 if rng.random() < 0.5 else -1.0
-    for attempt in range(_LOOP_TRIES):
-        # Later attempts swing less, down to a circle.
-        swing = 0.5 * (1.0 - attempt / (_LOOP_TRIES - 1))
-        orders = np.arange(2, 6)
-        amplitudes = swing * rng.random(orders.size) * 2.0 / orders
-        phases = rng.uniform(0.0, 2.0 * np.pi, orders.size)
-        line = _loop(length_cm, direction, orders, amplitudes, phases)
-        if line is None or np.max(np.abs(line.curvature_per_cm)) > 1.0 / min_radius_cm:
-            continue
-        if not comes_near_itself(line, separation_cm, closed=True):
-            return line
-    raise ConfigError(
-        f"track: no closed road of {length_cm:.0f} cm with bends of {min_radius_cm:.0f} cm found; "
-        "choose a longer length_cm"
-    )
-
-
-def _loop(
-    length_cm: float,
-    direction: float,
-    orders: Float[np.ndarray, "k"] | np.ndarray,
-    amplitudes: Float[np.ndarray, "k"],
-    phases: Float[np.ndarray, "k"],
-) -> CentreLine | None:
-    """The loop r = 1 + sum a_k cos(k phi + p_k), scaled to a length; None when r comes near 0."""
-
-    def curve(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        angle = np.outer(phi, orders) + phases
-        r = 1.0 + np.cos(angle) @ amplitudes
-        dr = -np.sin(angle) @ (amplitudes * orders)
-        ddr = -np.cos(angle) @ (amplitudes * orders**2)
-        turn = np.exp(1j * phi)
-        return r * turn, (dr + 1j * r) * turn, (ddr + 2j * dr - r) * turn
-
-    fine = np.linspace(0.0, 2.0 * np.pi, 16384 + 1)
-    z, dz, _ = curve(fine)
-    if np.min(np.abs(z)) < 0.2:
-        return None
-    speed = np.abs(dz)
-    arc = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(fine))])
-    n = max(8, round(length_cm / _SAMPLE_CM))
-    z, dz, ddz = curve(np.interp(np.arange(n) * arc[-1] / n, arc, fine))
-    scale = length_cm / arc[-1]
-    z, heading = z * scale, np.unwrap(np.angle(dz))
-    curvature = np.imag(np.conj(dz) * ddz) / np.abs(dz) ** 3 / scale
-    # Start at the origin along +x; a loop driven the other way round is the mirror image.
-    z, heading = (z - z[0]) * np.exp(-1j * heading[0]), heading - heading[0]
-    xy = np.stack([z.real, direction * z.imag], axis=1)
-    return CentreLine(xy, direction * heading, direction * curvature, length_cm / n)

@@ -1,88 +1,117 @@
-"""A scripted driver: follows the lane and wanders a little, so that labels vary."""
+"""A scripted driver with perfect sight: leads the front axle along a line of its choice in the lane."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
 
+from datagen.world.car import CarSettings, advance
+from datagen.world.script import DriverSettings, Script
 from datagen.world.track import Track
-from lanenet.config import Settings
-from lanenet.errors import ConfigError
-from lanenet.geometry.frames import car_from_map, map_from_car
-from lanenet.geometry.steering import pure_pursuit_angle_rad
+from lanenet.geometry.frames import map_from_car
 
-_WAVES = 4
+__all__ = ["Driver", "DriverSettings", "Script"]
 
-
-class DriverSettings(Settings):
-    """How the car is driven.
-
-    Attributes:
-        speed_cm_s: Commanded speed.
-        aim_ahead_cm: Distance ahead of the front axle, along the road, of the point that is steered for.
-        wander_cm: Largest offset from the middle of the lane that the driver aims for.
-        shortest_wander_cm: Shortest wave of the wandering.
-        longest_wander_cm: Longest wave.
-    """
-
-    speed_cm_s: float = Field(default=60.0, gt=0.0)
-    aim_ahead_cm: float = Field(default=20.0, gt=0.0)
-    wander_cm: float = Field(default=6.0, ge=0.0)
-    shortest_wander_cm: float = Field(default=150.0, gt=0.0)
-    longest_wander_cm: float = Field(default=400.0, gt=0.0)
+_TRIM_AFTER = 5.0  # aim distances that it takes to learn what the steering is off by
+_MOST_TRIM_RAD = 0.15
+_TRIM_WITHIN_CM = 5.0
 
 
 class Driver:
-    """Pure pursuit along the lane, with perfect sight and a smooth random offset."""
+    """Turns the front wheels to the line's direction and a little towards the line.
+
+    The front axle goes where its wheels point, so that this follows bends without cutting them. The wheels
+    answer late: the driver steers for the place where the car will be by then. What the steering is off by is
+    learned from the offset that remains.
+
+    Source:
+        Front-axle law: Hoffmann et al. 2007, "Autonomous automobile trajectory tracking for off-road
+        driving", American Control Conference (there with the speed over the gain for the aim distance).
+        Prediction and trim: own choice.
+    """
 
     def __init__(
         self,
         settings: DriverSettings,
         track: Track,
         start_s_cm: float,
-        max_steering_rad: float,
+        car: CarSettings,
+        rate_hz: float,
         rng: np.random.Generator,
     ) -> None:
-        """Set out near a place along the road.
-
-        Raises:
-            ConfigError: If the shortest wave is longer than the longest.
-        """
-        if settings.shortest_wander_cm > settings.longest_wander_cm:
-            raise ConfigError(
-                f"driver: shortest_wander_cm {settings.shortest_wander_cm:g} exceeds longest_wander_cm "
-                f"{settings.longest_wander_cm:g}"
-            )
-        self.settings, self.track = settings, track
-        self.s_cm = start_s_cm
-        self.max_steering_rad = max_steering_rad
-        lengths_cm = rng.uniform(settings.shortest_wander_cm, settings.longest_wander_cm, _WAVES)
-        self._waves = 2.0 * np.pi / lengths_cm
-        self._phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
-        share = rng.uniform(0.5, 1.0, _WAVES)
-        self._amplitudes_cm = settings.wander_cm * share / share.sum()
-
-    def offset_cm(self, s_cm: float) -> float:
-        """Offset that the driver aims for at a place along the road, left positive, [cm]."""
-        return float(np.sum(self._amplitudes_cm * np.sin(self._waves * s_cm + self._phases)))
+        """Set out with the rear axle near a place along the road."""
+        self.track, self.script = track, Script(settings, rate_hz, rng)
+        self._aim_ahead_cm = settings.aim_ahead_cm
+        self._wheelbase_cm, self._max_steering_rad = car.wheelbase_cm, car.max_steering_rad
+        # A command holds until the next one: on average it is half a frame old.
+        self._lead_s = car.delay_s + 0.5 / rate_hz
+        self.s_cm = start_s_cm + (0.0 if track.closed else car.wheelbase_cm)
+        self._steered_rad, self._speed_cm_s, self._trim_rad = 0.0, 0.0, 0.0
 
     def start_pose(self) -> Float[np.ndarray, "3"]:
-        """Pose on the wandering line at the current place (rear axle, frame map)."""
-        xy_cm, heading = self.track.point(self.s_cm, self.offset_cm(self.s_cm))
-        slope = self.offset_cm(self.s_cm + 0.5) - self.offset_cm(self.s_cm - 0.5)
-        return np.array([xy_cm[0], xy_cm[1], heading + np.arctan(slope)])
+        """Pose with the front axle on the line at the current place (rear axle, frame map)."""
+        return self.pose_at(self.s_cm, self.script.offset_cm(self.s_cm), self.script.slope(self.s_cm))
 
-    def steer(self, pose: Float[np.ndarray, "3"], wheelbase_cm: float) -> float:
+    def pose_at(self, s_cm: float, offset_cm: float = 0.0, slope: float = 0.0) -> Float[np.ndarray, "3"]:
+        """Pose of a car that follows a line beside the centre line with its front axle.
+
+        Args:
+            s_cm: Place of the front axle along the road.
+            offset_cm: Its offset from the centre line, left positive.
+            slope: Change of that offset per way.
+        """
+        front_cm, road_rad = self.track.point(s_cm, offset_cm)
+        curvature = self.track.point(s_cm + 1.0)[1] - road_rad
+        turned = min(max(self._wheelbase_cm * curvature, -0.9), 0.9)
+        heading = road_rad + math.atan(slope) - math.asin(turned)
+        rear_cm = front_cm - self._wheelbase_cm * np.array([math.cos(heading), math.sin(heading)])
+        return np.array([rear_cm[0], rear_cm[1], heading])
+
+    def command(self, pose: Float[np.ndarray, "3"], t_s: float) -> tuple[float, float]:
+        """Return the commanded speed, [cm/s], and steering, [rad], positive left, at a pose and time."""
+        steering_rad = self.steer(pose)
+        self._speed_cm_s = self.script.speed_cm_s(self.s_cm, t_s)
+        return self._speed_cm_s, steering_rad
+
+    def steer(self, pose: Float[np.ndarray, "3"]) -> float:
         """Return the steering command at a pose, [rad], positive left; keeps count of the way driven."""
-        front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
-        s_cm, _ = self.track.nearest(front, near_s_cm=self.s_cm)
-        if self.track.closed:
-            lap_cm = self.track.length_cm
-            s_cm += lap_cm * round((self.s_cm - s_cm) / lap_cm)
-        self.s_cm = s_cm
-        aim_s_cm = s_cm + self.settings.aim_ahead_cm
-        aim_cm, _ = self.track.point(aim_s_cm, self.offset_cm(aim_s_cm))
-        right_cm, ahead_cm = car_from_map(aim_cm[None], pose, wheelbase_cm)[0]
-        steering = pure_pursuit_angle_rad(float(right_cm), float(ahead_cm), wheelbase_cm)
-        return float(np.clip(steering, -self.max_steering_rad, self.max_steering_rad))
+        before_cm = self.s_cm
+        self.s_cm, _ = self._place(pose)
+        ahead = advance(
+            pose, self._speed_cm_s * self._lead_s, self._steered_rad + self._trim_rad, self._wheelbase_cm
+        )
+        s_cm, offset_cm = self._place(ahead)
+        off_cm = offset_cm - self.script.offset_cm(s_cm)
+        if abs(off_cm) < _TRIM_WITHIN_CM:
+            # The learned share is what the wheels do by themselves: to the left where the car drifts left.
+            share = off_cm / self._aim_ahead_cm * (self.s_cm - before_cm) / (_TRIM_AFTER * self._aim_ahead_cm)
+            self._trim_rad = min(max(self._trim_rad + share, -_MOST_TRIM_RAD), _MOST_TRIM_RAD)
+        direction = self.track.point(s_cm)[1] + math.atan(self.script.slope(s_cm))
+        wanted = direction - math.atan(off_cm / self._aim_ahead_cm) - float(ahead[2])
+        steering = math.remainder(wanted, 2.0 * math.pi) - self._trim_rad
+        self._steered_rad = min(max(steering, -self._max_steering_rad), self._max_steering_rad)
+        return self._steered_rad
+
+    def _place(self, pose: Float[np.ndarray, "3"]) -> tuple[float, float]:
+        """Way along the road, over all laps, and offset of the front axle at a pose."""
+        front = map_from_car(np.zeros((1, 2)), pose, self._wheelbase_cm)[0]
+        return place_on_track(self.track, front, self.s_cm)
+
+
+def place_on_track(track: Track, xy_cm: Float[np.ndarray, "2"], near_s_cm: float) -> tuple[float, float]:
+    """Find a point's place along the road, counting on over the laps.
+
+    Args:
+        track: The road.
+        xy_cm: The point, [cm], frame map.
+        near_s_cm: Way along the road that the point is near, any number of laps.
+
+    Returns:
+        Way along the road, and offset from its centre line (left positive), [cm].
+    """
+    s_cm, offset_cm = track.nearest(xy_cm, near_s_cm=near_s_cm)
+    if track.closed:
+        s_cm += track.length_cm * round((near_s_cm - s_cm) / track.length_cm)
+    return s_cm, offset_cm

@@ -1,7 +1,8 @@
-"""The inner loops of the renderer, compiled: what a pixel covers, floor, room, sensor.
+"""The floor's inner loops, compiled: what a pixel covers of the floor, the markings and the things on it.
 
-Each pixel is taken as the parallelogram that it covers on the road; a border covers the part of it that an
-unbounded straight edge at the same distance would, exactly. Corners multiply the two directions' shares.
+Each pixel is taken as the parallelogram that it covers on the road, drawn out by the car's motion during the
+exposure; a border covers the part of it that an unbounded straight edge at the same distance would. Corners
+multiply the two directions' shares.
 
 All in one file on purpose: numba's cache does not notice a change of a callee that lives in another file.
 ``no_type_check`` keeps run-time checks of shapes away from what numba compiles.
@@ -14,26 +15,29 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from datagen.world.ground import FAR, NOT_FLOOR, TEXTURE_CELL_CM, TEXTURE_LEVELS, TILE
+
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def box_share(distance, width_a, width_b):
-    """Share of a parallelogram on the inner side of an edge.
-
-    The distance across the edge, over the pixel, is the sum of two even distributions: their distribution
-    function is the share.
-
-    Args:
-        distance: From the pixel's centre to the edge, positive when the centre is inside.
-        width_a: Change of the distance over one pixel in u.
-        width_b: The same in v.
-
-    Returns:
-        0..1.
-    """
-    a, b = abs(width_a), abs(width_b)
+def fold(width_a, width_b, width_c):
+    """Turn three widths, of either sign, into two, the larger first: the third goes in by its variance."""
+    a, b, c = abs(width_a), abs(width_b), abs(width_c)
     if a < b:
         a, b = b, a
+    if c > 0.0:
+        if a < c:
+            a, c = c, a
+        b = np.sqrt(b * b + c * c)
+        if a < b:
+            a, b = b, a
+    return a, b
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def inner_share(distance, a, b):
+    """Share of a pixel on the inner side of an edge, by its folded widths across the edge."""
     half = 0.5 * (a + b)
     d = abs(distance)
     if d >= half:
@@ -43,6 +47,37 @@ def box_share(distance, width_a, width_b):
     else:
         outside = (half - d) * (half - d) / (2.0 * a * b)
     return 1.0 - outside if distance > 0.0 else outside
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def box_share(distance, width_a, width_b, width_c=0.0):
+    """Share of a parallelogram on the inner side of an edge.
+
+    The distance across the edge, over the pixel, is the sum of two even distributions: their distribution
+    function is the share. A third one, the motion, is folded into the smaller of the two by its variance.
+
+    Args:
+        distance: From the pixel's centre to the edge, positive when the centre is inside.
+        width_a: Change of the distance over one pixel in u.
+        width_b: The same in v.
+        width_c: The same over the exposure.
+
+    Returns:
+        0..1.
+    """
+    a, b = fold(width_a, width_b, width_c)
+    return inner_share(distance, a, b)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def strip_share(distance, half, width_a, width_b, width_c):
+    """Share of a pixel on a strip of half width ``half``, by the distance to its middle."""
+    a, b = fold(width_a, width_b, width_c)
+    if abs(distance) >= half + 0.5 * (a + b):
+        return 0.0
+    return inner_share(distance + half, a, b) - inner_share(distance - half, a, b)
 
 
 @njit(cache=True, error_model="numpy")
@@ -90,9 +125,10 @@ def locate(x, y, nodes, closed, start):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def painted_share(s, width_a, width_b, stretches, first, last):
+def painted_share(s, width_a, width_b, width_c, stretches, first, last):
     """Share of a pixel that lies on painted stretches along the road (rows first..last, ascending)."""
-    half = 0.5 * (abs(width_a) + abs(width_b))
+    a, b = fold(width_a, width_b, width_c)
+    half = 0.5 * (a + b)
     low, high = first, last
     while low < high:  # the first stretch that ends beyond the pixel's start
         middle = (low + high) // 2
@@ -102,190 +138,246 @@ def painted_share(s, width_a, width_b, stretches, first, last):
             low = middle + 1
     share = 0.0
     while low < last and stretches[low, 0] < s + half:
-        share += box_share(s - stretches[low, 0], width_a, width_b)
-        share -= box_share(s - stretches[low, 1], width_a, width_b)
+        share += inner_share(s - stretches[low, 0], a, b) - inner_share(s - stretches[low, 1], a, b)
         low += 1
     return min(max(share, 0.0), 1.0)
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def bilinear(texture, column, row):
-    """Sample a square texture that repeats; its side is a power of two."""
-    mask = texture.shape[0] - 1
+def sample(texture, start, side, shrink, along, across):
+    """Sample one level of a square texture that repeats, at a place in cells of level 0.
+
+    Args:
+        texture: See :func:`datagen.world.textures.pack_levels`.
+        start: Of the level.
+        side: Of the level, a power of two.
+        shrink: Cells of the level per cell of level 0.
+        along: Place.
+        across: Place.
+    """
+    column, row = along * shrink, across * shrink
+    mask = side - 1
     c0, r0 = int(np.floor(column)), int(np.floor(row))
     fc, fr = column - c0, row - r0
     c0, r0 = c0 & mask, r0 & mask
     c1, r1 = (c0 + 1) & mask, (r0 + 1) & mask
-    upper = texture[r0, c0] * (1.0 - fc) + texture[r0, c1] * fc
-    lower = texture[r1, c0] * (1.0 - fc) + texture[r1, c1] * fc
+    r0, r1 = start + r0 * side, start + r1 * side
+    upper = texture[r0 + c0] * (1.0 - fc) + texture[r0 + c1] * fc
+    lower = texture[r1 + c0] * (1.0 - fc) + texture[r1 + c1] * fc
     return upper * (1.0 - fr) + lower * fr
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def joint_share(position, period, width, width_a, width_b):
-    """Share of a pixel on the nearest of evenly spaced joints."""
-    d = position - period * np.floor(position / period + 0.5)
-    if abs(d) >= 0.5 * (width + abs(width_a) + abs(width_b)):
+def rectangle_share(x, y, ux, uy, vx, vy, mx, my, reach, boxes, q):
+    """Share of a pixel on a rectangle: x, y, cos and sin of the direction, half length, half width, ..."""
+    dx, dy, c, s = x - boxes[q, 0], y - boxes[q, 1], boxes[q, 2], boxes[q, 3]
+    along, across = dx * c + dy * s, dy * c - dx * s
+    if abs(along) >= boxes[q, 4] + reach or abs(across) >= boxes[q, 5] + reach:
         return 0.0
-    return box_share(d + 0.5 * width, width_a, width_b) - box_share(d - 0.5 * width, width_a, width_b)
+    alpha = strip_share(along, boxes[q, 4], ux * c + uy * s, vx * c + vy * s, mx * c + my * s)
+    if alpha > 0.0:
+        alpha *= strip_share(across, boxes[q, 5], uy * c - ux * s, vy * c - vx * s, my * c - mx * s)
+    return alpha
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def paint_floor(
-    out,
-    pixels,
-    points,
-    jacobians,
-    levels,
-    n_near,
-    pose,
-    floor_bgr,
-    texture,
-    texture_cell,
-    texture_level,
-    joints,
-    grid,
-    grid_frame,
-    nodes,
-    closed,
-    markings,
-    stretches,
-    wear,
-    clutter,
-    lamps,
-):
+def list_near(low_x, low_y, high_x, high_y, places, reaches, among, count, found):
+    """Write which of ``among`` have a circle that touches the box into ``found``; return how many."""
+    near = 0
+    for k in range(count):
+        q = among[k]
+        reach, x, y = reaches[q], places[q, 0], places[q, 1]
+        if low_x - reach < x < high_x + reach and low_y - reach < y < high_y + reach:
+            found[near] = q
+            near += 1
+    return near
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def paint_floor(out, width, numbers, level, tiles, origin, floor, patterns, road, things):
     """Paint every pixel that sees the floor.
 
     Args:
         out: Image as rows of pixels, float32, filled in place.
-        pixels: Index of each pixel to paint; the first ``n_near`` may show the road.
-        points: Their points of the road, relative to the rear axle: right, ahead.
-        jacobians: d(right, ahead)/d(u, v): four values.
-        levels: Level of the texture that fits the pixel's size.
-        n_near: How many are near enough to the car to show markings and clutter.
-        pose: Rear-axle centre x, y and heading.
-        floor_bgr: Mean colour.
-        texture: Floor's pattern, by level.
-        texture_cell: Side of its cells.
-        texture_level: Its strength.
-        joints: Direction, shift in both directions, distance in both directions, width, darkening.
-        grid: Nearest sample of the centre line by cell; -1 away from the road.
-        grid_frame: x and y of the grid's origin, cell.
-        nodes: See :func:`locate`.
-        closed: Whether the road is a loop.
-        markings: Offset, width, blue, green, red, first and last row of ``stretches``.
-        stretches: Painted stretches of all markings.
-        wear: 0..1.
-        clutter: Rectangles near the car, see ``Scene.clutter``.
-        lamps: Mirror images near the car: x, y, cos and sin of the view, widths along and across, level,
-            square of the reach.
+        width: Pixels per row, filled up.
+        numbers: See :class:`datagen.world.ground.FloorHits`.
+        level: See there.
+        tiles: See there.
+        origin: Rear-axle centre x and y.
+        floor: Colour of the road's floor, colour beside the road, colour of the pattern (three each).
+        patterns: Texture of the floor, texture of the wear, starts of their levels, and as numbers: strength
+            of the pattern, wear; direction, two shifts, two distances, width and darkening of the joints.
+        road: Grid of nearest samples, its frame (x and y of the origin, cell), nodes (see :func:`locate`),
+            whether closed, markings (offset, width, blue, green, red, first and last row of the stretches),
+            stretches, and the right and left border of the road.
+        things: Boxes painted on the floor and clutter on it (see ``Scene.clutter``), each with its reaches.
     """
-    ch, sh = np.cos(pose[2]), np.sin(pose[2])
-    cj, sj = np.cos(joints[0]), np.sin(joints[0])
-    rows, columns = grid.shape
-    for p in range(pixels.shape[0]):
-        right, ahead = points[p, 0], points[p, 1]
-        x = pose[0] + ahead * ch + right * sh
-        y = pose[1] + ahead * sh - right * ch
-        # What one pixel in u and one in v are on the map.
-        ux, uy = jacobians[p, 2] * ch + jacobians[p, 0] * sh, jacobians[p, 2] * sh - jacobians[p, 0] * ch
-        vx, vy = jacobians[p, 3] * ch + jacobians[p, 1] * sh, jacobians[p, 3] * sh - jacobians[p, 1] * ch
-        blue, green, red = floor_bgr[0], floor_bgr[1], floor_bgr[2]
-        along, across = x * cj + y * sj, y * cj - x * sj
-        pattern = 0.0
-        if texture_level > 0.0 or wear > 0.0:
-            pattern = bilinear(texture[levels[p]], along / texture_cell, across / texture_cell)
-        shade = texture_level * pattern
-        if joints[3] > 0.0:
-            share = joint_share(along - joints[1], joints[3], joints[5], ux * cj + uy * sj, vx * cj + vy * sj)
-            shade -= joints[6] * share
-        if joints[4] > 0.0:
-            share = joint_share(
-                across - joints[2], joints[4], joints[5], uy * cj - ux * sj, vy * cj - vx * sj
-            )
-            shade -= joints[6] * share
-        blue, green, red = blue + shade, green + shade, red + shade
-        if p < n_near:
-            column = int(np.floor((x - grid_frame[0]) / grid_frame[2]))
-            row = int(np.floor((y - grid_frame[1]) / grid_frame[2]))
-            if 0 <= row < rows and 0 <= column < columns and grid[row, column] >= 0:
-                s, offset, c, sn, k = locate(x, y, nodes, closed, grid[row, column])
-                across_u, across_v = uy * c - ux * sn, vy * c - vx * sn
-                scale = 1.0 / max(1.0 - k * offset, 0.2)
-                along_u, along_v = (ux * c + uy * sn) * scale, (vx * c + vy * sn) * scale
-                for m in range(markings.shape[0]):
-                    d = offset - markings[m, 0]
-                    half = 0.5 * markings[m, 1]
-                    if abs(d) >= half + 0.5 * (abs(across_u) + abs(across_v)):
-                        continue
-                    alpha = box_share(d + half, across_u, across_v) - box_share(d - half, across_u, across_v)
-                    if alpha > 0.0:
-                        first, last = int(markings[m, 5]), int(markings[m, 6])
-                        alpha *= painted_share(s, along_u, along_v, stretches, first, last)
-                        if wear > 0.0:
-                            alpha *= 1.0 - min(max(1.5 * (pattern - 3.0 + 3.2 * wear), 0.0), 1.0)
-                        blue += alpha * (markings[m, 2] - blue)
-                        green += alpha * (markings[m, 3] - green)
-                        red += alpha * (markings[m, 4] - red)
-            for q in range(clutter.shape[0]):
-                dx, dy = x - clutter[q, 0], y - clutter[q, 1]
-                reach = clutter[q, 4] + clutter[q, 5] + 6.0
-                if dx * dx + dy * dy > reach * reach:
+    texture, wear_texture, starts, settings = patterns
+    grid, frame, nodes, closed, markings, stretches, borders = road
+    boxes, box_reach, clutter, clutter_reach = things
+    texture_level, wear = settings[0], settings[1]
+    cj, sj = np.cos(settings[2]), np.sin(settings[2])
+    height = level.shape[0] // width
+    all_boxes, all_clutter = np.arange(len(boxes)), np.arange(len(clutter))
+    tile_boxes, tile_clutter = np.empty_like(all_boxes), np.empty_like(all_clutter)
+    near_boxes, near_clutter = np.empty_like(all_boxes), np.empty_like(all_clutter)
+    origin_x, origin_y = origin[0], origin[1]
+    per_cell = 1.0 / frame[2]
+    per_joint_u, per_joint_v = 1.0 / max(settings[5], 1e-9), 1.0 / max(settings[6], 1e-9)
+    base_side = int(np.sqrt(starts[1]) + 0.5)
+    for tile in range(tiles.shape[0]):
+        if tiles[tile, 0] > tiles[tile, 2]:
+            continue
+        top, left = tile // (width // TILE) * TILE, tile % (width // TILE) * TILE
+        low_x, low_y = origin_x + tiles[tile, 0], origin_y + tiles[tile, 1]
+        high_x, high_y = origin_x + tiles[tile, 2], origin_y + tiles[tile, 3]
+        in_tile = list_near(low_x, low_y, high_x, high_y, boxes, box_reach, all_boxes, len(boxes), tile_boxes)
+        lying = list_near(
+            low_x, low_y, high_x, high_y, clutter, clutter_reach, all_clutter, len(clutter), tile_clutter
+        )
+        for v in range(top, min(top + TILE, height)):
+            i = v * width + left
+            # Slices, so that no index can be negative as far as the compiler knows.
+            seen, colours, n = level[i : i + TILE], out[i : i + TILE], numbers[8 * i : 8 * (i + TILE)]
+            n_boxes, n_clutter = 0, 0
+            if in_tile + lying > 0:
+                # Near the horizon a tile covers a lot of floor, one of its rows much less.
+                low_x, low_y, high_x, high_y, spread = np.inf, np.inf, -np.inf, -np.inf, 0.0
+                for j in range(TILE):
+                    if seen[j] != NOT_FLOOR:
+                        low_x, high_x = min(low_x, n[j]), max(high_x, n[j])
+                        low_y, high_y = min(low_y, n[TILE + j]), max(high_y, n[TILE + j])
+                        wide = abs(n[2 * TILE + j]) + abs(n[3 * TILE + j]) + abs(n[4 * TILE + j])
+                        spread = max(
+                            spread, wide + abs(n[5 * TILE + j]) + abs(n[6 * TILE + j]) + abs(n[7 * TILE + j])
+                        )
+                low_x, low_y = low_x + origin_x - spread, low_y + origin_y - spread
+                high_x, high_y = high_x + origin_x + spread, high_y + origin_y + spread
+                n_boxes = list_near(
+                    low_x, low_y, high_x, high_y, boxes, box_reach, tile_boxes, in_tile, near_boxes
+                )
+                n_clutter = list_near(
+                    low_x, low_y, high_x, high_y, clutter, clutter_reach, tile_clutter, lying, near_clutter
+                )
+            for j in range(TILE):
+                fits = seen[j]
+                if fits == NOT_FLOOR:
                     continue
-                c, sn = clutter[q, 2], clutter[q, 3]
-                d, au, av = dx * c + dy * sn, ux * c + uy * sn, vx * c + vy * sn
-                alpha = box_share(d + clutter[q, 4], au, av) - box_share(d - clutter[q, 4], au, av)
-                d, au, av = dy * c - dx * sn, uy * c - ux * sn, vy * c - vx * sn
-                alpha *= box_share(d + clutter[q, 5], au, av) - box_share(d - clutter[q, 5], au, av)
-                blue += alpha * (clutter[q, 6] - blue)
-                green += alpha * (clutter[q, 7] - green)
-                red += alpha * (clutter[q, 8] - red)
-        for q in range(lamps.shape[0]):
-            dx, dy = x - lamps[q, 0], y - lamps[q, 1]
-            if dx * dx + dy * dy > lamps[q, 7]:
-                continue
-            a = (dx * lamps[q, 2] + dy * lamps[q, 3]) / lamps[q, 4]
-            b = (dy * lamps[q, 2] - dx * lamps[q, 3]) / lamps[q, 5]
-            r = a * a + b * b
-            if r < 12.0:
-                glow = lamps[q, 6] * np.exp(-0.5 * r)
-                blue, green, red = blue + glow, green + glow, red + glow
-        i = pixels[p]
-        out[i, 0], out[i, 1], out[i, 2] = blue, green, red
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def paint_room(out, pixels, azimuths, elevations, heading, room):
-    """Paint every pixel that sees the walls: azimuth from straight ahead (left positive), elevation >= 0."""
-    rows, columns = room.shape[0], room.shape[1]
-    for p in range(pixels.shape[0]):
-        column = (azimuths[p] + heading) / (2.0 * np.pi) * columns
-        c0 = int(np.floor(column))
-        fc = column - c0
-        row = min(elevations[p] / (0.5 * np.pi) * rows, rows - 1.001)
-        r0 = int(row)
-        fr = row - r0
-        c0 = c0 % columns
-        c1 = (c0 + 1) % columns
-        i = pixels[p]
-        for channel in range(3):
-            lower = room[r0, c0, channel] * (1.0 - fc) + room[r0, c1, channel] * fc
-            upper = room[r0 + 1, c0, channel] * (1.0 - fc) + room[r0 + 1, c1, channel] * fc
-            out[i, channel] = lower * (1.0 - fr) + upper * fr
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def develop(light, gains, noise, first, noise_level, out):
-    """Apply gains per pixel and channel, add a stretch of the (repeating) noise, round to uint8."""
-    last = noise.shape[0] - 1
-    j = first
-    for i in range(light.shape[0]):
-        for channel in range(3):
-            value = light[i, channel] * gains[i, channel] + noise_level * noise[j] + 0.5
-            out[i, channel] = np.uint8(min(max(value, 0.0), 255.0))
-            j = 0 if j == last else j + 1
+                near = fits < FAR
+                fits = fits if near else fits - FAR
+                shrink = 1.0 / (1 << fits)
+                x, y = origin_x + n[j], origin_y + n[TILE + j]
+                ux, uy, vx, vy = n[2 * TILE + j], n[3 * TILE + j], n[4 * TILE + j], n[5 * TILE + j]
+                mx, my = n[6 * TILE + j], n[7 * TILE + j]
+                # No edge further away than this cuts the pixel, whatever its direction.
+                reach = 0.5 * (abs(ux) + abs(uy) + abs(vx) + abs(vy) + abs(mx) + abs(my))
+                # Where along the road, and what of the markings.
+                offset, candidate, on_grid = 1e9, -1, False
+                c, sn, k_road, s_road = 1.0, 0.0, 0.0, 0.0
+                verge = borders[2]
+                if near:
+                    column = int(np.floor((x - frame[0]) * per_cell))
+                    row = int(np.floor((y - frame[1]) * per_cell))
+                    on_grid = (
+                        0 <= row < grid.shape[0] and 0 <= column < grid.shape[1] and grid[row, column] >= 0
+                    )
+                if on_grid:
+                    node = grid[row, column]
+                    c, sn = nodes[node, 2], nodes[node, 3]
+                    offset = (y - nodes[node, 1]) * c - (x - nodes[node, 0]) * sn
+                    # Most pixels lie on bare floor, which this rough offset tells.
+                    for m in range(markings.shape[0]):
+                        if abs(offset - markings[m, 0]) < 0.5 * markings[m, 1] + reach + 0.5:
+                            candidate = m
+                            break
+                    if candidate >= 0:
+                        s_road, offset, c, sn, k_road = locate(x, y, nodes, closed, node)
+                    if verge > 0.0:
+                        verge = 0.0 if borders[1] < offset < borders[0] else 1.0
+                        if min(abs(offset - borders[0]), abs(offset - borders[1])) < reach:
+                            acu, acv, acm = uy * c - ux * sn, vy * c - vx * sn, my * c - mx * sn
+                            inside = box_share(borders[0] - offset, acu, acv, acm)
+                            verge = 1.0 - inside * box_share(offset - borders[1], acu, acv, acm)
+                along, across = x * cj + y * sj, y * cj - x * sj
+                shade = 0.0
+                if texture_level > 0.0:
+                    # Drawn out by the motion: up to a few cells the next level's, which are twice as large,
+                    # will do; beyond, two samples of a level whose cells are not much smaller than it.
+                    blurred, motion2 = fits, (mx * mx + my * my) / (TEXTURE_CELL_CM * TEXTURE_CELL_CM)
+                    twice = motion2 * shrink * shrink > 9.0
+                    most = 9.0 if twice else 1.0
+                    while motion2 * shrink * shrink > most and blurred < TEXTURE_LEVELS - 1:
+                        blurred += 1
+                        shrink *= 0.5
+                        if not twice:
+                            break
+                    start, side = starts[blurred], base_side >> blurred
+                    a, b = along / TEXTURE_CELL_CM, across / TEXTURE_CELL_CM
+                    if twice:
+                        step_a = 0.25 * (mx * cj + my * sj) / TEXTURE_CELL_CM
+                        step_b = 0.25 * (my * cj - mx * sj) / TEXTURE_CELL_CM
+                        shade = sample(texture, start, side, shrink, a - step_a, b - step_b)
+                        shade += sample(texture, start, side, shrink, a + step_a, b + step_b)
+                        shade *= 0.5 * texture_level
+                    else:
+                        shade = texture_level * sample(texture, start, side, shrink, a, b)
+                if settings[5] > 0.0:
+                    d = along - settings[3]
+                    d -= settings[5] * np.floor(d * per_joint_u + 0.5)
+                    if reach > settings[5]:  # a far pixel covers several of them
+                        shade -= settings[8] * settings[7] * per_joint_u
+                    elif abs(d) < 0.5 * settings[7] + reach:
+                        shade -= settings[8] * strip_share(
+                            d, 0.5 * settings[7], ux * cj + uy * sj, vx * cj + vy * sj, mx * cj + my * sj
+                        )
+                if settings[6] > 0.0:
+                    d = across - settings[4]
+                    d -= settings[6] * np.floor(d * per_joint_v + 0.5)
+                    if reach > settings[6]:
+                        shade -= settings[8] * settings[7] * per_joint_v
+                    elif abs(d) < 0.5 * settings[7] + reach:
+                        shade -= settings[8] * strip_share(
+                            d, 0.5 * settings[7], uy * cj - ux * sj, vy * cj - vx * sj, my * cj - mx * sj
+                        )
+                blue = floor[0] + verge * (floor[3] - floor[0]) + shade * floor[6]
+                green = floor[1] + verge * (floor[4] - floor[1]) + shade * floor[7]
+                red = floor[2] + verge * (floor[5] - floor[2]) + shade * floor[8]
+                fresh = 1.0
+                if wear > 0.0 and (candidate >= 0 or (near and n_boxes > 0)):
+                    a, b = along / TEXTURE_CELL_CM, across / TEXTURE_CELL_CM
+                    worn = sample(wear_texture, starts[fits], base_side >> fits, 1.0 / (1 << fits), a, b)
+                    fresh = 1.0 - min(max(1.5 * (worn - 3.0 + 3.2 * wear), 0.0), 1.0)
+                if near:
+                    for k in range(n_boxes):
+                        q = near_boxes[k]
+                        alpha = fresh * rectangle_share(x, y, ux, uy, vx, vy, mx, my, reach, boxes, q)
+                        blue += alpha * (boxes[q, 6] - blue)
+                        green += alpha * (boxes[q, 7] - green)
+                        red += alpha * (boxes[q, 8] - red)
+                if candidate >= 0:
+                    acu, acv, acm = uy * c - ux * sn, vy * c - vx * sn, my * c - mx * sn
+                    scale = 1.0 / max(1.0 - k_road * offset, 0.2)
+                    alu, alv = (ux * c + uy * sn) * scale, (vx * c + vy * sn) * scale
+                    alm = (mx * c + my * sn) * scale
+                    for m in range(candidate, markings.shape[0]):
+                        if abs(offset - markings[m, 0]) >= 0.5 * markings[m, 1] + reach:
+                            continue
+                        alpha = strip_share(offset - markings[m, 0], 0.5 * markings[m, 1], acu, acv, acm)
+                        if alpha > 0.0:
+                            first, last = int(markings[m, 5]), int(markings[m, 6])
+                            alpha *= fresh * painted_share(s_road, alu, alv, alm, stretches, first, last)
+                            blue += alpha * (markings[m, 2] - blue)
+                            green += alpha * (markings[m, 3] - green)
+                            red += alpha * (markings[m, 4] - red)
+                if near:
+                    for k in range(n_clutter):
+                        q = near_clutter[k]
+                        alpha = rectangle_share(x, y, ux, uy, vx, vy, mx, my, reach, clutter, q)
+                        blue += alpha * (clutter[q, 6] - blue)
+                        green += alpha * (clutter[q, 7] - green)
+                        red += alpha * (clutter[q, 8] - red)
+                colours[j, 0], colours[j, 1], colours[j, 2] = blue, green, red

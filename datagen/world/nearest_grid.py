@@ -1,4 +1,8 @@
-"""Where to start looking for a point's place along the road: a grid of nearest samples."""
+"""Where to start looking for a point's place along the road: a grid of nearest samples.
+
+The grid is kept in square blocks, and only those that the road touches: a road of 200 m needs as much as its
+length, not the area that it spans. The renderer gets the blocks around the car, as one array.
+"""
 
 from __future__ import annotations
 
@@ -12,28 +16,95 @@ from datagen.world.track import Track
 
 _GRID_CELL_CM = 2.0
 _GRID_MARGIN_CM = 10.0  # around the markings, for pixels that reach over from outside
+_BLOCK_CELLS = 128
+
+
+class NearestGrid:
+    """The nearest sample of the centre line for places near a road."""
+
+    def __init__(self, track: Track) -> None:
+        """Find the nearest samples of a whole road."""
+        #: How far from the centre line it answers.
+        self.reach_cm = _GRID_MARGIN_CM + max(
+            (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
+        )
+        self._low = track.xy_cm.min(axis=0) - self.reach_cm - _GRID_CELL_CM
+        self._blocks: dict[tuple[int, int], Int[np.ndarray, "b b"]] = {}
+        self._window: tuple[tuple[int, ...], Int[np.ndarray, "r c"]] | None = None
+        self._fill(track)
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks the road touches."""
+        return len(self._blocks)
+
+    def around(
+        self, low_cm: Float[np.ndarray, "2"], high_cm: Float[np.ndarray, "2"]
+    ) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
+        """Return the grid over a box of the map, and more.
+
+        Args:
+            low_cm: Smallest x and y, frame map.
+            high_cm: Largest x and y.
+
+        Returns:
+            Nearest sample by cell, -1 away from the road; x and y of its origin and the size of a cell.
+        """
+        size_cm = _BLOCK_CELLS * _GRID_CELL_CM
+        first = np.floor((low_cm - self._low) / size_cm).astype(int)
+        last = np.floor((high_cm - self._low) / size_cm).astype(int)
+        key = (int(first[0]), int(first[1]), int(last[0]), int(last[1]))
+        # The car stays among the same blocks for many frames.
+        if self._window is None or self._window[0] != key:
+            self._window = key, self._join(*key)
+        return self._window[1], np.array([*(self._low + first * size_cm), _GRID_CELL_CM])
+
+    def _join(self, column0: int, row0: int, column1: int, row1: int) -> Int[np.ndarray, "r c"]:
+        n = _BLOCK_CELLS
+        grid = np.full(((row1 - row0 + 1) * n, (column1 - column0 + 1) * n), -1, np.int32)
+        for row in range(row0, row1 + 1):
+            for column in range(column0, column1 + 1):
+                block = self._blocks.get((row, column))
+                if block is not None:
+                    i, j = (row - row0) * n, (column - column0) * n
+                    grid[i : i + n, j : j + n] = block
+        return grid
+
+    def _fill(self, track: Track) -> None:
+        size_cm = _BLOCK_CELLS * _GRID_CELL_CM
+        low = np.floor((track.xy_cm - self.reach_cm - self._low) / size_cm).astype(int)
+        high = np.floor((track.xy_cm + self.reach_cm - self._low) / size_cm).astype(int)
+        samples: dict[tuple[int, int], list[int]] = {}
+        for i in range(len(low)):
+            for row in range(low[i, 1], high[i, 1] + 1):
+                for column in range(low[i, 0], high[i, 0] + 1):
+                    samples.setdefault((row, column), []).append(i)
+        best = np.empty((_BLOCK_CELLS, _BLOCK_CELLS))
+        for (row, column), index in samples.items():
+            block = np.full((_BLOCK_CELLS, _BLOCK_CELLS), -1, np.int32)
+            best.fill(1e18)
+            x, y = self._low + np.array([column, row]) * size_cm
+            _fill_grid(track.xy_cm, np.array(index), x, y, _GRID_CELL_CM, self.reach_cm, best, block)
+            self._blocks[row, column] = block
 
 
 def nearest_sample_grid(track: Track) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
-    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid."""
-    reach_cm = _GRID_MARGIN_CM + max(
-        (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
-    )
-    low = track.xy_cm.min(axis=0) - reach_cm - _GRID_CELL_CM
-    columns, rows = np.ceil((track.xy_cm.max(axis=0) + reach_cm - low) / _GRID_CELL_CM).astype(int) + 1
-    grid = np.full((rows, columns), -1, np.int32)
-    _fill_grid(track.xy_cm, low[0], low[1], _GRID_CELL_CM, reach_cm, grid)
-    return grid, np.array([low[0], low[1], _GRID_CELL_CM])
+    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid.
+
+    Over the whole road at once: for short ones only.
+    """
+    grid = NearestGrid(track)
+    reach_cm = grid.reach_cm
+    return grid.around(track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm)
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _fill_grid(nodes_xy, origin_x, origin_y, cell, reach, grid):
-    """Write into each cell within ``reach`` of the centre line the index of the nearest sample."""
+def _fill_grid(nodes_xy, index, origin_x, origin_y, cell, reach, best, grid):
+    """Write into each cell within ``reach`` of the centre line the index of the nearest of some samples."""
     rows, columns = grid.shape
-    best = np.full(grid.shape, 1e18)
     span = int(np.ceil(reach / cell)) + 1
-    for i in range(nodes_xy.shape[0]):
+    for i in index:
         column0 = int(np.floor((nodes_xy[i, 0] - origin_x) / cell))
         row0 = int(np.floor((nodes_xy[i, 1] - origin_y) / cell))
         for row in range(max(0, row0 - span), min(rows, row0 + span + 1)):

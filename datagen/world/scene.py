@@ -1,4 +1,4 @@
-"""What stands still in the world beside the road: the floor's pattern, lamps, clutter, the room."""
+"""The surroundings of one drive: the floor's pattern, lamps, clutter, the room, things that stand in it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from datagen.world.look import LookSettings
+from datagen.world.objects import Objects, place_objects
+from datagen.world.textures import floor_pattern, level_starts, noise, pack_levels
 from datagen.world.track import Track
 
-TEXTURE_CELL_CM = 0.5
-_TEXTURE_CELLS = 512
-_TEXTURE_LEVELS = 6
 _ROOM_COLUMNS, _ROOM_ROWS = 512, 64
 _CLUTTER_BGR = np.array(
     [
@@ -32,55 +31,56 @@ class Scene:
     """The fixed surroundings of one drive, frame map.
 
     Attributes:
-        texture: The floor's pattern, [grey levels], blurred more from level to level; it repeats.
+        texture: The floor's pattern, of unit variance, see :func:`datagen.world.textures.pack_levels`.
+        wear: The pattern by which paint wears off, in the same way.
         joint_rad: Direction of the floor's joints and grains.
         joint_shift_cm: Where the joints start.
         lamps: x, y, height above the floor, angular size, [cm], [rad].
         clutter: Rectangles: x, y, cos and sin of the direction, half length, half width, blue, green, red.
         room: The walls, rows of elevation (0..90 degrees, from the floor up) by columns of azimuth.
+        objects: Things above the floor, and shadows on it.
     """
 
-    texture: Float32[np.ndarray, "levels n n"]
+    texture: Float32[np.ndarray, "packed"]
+    wear: Float32[np.ndarray, "packed"]
     joint_rad: float
     joint_shift_cm: Float[np.ndarray, "2"]
     lamps: Float[np.ndarray, "lamps 4"]
     clutter: Float[np.ndarray, "things 9"]
     room: Float32[np.ndarray, "r c 3"]
+    objects: Objects
 
 
 def build_scene(track: Track, look: LookSettings, rng: np.random.Generator) -> Scene:
     """Draw the surroundings; each part has its own child of ``rng``, so that none moves another."""
-    texture_rng, joint_rng, lamp_rng, clutter_rng, room_rng = rng.spawn(5)
+    # The order is part of the format: a new part of the scene takes a new child at the end.
+    texture_rng, joint_rng, lamp_rng, clutter_rng, room_rng, object_rng, shadow_rng = rng.spawn(7)
+    texture, wear = _textures(look, texture_rng)
     return Scene(
-        texture=_texture(look, texture_rng),
+        texture=texture,
+        wear=wear,
         joint_rad=float(joint_rng.uniform(0.0, np.pi)),
         joint_shift_cm=joint_rng.uniform(0.0, 100.0, 2),
         lamps=_lamps(track, look.lamps_per_m, lamp_rng),
         clutter=_clutter(track, look.clutter_per_m, clutter_rng),
         room=_room(look.wall_level, room_rng),
+        objects=place_objects(track, look, object_rng, shadow_rng),
     )
 
 
-def _texture(look: LookSettings, rng: np.random.Generator) -> Float32[np.ndarray, "levels n n"]:
-    """Noise with equal power per octave from the grain size to 50 cm, filtered by Fourier transform."""
-    n = _TEXTURE_CELLS
+def _textures(
+    look: LookSettings, rng: np.random.Generator
+) -> tuple[Float32[np.ndarray, "packed"], Float32[np.ndarray, "packed"]]:
+    """Pattern of the floor and of the wear; zeros where neither is seen."""
     if look.texture_level == 0.0 and look.line_wear == 0.0:
-        return np.zeros((_TEXTURE_LEVELS, n, n), np.float32)
-    f = np.fft.fftfreq(n, TEXTURE_CELL_CM)
-    fu, fv = np.meshgrid(f * look.texture_stretch, np.fft.fftfreq(n, TEXTURE_CELL_CM))
-    frequency = np.hypot(fu, fv)
-    with np.errstate(divide="ignore"):
-        amplitude = np.where(frequency > 1.0 / 50.0, 1.0 / np.maximum(frequency, 1e-9), 0.0)
-    amplitude *= np.exp(-0.5 * (frequency * look.texture_scale_cm * 2.0) ** 2)
-    spectrum = np.fft.fft2(rng.standard_normal((n, n))) * amplitude
-    unit = np.fft.ifft2(spectrum).real.std()
-    plain_u, plain_v = np.meshgrid(f, f)
-    levels = []
-    for level in range(_TEXTURE_LEVELS):
-        sigma_cm = 0.4 * TEXTURE_CELL_CM * 2.0**level
-        blur = np.exp(-2.0 * (np.pi * sigma_cm) ** 2 * (plain_u**2 + plain_v**2))
-        levels.append(np.fft.ifft2(spectrum * blur).real / unit)
-    return np.asarray(levels, dtype=np.float32)
+        nothing = np.zeros(level_starts()[-1], np.float32)
+        return nothing, nothing
+    kind_rng = rng.spawn(1)[0]
+    wear = pack_levels(noise(look.texture_scale_cm, look.texture_stretch, rng))
+    if look.floor == "plain" or look.texture_level == 0.0:
+        return wear, wear
+    pattern = floor_pattern(look.floor, look.texture_scale_cm, look.texture_stretch, kind_rng)
+    return pack_levels(pattern), wear
 
 
 def _lamps(track: Track, per_m: float, rng: np.random.Generator) -> Float[np.ndarray, "lamps 4"]:

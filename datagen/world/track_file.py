@@ -11,7 +11,8 @@ from datagen.world.track import Marking, Track
 from lanenet.data.files import write_json
 from lanenet.errors import DriveFormatError
 
-FORMAT = "lanenet-track/1"
+FORMAT = "lanenet-track/2"
+_OLDER = "lanenet-track/1"  # without boxes and oncoming lane
 
 
 def write_track(path: Path, track: Track) -> None:
@@ -20,6 +21,7 @@ def write_track(path: Path, track: Track) -> None:
         "format": FORMAT,
         "closed": track.closed,
         "lane_width_cm": track.lane_width_cm,
+        "oncoming_cm": track.oncoming_cm,
         "s_cm": track.s_cm,
         "xy_cm": track.xy_cm,
         "heading_rad": track.heading_rad,
@@ -33,12 +35,13 @@ def write_track(path: Path, track: Track) -> None:
             }
             for marking in track.markings
         ],
+        "boxes": track.boxes,
     }
     write_json(path, data)
 
 
 def read_track(path: Path) -> Track:
-    """Read a track.
+    """Read a track, of this version of the format or the one before.
 
     Raises:
         DriveFormatError: If the file is missing, is not a track of this version, or its columns do not fit.
@@ -50,8 +53,10 @@ def read_track(path: Path) -> Track:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DriveFormatError(f"{path}: not valid JSON ({error})") from None
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
-    if found != FORMAT:
-        raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
+    if found not in (FORMAT, _OLDER):
+        raise DriveFormatError(f"{path}: expected format {FORMAT!r} or {_OLDER!r}, found {found!r}")
+    if found == _OLDER:
+        data = {**data, "boxes": [], "oncoming_cm": None}
     try:
         s_cm, heading_rad, curvature_per_cm = (
             np.asarray(data[name], dtype=np.float64) for name in ("s_cm", "heading_rad", "curvature_per_cm")
@@ -66,6 +71,8 @@ def read_track(path: Path) -> Track:
             )
             for m in data["markings"]
         )
+        boxes = np.asarray(data["boxes"], dtype=np.float64).reshape(-1, 9)
+        oncoming_cm = None if data["oncoming_cm"] is None else float(data["oncoming_cm"])
         closed, lane_width_cm = bool(data["closed"]), float(data["lane_width_cm"])
     except KeyError as error:
         raise DriveFormatError(f"{path}: key {error} is missing") from None
@@ -78,6 +85,8 @@ def read_track(path: Path) -> Track:
             f"{path}: expected s_cm, xy_cm, heading_rad and curvature_per_cm of one length of at least 2, "
             f"found {', '.join(map(str, lengths))}"
         )
-    if not all(np.isfinite(column).all() for column in columns):
-        raise DriveFormatError(f"{path}: a number of the centre line is missing or not finite")
-    return Track(s_cm, xy_cm, heading_rad, curvature_per_cm, closed, lane_width_cm, markings)
+    if not all(np.isfinite(column).all() for column in (*columns, boxes)):
+        raise DriveFormatError(f"{path}: a number of the centre line or of a box is missing or not finite")
+    return Track(
+        s_cm, xy_cm, heading_rad, curvature_per_cm, closed, lane_width_cm, markings, boxes, oncoming_cm
+    )

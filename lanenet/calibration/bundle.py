@@ -56,11 +56,34 @@ class LensFit:
         """Root mean square distance over all corners, as OpenCV states it."""
         return float(np.sqrt(np.mean(np.sum(np.concatenate(self.residuals_px) ** 2, axis=1))))
 
-    @property
-    def bic(self) -> float:
-        """Bayesian information criterion of the lens; the lower of two models is the better supported."""
+    def bic(self, correlation: float) -> float:
+        """Bayesian information criterion of the lens; the lower of two models is the better supported.
+
+        Args:
+            correlation: Of the residuals of neighbouring corners. A board that is not quite flat moves a
+                whole patch of corners, which then counts for few.
+        """
         n = 2 * sum(len(r) for r in self.residuals_px)
-        return float(n * np.log(max(self.robust_cost, 1e-12) / n) + np.count_nonzero(self.free) * np.log(n))
+        independent = n * ((1.0 - correlation) / (1.0 + correlation)) ** 2
+        misfit = np.log(max(self.robust_cost, 1e-12) / n)
+        return float(independent * misfit + np.count_nonzero(self.free) * np.log(max(independent, 2.0)))
+
+
+#: Residuals of one view's neighbouring corners are never taken for more alike than this.
+_MAX_CORRELATION = 0.8
+
+
+def neighbour_correlation(views: Sequence[BoardView], errors_px: Sequence[Float[np.ndarray, "_ 2"]]) -> float:
+    """Correlation of the residuals of neighbouring corners, between 0 and the largest that is believed."""
+    product = square = 0.0
+    for view, errors in zip(views, errors_px, strict=True):
+        distance = np.linalg.norm(view.points_cm[:, None] - view.points_cm[None], axis=2)
+        np.fill_diagonal(distance, np.inf)
+        first, second = np.nonzero(np.triu(distance < 1.2 * distance.min()))
+        centred = errors - errors.mean(axis=0)
+        product += float(np.mean(np.sum(centred[first] * centred[second], axis=1)))
+        square += float(np.mean(np.sum(centred**2, axis=1)))
+    return min(max(product / max(square, 1e-12), 0.0), _MAX_CORRELATION)
 
 
 def free_numbers(model: CameraModel, distortion: Sequence[int]) -> Bool[np.ndarray, "p"]:

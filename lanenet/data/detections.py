@@ -20,8 +20,12 @@ FORMAT = "lanenet-detections/1"
 
 SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
+#: Written if a detector measures the lane at all; tables of other detectors, and older ones, do without.
+LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm")
 #: Columns that may be empty.
 _OPEN_COLUMNS = ("t_s", *POINT_NAMES, *SIGMA_NAMES, *PARABOLA_NAMES, "steering_rad")
+#: A straight lane has an infinite radius.
+_INFINITE_COLUMNS = ("radius_cm",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,9 @@ class Detections:
         parabolas: (a, b, c) of the left and the right line, x and y in cm.
         steering_rad: Steering target, positive left.
         confidence: 0 to 1.
+        radius_cm: Radius of curvature of the lane's middle, infinite where straight; all NaN if the table
+            has no such column.
+        offset_cm: The car's place right of the lane's middle; as above.
     """
 
     frame: Int[np.ndarray, "n"]
@@ -45,6 +52,8 @@ class Detections:
     parabolas: Float[np.ndarray, "n 2 3"]
     steering_rad: Float[np.ndarray, "n"]
     confidence: Float[np.ndarray, "n"]
+    radius_cm: Float[np.ndarray, "n"]
+    offset_cm: Float[np.ndarray, "n"]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -70,7 +79,7 @@ class DetectionTable:
                     estimate.points_cm,
                     estimate.sigma_cm,
                     estimate.parabolas.ravel(),
-                    [estimate.steering_rad, estimate.confidence],
+                    [estimate.steering_rad, estimate.confidence, estimate.radius_cm, estimate.offset_cm],
                 ]
             )
         )
@@ -83,25 +92,32 @@ class DetectionTable:
             MissingExtraError: If pyarrow is not installed and the table is Parquet.
         """
         ending = _ending(path)
-        names = (*_OPEN_COLUMNS, "confidence")
+        names = (*_OPEN_COLUMNS, "confidence", *LANE_NAMES)
         rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(names))
-        bad = np.argwhere(np.isinf(rows))
-        if len(bad):
-            row, column = bad[0]
-            raise LabelFormatError(
-                f"{path}: frame {self._frames[row]}, column {names[column]!r}: found {rows[row, column]}"
-            )
-        if np.isnan(rows[:, -1]).any():
-            row = int(np.flatnonzero(np.isnan(rows[:, -1]))[0])
-            raise LabelFormatError(f"{path}: frame {self._frames[row]}, column 'confidence': found NaN")
+        columns = {name: rows[:, k] for k, name in enumerate(names)}
+        for name, values in columns.items():
+            bad = np.isinf(values) & (name not in _INFINITE_COLUMNS)
+            bad |= np.isnan(values) & (name == "confidence")
+            # "-inf" is no radius either.
+            bad |= np.isneginf(values)
+            if bad.any():
+                row = int(np.flatnonzero(bad)[0])
+                value = "NaN" if np.isnan(values[row]) else str(values[row])
+                raise LabelFormatError(f"{path}: frame {self._frames[row]}, column {name!r}: found {value}")
+        if all(np.isnan(columns[name]).all() for name in LANE_NAMES):
+            columns = {name: values for name, values in columns.items() if name not in LANE_NAMES}
         frame = np.array(self._frames, dtype=np.int64)
         if ending == ".csv":
-            columns = {"frame": frame, **{name: rows[:, k] for k, name in enumerate(names)}}
-            write_csv(path, columns, allow_empty=_OPEN_COLUMNS)
+            write_csv(
+                path,
+                {"frame": frame, **columns},
+                allow_empty=(*_OPEN_COLUMNS, *LANE_NAMES),
+                allow_infinite=_INFINITE_COLUMNS,
+            )
             return
         arrow = require("pyarrow", "data")
         arrays: dict[str, Any] = {"frame": arrow.array(frame)}
-        arrays |= {name: float_array(rows[:, k]) for k, name in enumerate(names)}
+        arrays |= {name: float_array(values) for name, values in columns.items()}
         units = {
             "_cm": "centimetre",
             "_rad": "radian",
@@ -127,15 +143,24 @@ def read_detections(path: Path) -> Detections:
         specs |= {
             name: ColumnSpec(required=name not in SIGMA_NAMES, allow_empty=True) for name in _OPEN_COLUMNS
         }
+        specs |= {
+            name: ColumnSpec(required=False, allow_empty=True, allow_infinite=name in _INFINITE_COLUMNS)
+            for name in LANE_NAMES
+        }
         columns = read_csv(path, specs, LabelFormatError)
-        unknown = np.full(len(columns["frame"]), np.nan)
-        columns |= {name: unknown for name in SIGMA_NAMES if name not in columns}
     else:
         table = ParquetTable(path)
         if table.meta.get("format") != FORMAT:
             raise LabelFormatError(f"{path}: expected format {FORMAT!r}, found {table.meta.get('format')!r}")
         columns = {"frame": table.ints("frame"), "confidence": table.floats("confidence")}
         columns |= {name: table.floats(name, allow_null=True) for name in _OPEN_COLUMNS}
+        columns |= {
+            name: table.floats(name, allow_null=True, allow_infinite=name in _INFINITE_COLUMNS)
+            for name in LANE_NAMES
+            if name in table.column_names
+        }
+    unknown = np.full(len(columns["frame"]), np.nan)
+    columns |= {name: unknown for name in (*SIGMA_NAMES, *LANE_NAMES) if name not in columns}
 
     def together(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([columns[name] for name in names], axis=1)
@@ -148,6 +173,8 @@ def read_detections(path: Path) -> Detections:
         parabolas=together(PARABOLA_NAMES).reshape(-1, len(SIDES), 3),
         steering_rad=columns["steering_rad"],
         confidence=columns["confidence"],
+        radius_cm=columns["radius_cm"],
+        offset_cm=columns["offset_cm"],
     )
 
 

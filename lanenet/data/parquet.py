@@ -56,15 +56,22 @@ class ParquetTable:
     def __len__(self) -> int:
         return int(self._table.num_rows)
 
-    def floats(self, name: str, allow_null: bool = False) -> Float[np.ndarray, "n"]:
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """The columns that the file has."""
+        return tuple(self._table.column_names)
+
+    def floats(
+        self, name: str, allow_null: bool = False, allow_infinite: bool = False
+    ) -> Float[np.ndarray, "n"]:
         """Return a column of numbers, float64; null is NaN.
 
         Raises:
-            LabelFormatError: If the column is missing, holds something else, an infinite value, or a null
+            LabelFormatError: If the column is missing, holds something else, or an infinite value or a null
                 where none is allowed; names the file and the column.
         """
         values = self._numpy(name, np.float64)
-        bad = np.isinf(values) if allow_null else ~np.isfinite(values)
+        bad = (np.isnan(values) & (not allow_null)) | (np.isinf(values) & (not allow_infinite))
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             raise LabelFormatError(f"{self.path}: column {name!r}, row {row}: found {values[row]}")

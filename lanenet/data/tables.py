@@ -31,6 +31,7 @@ class ColumnSpec:
         low: Smallest value of a number.
         high: Largest value of a number.
         increasing: Whether each number has to be larger than the one before.
+        allow_infinite: Whether a number may be infinite, written ``inf``.
     """
 
     kind: Literal["float", "int", "text"] = "float"
@@ -39,6 +40,7 @@ class ColumnSpec:
     low: float = -math.inf
     high: float = math.inf
     increasing: bool = False
+    allow_infinite: bool = False
 
 
 def read_csv(
@@ -100,6 +102,7 @@ def write_csv(
     path: Path,
     columns: dict[str, np.ndarray] | dict[str, Sequence[Any]] | dict[str, Any],
     allow_empty: Collection[str] = (),
+    allow_infinite: Collection[str] = (),
 ) -> None:
     """Write columns of equal length as CSV, atomically.
 
@@ -107,15 +110,19 @@ def write_csv(
         path: Destination.
         columns: Numbers (nine significant digits), whole numbers, truth values (1 and 0) or texts.
         allow_empty: Columns in which NaN is written as an empty cell.
+        allow_infinite: Columns in which an infinite value is written as ``inf``.
 
     Raises:
-        ValueError: If the lengths differ, a value is infinite, or NaN stands where no cell may be empty.
+        ValueError: If the lengths differ, a value is infinite or NaN where it may not be.
     """
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     lengths = {name: len(values) for name, values in arrays.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"{path}: columns of different lengths: {lengths}")
-    cells = [_cells(path, name, values, name in allow_empty) for name, values in arrays.items()]
+    cells = [
+        _cells(path, name, values, name in allow_empty, name in allow_infinite)
+        for name, values in arrays.items()
+    ]
     rows = [",".join(row) for row in zip(*cells, strict=True)]
     write_text(path, "\n".join([",".join(_quoted(name) for name in arrays), *rows]) + "\n")
 
@@ -159,21 +166,22 @@ def _parsed(cell: str, spec: ColumnSpec) -> float | int | str:
         value = int(cell) if spec.kind == "int" else float(cell)
     except ValueError:
         raise ValueError(f"expected {expected}, found {cell[:40]!r}") from None
-    if not math.isfinite(value) or abs(value) > (_INT64_MAX if spec.kind == "int" else math.inf):
+    infinite = spec.allow_infinite and isinstance(value, float) and math.isinf(value)
+    if not (math.isfinite(value) or infinite) or (spec.kind == "int" and abs(value) > _INT64_MAX):
         raise ValueError(f"expected {expected}, found {cell[:40]!r}")
     if not spec.low <= value <= spec.high:
         raise ValueError(f"expected {spec.low:g} to {spec.high:g}, found {cell[:40]}")
     return value
 
 
-def _cells(path: Path, name: str, values: np.ndarray, allow_empty: bool) -> list[str]:
+def _cells(path: Path, name: str, values: np.ndarray, allow_empty: bool, allow_infinite: bool) -> list[str]:
     if values.dtype.kind == "b":
         return ["1" if value else "0" for value in values.tolist()]
     if values.dtype.kind in "iu":
         return [str(value) for value in values.tolist()]
     if values.dtype.kind != "f":
         return [_quoted(str(value)) for value in values.tolist()]
-    bad = ~np.isfinite(values) & ~(np.isnan(values) & allow_empty)
+    bad = (np.isnan(values) & (not allow_empty)) | (np.isinf(values) & (not allow_infinite))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise ValueError(f"{path}: column {name!r}, row {row}: found {values[row]}")

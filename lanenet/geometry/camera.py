@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from jaxtyping import Float
 CameraModel = Literal["fisheye", "pinhole"]
 
 _NEWTON_STEPS = 30
+#: Newton's method squares its error: after a step as short as this there is nothing left to gain.
+_LAST_STEP_RAD = 1e-12
 _MAX_RESIDUAL_PX = 1e-6
 
 
@@ -44,7 +47,7 @@ class Mounting:
         """Optical centre, [cm], frame car with z up."""
         return np.array([self.right_of_centre_cm, self.ahead_of_front_axle_cm, self.height_cm])
 
-    @property
+    @cached_property
     def camera_from_car(self) -> Float[np.ndarray, "3 3"]:
         """Rotation that turns vectors of the car frame (z up) into the camera frame."""
         cy, sy = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
@@ -80,7 +83,7 @@ class Camera:
     mounting: Mounting
     wheelbase_cm: float
 
-    @property
+    @cached_property
     def max_angle_rad(self) -> float:
         """Largest angle from the optical axis that the model maps one-to-one, [rad].
 
@@ -228,6 +231,7 @@ def _invert_fisheye(
     low = np.zeros_like(radius)
     high = np.full_like(radius, max_angle_rad)
     theta = np.clip(radius, 0.0, max_angle_rad)
+    seen = radius <= _fisheye_radius(np.array([max_angle_rad]), D)
     for _ in range(_NEWTON_STEPS):
         error = _fisheye_radius(theta, D) - radius
         low = np.where(error < 0.0, theta, low)
@@ -236,8 +240,10 @@ def _invert_fisheye(
         with np.errstate(divide="ignore", invalid="ignore"):
             step = theta - error / slope
         inside = (step >= low) & (step <= high)
-        theta = np.where(inside, step, 0.5 * (low + high))
-    return np.where(radius <= _fisheye_radius(np.array([max_angle_rad]), D), theta, np.nan)
+        before, theta = theta, np.where(inside, step, 0.5 * (low + high))
+        if np.max(np.abs(theta - before), where=seen, initial=0.0) <= _LAST_STEP_RAD:
+            break
+    return np.where(seen, theta, np.nan)
 
 
 def _pinhole_coefficients(D: Float[np.ndarray, "_"]) -> tuple[float, float, float, float, float]:

@@ -162,7 +162,7 @@ def _time_frame(
     mark("lift")
     raster = window.rasterise(road.points_cm)
     mark("raster")
-    lane_filter.estimate(road.points_cm)
+    lane_filter.estimate(road.points_cm, road.normals)
     mark("lane filter")
     if network is not None:
         network.detect_raster(raster)

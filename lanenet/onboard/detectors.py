@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from pydantic import Field
 
-from lanenet.config import check_settings, load_settings
+from lanenet.config import Settings, check_settings, load_settings
 from lanenet.data.label_set import LabelSet
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera
@@ -24,15 +25,30 @@ DetectorName = Literal["network", "lane-filter", "hough", "painter"]
 WITHOUT_CAMERA = ("hough", "painter")
 
 
+class LaneFilterFile(Settings):
+    """Settings file of ``lane-filter``: what differs from the defaults.
+
+    Attributes:
+        filter: Of :class:`LaneFilterSettings`; the lane width may be left out where the drive or the command
+            line tells it.
+        perception: How edge points are found in the frames.
+    """
+
+    filter: dict[str, Any] = Field(default_factory=dict)
+    perception: PerceptionSettings = PerceptionSettings()
+
+
 def build_detector(
     name: DetectorName,
     camera: Camera | None,
     *,
     model: Path | None = None,
     lane_width_cm: float | None = None,
+    drive_lane_width_cm: float | None = None,
     marking_cm: float | None = None,
     any_camera: bool = False,
     config: Path | None = None,
+    mask: UInt8[np.ndarray, "h w"] | None = None,
 ) -> Detector:
     """Build a detector for a camera.
 
@@ -40,18 +56,24 @@ def build_detector(
         name: Which one.
         camera: Camera of the frames; ``hough`` and ``painter`` do without, but then know no centimetres.
         model: ONNX file, needed by ``network``.
-        lane_width_cm: Between the middles of the two lines, needed by ``lane-filter``.
-        marking_cm: Thickness of the tape for ``lane-filter``; None takes its default.
+        lane_width_cm: Between the middles of the two lines, for ``lane-filter``; goes before the file's.
+        drive_lane_width_cm: What the source says about that; counts where neither it nor the file does.
+        marking_cm: Thickness of the tape for ``lane-filter``; goes before the file's.
         any_camera: Accept a model that was trained with another camera.
-        config: YAML with the settings of ``hough`` or ``painter``; None takes the defaults.
+        config: YAML with settings: :class:`LaneFilterFile`, :class:`HoughSettings` or
+            :class:`PainterSettings`; None takes the defaults.
+        mask: Nonzero on the car itself; ``lane-filter`` and ``network`` leave out what they see there.
 
     Raises:
-        ConfigError: If something that the detector needs is missing or out of range.
+        ConfigError: If something that the detector needs is missing or out of range, or it cannot use what
+            is given.
         ModelMismatchError: If the model cannot be used with this camera.
-        CalibrationError: If the camera sees no road.
+        CalibrationError: If the camera sees no road, or the mask is of another size.
     """
-    if config is not None and name not in WITHOUT_CAMERA:
-        raise ConfigError(f"detector {name}: takes no settings file, found {config}")
+    if config is not None and name == "network":
+        raise ConfigError(f"detector network: takes no settings file, its model holds them; found {config}")
+    if mask is not None:
+        refuse_mask(name)
     if name == "hough":
         return HoughTracker(
             camera, HoughSettings() if config is None else load_settings(HoughSettings, config)
@@ -64,13 +86,51 @@ def build_detector(
     if name == "network":
         if model is None:
             raise ConfigError("detector network: expected a model (--model MODEL.onnx)")
-        return NetworkDetector(model, camera, any_camera=any_camera)
-    if lane_width_cm is None:
-        raise ConfigError(
-            "detector lane-filter: the source comes without a lane width, expected one (--lane-width CM)"
-        )
-    extractor = RoadEdgeExtractor(camera, PerceptionSettings())
-    return LaneFilter(extractor, filter_settings(lane_width_cm, marking_cm))
+        return NetworkDetector(model, camera, any_camera=any_camera, mask=mask)
+    settings, perception = lane_filter_settings(config, lane_width_cm, drive_lane_width_cm, marking_cm)
+    return LaneFilter(RoadEdgeExtractor(camera, perception, mask), settings)
+
+
+def refuse_mask(name: DetectorName) -> None:
+    """Refuse a mask for a detector that cannot use one.
+
+    Raises:
+        ConfigError: If it looks at whole frames.
+    """
+    if name in WITHOUT_CAMERA:
+        raise ConfigError(f"detector {name}: takes no mask (--mask); lane-filter and network do")
+
+
+def lane_filter_settings(
+    config: Path | None,
+    lane_width_cm: float | None = None,
+    drive_lane_width_cm: float | None = None,
+    marking_cm: float | None = None,
+) -> tuple[LaneFilterSettings, PerceptionSettings]:
+    """Read the lane filter's settings file and put what is given in so many words above it.
+
+    Args:
+        config: YAML of :class:`LaneFilterFile`; None takes the defaults.
+        lane_width_cm: As for :func:`build_detector`.
+        drive_lane_width_cm: As for :func:`build_detector`.
+        marking_cm: As for :func:`build_detector`.
+
+    Raises:
+        ConfigError: If nothing tells the lane width, or a value is unknown or out of range.
+    """
+    file = LaneFilterFile() if config is None else load_settings(LaneFilterFile, config)
+    drive = {"lane_width_cm": drive_lane_width_cm}
+    given = {"lane_width_cm": lane_width_cm, "marking_cm": marking_cm}
+    data = {
+        **{key: value for key, value in drive.items() if value is not None},
+        **file.filter,
+        **{key: value for key, value in given.items() if value is not None},
+    }
+    if "lane_width_cm" not in data:
+        where = "neither the source nor a settings file tells" if config is None else f"{config} lacks"
+        raise ConfigError(f"detector lane-filter: {where} the lane width, expected one (--lane-width CM)")
+    where = "lane filter" if config is None else f"{config}: filter"
+    return check_settings(LaneFilterSettings, data, where), file.perception
 
 
 def filter_settings(lane_width_cm: float, marking_cm: float | None = None) -> LaneFilterSettings:
@@ -79,8 +139,7 @@ def filter_settings(lane_width_cm: float, marking_cm: float | None = None) -> La
     Raises:
         ConfigError: If a value is out of range.
     """
-    data = {"lane_width_cm": lane_width_cm} | ({} if marking_cm is None else {"marking_cm": marking_cm})
-    return check_settings(LaneFilterSettings, data, "lane filter")
+    return lane_filter_settings(None, lane_width_cm, marking_cm=marking_cm)[0]
 
 
 def lane_filter_points_cm(
@@ -91,7 +150,7 @@ def lane_filter_points_cm(
     The filter starts again wherever a frame does not follow the one before it.
 
     Args:
-        label_set: Frames with their edge points.
+        label_set: Frames with their edge points and the directions of these.
         settings: Of the filter; None takes its defaults with the label set's lane width.
 
     Returns:
@@ -109,5 +168,6 @@ def lane_filter_points_cm(
         )
         if not follows:
             lane_filter.reset()
-        points[i] = lane_filter.estimate(np.asarray(edges[:, :2], np.float64)).points_cm
+        edges = np.asarray(edges, np.float64)
+        points[i] = lane_filter.estimate(edges[:, :2], edges[:, 2:]).points_cm
     return points

@@ -59,15 +59,28 @@ def _mark_points(picture: np.ndarray, analysis: ErrorAnalysis, rows: int, column
         cv2.putText(picture, name, (u + 8, v - 6), _FONT, 0.6, _LINE_BGR, 2, cv2.LINE_AA)
 
 
-def _write_figures(picture: np.ndarray, analysis: ErrorAnalysis, top: int) -> None:
+def figure_lines(analysis: ErrorAnalysis) -> list[str]:
+    """Return the lines of text below the grid; they say so where L, R or both are not seen."""
     chosen = analysis.settings
-    lines = (
+    lines = [
         f"pixels per cell of {10.0 * chosen.cell_cm:.1f} mm; at L and R: "
         f"{analysis.line_pixels[0]} and {analysis.line_pixels[1]} px",
-        f"sideways {10.0 * max(analysis.line_cm_per_px):.1f} mm/px, "
-        f"with the filter's grid {10.0 * analysis.position_error_cm:.1f} mm",
-        f"steering error at {chosen.lookahead_cm:g} cm: "
-        f"{math.degrees(analysis.steering_error_rad):.1f} degrees at most",
-    )
-    for index, line in enumerate(lines):
+    ]
+    # max() over NaN depends on the order.
+    seen = [step for step in analysis.line_cm_per_px if math.isfinite(step)]
+    if seen:
+        lines += [
+            f"sideways {10.0 * max(seen):.1f} mm/px, "
+            f"with the filter's grid {10.0 * analysis.position_error_cm:.1f} mm"
+            + ("" if len(seen) == 2 else ", at the one of them that is seen"),
+            f"steering error at {chosen.lookahead_cm:g} cm: "
+            f"{math.degrees(analysis.steering_error_rad):.1f} degrees at most",
+        ]
+    else:
+        lines.append(f"neither L nor R is seen at {chosen.lookahead_cm:g} cm: no errors to tell")
+    return lines
+
+
+def _write_figures(picture: np.ndarray, analysis: ErrorAnalysis, top: int) -> None:
+    for index, line in enumerate(figure_lines(analysis)):
         cv2.putText(picture, line, (8, top + 19 + 20 * index), _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)

@@ -23,6 +23,8 @@ TRUTH_BGR = (255, 60, 255)
 _FILL_SHARE = 0.35
 FAR_CM = 40.0
 _SAMPLES = 41
+# Nothing is drawn further outside the picture than this share of its size.
+_MARGIN = 0.25
 # OpenCV draws in fixed point: this many bits below a pixel.
 _SHIFT = 4
 
@@ -95,15 +97,23 @@ def _draw_image_lane(
         return np.asarray((line_px + 0.5) * scale - 0.5)
 
     if lane.filled and lane.left_px is not None and lane.right_px is not None:
-        outline = enlarged(np.concatenate([lane.left_px, lane.right_px[::-1]]))
-        filled = picture.copy()
-        cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], FILL_BGR)
-        cv2.addWeighted(filled, _FILL_SHARE, picture, 1.0 - _FILL_SHARE, 0.0, dst=picture)
+        _fill_between(picture, enlarged(lane.left_px), enlarged(lane.right_px))
     for line_px in lane.memory_px:
         _draw_polyline(picture, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
     for side_px, colour in ((lane.left_px, LEFT_BGR), (lane.right_px, RIGHT_BGR)):
         if side_px is not None:
             _draw_polyline(picture, enlarged(side_px), colour, thickness)
+
+
+def _fill_between(picture: UInt8[np.ndarray, "h w 3"], left_px: Polyline, right_px: Polyline) -> None:
+    left_px, right_px = (line[np.isfinite(line).all(axis=1)] for line in (left_px, right_px))
+    if min(len(left_px), len(right_px)) < 2:
+        return
+    outline = _clipped_area(np.concatenate([left_px, right_px[::-1]]), *_bounds(picture))
+    if len(outline) >= 3:
+        filled = picture.copy()
+        cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], FILL_BGR)
+        cv2.addWeighted(filled, _FILL_SHARE, picture, 1.0 - _FILL_SHARE, 0.0, dst=picture)
 
 
 def _enlarged(frame_bgr: UInt8[np.ndarray, "h w *c"], scale: int) -> UInt8[np.ndarray, "sh sw 3"]:
@@ -136,9 +146,67 @@ def _draw_polyline(
 ) -> None:
     seen = np.isfinite(points_px).all(axis=1)
     for k in np.flatnonzero(seen[:-1] & seen[1:]):
-        cv2.line(
-            picture, _fixed(points_px[k]), _fixed(points_px[k + 1]), colour, thickness, cv2.LINE_AA, _SHIFT
+        ends = _clipped_line(points_px[k], points_px[k + 1], *_bounds(picture))
+        if ends is not None:
+            cv2.line(picture, _fixed(ends[0]), _fixed(ends[1]), colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _bounds(
+    picture: UInt8[np.ndarray, "h w 3"],
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Lowest and highest place at which anything is drawn: the picture and a margin wider than any line."""
+    size = np.array([picture.shape[1], picture.shape[0]], np.float64)
+    return -_MARGIN * size, (1.0 + _MARGIN) * size
+
+
+def _clipped_line(
+    start_px: Float[np.ndarray, "2"],
+    end_px: Float[np.ndarray, "2"],
+    low_px: Float[np.ndarray, "2"],
+    high_px: Float[np.ndarray, "2"],
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
+    """The part of a line within a box, or None: OpenCV's fixed point overflows far outside the picture.
+
+    Source:
+        Liang and Barsky 1984, "A new concept and method for line clipping", ACM Transactions on Graphics 3.
+    """
+    first, last = 0.0, 1.0
+    step = end_px - start_px
+    for axis in (0, 1):
+        if step[axis] == 0.0:
+            if not low_px[axis] <= start_px[axis] <= high_px[axis]:
+                return None
+            continue
+        enter, leave = sorted(
+            ((low_px - start_px)[axis] / step[axis], (high_px - start_px)[axis] / step[axis])
         )
+        first, last = max(first, float(enter)), min(last, float(leave))
+    if first > last:
+        return None
+    return start_px + first * step, start_px + last * step
+
+
+def _clipped_area(
+    outline_px: Float[np.ndarray, "n 2"], low_px: Float[np.ndarray, "2"], high_px: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "m 2"]:
+    """The part of an area within a box.
+
+    Source:
+        Sutherland and Hodgman 1974, "Reentrant polygon clipping", Communications of the ACM 17.
+    """
+    points = outline_px
+    for axis, limit, sign in ((a, b[a], s) for a in (0, 1) for b, s in ((low_px, 1.0), (high_px, -1.0))):
+        kept: list[np.ndarray] = []
+        for k in range(len(points)):
+            before, point = points[k - 1], points[k]
+            was, now = (sign * (p[axis] - limit) >= 0.0 for p in (before, point))
+            if was != now:
+                share = (limit - before[axis]) / (point[axis] - before[axis])
+                kept.append(before + share * (point - before))
+            if now:
+                kept.append(point)
+        points = np.array(kept, np.float64).reshape(-1, 2)
+    return points
 
 
 def _draw_arrow(picture: UInt8[np.ndarray, "h w 3"], steering_rad: float, thickness: int) -> None:

@@ -24,12 +24,17 @@ class LaneEstimate:
         sigma_cm: Standard deviation of each point; NaN where the detector does not know it.
         steering_rad: Steering target, positive left; NaN when there is none.
         confidence: 0 (nothing seen) to 1.
+        radius_cm: Radius of curvature of the lane's middle; infinite where straight, NaN where the detector
+            does not know it.
+        offset_cm: The car's place right of the lane's middle; NaN where the detector does not know it.
     """
 
     points_cm: Float[np.ndarray, "6"] = field(default_factory=_no_points)
     sigma_cm: Float[np.ndarray, "6"] = field(default_factory=_no_points)
     steering_rad: float = float("nan")
     confidence: float = 0.0
+    radius_cm: float = float("nan")
+    offset_cm: float = float("nan")
 
     @property
     def mask(self) -> np.ndarray:

@@ -13,8 +13,8 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges import to_gray
 
-#: A line whose nearest seen point lies further ahead than this says nothing about the label rows.
-_MAX_NEAREST_CM = 60.0
+#: A line is continued towards the car by no more than this, nor by more than the length that is seen.
+_MAX_CONTINUED_CM = 30.0
 #: The stretch at the near end that gives the direction of the part that no frame sees.
 _NEAR_STRETCH_CM = 20.0
 _SAMPLES = 41
@@ -78,7 +78,8 @@ def rows_on_road(line_px: Float[np.ndarray, "n 2"], camera: Camera) -> Float[np.
     """Move a line of the image to the road and find where it crosses the label rows.
 
     Between the nearest and the farthest point that is seen, x is interpolated. Rows nearer than that lie on
-    the straight line through the nearest 20 cm; rows farther are not known.
+    the straight line through the nearest 20 cm, if they are no more than 30 cm and no more than the length
+    seen away from it; rows nearer still, and rows farther, are not known.
 
     Args:
         line_px: Polyline, [px], frame image.
@@ -99,7 +100,7 @@ def rows_of_points(points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"
     result = np.full(len(ROWS_CM), np.nan)
     order = np.argsort(points_cm[:, 1], kind="stable")
     x, y = points_cm[order, 0], points_cm[order, 1]
-    if len(y) < 2 or y[0] > _MAX_NEAREST_CM or y[-1] - y[0] < 1.0:
+    if len(y) < 2 or y[-1] - y[0] < 1.0:
         return result
     rows = np.array(ROWS_CM)
     seen = (rows >= y[0]) & (rows <= y[-1])
@@ -108,6 +109,6 @@ def rows_of_points(points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"
     centred = y[stretch] - y[stretch].mean()
     if (centred @ centred) > 1e-9:
         slope = float(centred @ x[stretch]) / float(centred @ centred)
-        nearer = rows < y[0]
+        nearer = (rows < y[0]) & (y[0] - rows <= min(_MAX_CONTINUED_CM, y[-1] - y[0]))
         result[nearer] = x[0] + slope * (rows[nearer] - y[0])
     return result

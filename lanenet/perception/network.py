@@ -182,6 +182,7 @@ class NetworkDetector:
         any_camera: bool = False,
         window: BirdseyeWindow | None = None,
         threads: int = 1,
+        mask: UInt8[np.ndarray, "h w"] | None = None,
     ) -> None:
         """Open a model for a camera.
 
@@ -192,8 +193,11 @@ class NetworkDetector:
                 calibrated cameras look alike, but not where one of them sees more.
             window: The bird's-eye window that the caller counts on; None takes the model's.
             threads: Threads of the computation.
+            mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
+                leave out.
 
         Raises:
+            CalibrationError: If the mask's size is not the camera's.
             ModelMismatchError: If the file is not a model of this format, or was made for another window or
                 camera; the message says which.
         """
@@ -209,7 +213,7 @@ class NetworkDetector:
                 f"this camera is {camera_hash}; train with this camera, or allow any camera if both are "
                 "calibrated and see about the same road"
             )
-        self._extractor = RoadEdgeExtractor(camera, self.meta.perception)
+        self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
         self._sigma_cm: Float[np.ndarray, "6"] = np.array(self.meta.rmse_cm)

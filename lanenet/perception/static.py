@@ -18,6 +18,9 @@ _LEAST_CHANGE = 4.0
 _LEAST_FRAMES = 20
 #: An edge that is there in this share of the frames is the car's.
 _STATIC_SHARE = 0.7
+#: What never moves but covers more of the rows than this is not taken for the car: it may as well be a lane
+#: that the car follows without a curve.
+MAX_CAR_SHARE = 0.2
 #: The car is looked for in this share of the rows, from the bottom.
 _CAR_SHARE = 0.4
 
@@ -68,6 +71,12 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
     height = static.shape[0]
     static[: round((1.0 - _CAR_SHARE) * height)] = 0
     return _down_to_the_border(static)
+
+
+def hidden_rows(mask: UInt8[np.ndarray, "h w"]) -> int:
+    """Return how many rows lie at or below the highest one that a mask touches."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    return mask.shape[0] - int(rows[0]) if rows.size else 0
 
 
 def _down_to_the_border(static: np.ndarray) -> np.ndarray:

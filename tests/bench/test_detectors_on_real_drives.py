@@ -12,13 +12,17 @@ import pytest
 from lanenet.data.drive import open_drive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.detectors import build_detector
+from lanenet.onboard.masks import find_mask
 from lanenet.onboard.sources import open_source
 from lanenet.perception.estimate import Detector
 from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
 from lanenet.perception.painter.painter import LanePainter, PainterSettings
 
 pytestmark = pytest.mark.slow
+PAPER = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "lane_filter_paper.yaml"
 LOG = logging.getLogger(__name__)
+
+HOUGH_VALUE = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "hough_value.yaml"
 
 #: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
 #: a guess for the first, and for the others the median of what the painter measured with that camera.
@@ -64,12 +68,20 @@ def test_steering_beside_the_drivers(shared_data: Path, tub: str) -> None:
     compared: dict[str, Detector] = {
         "hough": HoughTracker(camera),
         "hough, V channel": HoughTracker(camera, value),
+        "hough, hough_value.yaml": build_detector("hough", camera, config=HOUGH_VALUE),
         "painter": LanePainter(camera),
-        "lane filter": build_detector("lane-filter", camera, lane_width_cm=TUBS[tub][3]),
-        "lane filter, 5 cm tape": build_detector(
-            "lane-filter", camera, lane_width_cm=TUBS[tub][3], marking_cm=5.08
-        ),
     }
+    mask, told = find_mask(open_source(shared_data / tub))
+    LOG.warning("%s: %s", tub, told)
+    for name, config in {"lane filter": None, "lane filter, plain Canny of the paper": PAPER}.items():
+        for tape, marking_cm in {"": None, ", 5 cm tape": 5.08}.items():
+            compared[name + tape] = build_detector(
+                "lane-filter", camera, lane_width_cm=TUBS[tub][3], marking_cm=marking_cm, config=config
+            )
+    if mask is not None:
+        compared["lane filter, bumper masked"] = build_detector(
+            "lane-filter", camera, lane_width_cm=TUBS[tub][3], mask=mask
+        )
     for name, detector in compared.items():
         steering, confidence = np.full(len(drive), np.nan), np.zeros(len(drive))
         for i in range(len(drive)):

@@ -23,14 +23,35 @@ def read_simulation(path: Path) -> Any:
     return load_settings(SimulationSettings, path)
 
 
+def read_track(path: Path) -> Any:
+    from datagen.world.track import load_track
+
+    return load_track(path)
+
+
 def read_camera_file(path: Path) -> Any:
     from lanenet.data.camera_file import read_camera
 
     return read_camera(path)
 
 
+def read_detector_settings(path: Path) -> Any:
+    from lanenet.onboard.detectors import build_detector, lane_filter_settings
+
+    # The detector's name comes first in the file's.
+    if path.stem.startswith("lane_filter"):
+        return lane_filter_settings(path, drive_lane_width_cm=40.0)
+    return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
+
+
 #: What reads the YAML files of each folder below configs/.
-READERS = {".": read_training_run, "drives": read_simulation, "cameras": read_camera_file}
+READERS = {
+    ".": read_training_run,
+    "drives": read_simulation,
+    "tracks": read_track,
+    "cameras": read_camera_file,
+    "detectors": read_detector_settings,
+}
 
 
 def test_the_config_of_the_readme_ships() -> None:
@@ -48,6 +69,17 @@ def test_every_shipped_config_loads(path: Path) -> None:
 def test_a_training_run_is_named_after_its_file(path: Path) -> None:
     # checkpoints/<name>/ then tells which config made it, and two configs never share a folder.
     assert read_training_run(path).name == path.stem
+
+
+def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
+    from lanenet.perception.birdseye import PerceptionSettings
+    from lanenet.perception.lane_filter import PAPER, LaneFilterSettings
+
+    default = read_detector_settings(CONFIGS / "detectors" / "lane_filter.yaml")
+    assert default == (LaneFilterSettings(lane_width_cm=40.0), PerceptionSettings())
+    filter_, perception = read_detector_settings(CONFIGS / "detectors" / "lane_filter_paper.yaml")
+    assert filter_ == LaneFilterSettings(lane_width_cm=40.0, **PAPER)
+    assert perception.edges.method == "canny"
 
 
 def test_a_misspelt_key_is_named() -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Num, UInt8
+from jaxtyping import Bool, Int16, Num, UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
@@ -14,6 +15,10 @@ from lanenet.errors import ConfigError
 
 #: Neighbouring pixels that differ by this much belong to a contour or to noise.
 _ROUGH_STEP = 16
+#: Stands for the hue of what has no colour.
+_GRAY_HUE = np.uint8(179)
+#: How crowded a frame is, is counted in blocks of this size.
+_BLOCK_PX = 10
 #: Place of each channel in OpenCV's HSV image.
 _CHANNELS = {"hue": 0, "saturation": 1, "value": 2}
 
@@ -29,10 +34,13 @@ class HoughEdgeSettings(Settings):
         roi_height_px: Rows of the region of interest.
         channel: Channel of HSV that serves as gray image; the paper's is the hue, 0 to 179 in OpenCV. Hue is
             noise where a colour is nearly gray, so white lines on gray floors need ``value``.
+        min_saturation: A hue of less saturation than this is noise and is taken for 179, the end of the scale
+            that is far from yellow markings and from brown floors. Not in the paper; 0 is the paper's.
+        min_value: The same for the hue of a dark pixel.
         blur_px: Size of the Gauss kernel.
         threshold: T of eq. 1, on the absolute response of the 3 x 3 Sobel operator.
         max_rough_share: Where more than this share of the channel's neighbours differ by 16 or more, the
-            channel is noise and nothing is answered. Not in the paper.
+            channel is noise and nothing is answered. Not in the paper; 1 is the paper's.
     """
 
     width_px: int = Field(default=160, ge=16)
@@ -40,6 +48,8 @@ class HoughEdgeSettings(Settings):
     roi_top_px: int = Field(default=50, ge=0)
     roi_height_px: int = Field(default=70, ge=8)
     channel: Literal["hue", "saturation", "value"] = "hue"
+    min_saturation: int = Field(default=40, ge=0, le=255)
+    min_value: int = Field(default=40, ge=0, le=255)
     blur_px: Literal[3, 5, 7] = 5
     threshold: float = Field(default=100.0, gt=0.0)
     max_rough_share: float = Field(default=0.4, gt=0.0, le=1.0)
@@ -54,6 +64,26 @@ class HoughEdgeSettings(Settings):
         return self
 
 
+@dataclass(frozen=True)
+class Contours:
+    """Contours of the region of interest.
+
+    Attributes:
+        response: Signed response of the horizontal Sobel operator: positive where the channel rises to the
+            right.
+        binary: 1 where its absolute value reaches the threshold; all 0 in a frame that shows no road.
+    """
+
+    response: Int16[np.ndarray, "r c"]
+    binary: UInt8[np.ndarray, "r c"]
+
+    @property
+    def by_sign(self) -> tuple[UInt8[np.ndarray, "r c"], UInt8[np.ndarray, "r c"]]:
+        """The rising and the falling contours, each as a binary image of its own."""
+        rising = self.binary * (self.response > 0)
+        return rising, self.binary - rising
+
+
 def cut_roi(frame_bgr: UInt8[np.ndarray, "h w 3"], settings: HoughEdgeSettings) -> UInt8[np.ndarray, "r c 3"]:
     """Scale a frame to the paper's size and cut out the near field."""
     height, width = frame_bgr.shape[:2]
@@ -64,9 +94,15 @@ def cut_roi(frame_bgr: UInt8[np.ndarray, "h w 3"], settings: HoughEdgeSettings) 
 
 
 def gray_of(roi_bgr: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) -> UInt8[np.ndarray, "r c"]:
-    """Return the channel of HSV that serves as gray image."""
+    """Return the channel of HSV that serves as gray image; a hue that would be noise becomes 179."""
     hsv = cv2.cvtColor(roi_bgr, cv2.COLOR_BGR2HSV)
-    return np.asarray(cv2.extractChannel(hsv, _CHANNELS[settings.channel]))
+    gray = np.asarray(cv2.extractChannel(hsv, _CHANNELS[settings.channel]))
+    return np.where(is_coloured(hsv, settings), gray, _GRAY_HUE) if settings.channel == "hue" else gray
+
+
+def is_coloured(roi_hsv: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) -> Bool[np.ndarray, "r c"]:
+    """Tell where a pixel is colourful and bright enough for its hue to mean something."""
+    return (roi_hsv[..., 1] >= settings.min_saturation) & (roi_hsv[..., 2] >= settings.min_value)
 
 
 def rough_share(gray: UInt8[np.ndarray, "r c"]) -> float:
@@ -74,32 +110,41 @@ def rough_share(gray: UInt8[np.ndarray, "r c"]) -> float:
     return float((cv2.absdiff(gray[:, 1:], gray[:, :-1]) >= _ROUGH_STEP).mean())
 
 
+def crowded_share(binary: UInt8[np.ndarray, "r c"]) -> float:
+    """Return the share of blocks that hold a contour: near 1 in a texture, mostly below a half on a road.
+
+    A road's markings fill few blocks well; strokes, leaves and tiles leave some contour in most.
+    """
+    rows, columns = (max(n // _BLOCK_PX, 1) for n in binary.shape)
+    blocks = binary[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
+    return float(blocks.reshape(rows, -1, columns, blocks.shape[1] // columns).any(axis=(1, 3)).mean())
+
+
 def horizontal_response(
     gray: UInt8[np.ndarray, "r c"], settings: HoughEdgeSettings
-) -> Num[np.ndarray, "r c"]:
-    """Return the absolute horizontal Sobel response f(x, y) of the blurred channel.
-
-    The paper does not say what becomes of negative responses; both sides of a line are contours, hence the
-    absolute value.
-    """
+) -> Int16[np.ndarray, "r c"]:
+    """Return the horizontal Sobel response of the blurred channel, positive where it rises to the right."""
     blurred = cv2.GaussianBlur(gray, (settings.blur_px, settings.blur_px), 0)
-    return np.asarray(np.abs(cv2.Sobel(blurred, cv2.CV_16S, 1, 0)))
+    return np.asarray(cv2.Sobel(blurred, cv2.CV_16S, 1, 0))
 
 
 def binarise(response: Num[np.ndarray, "r c"], threshold: float) -> UInt8[np.ndarray, "r c"]:
-    """Keep responses of at least T: 0 below, 1 from there on.
+    """Keep responses f(x, y) of at least T: 0 below, 1 from there on.
+
+    The paper does not say what becomes of negative responses; both sides of a line are contours, so that f
+    is taken for the absolute response.
 
     Source:
         Suto 2021, eq. 1.
     """
-    return (response >= threshold).astype(np.uint8)
+    return (np.abs(response) >= threshold).astype(np.uint8)
 
 
-def find_contours(
-    frame_bgr: UInt8[np.ndarray, "h w 3"], settings: HoughEdgeSettings
-) -> UInt8[np.ndarray, "r c"]:
-    """Return the binary contours of the region of interest (section 4.1 of the paper as a whole)."""
+def find_contours(frame_bgr: UInt8[np.ndarray, "h w 3"], settings: HoughEdgeSettings) -> Contours:
+    """Return the contours of the region of interest (section 4.1 of the paper as a whole)."""
     gray = gray_of(cut_roi(frame_bgr, settings), settings)
+    response = horizontal_response(gray, settings)
+    binary = binarise(response, settings.threshold)
     if rough_share(gray) > settings.max_rough_share:
-        return np.zeros_like(gray)
-    return binarise(horizontal_response(gray, settings), settings.threshold)
+        binary = np.zeros_like(gray)
+    return Contours(response, binary)

@@ -30,9 +30,11 @@ class HoughSteeringSettings(Settings):
         angle_smoothing: w1 of eq. 15.
         line_smoothing: w2 of eq. 16.
         distance_row: Row on which the distances of eq. 11, 13 and 14 are measured.
+        max_jump_px: A single line whose distance differs by more than this from its side's last one is
+            another line, and says nothing about a change (eq. 13, 14). Not in the paper; None is the paper's.
         max_angle_deg: Bound of the current angle, that of eq. 11; eq. 13 and 14 have none of their own.
-        hold_frames: For so many frames without a line the last angle is held; then all is forgotten. The
-            paper holds it for ever.
+        hold_frames: A side that so many frames did not show is forgotten; with the last side, so is the
+            angle, which is held until then. None holds for ever, as the paper does.
     """
 
     vanishing_weight: float = Field(default=0.8, ge=0.0)
@@ -41,8 +43,9 @@ class HoughSteeringSettings(Settings):
     angle_smoothing: float = Field(default=0.1, gt=0.0, le=1.0)
     line_smoothing: float = Field(default=0.05, gt=0.0, le=1.0)
     distance_row: Literal["top", "bottom"] = "top"
+    max_jump_px: float | None = Field(default=10.0, ge=0.0)
     max_angle_deg: float = Field(default=60.0, gt=0.0, le=180.0)
-    hold_frames: int = Field(default=10, ge=0)
+    hold_frames: int | None = Field(default=10, ge=0)
 
 
 def combine_angles(vanishing_deg: float, distance_deg: float, settings: HoughSteeringSettings) -> float:
@@ -52,16 +55,6 @@ def combine_angles(vanishing_deg: float, distance_deg: float, settings: HoughSte
         Suto 2021, eq. 8.
     """
     return settings.vanishing_weight * vanishing_deg + settings.distance_weight * distance_deg
-
-
-def vanishing_point(one: Line, other: Line) -> Point:
-    """Intersect two lines of different slope: x = (b_j - b_i) / (m_i - m_j), y = m_i x + b_i.
-
-    Source:
-        Suto 2021, eq. 9.
-    """
-    x = (other.b - one.b) / (one.m - other.m)
-    return x, one.m * x + one.b
 
 
 def vanishing_angle_deg(vp: Point, c1: Point, c2: Point) -> float:

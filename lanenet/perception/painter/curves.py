@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -89,13 +88,20 @@ def slide_windows(
     if len(points) == 0 or len(guess) < 2:
         return np.empty((0, 2))
     rows = np.linspace(guess[0, 1], guess[-1, 1], settings.windows + 1)
-    beside = points[:, 0] - np.interp(points[:, 1], guess[:, 1], guess[:, 0])
+    # By rising y, so that a window is a slice; a point on the border of two windows lies in both.
+    points = points[np.argsort(points[:, 1])]
+    y = points[:, 1]
+    beside = points[:, 0] - np.interp(y, guess[:, 1], guess[:, 0])
+    starts = np.searchsorted(y, rows[:-1], side="left").tolist()
+    ends = np.searchsorted(y, rows[1:], side="right").tolist()
     offset, chosen = 0.0, np.zeros(len(points), bool)
-    for low, high in pairwise(rows.tolist()):
-        inside = (points[:, 1] >= low) & (points[:, 1] <= high) & (np.abs(beside - offset) <= half_width)
-        chosen |= inside
-        if np.count_nonzero(inside) >= settings.min_points:
-            offset = float(beside[inside].mean())
+    for start, end in zip(starts, ends, strict=True):
+        window = beside[start:end]
+        inside = np.abs(window - offset) <= half_width
+        chosen[start:end] |= inside
+        count = np.count_nonzero(inside)
+        if count >= settings.min_points:
+            offset = float(window[inside].sum()) / count
     return points[chosen]
 
 
@@ -111,9 +117,9 @@ def fit_curve(points: Float[np.ndarray, "n 2"], length: float, settings: CurveSe
         return None
     middle, half = 0.5 * (far + near), 0.5 * (far - near)
     t = (points[:, 1] - middle) / half
-    if len(np.unique(t)) < 3:
+    if not np.any((points[:, 1] > near) & (points[:, 1] < far)):
         return None
-    p, q, r = np.polyfit(t, points[:, 0], 2)
+    p, q, r = np.linalg.lstsq(np.stack([t * t, t, np.ones_like(t)], axis=1), points[:, 0], rcond=None)[0]
     # x = p t^2 + q t + r with t = (y - middle) / half, written out in y.
     a = p / half**2
     b = q / half - 2.0 * a * middle

@@ -94,9 +94,9 @@ def value_channel(
     Source:
         Pentek, section 3, image preprocessing.
     """
-    stronger = cv2.convertScaleAbs(frame_bgr, alpha=settings.contrast, beta=0.0)
-    # V of HSV is the largest of the three channels.
-    return np.asarray(stronger.max(axis=2))
+    # V of HSV is the largest of the three channels, and stays that when all are raised alike.
+    largest = np.maximum(np.maximum(frame_bgr[..., 0], frame_bgr[..., 1]), frame_bgr[..., 2])
+    return np.asarray(cv2.convertScaleAbs(largest, alpha=settings.contrast, beta=0.0))
 
 
 def find_painter_edges(

@@ -72,12 +72,14 @@ def join_side(
     bottom_width_px: float,
     earlier: SolidLine | None,
     settings: PainterLineSettings,
-) -> SolidLine | None:
-    """Join the segments of one side to a solid line (the paper's ``getLeftRoadLine``).
+    count: int = 1,
+) -> list[SolidLine]:
+    """Join the segments of one side to solid lines (the paper's ``getLeftRoadLine``), the best one first.
 
     Each segment's line y = m x + b gives x at the region's bottom and top. The segment that most length
     agrees with counts, and the line is the mean of those that agree with it, weighted by length: a mean over
-    all of them would lie between a marking and the kerb beside it.
+    all of them would lie between a marking and the kerb beside it. Further lines are joined in the same way
+    from the segments that are left.
 
     Args:
         segments_px: Segments of this side; none is level.
@@ -86,31 +88,34 @@ def join_side(
         earlier: The side's line of the frame before; agreement with it counts as much as the longest
             agreement of this frame.
         settings: Tolerances.
+        count: Lines that are wanted at most.
 
     Returns:
-        The line, or None if the segments that agree are too short together.
+        The lines; none if the segments that agree are too short together.
 
     Source:
         Pentek, section 3: "slope-intercept equation from two points". The agreement is not in the paper.
     """
-    if len(segments_px) == 0:
-        return None
+    lines: list[SolidLine] = []
     x1, y1, x2, y2 = segments_px.T
     inverse = (x2 - x1) / (y2 - y1)
-    bottom, top = (x1 + inverse * (row - y1) for row in rows_px)
+    ends = np.stack([x1 + inverse * (row - y1) for row in rows_px], axis=1)
     length = np.abs(y2 - y1)
-    ends = np.stack([bottom, top], axis=1)
-    near = _agree(ends[:, None, :], ends[None, :, :], settings.agree_share * bottom_width_px)
-    score = near @ length
-    if earlier is not None:
-        known = np.array([earlier.bottom_px, earlier.top_px])
-        score = score + score.max() * _agree(ends, known, settings.agree_share * bottom_width_px)
-    best = int(np.argmax(score))
-    chosen = near[best]
-    if length[chosen].sum() < settings.min_support_share * (rows_px[0] - rows_px[1]):
-        return None
-    weight = length[chosen] / length[chosen].sum()
-    return SolidLine(float(weight @ bottom[chosen]), float(weight @ top[chosen]))
+    tolerance = settings.agree_share * bottom_width_px
+    near = _agree(ends[:, None, :], ends[None, :, :], tolerance)
+    while len(lines) < count and len(length):
+        score = near @ length
+        if earlier is not None:
+            known = np.array([earlier.bottom_px, earlier.top_px])
+            score = score + score.max() * _agree(ends, known, tolerance)
+        chosen = near[int(np.argmax(score))]
+        total = float(length[chosen].sum())
+        # Too short where the line before was, perhaps, but not elsewhere: go on with the others.
+        if total >= settings.min_support_share * (rows_px[0] - rows_px[1]):
+            bottom, top = (length[chosen] / total) @ ends[chosen]
+            lines.append(SolidLine(float(bottom), float(top)))
+        ends, length, near = ends[~chosen], length[~chosen], near[~chosen][:, ~chosen]
+    return lines
 
 
 def _agree(
@@ -119,17 +124,59 @@ def _agree(
     return np.asarray((np.abs(ends - other) <= tolerance_px).all(axis=-1))
 
 
+def find_side_lines(
+    segments_px: Float[np.ndarray, "n 4"],
+    trapezoid_px: Float[np.ndarray, "4 2"],
+    earlier: tuple[SolidLine | None, SolidLine | None],
+    settings: PainterLineSettings,
+    count: int = 1,
+) -> tuple[list[SolidLine], list[SolidLine]]:
+    """Find solid lines of the left and of the right side, the best ones first.
+
+    A segment belongs to the left side if it rises to the right and its lower end lies in the left half of
+    the region, to the right side if it is the other way round.
+
+    Args:
+        segments_px: All segments.
+        trapezoid_px: The region, clockwise from the top left.
+        earlier: Lines of the frame before.
+        settings: Tolerances.
+        count: Lines per side that are wanted at most.
+    """
+    top, bottom = float(trapezoid_px[0, 1]), float(trapezoid_px[2, 1])
+    left_end, right_end = float(trapezoid_px[3, 0]), float(trapezoid_px[2, 0])
+    middle = 0.5 * (left_end + right_end)
+    x1, y1, x2, y2 = segments_px.T
+    dx, dy = x2 - x1, y2 - y1
+    steep = np.abs(dy) >= np.maximum(settings.min_slope * np.abs(dx), 1e-6)
+    lower_x = np.where(y1 >= y2, x1, x2)
+    left, right = (
+        join_side(
+            segments_px[steep & rising & half],
+            (bottom, top),
+            right_end - left_end,
+            known,
+            settings,
+            count,
+        )
+        for rising, half, known in (
+            (dx * dy < 0.0, lower_x <= middle, earlier[0]),
+            (dx * dy > 0.0, lower_x >= middle, earlier[1]),
+        )
+    )
+    return left, right
+
+
 def find_two_lines(
     segments_px: Float[np.ndarray, "n 4"],
     trapezoid_px: Float[np.ndarray, "4 2"],
     earlier: tuple[SolidLine | None, SolidLine | None],
     settings: PainterLineSettings,
 ) -> tuple[SolidLine | None, SolidLine | None]:
-    """Find the solid left and right line of a frame.
+    """Find the solid left and right line of a frame by the segments alone, as the paper does.
 
-    A segment belongs to the left line if it rises to the right and its lower end lies in the left half of
-    the region, to the right line if it is the other way round. Two lines that cross within the region, or
-    nearly meet at its bottom, are no lane; then the one that agrees with the frame before stays, or none.
+    Two lines that cross within the region, or nearly meet at its bottom, are no lane; then the one that
+    agrees with the frame before stays, or none.
 
     Args:
         segments_px: All segments.
@@ -137,34 +184,34 @@ def find_two_lines(
         earlier: Lines of the frame before.
         settings: Tolerances.
     """
-    top, bottom = float(trapezoid_px[0, 1]), float(trapezoid_px[2, 1])
-    left_end, right_end = float(trapezoid_px[3, 0]), float(trapezoid_px[2, 0])
-    width, middle = right_end - left_end, 0.5 * (left_end + right_end)
-    x1, y1, x2, y2 = segments_px.T
-    dx, dy = x2 - x1, y2 - y1
-    steep = np.abs(dy) >= np.maximum(settings.min_slope * np.abs(dx), 1e-6)
-    lower_x = np.where(y1 >= y2, x1, x2)
-    sides = []
-    for rising, half, known in (
-        (dx * dy < 0.0, lower_x <= middle, earlier[0]),
-        (dx * dy > 0.0, lower_x >= middle, earlier[1]),
-    ):
-        sides.append(join_side(segments_px[steep & rising & half], (bottom, top), width, known, settings))
-    left, right = sides
-    if left is None or right is None:
+    sides = find_side_lines(segments_px, trapezoid_px, earlier, settings)
+    left, right = (side[0] if side else None for side in sides)
+    if left is None or right is None or are_apart(left, right, trapezoid_px, settings):
         return left, right
-    apart = right.bottom_px - left.bottom_px >= settings.min_width_share * width
-    if apart and right.top_px > left.top_px:
-        return left, right
-    tolerance = settings.agree_share * width
+    tolerance = agree_px(trapezoid_px, settings)
     stays = [
-        line if line is not None and known is not None and _close(line, known, tolerance) else None
+        line if known is not None and are_close(line, known, tolerance) else None
         for line, known in zip((left, right), earlier, strict=True)
     ]
     return (stays[0], stays[1]) if stays.count(None) == 1 else (None, None)
 
 
-def _close(one: SolidLine, other: SolidLine, tolerance_px: float) -> bool:
+def are_apart(
+    left: SolidLine, right: SolidLine, trapezoid_px: Float[np.ndarray, "4 2"], settings: PainterLineSettings
+) -> bool:
+    """Return whether two lines leave room for a lane: they neither cross nor nearly meet in the region."""
+    width = float(trapezoid_px[2, 0] - trapezoid_px[3, 0])
+    apart = right.bottom_px - left.bottom_px >= settings.min_width_share * width
+    return apart and right.top_px > left.top_px
+
+
+def agree_px(trapezoid_px: Float[np.ndarray, "4 2"], settings: PainterLineSettings) -> float:
+    """Return how near lines lie that are one, [px]."""
+    return settings.agree_share * float(trapezoid_px[2, 0] - trapezoid_px[3, 0])
+
+
+def are_close(one: SolidLine, other: SolidLine, tolerance_px: float) -> bool:
+    """Return whether two lines lie near to each other at the region's top and bottom."""
     return (
         abs(one.bottom_px - other.bottom_px) <= tolerance_px
         and abs(one.top_px - other.top_px) <= tolerance_px

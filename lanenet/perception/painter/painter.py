@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,34 +16,35 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, ROWS_CM
 from lanenet.geometry.steering import proportional_angle_rad
 from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.image_lane import (
-    ImageLane,
-    Polyline,
-    check_size,
-    rows_of_points,
-    sample_segment,
-    to_bgr,
-)
-from lanenet.perception.painter.curves import (
-    Curve,
-    CurveSettings,
-    curvature_radius,
-    fit_curve,
-    mean_curve,
-    slide_windows,
-)
+from lanenet.perception.image_lane import ImageLane, check_size, rows_of_points, to_bgr
+from lanenet.perception.painter.curves import CurveSettings
 from lanenet.perception.painter.edges import PainterEdgeSettings, find_painter_edges, find_trapezoid
+from lanenet.perception.painter.evidence import EvidenceSettings, find_edge_field
 from lanenet.perception.painter.lines import (
     PainterLineSettings,
     SolidLine,
+    agree_px,
+    are_close,
     blend,
     find_painter_segments,
+    find_side_lines,
     find_two_lines,
 )
-from lanenet.perception.painter.plane import Plane, RoadPlane, SquarePlane
+from lanenet.perception.painter.markings import (
+    Marking,
+    Pair,
+    choose_lane,
+    follow_lines,
+    straight_px,
+    weigh,
+)
+from lanenet.perception.painter.measure import PaintedLane, find_aim_cm, measure_lane
+from lanenet.perception.painter.plane import Plane, RoadPlane, SquarePlane, finite_rows
 
 #: Smaller frames hold no line that could be told from chance.
 _MIN_SIDE_PX = 48
+#: Default look-ahead in camera heights; see :class:`PainterSettings`.
+_LOOK_AHEAD_HEIGHTS = 3.5
 
 
 class PainterSettings(Settings):
@@ -53,51 +55,33 @@ class PainterSettings(Settings):
         video_weight: ``video``: weight of the current frame in the average.
         hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
         curves: Follow curves by sliding windows; False leaves the paper's straight lines.
+        look_ahead_cm: With a camera: distance of the point that is steered at. None takes 3.5 camera heights:
+            nearer to the car the lane's middle tells where the car stands in the lane, not where it leads.
         edges: From frame to edges.
         lines: From edges to straight lines.
         curve: From straight lines to curves.
+        evidence: What a line has to show before it is answered.
     """
 
     mode: Literal["photo", "video"] = "video"
     video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
     hold_frames: int = Field(default=5, ge=0)
     curves: bool = True
+    look_ahead_cm: float | None = Field(default=None, gt=0.0)
     edges: PainterEdgeSettings = PainterEdgeSettings()
     lines: PainterLineSettings = PainterLineSettings()
     curve: CurveSettings = CurveSettings()
-
-
-@dataclass(frozen=True)
-class PaintedLane:
-    """What the road of a calibrated camera tells about the last frame.
-
-    Attributes:
-        radius_cm: Radius of curvature of the lane's middle at its near end; infinite where straight, NaN
-            where unknown.
-        offset_cm: The car's place right of the lane's middle, at the near end; NaN where unknown.
-    """
-
-    radius_cm: float = float("nan")
-    offset_cm: float = float("nan")
-
-    @property
-    def radius_m(self) -> float:
-        """The radius in metres, for people."""
-        return 0.01 * self.radius_cm
-
-    @property
-    def offset_m(self) -> float:
-        """The offset in metres, for people."""
-        return 0.01 * self.offset_cm
+    evidence: EvidenceSettings = EvidenceSettings()
 
 
 class LanePainter:
     """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
 
-    With a camera the lines are moved to the road, and the steering aims at the lane's middle 15 cm ahead.
-    Without one the points are NaN, and the steering is the angle in the image between straight up and the
-    lane's middle, halfway up the region, seen from the middle of its bottom. The confidence is the share of
-    the two lines that this frame shows; a line that is only remembered is drawn, but not answered.
+    With a camera the lines are moved to the road, and the steering aims at the lane's middle some camera
+    heights ahead. Without one the points are NaN, and the steering is the angle in the image between straight
+    up and the lane's middle, halfway up the region, seen from the middle of its bottom. The confidence is the
+    share of the two lines that this frame shows; a line that is only remembered is drawn as a memory, not
+    answered.
 
     Attributes:
         last: Lines of the last frame in the image, for drawing.
@@ -140,120 +124,112 @@ class LanePainter:
         if min(height, width) < _MIN_SIDE_PX:
             return LaneEstimate()
         trapezoid = find_trapezoid(width, height, self.camera, self.settings.edges)
-        edges = find_painter_edges(frame, trapezoid, self.settings.edges)
-        region_height = float(trapezoid[2, 1] - trapezoid[0, 1])
-        segments = find_painter_segments(edges, region_height, self.settings.lines)
-        earlier = (self._earlier[0], self._earlier[1])
-        found = find_two_lines(segments, trapezoid, earlier, self.settings.lines)
-        self._remember(found)
-        plane: Plane = self._road if self._road is not None else SquarePlane(trapezoid)
-        points = plane.edge_points(edges)
-        curves = [self._curve(k, line is not None, trapezoid, plane, points) for k, line in enumerate(found)]
-        lines = [self._line_px(k, curves[k], trapezoid, plane) for k in (0, 1)]
-        self.lane = self._measure(curves) if self.camera is not None else PaintedLane()
-        self.last = ImageLane(lines[0], lines[1], filled=True, text=_caption(self.lane))
-        rows = self._rows(found, curves, trapezoid)
+        found = self._smooth(self._find(frame, trapezoid), trapezoid)
+        rows = np.full((2, len(ROWS_CM)), np.nan)
+        if self.camera is not None:
+            for side, marking in enumerate(found):
+                if marking is not None:
+                    rows[side] = rows_of_points(marking.points)
+        self.lane = PaintedLane() if self.camera is None else measure_lane(found, rows)
+        self.last = self._image_lane(found, trapezoid)
         return LaneEstimate(
             points_cm=rows.reshape(N_POINTS),
-            steering_rad=self._steering_rad(found, rows, lines, trapezoid),
-            confidence=0.5 * sum(line is not None for line in found),
+            steering_rad=self._steering_rad(found, trapezoid),
+            confidence=0.5 * sum(marking is not None for marking in found),
+            radius_cm=self.lane.radius_cm,
+            offset_cm=self.lane.offset_cm,
         )
 
-    def _remember(self, found: tuple[SolidLine | None, SolidLine | None]) -> None:
-        for k, line in enumerate(found):
-            if line is not None:
-                self._earlier[k] = blend(line, self._earlier[k], self.settings.video_weight)
-                self._missed[k] = 0
-            else:
+    def _find(self, frame_bgr: UInt8[np.ndarray, "h w 3"], trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
+        """The lines that this frame shows."""
+        chosen = self.settings
+        edges = find_painter_edges(frame_bgr, trapezoid_px, chosen.edges)
+        segments = find_painter_segments(edges, float(trapezoid_px[2, 1] - trapezoid_px[0, 1]), chosen.lines)
+        earlier = (self._earlier[0], self._earlier[1])
+        plane: Plane = self._road if self._road is not None else SquarePlane(trapezoid_px)
+        points = plane.edge_points(edges)
+        height_cm = None if self.camera is None else self.camera.mounting.height_cm
+        half_width = chosen.curve.half_width_share
+        if height_cm is not None:
+            half_width = chosen.curve.half_width_heights * height_cm
+        curve = chosen.curve if chosen.curves else None
+
+        def follow(lines: Sequence[SolidLine]) -> dict[SolidLine, tuple[Marking, Marking | None]]:
+            ways = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
+            return dict(zip(lines, ways, strict=True))
+
+        if not chosen.evidence.required:
+            pair = find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
+            ways = follow([line for line in pair if line is not None])
+            left, right = (None if line is None else ways[line][1] or ways[line][0] for line in pair)
+            return left, right
+        field = find_edge_field(frame_bgr, edges, trapezoid_px, chosen.edges)
+        tolerance = agree_px(trapezoid_px, chosen.lines)
+        both_sides = find_side_lines(
+            segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates
+        )
+        ways = follow([*both_sides[0], *both_sides[1]])
+        sides = []
+        for lines, before in zip(both_sides, earlier, strict=True):
+            known = [before is not None and are_close(line, before, tolerance) for line in lines]
+            sides.append(
+                [
+                    weigh(*ways[line], field, again, chosen.evidence)
+                    for line, again in zip(lines, known, strict=True)
+                ]
+            )
+        return choose_lane(sides[0], sides[1], trapezoid_px, height_cm, chosen.lines, chosen.evidence)
+
+    def _smooth(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
+        """Average straight lines over frames, and keep what is expected in the next one."""
+        smooth: list[Marking | None] = []
+        for k, marking in enumerate(found):
+            if marking is None:
                 self._missed[k] += 1
                 if self._missed[k] > self.settings.hold_frames:
                     self._earlier[k] = None
-
-    def _straight_px(self, side: int, trapezoid_px: Float[np.ndarray, "4 2"]) -> Polyline | None:
-        line = self._earlier[side]
-        if line is None:
-            return None
-        near = (line.bottom_px, float(trapezoid_px[2, 1]))
-        return sample_segment(near, (line.top_px, float(trapezoid_px[0, 1])))
-
-    def _curve(
-        self,
-        side: int,
-        found: bool,
-        trapezoid_px: Float[np.ndarray, "4 2"],
-        plane: Plane,
-        points: Float[np.ndarray, "n 2"],
-    ) -> Curve | None:
-        straight = self._straight_px(side, trapezoid_px)
-        if not (self.settings.curves and found) or straight is None:
-            return None
-        guess = plane.from_image(straight)
-        if len(guess) < 2 or not np.all(np.diff(guess[:, 1]) > 0.0):
-            return None
-        settings = self.settings.curve
-        half_width = settings.half_width_share
-        if self.camera is not None:
-            half_width = settings.half_width_heights * self.camera.mounting.height_cm
-        chosen = slide_windows(points, guess, half_width, settings)
-        seen = points[:, 1].max() if len(points) else guess[-1, 1]
-        length = float(min(guess[-1, 1], seen) - guess[0, 1])
-        return fit_curve(chosen, length, settings) if length > 0.0 else None
-
-    def _line_px(
-        self, side: int, curve: Curve | None, trapezoid_px: Float[np.ndarray, "4 2"], plane: Plane
-    ) -> Polyline | None:
-        straight = self._straight_px(side, trapezoid_px)
-        if curve is None or straight is None:
-            return straight
-        line = plane.to_image(curve.sample(float(plane.from_image(straight)[0, 1])))
-        return line if len(line) >= 2 else None
-
-    def _measure(self, curves: list[Curve | None]) -> PaintedLane:
-        left, right = curves
-        if left is None or right is None:
-            return PaintedLane()
-        middle = mean_curve(left, right)
-        y = middle.near
-        return PaintedLane(curvature_radius(middle, y), -((middle.a * y + middle.b) * y + middle.c))
-
-    def _rows(
-        self,
-        found: tuple[SolidLine | None, SolidLine | None],
-        curves: list[Curve | None],
-        trapezoid_px: Float[np.ndarray, "4 2"],
-    ) -> Float[np.ndarray, "2 3"]:
-        rows = np.full((2, len(ROWS_CM)), np.nan)
-        for side, curve in enumerate(curves):
-            straight = self._straight_px(side, trapezoid_px)
-            if self._road is None or found[side] is None or straight is None:
+                smooth.append(None)
                 continue
-            rows[side] = rows_of_points(
-                curve.sample() if curve is not None else self._road.from_image(straight)
-            )
-        return rows
+            before = self._earlier[k]
+            # Another line than before; their mean would lie on neither.
+            if before is not None and not are_close(
+                marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)
+            ):
+                before = None
+            line = blend(marking.line, before, self.settings.video_weight)
+            self._earlier[k], self._missed[k] = line, 0
+            if marking.curve is None:
+                line_px = straight_px(line, trapezoid_px)
+                points = marking.points
+                if self._road is not None:
+                    points = finite_rows(self._road.from_image(line_px))
+                    points = points[np.argsort(points[:, 1], kind="stable")]
+                marking = replace(marking, line=line, line_px=line_px, points=points)
+            smooth.append(marking)
+        return smooth[0], smooth[1]
 
-    def _steering_rad(
-        self,
-        found: tuple[SolidLine | None, SolidLine | None],
-        rows_cm: Float[np.ndarray, "2 3"],
-        lines_px: list[Polyline | None],
-        trapezoid_px: Float[np.ndarray, "4 2"],
-    ) -> float:
-        left, right = lines_px
-        if found[0] is None or found[1] is None or left is None or right is None:
+    def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> ImageLane:
+        left, right = (None if marking is None else marking.line_px for marking in found)
+        memory = tuple(
+            straight_px(line, trapezoid_px)
+            for line, marking in zip(self._earlier, found, strict=True)
+            if line is not None and marking is None
+        )
+        return ImageLane(left, right, memory, filled=True, text=self.lane.text)
+
+    def _steering_rad(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> float:
+        left, right = found
+        if left is None or right is None:
             return float("nan")
         if self.camera is not None:
-            aim = float(rows_cm[:, 1].mean())
-            return proportional_angle_rad(aim, ROWS_CM[1]) if math.isfinite(aim) else float("nan")
+            look_ahead_cm = self.settings.look_ahead_cm
+            if look_ahead_cm is None:
+                look_ahead_cm = _LOOK_AHEAD_HEIGHTS * self.camera.mounting.height_cm
+            aim = find_aim_cm(found, look_ahead_cm)
+            return float("nan") if aim is None else proportional_angle_rad(*aim)
         bottom = float(trapezoid_px[2, 1])
         row = 0.5 * (float(trapezoid_px[0, 1]) + bottom)
-        middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in (left, right))
+        lines = (left.line_px, right.line_px)
+        middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in lines)
         start = 0.5 * float(trapezoid_px[2, 0] + trapezoid_px[3, 0])
         return math.atan2(start - middle, bottom - row)
-
-
-def _caption(lane: PaintedLane) -> str:
-    if not math.isfinite(lane.offset_cm):
-        return ""
-    radius = f"R {lane.radius_m:.1f} m" if lane.radius_m < 100.0 else "straight"
-    return f"{radius}  {abs(lane.offset_m):.2f} m {'right' if lane.offset_cm > 0.0 else 'left'} of the middle"

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 from boards import fisheye_of, views_of
 
+from lanenet.calibration.bundle import LensFit
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.chessboard_camera import calibrate_lens, view_errors_px
 from lanenet.calibration.ground import calibrate_ground
+from lanenet.calibration.lens import camera_of_lens
+from lanenet.calibration.lens_choice import check_wanted_model, folds_inside, miss_text
 from lanenet.errors import CalibrationError
-from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.camera import Camera, CameraModel, Mounting
 
 NEAR_METRE_CM = np.stack(
     np.meshgrid(np.arange(-40.0, 41.0, 10.0), np.arange(10.0, 101.0, 10.0)), axis=-1
@@ -123,3 +127,91 @@ def test_random_corners_give_an_error_and_no_camera(seed: int, views: list[Board
     noise = [dataclasses.replace(v, corners_px=rng.uniform(0.0, 470.0, (54, 2))) for v in views[:6]]
     with pytest.raises(CalibrationError):
         calibrate_lens(noise)
+
+
+@pytest.mark.parametrize(("field_deg", "seed"), [(170.0, 4), (200.0, 1)])
+def test_a_pinhole_forced_on_a_fisheye_is_refused(field_deg: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    views = views_of(fisheye_of(field_deg, rng), rng, 10)
+    with pytest.raises(
+        CalibrationError, match=r"pinhole lens .* fisheye lens .*0\.[23]\d px.*--model fisheye"
+    ):
+        calibrate_lens(views, "pinhole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_forced_models_over_seeds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    wide = views_of(fisheye_of((140.0, 170.0, 200.0)[seed % 3], rng), rng, 12)
+    with pytest.raises(CalibrationError, match="--model fisheye"):
+        calibrate_lens(wide, "pinhole")
+    assert calibrate_lens(wide, "fisheye").camera.model == "fisheye"
+    # A narrow lens without distortion is both, and neither choice is an error.
+    K = np.array([[700.0, 0.0, 322.0], [0.0, 703.0, 238.0], [0.0, 0.0, 1.0]])
+    narrow = Camera("pinhole", 640, 480, K, np.zeros(5), Mounting(20.0), 26.0)
+    views = views_of(narrow, rng, 12, near_cm=35.0, far_cm=80.0)
+    for model in ("pinhole", "fisheye"):
+        found = calibrate_lens(views, model).camera
+        assert found.model == model
+        assert found.K[0, 0] == pytest.approx(700.0, rel=0.02)
+
+
+def test_wanted_models_are_compared() -> None:
+    fits: dict[CameraModel, LensFit] = {"fisheye": fit_with_rms(0.30), "pinhole": fit_with_rms(0.31)}
+    assert check_wanted_model("pinhole", "fisheye", fits, None) is None
+    fits["pinhole"] = fit_with_rms(0.37)
+    note = check_wanted_model("pinhole", "fisheye", fits, None)
+    assert note is not None and "0.37 px as pinhole, 0.30 px as fisheye" in note
+    fits["pinhole"] = fit_with_rms(0.52)
+    with pytest.raises(
+        CalibrationError, match=r"pinhole lens misses .* 0\.52 px RMS, .* 0\.30 px: use --model"
+    ):
+        check_wanted_model("pinhole", "fisheye", fits, None)
+    # Both are good enough: a twentieth of a pixel is no error, but a note.
+    tiny: dict[CameraModel, LensFit] = {"fisheye": fit_with_rms(0.03), "pinhole": fit_with_rms(0.07)}
+    assert check_wanted_model("pinhole", "fisheye", tiny, None) is not None
+    with pytest.raises(CalibrationError, match=r"does not fit these views \(folds"):
+        check_wanted_model("pinhole", "fisheye", {"fisheye": fit_with_rms(0.3)}, "folds the image back")
+
+
+def fit_with_rms(rms_px: float) -> LensFit:
+    residuals = [np.full((54, 2), rms_px / np.sqrt(2.0))]
+    lens = np.zeros(9)
+    return LensFit("pinhole", lens, lens == 0.0, np.zeros((1, 6)), residuals, lens, 1.0)
+
+
+def test_a_pinhole_that_folds_inside_the_image_is_not_taken() -> None:
+    # r (1 - 0.3 r^2) grows up to r = 1.05, where it is 0.70; the image reaches 1.33.
+    camera = camera_of_lens("pinhole", np.array([300.0, 300.0, 319.5, 239.5, -0.3, 0, 0, 0, 0]), (640, 480))
+    assert folds_inside(camera)
+    # r (1 - 0.1 r^2) grows up to r = 1.83, where it is 1.22; the image reaches 1.00.
+    milder = camera_of_lens("pinhole", np.array([400.0, 400.0, 319.5, 239.5, -0.1, 0, 0, 0, 0]), (640, 480))
+    assert not folds_inside(milder)
+
+
+def test_corners_of_a_turned_board_are_named(views: list[BoardView]) -> None:
+    def turned(view: BoardView) -> BoardView:
+        grid = view.corners_px.reshape(6, 9, 2).transpose(1, 0, 2)
+        return dataclasses.replace(view, corners_px=grid.reshape(-1, 2).copy())
+
+    with pytest.raises(CalibrationError, match=r"do not fit one board.* 6x9 board, expected 9x6"):
+        calibrate_lens([turned(view) for view in views])
+    result = calibrate_lens([*views[:7], *[turned(view) for view in views[7:]]], "fisheye")
+    assert set(result.dropped) == {view.name for view in views[7:]}
+    assert "6x9" in result.dropped[views[8].name]
+
+
+def test_corners_of_no_board_give_a_message_that_can_be_read(views: list[BoardView]) -> None:
+    rng = np.random.default_rng(0)
+    shuffled = [dataclasses.replace(v, corners_px=rng.permutation(v.corners_px)) for v in views[:6]]
+    with pytest.raises(CalibrationError, match="do not fit one board") as caught:
+        calibrate_lens(shuffled)
+    assert max(float(number) for number in re.findall(r"\d+\.?\d*", str(caught.value))) < 1e5
+    assert miss_text(1.3e18, views) == "misses the corners altogether"
+    assert miss_text(12.34, views) == "misses the corners by 12.3 px"
+
+
+def test_a_large_residual_is_noted(truth: Camera) -> None:
+    noisy = views_of(truth, np.random.default_rng(8), 10, noise_px=0.5)
+    assert any(note.startswith("RMS 0.") for note in calibrate_lens(noisy, "fisheye").notes)

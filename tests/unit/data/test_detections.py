@@ -66,6 +66,39 @@ def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
+def test_radius_and_offset_where_a_detector_knows_them(tmp_path: Path, name: str) -> None:
+    table = make_table()
+    table.write(tmp_path / name)
+    # Nobody measured them: no columns, as in older files.
+    old = read_detections(tmp_path / name)
+    assert np.isnan(old.radius_cm).all() and np.isnan(old.offset_cm).all() and len(old.offset_cm) == 3
+    table.add(8, 0.4, LaneEstimate(radius_cm=145.5, offset_cm=-3.25))
+    table.add(9, 0.45, LaneEstimate(radius_cm=float("inf"), offset_cm=0.5))
+    table.write(tmp_path / name)
+    new = read_detections(tmp_path / name)
+    np.testing.assert_allclose(new.radius_cm, [np.nan, np.nan, np.nan, 145.5, np.inf])
+    np.testing.assert_allclose(new.offset_cm, [np.nan, np.nan, np.nan, -3.25, 0.5])
+    np.testing.assert_allclose(new.points_cm[:3], old.points_cm)
+    if name.endswith(".csv"):
+        lines = (tmp_path / name).read_text().splitlines()
+        assert lines[0].endswith(",steering_rad,confidence,radius_cm,offset_cm")
+        assert lines[1].endswith(",0.875,,") and lines[5].endswith(",0,inf,0.5")
+    table.add(10, 0.5, LaneEstimate(offset_cm=float("inf")))
+    with pytest.raises(LabelFormatError, match="frame 10, column 'offset_cm': found inf"):
+        table.write(tmp_path / name)
+
+
+def test_only_the_radius_may_be_infinite_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "seen.csv"
+    table = make_table()
+    table.add(8, 0.4, LaneEstimate(radius_cm=145.5, offset_cm=-3.25))
+    table.write(path)
+    path.write_text(path.read_text().replace("-3.25", "inf"))
+    with pytest.raises(LabelFormatError, match=r"line 5, column 'offset_cm': expected a number, found 'inf'"):
+        read_detections(path)
+
+
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
 def test_an_empty_table(tmp_path: Path, name: str) -> None:
     DetectionTable().write(tmp_path / name)
     back = read_detections(tmp_path / name)

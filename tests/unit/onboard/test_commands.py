@@ -223,12 +223,10 @@ def tiny_labels(path: Path) -> LabelSet:
     y = np.arange(1.0, 60.0, 0.3)
     edges, points = [], []
     for shift in (-3.0, 0.0, 2.0, 5.0):
-        x = np.array([-21.0, -19.0, 19.0, 21.0]) + shift
-        edges.append(
-            np.concatenate([np.stack([y * 0 + v, y, y * 0 + 1.0, y * 0], axis=1) for v in x]).astype(
-                np.float32
-            )
-        )
+        # Bright markings: their two edges face each other.
+        sides = {-21.0: 1.0, -19.0: -1.0, 19.0: 1.0, 21.0: -1.0}
+        both = [np.stack([y * 0 + x + shift, y, y * 0 + to, y * 0], axis=1) for x, to in sides.items()]
+        edges.append(np.concatenate(both).astype(np.float32))
         points.append(np.repeat([-20.0 + shift, 20.0 + shift], 3))
     n = len(points)
     line = np.array([[0.0, -20.0], [0.0, 60.0]], np.float32)

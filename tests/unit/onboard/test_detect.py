@@ -159,9 +159,10 @@ def test_lane_filter_on_label_sets_starts_again_after_gaps() -> None:
     y = np.arange(5.0, 60.0, 0.25)
 
     def edges(shift: float) -> np.ndarray:
-        lines = [x + side - shift for x in (-60.0, -20.0, 20.0, 60.0) for side in (-1.0, 1.0)]
+        # Bright markings: their two edges face each other.
+        lines = [(x + side - shift, -side) for x in (-60.0, -20.0, 20.0, 60.0) for side in (-1.0, 1.0)]
         return np.concatenate(
-            [np.stack([np.full_like(y, x), y, y * 0.0, y * 0.0 + 1.0], axis=1) for x in lines]
+            [np.stack([np.full_like(y, x), y, np.full_like(y, to), y * 0.0], axis=1) for x, to in lines]
         )
 
     shifts = [0.0, 8.0, 16.0, 24.0, 24.0]
@@ -181,3 +182,6 @@ def test_lane_filter_on_label_sets_starts_again_after_gaps() -> None:
     )
     centres = lane_filter_points_cm(labels)[:, [1, 4]].mean(axis=1)
     assert centres == pytest.approx([0.0, -8.0, -16.0, -24.0, 16.0], abs=0.2)
+    # The directions in the label set are used: there is no dark marking.
+    dark = lane_filter_points_cm(labels, LaneFilterSettings(lane_width_cm=40.0, polarity="dark"))
+    assert np.isnan(dark).all()

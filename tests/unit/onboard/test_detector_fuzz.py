@@ -100,7 +100,7 @@ def test_settings_file_is_read_and_refused_where_there_is_none(tmp_path: Path) -
     tracker = build_detector("hough", None, config=path)
     assert isinstance(tracker, HoughTracker) and tracker.settings.edges.channel == "value"
     with pytest.raises(ConfigError, match="takes no settings file"):
-        build_detector("lane-filter", example_camera(), lane_width_cm=40.0, config=path)
+        build_detector("network", example_camera(), config=path)
     path.write_text("edges: {chanel: value}\n")
     with pytest.raises(ConfigError, match="did you mean 'channel'"):
         build_detector("hough", None, config=path)

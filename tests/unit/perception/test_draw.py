@@ -7,6 +7,7 @@ from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import ROWS_CM, parabola_x_cm
 from lanenet.perception.draw import ARROW_BGR, LEFT_BGR, RIGHT_BGR, draw_estimate
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.image_lane import ImageLane
 
 NAN = float("nan")
 K = np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 59.5], [0.0, 0.0, 1.0]])
@@ -50,6 +51,39 @@ def test_unknown_lane_draws_nothing() -> None:
 def test_points_far_outside_do_not_upset_it() -> None:
     wild = LaneEstimate(np.array([-1e6, -1e7, -1e8, 1e6, 1e7, 1e8]))
     assert draw_estimate(np.zeros((120, 160, 3), np.uint8), wild, CAMERA).shape == (120, 160, 3)
+
+
+@pytest.mark.parametrize("far", [1e4, 1e7, 1e12])
+def test_long_image_lines_are_cut_where_the_picture_ends(far: float) -> None:
+    # Both run level through the picture, at rows 40 and 80, from far to the left to far to the right.
+    lane = ImageLane(
+        np.array([[-far, 40.0], [far, 40.0]]), np.array([[-far, 80.0], [far, 80.0]]), filled=True
+    )
+    frame = np.zeros((120, 160, 3), np.uint8)
+    picture = draw_estimate(frame, LaneEstimate(), None, image_lane=lane)
+    assert has_colour(picture, LEFT_BGR)[40].all() and has_colour(picture, RIGHT_BGR)[80].all()
+    inside = picture[60].astype(int)
+    assert (inside == inside[0]).all() and inside.any() and not picture[[10, 110]].any()
+
+
+def test_slanted_lines_keep_their_place_when_cut() -> None:
+    def drawn(scale: float) -> np.ndarray:
+        # Through (80, 60) with slope 1/2.
+        ends = np.array([[80.0, 60.0]]) + scale * np.array([[-2.0, -1.0], [2.0, 1.0]])
+        lane = ImageLane(ends, None, memory_px=(ends * [1.0, -1.0] + [0.0, 120.0],))
+        return draw_estimate(np.zeros((120, 160, 3), np.uint8), LaneEstimate(), None, image_lane=lane)
+
+    near, far = drawn(45.0), drawn(1e9)
+    assert has_colour(near, LEFT_BGR).sum() > 150
+    assert (has_colour(near, LEFT_BGR) != has_colour(far, LEFT_BGR)).mean() < 0.005
+
+
+def test_lines_outside_or_unknown_draw_nothing() -> None:
+    outside = np.array([[-1e9, -500.0], [1e9, -500.0]])
+    unknown = np.array([[10.0, 10.0], [NAN, 20.0]])
+    frame = np.zeros((120, 160, 3), np.uint8)
+    lane = ImageLane(outside, unknown, filled=True)
+    assert not draw_estimate(frame, LaneEstimate(), None, image_lane=lane).any()
 
 
 def test_positive_steering_points_left() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from lanenet.cli import app
 from lanenet.data.camera_file import write_camera
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.analysis_picture import draw_analysis
+from lanenet.perception.analysis_picture import draw_analysis, figure_lines
 from lanenet.perception.error_analysis import AnalysisSettings, analyse_errors, figures, steering_error_rad
 
 DOWN = Camera(
@@ -98,3 +99,19 @@ def test_the_command_shows_the_figures_and_writes_the_picture(tmp_path: Path) ->
     np.testing.assert_array_equal(cv2.imread(str(picture)), draw_analysis(analyse_errors(PAPER)))
     wrong = CliRunner().invoke(app, ["analyse", str(camera), "--out", str(tmp_path / "x.jpg")])
     assert wrong.exit_code != 0
+
+
+def test_text_where_one_or_both_lines_are_not_seen() -> None:
+    nan = math.nan
+    full = analyse_errors(DOWN)
+    both = dataclasses.replace(full, line_cm_per_px=(0.5, 0.75), position_error_cm=0.95)
+    assert figure_lines(both)[1] == "sideways 7.5 mm/px, with the filter's grid 9.5 mm"
+    for steps in ((nan, 0.5), (0.5, nan)):
+        one = dataclasses.replace(full, line_cm_per_px=steps, position_error_cm=0.7)
+        assert figure_lines(one)[1].startswith(
+            "sideways 5.0 mm/px, with the filter's grid 7.0 mm, at the one"
+        )
+    none = dataclasses.replace(full, line_cm_per_px=(nan, nan), position_error_cm=nan, steering_error_rad=nan)
+    assert "neither L nor R is seen at 15 cm" in figure_lines(none)[1]
+    assert not any("nan" in line for line in figure_lines(none))
+    assert draw_analysis(none).shape == draw_analysis(full).shape

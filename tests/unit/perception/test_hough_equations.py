@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanenet.perception.hough import lines, steering
+from lanenet.perception.hough import choice, lines, steering
 from lanenet.perception.hough.edges import binarise
 from lanenet.perception.hough.lines import HoughLineSettings, Line, Segment
 from lanenet.perception.hough.steering import HoughSteeringSettings
@@ -19,7 +19,7 @@ C1, C2 = (80.0, 70.0), (80.0, 0.0)
 
 
 def test_eq_1_threshold_keeps_what_reaches_it() -> None:
-    assert binarise(np.array([[0, 99, 100, 101]]), 100.0).tolist() == [[0, 0, 1, 1]]
+    assert binarise(np.array([[0, 99, 100, 101, -99, -100]]), 100.0).tolist() == [[0, 0, 1, 1, 0, 1]]
 
 
 def test_eq_2_slope_of_a_rising_line_is_negative() -> None:
@@ -54,17 +54,17 @@ def test_eq_4_gates() -> None:
 
 def test_eq_5_cost_of_a_pair() -> None:
     # 0.7 * (10 + 20) + 0.3 * 40
-    assert lines.pair_cost(10.0, 20.0, 40.0, LINES) == pytest.approx(33.0)
+    assert choice.pair_cost(10.0, 20.0, 40.0, LINES) == pytest.approx(33.0)
 
 
 def test_eq_5_without_memory_the_most_central_pair_wins() -> None:
     inner, outer = Segment(40.0, 60.0, 70.0, 30.0), Segment(10.0, 60.0, 40.0, 30.0)
     right = Segment(120.0, 60.0, 90.0, 30.0)
     # The middles of the lower ends lie at x = 80 and x = 65; c1 is at x = 80.
-    found = lines.choose_pair([outer, inner], [right], (None, None), 160.0, 70.0, LINES)
+    found = choice.choose_pair([outer, inner], [right], (None, None), 160.0, 70.0, LINES)
     assert found == (inner, right)
     # The memory of the outer line weighs more: 0.7 * 60 against 0.3 * (18.0 - 10.0).
-    found = lines.choose_pair([outer, inner], [right], (outer.line, None), 160.0, 70.0, LINES)
+    found = choice.choose_pair([outer, inner], [right], (outer.line, None), 160.0, 70.0, LINES)
     assert found == (outer, right)
 
 
@@ -73,16 +73,44 @@ def test_eq_6_x_on_a_row() -> None:
     assert lines.x_at(Line(-1.0, 80.0), 70.0) == 10.0
     assert lines.x_at(Line(0.5, -20.0), 10.0) == 60.0
     # Distance to the same line shifted by 5 px: 5 at the top and 5 at the bottom.
-    assert lines.line_distance(Line(-1.0, 80.0), Line(-1.0, 85.0), 70.0) == pytest.approx(10.0)
-    assert lines.line_distance(Line(-1.0, 80.0), None, 70.0) == 0.0
+    assert choice.line_distance(Line(-1.0, 80.0), Line(-1.0, 85.0), 70.0) == pytest.approx(10.0)
+    assert choice.line_distance(Line(-1.0, 80.0), None, 70.0) == 0.0
 
 
 def test_eq_7_single_line() -> None:
     # 0.7 * 10 + 0.3 * 50
-    assert lines.single_cost(10.0, 50.0, LINES) == pytest.approx(22.0)
+    assert choice.single_cost(10.0, 50.0, LINES) == pytest.approx(22.0)
     near, far = Segment(50.0, 60.0, 70.0, 40.0), Segment(10.0, 60.0, 30.0, 40.0)
-    assert lines.choose_single([far, near], None, 160.0, 70.0, LINES) == near
-    assert lines.choose_single([far, near], far.line, 160.0, 70.0, LINES) == far
+
+    def choose(earlier: Line | None) -> choice.Chosen:
+        return choice.choose_lines([far, near], [], (earlier, None), 160.0, 70.0, LINES)
+
+    assert choose(None) == (near, None)
+    assert choose(far.line) == (far, None)
+
+
+def test_lines_that_cross_within_the_region_are_no_pair() -> None:
+    # y = -x + 150 and y = x - 10 meet at (80, 70): both lean outwards.
+    left, right = Segment(80.0, 70.0, 120.0, 30.0), Segment(80.0, 70.0, 40.0, 30.0)
+    assert lines.vanishing_point(left.line, right.line) == (80.0, 70.0)
+
+    def choose(earlier: choice.Earlier, settings: HoughLineSettings = LINES) -> choice.Chosen:
+        return choice.choose_lines([left], [right], earlier, 160.0, 70.0, settings)
+
+    # Both cost the same; one that earlier frames showed comes first.
+    assert choose((None, None)) == (left, None)
+    assert choose((None, right.line)) == (None, right)
+    assert choose((left.line, None)) == (left, None)
+    # The paper knows no such limit.
+    assert choose((None, None), HoughLineSettings(max_vanishing_share=None)) == (left, right)
+
+
+def test_the_limit_of_the_vanishing_point() -> None:
+    # y = -x + 100 and y = x - 60 meet at (80, 20): 20 / 70 of the height.
+    left, right = Segment(40.0, 60.0, 70.0, 30.0), Segment(120.0, 60.0, 90.0, 30.0)
+    for share, found in ((0.28, None), (0.29, (left, right))):
+        settings = HoughLineSettings(max_vanishing_share=share)
+        assert choice.choose_pair([left], [right], (None, None), 160.0, 70.0, settings) == found
 
 
 def test_eq_8_weights() -> None:
@@ -91,7 +119,7 @@ def test_eq_8_weights() -> None:
 
 def test_eq_9_vanishing_point() -> None:
     # y = -x + 80 and y = x - 60 meet at x = 140 / 2.
-    assert steering.vanishing_point(Line(-1.0, 80.0), Line(1.0, -60.0)) == (70.0, 10.0)
+    assert lines.vanishing_point(Line(-1.0, 80.0), Line(1.0, -60.0)) == (70.0, 10.0)
 
 
 @pytest.mark.parametrize(
@@ -145,8 +173,8 @@ def test_mirrored_lines_mirror_every_angle(ml: float, mr: float, xl: float, xr: 
     left, right = Line(-ml, 60.0 + ml * xl), Line(mr, 60.0 - mr * xr)
     # Mirrored at the centre line x = 80: x becomes 160 - x.
     left_m, right_m = Line(-mr, right.b + 160.0 * mr), Line(ml, left.b - 160.0 * ml)
-    one = steering.vanishing_angle_deg(steering.vanishing_point(left, right), C1, C2)
-    other = steering.vanishing_angle_deg(steering.vanishing_point(left_m, right_m), C1, C2)
+    one = steering.vanishing_angle_deg(lines.vanishing_point(left, right), C1, C2)
+    other = steering.vanishing_angle_deg(lines.vanishing_point(left_m, right_m), C1, C2)
     # The arc cosine near 1 loses half of its digits.
     assert one == pytest.approx(-other, abs=1e-4)
     sides = [steering.horizontal_distance(line, C1, 0.0) for line in (left, right, left_m, right_m)]

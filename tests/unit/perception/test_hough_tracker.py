@@ -14,6 +14,13 @@ from lanenet.perception.hough.edges import HoughEdgeSettings, cut_roi, find_cont
 from lanenet.perception.hough.lines import Segment, find_segments, split_sides
 from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
 
+BOTTOM = HoughSettings.model_validate({"steering": {"distance_row": "bottom"}})
+
+
+def left_line(b: float) -> Segment:
+    """A left line y = -x + b."""
+    return Segment(b - 60.0, 60.0, b - 20.0, 20.0)
+
 
 def test_is_a_detector_with_the_papers_defaults() -> None:
     tracker = HoughTracker()
@@ -38,13 +45,13 @@ def test_contours_are_vertical_edges_of_the_hue() -> None:
     frame = np.zeros((120, 160, 3), np.uint8)
     frame[:] = (200, 30, 30)
     frame[:, 80:] = (30, 220, 220)
-    binary = find_contours(frame, HoughEdgeSettings())
+    binary = find_contours(frame, HoughEdgeSettings()).binary
     columns = np.flatnonzero(binary.any(axis=0))
     assert columns.min() >= 77 and columns.max() <= 82 and binary[:, 79:81].all()
     level = np.zeros((120, 160, 3), np.uint8)
     level[:] = (200, 30, 30)
     level[90:] = (30, 220, 220)
-    assert not find_contours(level, HoughEdgeSettings()).any()
+    assert not find_contours(level, HoughEdgeSettings()).binary.any()
 
 
 def test_segments_and_sides() -> None:
@@ -57,16 +64,6 @@ def test_segments_and_sides() -> None:
     assert all(s.y1 >= s.y2 and s.x1 <= 30 for s in left) and all(s.x1 >= 130 for s in right)
     # A left line's slope on the right side of the image is no lane line.
     assert split_sides([Segment(100.0, 60.0, 130.0, 30.0)], 160.0, 70.0, settings) == ([], [])
-
-
-@pytest.mark.parametrize(("centre", "slope"), [(0.0, 0.0), (4.0, 0.1), (-5.0, -0.1)])
-def test_lines_lie_at_an_edge_of_the_markings(centre: float, slope: float) -> None:
-    estimate = HoughTracker(CAMERA).detect(lane_frame(centre, slope))
-    assert estimate.confidence == 1.0 and estimate.mask.all()
-    for side, x in ((-20.0, estimate.points_cm[:3]), (20.0, estimate.points_cm[3:])):
-        truth = side + centre + slope * np.array([0.0, 15.0, 30.0])
-        # Half a marking, and a pixel of the scaled frame.
-        assert np.abs(x - truth).max() < 4.0
 
 
 def test_steering_is_positive_left_and_mirrors() -> None:
@@ -109,15 +106,96 @@ def test_one_line_steers_only_after_a_pair() -> None:
 
 
 def test_a_left_line_that_comes_closer_steers_right() -> None:
-    settings = HoughSettings.model_validate({"steering": {"distance_row": "bottom"}})
-    tracker = HoughTracker(None, settings)
+    tracker = HoughTracker(None, BOTTOM)
     before = tracker.track(Segment(20.0, 60.0, 60.0, 20.0), Segment(140.0, 60.0, 100.0, 20.0))
     # On the row of c1 the line moves from 70 to 60 px: 60 * -10 / 70, a tenth of it by eq. 15.
     after = tracker.track(Segment(30.0, 60.0, 70.0, 20.0), None)
     assert before == pytest.approx(0.0, abs=1e-9)
     assert after == pytest.approx(-60.0 / 7.0 * 0.1)
     # The averaged line has moved by a twentieth of the way (eq. 16).
-    assert tracker.state.left is not None and tracker.state.left.b == pytest.approx(80.0 + 0.05 * 10.0)
+    assert tracker.state.left is not None and tracker.state.left.line.b == pytest.approx(80.5)
+
+
+def test_a_single_line_is_compared_with_the_frame_before_and_not_with_the_average() -> None:
+    tracker = HoughTracker(None, BOTTOM)
+    # On the row of c1 = (80, 70): the left line y = -x + b is at x = b - 70, 150 - b beside c1.
+    assert tracker.track(left_line(80.0), Segment(140.0, 60.0, 100.0, 20.0)) == pytest.approx(0.0, abs=1e-9)
+    # d from 70 to 63: eq. 13 gives -60 * 7 / 70 = -6; eq. 12: 0 - 6; eq. 15: 0.1 * -6 + 0.9 * 0 = -0.6.
+    assert tracker.track(left_line(87.0), None) == pytest.approx(-0.6)
+    # d stays 63, although the averaged line lies at b = 80.35: no change.
+    assert tracker.track(left_line(87.0), None) == pytest.approx(-0.6)
+    # d from 63 to 66.15: 60 * 3.15 / 63 = 3; -0.6 + 3 = 2.4; 0.1 * 2.4 + 0.9 * -0.6 = -0.3.
+    assert tracker.track(left_line(83.85), None) == pytest.approx(-0.3)
+
+
+def test_a_line_that_stays_does_not_wind_the_steering_up() -> None:
+    tracker = HoughTracker(None, BOTTOM)
+    tracker.track(left_line(80.0), Segment(140.0, 60.0, 100.0, 20.0))
+    # d from 70 to 77: 60 * 7 / 70 = 6, a tenth of it; every further frame shows the same.
+    for _ in range(50):
+        angle = tracker.track(left_line(73.0), None)
+    assert angle == pytest.approx(0.6)
+
+
+def test_d_of_a_side_is_that_of_its_last_frame_even_if_frames_lie_between() -> None:
+    tracker = HoughTracker(None, BOTTOM)
+    right = Segment(140.0, 60.0, 100.0, 20.0)
+    tracker.track(left_line(80.0), right)
+    # The right line y = x - 80 stays at x = 150; the left one is away.
+    for _ in range(3):
+        assert tracker.track(None, right) == pytest.approx(0.0, abs=1e-9)
+    # As in the test above, with the 70 of three frames ago.
+    assert tracker.track(left_line(87.0), None) == pytest.approx(-0.6)
+
+
+def test_a_line_far_from_the_last_is_another_one() -> None:
+    right = Segment(140.0, 60.0, 100.0, 20.0)
+    for limit, angle in ((10.0, 0.0), (None, -60.0 * 11.0 / 70.0 * 0.1)):
+        steering = {"distance_row": "bottom", "max_jump_px": limit}
+        tracker = HoughTracker(None, HoughSettings.model_validate({"steering": steering}))
+        tracker.track(left_line(80.0), right)
+        assert tracker.track(left_line(91.0), None) == pytest.approx(angle, abs=1e-9)
+
+
+def test_each_side_is_forgotten_on_its_own() -> None:
+    tracker = HoughTracker(None, HoughSettings.model_validate({"steering": {"hold_frames": 2}}))
+    left, right = left_line(80.0), Segment(140.0, 60.0, 100.0, 20.0)
+    tracker.track(left, right)
+    for missed in (1, 2):
+        tracker.track(None, right)
+        assert tracker.state.left is not None and tracker.state.left.missed == missed
+    tracker.track(None, right)
+    assert tracker.state.left is None and tracker.state.right is not None
+    assert tracker.state.right.missed == 0 and tracker.state.steering_deg is not None
+    # A forgotten side starts anew: no average with the line of long ago.
+    tracker.track(left_line(60.0), right)
+    assert tracker.state.left is not None and tracker.state.left.line == left_line(60.0).line
+
+
+def test_none_holds_for_ever_as_in_the_paper() -> None:
+    tracker = HoughTracker(None, HoughSettings.model_validate({"steering": {"hold_frames": None}}))
+    seen = tracker.track(left_line(70.0), Segment(140.0, 60.0, 100.0, 20.0))
+    for _ in range(100):
+        assert tracker.track(None, None) == seen
+    assert tracker.state.left is not None and tracker.state.left.missed == 100
+
+
+def test_the_hint_names_the_other_settings_where_the_hue_shows_nothing() -> None:
+    tracker = HoughTracker()
+    assert tracker.hint == ""
+    for _ in range(20):
+        tracker.detect(np.full((240, 320, 3), 90, np.uint8))
+    assert "in 0 of 20 frames" in tracker.hint and "configs/detectors/hough_value.yaml" in tracker.hint
+    tracker.reset()
+    assert "in 0 of 20 frames" in tracker.hint
+    # One of 21 is fewer than a twentieth, two of 22 are not.
+    tracker.detect(lane_frame())
+    assert "in 1 of 21 frames" in tracker.hint
+    tracker.detect(lane_frame())
+    assert tracker.hint == ""
+    value = HoughTracker(None, HoughSettings.model_validate({"edges": {"channel": "value"}}))
+    value.detect(np.full((240, 320, 3), 90, np.uint8))
+    assert value.hint == ""
 
 
 def test_steering_is_held_without_lines_and_then_forgotten() -> None:

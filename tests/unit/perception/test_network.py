@@ -79,6 +79,20 @@ def test_a_frame_gives_points_errors_and_steering(model_path):
     assert 0.0 < estimate.confidence <= 1.0
 
 
+def test_a_mask_hides_the_car(model_path):
+    frame = striped_frame()
+    # A bumper with a bright edge, which is no road.
+    bumper = frame.copy()
+    bumper[105:, 60:100] = 230
+    mask = np.zeros((120, 160), np.uint8)
+    mask[100:, 55:105] = 255
+    masked, plain = NetworkDetector(model_path, CAMERA, mask=mask), NetworkDetector(model_path, CAMERA)
+    np.testing.assert_array_equal(masked.detect(bumper).points_cm, masked.detect(frame).points_cm)
+    assert (plain.detect(bumper).points_cm != plain.detect(frame).points_cm).any()
+    with pytest.raises(CalibrationError, match=r"mask of 80x60 px.*160x120"):
+        NetworkDetector(model_path, CAMERA, mask=mask[::2, ::2])
+
+
 def test_frames_do_not_leak_into_each_other(model_path):
     detector = NetworkDetector(model_path, CAMERA)
     first = detector.detect(striped_frame())

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,16 +13,31 @@ from lanenet.config import check_settings
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector
-from lanenet.perception.painter.curves import CurveSettings, curvature_radius, fit_curve, slide_windows
+from lanenet.perception.painter.curves import (
+    Curve,
+    CurveSettings,
+    curvature_radius,
+    fit_curve,
+    slide_windows,
+)
 from lanenet.perception.painter.edges import (
     PainterEdgeSettings,
     find_painter_edges,
     find_trapezoid,
     value_channel,
 )
+from lanenet.perception.painter.evidence import (
+    EdgeField,
+    EvidenceSettings,
+    LineEvidence,
+    find_edge_field,
+    measure_evidence,
+)
 from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, find_two_lines, join_side
+from lanenet.perception.painter.markings import Marking, choose_lane, straight_px
+from lanenet.perception.painter.measure import find_aim_cm, measure_lane
 from lanenet.perception.painter.painter import LanePainter, PainterSettings
-from lanenet.perception.painter.plane import SquarePlane
+from lanenet.perception.painter.plane import RoadPlane, SquarePlane, finite_rows, move_lines
 
 TRAPEZOID = np.array([[120.0, 100.0], [200.0, 100.0], [320.0, 200.0], [0.0, 200.0]])
 LINES = PainterLineSettings()
@@ -76,9 +92,20 @@ def test_dashes_join_to_one_line_and_a_stray_segment_does_not_pull() -> None:
     dashes = np.array(
         [[100.0, 200.0, 120.0, 180.0], [150.0, 150.0, 180.0, 120.0], [20.0, 190.0, 30.0, 180.0]]
     )
-    line = join_side(dashes, (200.0, 100.0), 320.0, None, LINES)
-    assert line is not None and (line.bottom_px, line.top_px) == pytest.approx((100.0, 200.0))
-    assert join_side(dashes[2:], (200.0, 100.0), 320.0, None, LINES) is None
+    (line,) = join_side(dashes, (200.0, 100.0), 320.0, None, LINES)
+    assert (line.bottom_px, line.top_px) == pytest.approx((100.0, 200.0))
+    assert join_side(dashes[2:], (200.0, 100.0), 320.0, None, LINES) == []
+
+
+def test_further_lines_come_after_the_best_and_a_short_one_stops_none() -> None:
+    longest, second = [100.0, 200.0, 180.0, 120.0], [10.0, 200.0, 60.0, 150.0]
+    short = [150.0, 200.0, 160.0, 190.0]
+    segments = np.array([short, second, longest])
+    lines = join_side(segments, (200.0, 100.0), 320.0, None, LINES, count=3)
+    assert [line.bottom_px for line in lines] == pytest.approx([100.0, 10.0])
+    # The frame before had the line that is now too short: the others are found all the same.
+    lines = join_side(segments, (200.0, 100.0), 320.0, SolidLine(150.0, 250.0), LINES, count=1)
+    assert [line.bottom_px for line in lines] == pytest.approx([100.0])
 
 
 def test_sides_by_slope_and_lines_that_cross_are_no_lane() -> None:
@@ -99,6 +126,22 @@ def test_the_plane_is_the_trapezoid_stretched_to_a_square() -> None:
     corners = plane.from_image(TRAPEZOID)
     assert corners == pytest.approx(np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]), abs=1e-6)
     assert plane.to_image(corners) == pytest.approx(TRAPEZOID, abs=1e-4)
+
+
+def test_lines_moved_together_are_those_moved_one_by_one() -> None:
+    plane = RoadPlane(CAMERA)
+    # The second line begins above the horizon, of the third nothing is on the road.
+    lines = [
+        np.array([[100.0, 200.0], [120.0, 160.0]]),
+        np.array([[200.0, 0.0], [210.0, 150.0], [220.0, 220.0]]),
+        np.array([[10.0, 0.0]]),
+    ]
+    moved = move_lines(plane.from_image, lines)
+    assert [len(line) for line in moved] == [2, 2, 0] and move_lines(plane.from_image, []) == []
+    for line, together in zip(lines, moved, strict=True):
+        assert together == pytest.approx(finite_rows(plane.from_image(line)), abs=1e-9)
+        # And back to where they came from.
+        assert plane.to_image(together) == pytest.approx(line[len(line) - len(together) :], abs=1e-6)
 
 
 @given(st.floats(-0.004, 0.004), st.floats(-0.3, 0.3), st.floats(-30.0, 30.0))
@@ -127,6 +170,8 @@ def test_too_few_points_are_no_curve() -> None:
     assert fit_curve(points, 100.0, CurveSettings()) is None
     assert fit_curve(points[:5], 40.0, CurveSettings()) is None
     assert len(slide_windows(np.empty((0, 2)), points, 5.0, CurveSettings())) == 0
+    # However many points: two rows do not bend.
+    assert fit_curve(np.tile([[0.0, 0.0], [1.0, 40.0]], (30, 1)), 40.0, CurveSettings()) is None
 
 
 def test_radius_of_a_circle() -> None:
@@ -149,12 +194,130 @@ def test_lane_on_the_road(centre: float, slope: float, bend: float) -> None:
     # Both edges of a marking are in the window, so its middle is what is found.
     assert np.abs(estimate.points_cm.reshape(2, 3)[:, 1:] - (middle + [[-20.0], [20.0]])[:, 1:]).max() < 1.5
     assert np.abs(estimate.points_cm.reshape(2, 3)[:, 0] - (middle[0] + np.array([-20.0, 20.0]))).max() < 3.0
-    assert estimate.steering_rad == pytest.approx(math.atan2(-middle[1], 15.0), abs=0.08)
-    assert painter.lane.offset_m == pytest.approx(-0.01 * centre, abs=0.03)
+    # 3.5 heights of 20 cm ahead.
+    aim = centre + slope * 70.0 + bend * 70.0**2
+    assert estimate.steering_rad == pytest.approx(math.atan2(-aim, 70.0), abs=0.03)
+    assert estimate.offset_cm == pytest.approx(-centre, abs=3.0)
+    assert (painter.lane.offset_cm, painter.lane.radius_cm) == (estimate.offset_cm, estimate.radius_cm)
     if bend:
-        assert painter.lane.radius_m == pytest.approx(0.01 / (2.0 * bend), rel=0.3)
+        assert estimate.radius_cm == pytest.approx(1.0 / (2.0 * bend), rel=0.3)
     else:
-        assert painter.lane.radius_m > 8.0
+        assert estimate.radius_cm > 800.0
+
+
+def test_straight_lines_tell_offset_and_an_infinite_radius() -> None:
+    painter = LanePainter(CAMERA, PainterSettings(curves=False))
+    estimate = painter.detect(lane_frame(4.0))
+    assert estimate.radius_cm == math.inf and estimate.offset_cm == pytest.approx(-4.0, abs=2.0)
+    assert painter.last.text.startswith("straight  ") and painter.last.text.endswith(" cm left of the middle")
+    nothing = painter.detect(np.zeros((240, 320, 3), np.uint8))
+    assert math.isnan(nothing.radius_cm) and math.isnan(nothing.offset_cm) and painter.last.text == ""
+
+
+def test_radius_of_the_only_curve_and_offset_at_the_nearest_known_row() -> None:
+    points = np.stack([np.zeros(2), [10.0, 60.0]], axis=1)
+    straight = Marking(SolidLine(0.0, 0.0), None, points, points)
+    bent = Marking(SolidLine(0.0, 0.0), Curve(0.005, 0.0, 20.0, 0.0, 60.0), points, points)
+    rows = np.array([[math.nan, -18.0, -17.0], [22.0, 21.0, 20.0]])
+    lane = measure_lane((straight, bent), rows)
+    assert lane.radius_cm == pytest.approx(100.0) and lane.offset_cm == pytest.approx(-1.5)
+    assert lane.text == "R 100 cm  1.5 cm left of the middle"
+    assert measure_lane((straight, straight), rows).radius_cm == math.inf
+    assert math.isnan(measure_lane((straight, None), rows).radius_cm)
+    assert math.isnan(measure_lane((straight, bent), rows * math.nan).offset_cm)
+
+
+def test_the_aim_lies_where_both_lines_are_seen() -> None:
+    left = np.array([[-20.0, 20.0], [-10.0, 120.0]])
+    right = np.array([[20.0, 10.0], [20.0, 50.0]])
+    pair = tuple(Marking(SolidLine(0.0, 0.0), None, line, line) for line in (left, right))
+    for look_ahead, y in ((5.0, 20.0), (40.0, 40.0), (100.0, 50.0)):
+        aim = find_aim_cm((pair[0], pair[1]), look_ahead)
+        assert aim == pytest.approx((0.5 * (-20.0 + 0.1 * (y - 20.0) + 20.0), y))
+    beyond = Marking(SolidLine(0.0, 0.0), None, left, left + [0.0, 60.0])
+    assert find_aim_cm((beyond, pair[1]), 40.0) is None and find_aim_cm((None, pair[1]), 40.0) is None
+
+
+def test_look_ahead_of_the_steering() -> None:
+    frame = lane_frame(0.0, 0.0, 0.0025)
+    near, far = (
+        LanePainter(CAMERA, PainterSettings(look_ahead_cm=y)).detect(frame).steering_rad for y in (25.0, 60.0)
+    )
+    # A bend to the right, little of which is seen near the car.
+    assert -0.1 < near < 0.0 and far == pytest.approx(math.atan2(-9.0, 60.0), abs=0.03)
+
+
+def edge_frame() -> tuple[np.ndarray, EdgeField]:
+    """A white stripe from (100, 200) to (160, 100) in the trapezoid, and the field of its edges."""
+    frame = np.full((240, 320, 3), 60, np.uint8)
+    cv2.line(frame, (88, 220), (172, 80), (230, 230, 230), 5)
+    settings = PainterEdgeSettings()
+    edges = find_painter_edges(frame, TRAPEZOID, settings)
+    return frame, find_edge_field(frame, edges, TRAPEZOID, settings)
+
+
+def test_evidence_of_a_stripe_and_of_lines_beside_and_across_it() -> None:
+    _, edges = edge_frame()
+    settings = EvidenceSettings()
+    on = measure_evidence(np.array([[100.0, 200.0], [160.0, 100.0]]), edges, settings)
+    assert on.support > 0.95 and on.aligned > 0.9 and on.extent > 0.95 and on.clutter < 0.05
+    assert on.is_strong(settings) and on.is_likely(settings)
+    beside = measure_evidence(np.array([[160.0, 200.0], [190.0, 100.0]]), edges, settings)
+    assert beside.support == 0.0 and not beside.is_likely(settings)
+    # It crosses the stripe, whose edges do not run along it.
+    across = measure_evidence(np.array([[160.0, 200.0], [100.0, 100.0]]), edges, settings)
+    assert across.support == 0.0
+    assert measure_evidence(np.array([[100.0, 200.0]]), edges, settings) == LineEvidence()
+    none = EdgeField(np.empty((0, 2)), np.empty((0, 2)), TRAPEZOID, 320)
+    assert measure_evidence(np.array([[100.0, 200.0], [160.0, 100.0]]), none, settings) == LineEvidence()
+
+
+def marking(bottom: float, top: float, support: float, aligned: float = 0.9) -> Marking:
+    line = SolidLine(bottom, top)
+    line_px = straight_px(line, TRAPEZOID)
+    points = SquarePlane(TRAPEZOID).from_image(line_px)
+    return Marking(line, None, line_px, points, LineEvidence(support, 0.0, aligned, 0.9))
+
+
+def choose(lefts: list[Marking], rights: list[Marking]) -> tuple[float | None, float | None]:
+    pair = choose_lane(lefts, rights, TRAPEZOID, None, LINES, EvidenceSettings())
+    left, right = (None if m is None else m.line.bottom_px for m in pair)
+    return left, right
+
+
+def test_choice_of_the_lane() -> None:
+    left, right = marking(60.0, 135.0, 0.8), marking(260.0, 185.0, 0.7)
+    assert choose([left], [right]) == (60.0, 260.0)
+    # The lane of the car rather than both lanes; but not for a faint line between them.
+    assert choose([left, marking(160.0, 160.0, 0.5)], [right]) == (160.0, 260.0)
+    assert choose([left, marking(160.0, 160.0, 0.2, 0.5)], [right]) == (60.0, 260.0)
+    # Lines that do not run beside each other on the road are no lane: the better one stays.
+    assert choose([left], [marking(260.0, 140.0, 0.7)]) == (60.0, None)
+    # A faint line is answered with a partner only.
+    faint = marking(260.0, 185.0, 0.3, 0.5)
+    assert choose([left], [faint]) == (60.0, 260.0) and choose([], [faint]) == (None, None)
+    assert choose([marking(60.0, 135.0, 0.5)], []) == (None, None)
+
+
+def test_the_papers_plain_behaviour_by_settings() -> None:
+    # Every segment of a side counts, and whatever comes of it is answered.
+    plain = check_settings(
+        PainterSettings,
+        {
+            "mode": "photo",
+            "curves": False,
+            "evidence": {"required": False},
+            "edges": {"max_edge_share": 1.0},
+            "lines": {"agree_share": 1e6, "min_support_share": 0.0, "min_width_share": 0.0},
+        },
+        "test",
+    )
+    segments = np.array([[100.0, 200.0, 120.0, 180.0], [20.0, 200.0, 60.0, 160.0]])
+    left, right = find_two_lines(segments, TRAPEZOID, (None, None), plain.lines)
+    assert left is not None and right is None
+    # The mean over all, weighted by length: (20 * 100 + 40 * 20) / 60.
+    assert left.bottom_px == pytest.approx(46.667, abs=1e-3)
+    assert LanePainter(None, plain).detect(lane_frame(0.0)).confidence > 0.0
 
 
 def test_without_a_camera_the_image_lines_lie_on_the_markings() -> None:
@@ -166,7 +329,7 @@ def test_without_a_camera_the_image_lines_lie_on_the_markings() -> None:
     )
     estimate = painter.detect(lane_frame(0.0))
     assert estimate.confidence == 1.0 and not estimate.mask.any()
-    assert abs(estimate.steering_rad) < 0.05 and math.isnan(painter.lane.radius_m)
+    assert abs(estimate.steering_rad) < 0.05 and math.isnan(painter.lane.radius_cm)
     for side, line in ((-20.0, painter.last.left_px), (20.0, painter.last.right_px)):
         assert line is not None
         for y in (30.0, 60.0):
@@ -182,11 +345,12 @@ def test_video_remembers_and_photo_does_not() -> None:
         painter.detect(lane_frame())
         empty = painter.detect(black)
         assert not empty.mask.any() and empty.confidence == 0.0 and math.isnan(empty.steering_rad)
-    # What is remembered is drawn, not answered.
-    assert video.last.left_px is not None and photo.last.left_px is None
+    # What is remembered is drawn as such, not answered.
+    assert video.last.left_px is None and len(video.last.memory_px) == 2
+    assert photo.last.left_px is None and photo.last.memory_px == ()
     for _ in range(5):
         video.detect(black)
-    assert video.last.left_px is None
+    assert video.last.memory_px == ()
 
 
 def test_filled_lane_is_drawn() -> None:

@@ -9,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.world.kernels import box_share, locate, painted_share
+from datagen.world.light import mirror_lamps
 from datagen.world.look import LookSettings, random_look
 from datagen.world.renderer import PixelGround, Renderer
 from datagen.world.rig import CameraSettings
+from datagen.world.scene import build_scene
 from datagen.world.track import MarkingSettings, Track, TrackSettings, random_track
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
@@ -153,7 +155,7 @@ def test_box_share_is_the_area_behind_an_edge(d, a, b):
 def test_dashes_are_painted_with_their_length():
     stretches = np.array([[10.0, 30.0], [50.0, 70.0], [90.0, 110.0]])
     s = np.arange(0.0, 120.0, 0.25)
-    share = np.array([painted_share(x, 0.8, 0.3, stretches, 0, 3) for x in s])
+    share = np.array([painted_share(x, 0.8, 0.3, 0.0, stretches, 0, 3) for x in s])
     assert share.sum() * 0.25 == pytest.approx(60.0, abs=1e-6)
     assert share[s == 20.0] == 1.0 and share[s == 40.0] == 0.0 and share[s == 50.0] == pytest.approx(0.5)
 
@@ -191,9 +193,7 @@ def test_moving_the_world_moves_nothing_in_the_image():
     c, s = np.cos(1.3), np.sin(1.3)
     there = np.array([c * pose[0] - s * pose[1] + 120.0, s * pose[0] + c * pose[1] - 40.0, pose[2] + 1.3])
     a, b = _renderer(track).render(pose).astype(int), _renderer(moved).render(there).astype(int)
-    floor = np.zeros(a.shape[:2], bool)
-    floor.ravel()[GROUND.floor] = True
-    assert np.abs(a - b)[floor].max() <= 1
+    assert np.abs(a - b)[GROUND.floor].max() <= 1
 
 
 def test_mirrored_road_gives_the_mirrored_image():
@@ -201,9 +201,7 @@ def test_mirrored_road_gives_the_mirrored_image():
     pose = _pose(track, 150.0, 3.0, 0.1)
     image = _renderer(track).render(pose)
     mirrored = _renderer(track.mirrored()).render(pose * [1.0, -1.0, -1.0])
-    floor = np.zeros(image.shape[:2], bool)
-    floor.ravel()[GROUND.floor] = True
-    floor &= floor[:, ::-1]
+    floor = GROUND.floor & GROUND.floor[:, ::-1]
     assert np.abs(image.astype(int) - mirrored[:, ::-1].astype(int))[floor].max() <= 1
     assert (image[floor] > 150).any()
 
@@ -232,7 +230,7 @@ def test_place_along_the_road_agrees_with_the_track():
         for s, offset in zip(rng.uniform(2.0, 898.0, 200), rng.uniform(-25.0, 25.0, 200), strict=True):
             xy, heading = track.point(s, offset)
             guess = (int(s / track.step_cm) + int(rng.integers(-3, 4))) % len(track.s_cm)
-            found = locate(xy[0], xy[1], renderer._nodes, closed, guess)
+            found = locate(xy[0], xy[1], renderer._road[0], closed, guess)
             near = (found[0] - s + 450.0) % 900.0 - 450.0 if closed else found[0] - s
             assert abs(near) < 0.01
             assert found[1] == pytest.approx(offset, abs=0.005)
@@ -286,12 +284,11 @@ def test_noise_depends_on_the_frame_and_not_on_the_order():
 
 def test_lamps_wander_as_a_mirror_would_have_it():
     track = _road(0)
-    renderer = _renderer(track, lamps_per_m=2.0)
-    lamps = renderer._scene.lamps
+    lamps = build_scene(track, LookSettings(lamps_per_m=2.0), np.random.default_rng(7)).lamps
     pose = _pose(track, 200.0)
-    spots = renderer._mirrored_lamps(pose)
     # Equal angles: the ray through the spot, mirrored in the floor, meets the lamp.
     eye = np.array([*(pose[:2] + 24.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])), 20.0])
+    spots = mirror_lamps(lamps, eye, 120.0, 250.0)
     for spot in spots:
         ray = np.array([*spot[:2], 0.0]) - eye
         ray[2] = -ray[2]

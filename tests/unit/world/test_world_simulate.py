@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from datagen.world.car import CarSettings, advance
-from datagen.world.driver import Driver, DriverSettings
 from datagen.world.look import LookSettings
 from datagen.world.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings, build_world, drive_frames, frames_of, simulate_drive
@@ -62,7 +61,7 @@ def test_the_car_does_not_change_the_road_or_the_wandering():
     b = build_world(_settings(seed=2, car=CarSettings(speed_noise=0.0, steering_gain=0.8, speed_gain=0.94)))
     n = min(len(a.track.xy_cm), len(b.track.xy_cm))
     np.testing.assert_array_equal(a.track.xy_cm[:n], b.track.xy_cm[:n])
-    assert a.driver.offset_cm(100.0) == b.driver.offset_cm(100.0)
+    assert a.driver.script.offset_cm(100.0) == b.driver.script.offset_cm(100.0)
 
 
 def test_truth_follows_from_pose_and_track():
@@ -168,8 +167,7 @@ def test_an_interrupted_drive_leaves_nothing(tmp_path):
 def test_contradictions_are_refused():
     with pytest.raises(ConfigError, match="too short for 12 frames"):
         build_world(_settings(track=TrackSettings(length_cm=150.0)))
-    world = build_world(_settings())
     with pytest.raises(ConfigError, match="shortest_wander_cm 500"):
-        Driver(DriverSettings(shortest_wander_cm=500.0), world.track, 0.0, 0.4, np.random.default_rng(0))
+        check_settings(SimulationSettings, {"driver": {"shortest_wander_cm": 500.0}}, "x.yaml")
     with pytest.raises(ConfigError, match="did you mean 'frames'"):
         check_settings(SimulationSettings, {"frame": 3}, "x.yaml")

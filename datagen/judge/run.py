@@ -1,0 +1,242 @@
+"""One run: a detector drives one road, and is measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from datagen.judge.settings import JudgeSettings
+from datagen.judge.wheels import DepartureCounter, wheel_offsets_cm
+from datagen.world.closed_loop import ClosedLoop, LoopFrame
+from datagen.world.pilot import (
+    DetectorPilot,
+    DriverPilot,
+    Pilot,
+    PilotSettings,
+    TruePointsPilot,
+    steering_settings,
+)
+from datagen.world.world import SimulationSettings, World, assemble_world
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+from lanenet.perception.estimate import Detector
+
+#: Makes a detector for a camera, a lane width and a width of the markings, both in cm.
+BuildDetector = Callable[[Camera, float, float | None], Detector]
+
+#: The scripted driver, who is given the true pose, and the steering law, given the true points.
+TRUTH, TRUE_POINTS = "truth", "true-points"
+
+_FACING_AWAY_RAD = 1.2
+_MOVED_CM = 5.0
+_AHEAD_OF_STUCK_CM = 50.0
+_BEFORE_THE_END_CM = 60.0  # of an open road: further on there is not enough road to see
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """Who takes part.
+
+    Attributes:
+        name: In tables and file names.
+        build: Makes its detector; None for those that are given the truth.
+        identity: Changes when its answers may change, beside what the settings say.
+    """
+
+    name: str
+    build: BuildDetector | None = None
+    identity: str = ""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How one run went.
+
+    Attributes:
+        entrant: Who drove.
+        kind: Kind of road.
+        number: Number of the road among its kind.
+        seed: Of the world.
+        completed: Whether all the way was driven, put back or not.
+        ended: Why the run ended: ``completed``, ``left the lane``, ``stuck`` or ``out of time``.
+        laps: Driven; of an open road, its share.
+        departures: How often a wheel went over a line.
+        put_backs: How often the car had to be put back.
+        mean_offset_cm: Mean distance of the front axle's middle from the lane's centre.
+        worst_offset_cm: Largest such distance.
+        steering_rms_rad_s: Root mean square of the change of the commanded steering per second.
+        unanswered: Share of the frames without an answer.
+        frames: Number of frames.
+        time_s: Time driven.
+    """
+
+    entrant: str
+    kind: str
+    number: int
+    seed: int
+    completed: bool
+    ended: str
+    laps: float
+    departures: int
+    put_backs: int
+    mean_offset_cm: float
+    worst_offset_cm: float
+    steering_rms_rad_s: float
+    unanswered: float
+    frames: int
+    time_s: float
+
+    @property
+    def road(self) -> str:
+        """Name of the road."""
+        return f"{self.kind}_{self.number:02d}"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One run frame by frame.
+
+    Attributes:
+        t_s: Time since the start.
+        xy_cm: Middle of the front axle, frame map.
+        s_cm: Its way along the road.
+        offset_cm: Its offset from the lane's centre, left positive.
+        steering_rad: Commanded steering.
+        answered: Whether the detector had an answer.
+        over: Whether the car was out of its lane.
+        put_back: Whether the car was put back after this frame.
+    """
+
+    t_s: Float[np.ndarray, "n"]
+    xy_cm: Float[np.ndarray, "n 2"]
+    s_cm: Float[np.ndarray, "n"]
+    offset_cm: Float[np.ndarray, "n"]
+    steering_rad: Float[np.ndarray, "n"]
+    answered: Bool[np.ndarray, "n"]
+    over: Bool[np.ndarray, "n"]
+    put_back: Bool[np.ndarray, "n"]
+
+
+def drive_run(
+    settings: JudgeSettings, simulation: SimulationSettings, entrant: Entrant, kind: str, number: int
+) -> tuple[RunResult, Trajectory]:
+    """Let an entrant drive a road.
+
+    Args:
+        settings: The contest.
+        simulation: The road's world, see :func:`datagen.judge.settings.road_simulation`.
+        entrant: Who drives.
+        kind: Kind of road, for the result.
+        number: Number of the road, for the result.
+    """
+    world = assemble_world(simulation)
+    loop = ClosedLoop(world, build_pilot(world, entrant, settings.pilot), settings.pilot, settings.speed_cm_s)
+    referee = _Referee(settings, world, loop.s_cm)
+    most_frames = math.ceil(settings.slack * referee.way_cm / settings.speed_cm_s * simulation.rate_hz)
+    ended = "out of time"
+    for _ in range(most_frames):
+        lost = referee.look(loop.next_frame())
+        if referee.share == 1.0:
+            ended = "completed"
+            break
+        if lost and not settings.put_back:
+            ended = lost
+            break
+        if lost:
+            loop.put_back(_AHEAD_OF_STUCK_CM if lost == "stuck" else 0.0)
+            referee.put_back(loop.s_cm)
+    trajectory = referee.trajectory()
+    result = RunResult(
+        entrant=entrant.name,
+        kind=kind,
+        number=number,
+        seed=simulation.seed,
+        completed=ended == "completed",
+        ended=ended,
+        laps=referee.share * (settings.laps if world.track.closed else 1),
+        departures=referee.wheels.count,
+        put_backs=int(trajectory.put_back.sum()),
+        mean_offset_cm=float(np.abs(trajectory.offset_cm).mean()),
+        worst_offset_cm=float(np.abs(trajectory.offset_cm).max()),
+        steering_rms_rad_s=_steering_rms_rad_s(trajectory, simulation.rate_hz),
+        unanswered=float(1.0 - trajectory.answered.mean()),
+        frames=len(trajectory.t_s),
+        time_s=float(trajectory.t_s[-1]),
+    )
+    return result, trajectory
+
+
+class _Referee:
+    """Watches a run: where the car is, whether its wheels are out, whether it is lost.
+
+    Attributes:
+        way_cm: To be driven.
+        share: Of the way, driven so far.
+        wheels: Counts the departures.
+    """
+
+    def __init__(self, settings: JudgeSettings, world: World, start_cm: float) -> None:
+        self._settings, self._track = settings, world.track
+        self._wheelbase_cm = world.settings.car.wheelbase_cm
+        length_cm = world.track.length_cm
+        if world.track.closed:
+            self.way_cm = settings.laps * length_cm
+        else:
+            self.way_cm = max(length_cm - _BEFORE_THE_END_CM - start_cm, 1.0)
+        self.share = 0.0
+        self.wheels = DepartureCounter(world.track.lane_width_cm)
+        self._start_cm, self._moved_at_s, self._moved_to_cm = start_cm, 0.0, start_cm
+        self._rows: list[list[float]] = []
+
+    def look(self, frame: LoopFrame) -> str:
+        """Take a frame; return why the car is beyond recovery, or an empty text."""
+        state, settings, track = frame.state, self._settings, self._track
+        over = self.wheels.update(
+            wheel_offsets_cm(track, state.pose, self._wheelbase_cm, settings.track_width_cm, frame.s_cm)
+        )
+        front_cm = map_from_car(np.zeros((1, 2)), state.pose, self._wheelbase_cm)[0]
+        flags = [float(frame.answered), float(over), 0.0]
+        numbers = [state.t_s, *map(float, front_cm), frame.s_cm, frame.offset_cm, state.steering_rad]
+        self._rows.append(numbers + flags)
+        self.share = min(max((frame.s_cm - self._start_cm) / self.way_cm, 0.0), 1.0)
+        if abs(frame.s_cm - self._moved_to_cm) > _MOVED_CM:
+            self._moved_at_s, self._moved_to_cm = state.t_s, frame.s_cm
+        away_rad = math.remainder(float(state.pose[2]) - track.point(frame.s_cm)[1], 2.0 * math.pi)
+        if abs(frame.offset_cm) > settings.off_lane_share * track.lane_width_cm:
+            return "left the lane"
+        if abs(away_rad) > _FACING_AWAY_RAD:
+            return "left the lane"
+        return "stuck" if state.t_s - self._moved_at_s > settings.stuck_s else ""
+
+    def put_back(self, s_cm: float) -> None:
+        """The car stands in the lane again, at a place along the road."""
+        self._rows[-1][-1] = 1.0
+        self._moved_at_s, self._moved_to_cm = self._rows[-1][0], s_cm
+        self.wheels.put_back()
+
+    def trajectory(self) -> Trajectory:
+        """Return the run so far."""
+        table = np.array(self._rows)
+        flags = (table[:, 6:] > 0.5).T
+        return Trajectory(table[:, 0], table[:, 1:3], table[:, 3], table[:, 4], table[:, 5], *flags)
+
+
+def build_pilot(world: World, entrant: Entrant, settings: PilotSettings) -> Pilot:
+    """Return who steers in a world."""
+    car, track = world.settings.car, world.track
+    steering = steering_settings(settings, car.wheelbase_cm, car.max_steering_rad, track.lane_width_cm)
+    if entrant.build is not None:
+        marking_cm = track.markings[0].width_cm if track.markings else None
+        detector = entrant.build(world.camera, track.lane_width_cm, marking_cm)
+        return DetectorPilot(detector, settings, steering)
+    return DriverPilot(world.driver) if entrant.name == TRUTH else TruePointsPilot(track, steering)
+
+
+def _steering_rms_rad_s(trajectory: Trajectory, rate_hz: float) -> float:
+    """Of the commands of frames between which the car was not put back."""
+    change = np.diff(trajectory.steering_rad)[~trajectory.put_back[:-1]] * rate_hz
+    return float(np.sqrt(np.mean(change**2))) if change.size else 0.0

@@ -1,0 +1,213 @@
+"""Which things stand on a road: those that are listed, checked, and random ones where there is room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from datagen.world.furniture import (
+    Arrow,
+    Colour,
+    Furniture,
+    FurnitureRates,
+    Junction,
+    Parking,
+    StopLine,
+    Zebra,
+    extent_cm,
+)
+from datagen.world.furniture_paint import Painted, paint_furniture
+from datagen.world.road import Track
+from lanenet.errors import ConfigError
+
+_TRIES = 15
+_APART_CM = 30.0  # least gap between random things along the road
+_BESIDE_CM = 10.0  # and beside it
+_OUTLINE_CM = 5.0  # spacing of the points that are compared
+_BEND_RAD = 0.1  # how much the road may turn over a junction
+
+
+def listed_furniture(
+    track: Track, items: Sequence[Furniture], line_width_cm: float, where: str
+) -> list[Painted]:
+    """Paint what a file lists.
+
+    Raises:
+        ConfigError: If something lies beyond the end, on a bend that it does not fit, or on another stretch
+            of the road; with its place in the list.
+    """
+    result = []
+    for number, item in enumerate(items):
+        problem = _misplaced(track, item)
+        painted = None
+        if problem is None:
+            painted = paint_furniture(track, item, line_width_cm)
+            problem = _on_the_road(track, item, painted)
+        if painted is None or problem is not None:
+            raise ConfigError(f"{where}: key 'furniture.{number}.{item.kind}.at_cm': {problem}")
+        result.append(painted)
+    return result
+
+
+def random_furniture(
+    track: Track,
+    rates: FurnitureRates,
+    taken: Sequence[Furniture],
+    line_width_cm: float,
+    colour: Colour,
+    rng: np.random.Generator,
+) -> list[Painted]:
+    """Draw things where there is room; what finds none is left out.
+
+    Args:
+        track: The road.
+        rates: How many.
+        taken: Things that are there already.
+        line_width_cm: Width of the tape.
+        colour: Of the paint.
+        rng: Source of randomness; each kind of thing has its own child.
+    """
+    occupied = [(item.value.at_cm, extent_cm(item)) for item in taken]
+    # Side roads and bays may meet beside the road, also where their mouths are far apart along it.
+    outlines = [_outline(paint_furniture(track, item, line_width_cm).boxes) for item in taken]
+    result = []
+    # The order is part of the format: the widest things first, new kinds at the end.
+    kinds: tuple[Literal["junction", "parking", "zebra", "stop_line", "arrow"], ...] = (
+        "junction",
+        "parking",
+        "zebra",
+        "stop_line",
+        "arrow",
+    )
+    for kind, kind_rng in zip(kinds, rng.spawn(len(kinds)), strict=True):
+        expected = getattr(rates, f"{kind}_per_m") * track.length_cm / 100.0
+        for _ in range(kind_rng.poisson(expected)):
+            for _ in range(_TRIES):
+                at_cm = float(kind_rng.uniform(0.0, track.length_cm))
+                thing = _random_thing(track, kind, at_cm, kind_rng).model_copy(update={"colour": colour})
+                item = Furniture(**{kind: thing})
+                if not _is_free(track, item, occupied) or _misplaced(track, item) is not None:
+                    continue
+                painted = paint_furniture(track, item, line_width_cm)
+                outline = _outline(painted.boxes)
+                if any(_meets(outline, other, _BESIDE_CM) for other in outlines):
+                    continue
+                if _on_the_road(track, item, painted) is None:
+                    outlines.append(outline)
+                    occupied.append((at_cm, extent_cm(item)))
+                    result.append(painted)
+                    break
+    return result
+
+
+def _random_thing(track: Track, kind: str, at_cm: float, rng: np.random.Generator) -> Any:
+    lane_cm = track.lane_width_cm
+    share, choice, size = rng.random(3)
+    if kind == "junction":
+        return Junction(
+            at_cm=at_cm,
+            sides="left" if choice < 0.35 else "right" if choice < 0.7 else "both",
+            width_cm=2.0 * track.half_width_cm,
+            corner_radius_cm=lane_cm * (0.25 + 0.5 * size),
+            length_cm=lane_cm * (2.0 + 2.0 * share),
+            stop=bool(rng.random() < 0.7),
+        )
+    if kind == "parking":
+        across = choice < 0.4
+        return Parking(
+            at_cm=at_cm,
+            side="right" if share < 0.8 else "left",
+            bays=1 + int(4.0 * size),
+            bay_cm=lane_cm * (0.85 if across else 1.6),
+            depth_cm=lane_cm * (1.2 if across else 0.75),
+        )
+    if kind == "zebra":
+        bar_cm = 3.0 + 3.0 * share
+        return Zebra(at_cm=at_cm, length_cm=lane_cm * (0.7 + 0.6 * size), bar_cm=bar_cm, gap_cm=bar_cm)
+    if kind == "stop_line":
+        return StopLine(at_cm=at_cm, thickness_cm=2.0 + 3.0 * size, dashed=bool(choice < 0.3))
+    return Arrow(
+        at_cm=at_cm,
+        direction="straight" if choice < 0.34 else "left" if choice < 0.67 else "right",
+        length_cm=lane_cm * (0.6 + 0.4 * size),
+        strip_cm=1.5 + 2.0 * share,
+    )
+
+
+def _is_free(track: Track, item: Furniture, occupied: Sequence[tuple[float, float]]) -> bool:
+    for at_cm, length_cm in occupied:
+        apart = abs(item.value.at_cm - at_cm)
+        if track.closed:
+            apart = min(apart, track.length_cm - apart)
+        if apart < 0.5 * (extent_cm(item) + length_cm) + _APART_CM:
+            return False
+    return True
+
+
+def _misplaced(track: Track, item: Furniture) -> str | None:
+    """What is wrong with the place along the road; None where nothing is."""
+    at_cm, half_cm = item.value.at_cm, 0.5 * extent_cm(item)
+    last_cm = track.length_cm - (0.0 if track.closed else half_cm)
+    first_cm = 0.0 if track.closed else half_cm
+    if not first_cm <= at_cm <= last_cm:
+        return (
+            f"found {at_cm:g}, expected {first_cm:g} to {last_cm:.1f}: the road is {track.length_cm:.1f} cm "
+            f"long and this takes up {2.0 * half_cm:.1f} cm"
+        )
+    places = np.arange(at_cm - half_cm, at_cm + half_cm + track.step_cm, track.step_cm)
+    curvature = np.array([track.curvature(float(s)) for s in places])
+    if item.junction is not None:
+        turn = float(np.abs(np.cumsum(curvature)).max()) * track.step_cm
+        if turn > _BEND_RAD:
+            return (
+                f"found a road that turns by {np.rad2deg(turn):.0f} degrees over the junction at "
+                f"{at_cm:g} cm, expected at most {np.rad2deg(_BEND_RAD):.0f}"
+            )
+    if item.parking is not None:
+        inwards = curvature if item.parking.side == "left" else -curvature
+        back_cm = track.half_width_cm + abs(track.middle_cm) + item.parking.depth_cm
+        if inwards.max() * back_cm > 0.8:
+            return (
+                f"found a bend of {1.0 / inwards.max():.0f} cm towards the bays at {at_cm:g} cm, expected "
+                f"at least {back_cm / 0.8:.0f}"
+            )
+    return None
+
+
+def _on_the_road(track: Track, item: Furniture, painted: Painted) -> str | None:
+    """Whether something beside the road lies on another stretch of it."""
+    if item.junction is None and item.parking is None:
+        return None
+    outer = _outline(painted.boxes)
+    gap = np.abs(track.s_cm - item.value.at_cm)
+    if track.closed:
+        gap = np.minimum(gap, track.length_cm - gap)
+    reach = track.half_width_cm + 2.0
+    # What is beside the thing itself is its own stretch; corner and half the road for what is left of a bend.
+    others = np.flatnonzero(gap > 0.5 * extent_cm(item) + 2.0 * reach)[::3]
+    normal = np.stack([-np.sin(track.heading_rad[others]), np.cos(track.heading_rad[others])], axis=1)
+    middle = track.xy_cm[others] + track.middle_cm * normal
+    for i in range(0, len(middle), 4096):
+        d = np.linalg.norm(outer[:, None] - middle[None, i : i + 4096], axis=2)
+        if d.min() < reach:
+            s_cm = track.s_cm[others[i + int(d.min(axis=0).argmin())]]
+            return f"it lies on another stretch of the road, at {s_cm:.0f} cm; make it shorter or move it"
+    return None
+
+
+def _outline(boxes: Float[np.ndarray, "b 9"]) -> Float[np.ndarray, "c 2"]:
+    """Points along the middle of all strips."""
+    points = [np.empty((0, 2))]
+    for box in boxes:
+        share = np.linspace(-1.0, 1.0, max(2, int(np.ceil(2.0 * box[4] / _OUTLINE_CM)) + 1))
+        points.append(box[:2] + (share * box[4])[:, None] * box[2:4])
+    return np.concatenate(points)
+
+
+def _meets(a_cm: Float[np.ndarray, "a 2"], b_cm: Float[np.ndarray, "b 2"], within_cm: float) -> bool:
+    if not len(a_cm) or not len(b_cm):
+        return False
+    return bool(np.linalg.norm(a_cm[:, None] - b_cm[None], axis=2).min() < within_cm)

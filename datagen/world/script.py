@@ -1,0 +1,124 @@
+"""What a scripted driver is after: where in the lane, and how fast."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lanenet.config import Settings
+
+_WAVES = 4
+_EXCURSIONS = 64  # drawn ahead; a longer drive repeats them
+_EXCURSION_SHARE = 0.7  # of their spacing: the rest is driven where the driver would be anyway
+_SPEED_WAVE_CM = (100.0, 500.0)
+_CRAWL_CM = 1.0
+_SPEED_CM_S = {"wander": 60.0, "recover": 60.0, "fast": 100.0}
+
+
+class DriverSettings(Settings):
+    """How the car is driven.
+
+    Attributes:
+        style: ``wander`` keeps near the middle of the lane, ``recover`` also goes off to one side and comes
+            back, again and again; ``crawl`` is 1 cm per frame as in Kozlowski et al. 2024, ``fast`` 1 m/s.
+        direction: ``backward`` drives the same road the other way.
+        speed_cm_s: Commanded speed; None: the style's, 60 cm/s but for ``crawl`` and ``fast``.
+        speed_variation: Largest relative change of speed, which varies slowly.
+        pauses_per_m: Stops, per metre of road.
+        pause_s: How long the car is told to stand.
+        aim_ahead_cm: Distance ahead of the front axle of the point that the front wheels are turned to.
+        wander_cm: Largest offset from the middle of the lane that the driver aims for.
+        shortest_wander_cm: Shortest wave of the wandering.
+        longest_wander_cm: Longest wave.
+        recover_cm: Largest excursion to one side with the style ``recover``; the smallest is half of it.
+        recover_every_cm: From one excursion to the next.
+    """
+
+    style: Literal["wander", "recover", "crawl", "fast"] = "wander"
+    direction: Literal["forward", "backward"] = "forward"
+    speed_cm_s: float | None = Field(default=None, gt=0.0)
+    speed_variation: float = Field(default=0.0, ge=0.0, lt=1.0)
+    pauses_per_m: float = Field(default=0.0, ge=0.0)
+    pause_s: float = Field(default=1.5, gt=0.0)
+    aim_ahead_cm: float = Field(default=20.0, gt=0.0)
+    wander_cm: float = Field(default=6.0, ge=0.0)
+    shortest_wander_cm: float = Field(default=150.0, gt=0.0)
+    longest_wander_cm: float = Field(default=400.0, gt=0.0)
+    recover_cm: float = Field(default=12.0, ge=0.0)
+    recover_every_cm: float = Field(default=200.0, gt=0.0)
+
+    @model_validator(mode="after")
+    def _waves_in_order(self) -> DriverSettings:
+        if self.shortest_wander_cm > self.longest_wander_cm:
+            raise ValueError(
+                f"shortest_wander_cm {self.shortest_wander_cm:g} exceeds longest_wander_cm "
+                f"{self.longest_wander_cm:g}"
+            )
+        return self
+
+    def chosen_speed_cm_s(self, rate_hz: float) -> float:
+        """Commanded speed at a frame rate, without its variation."""
+        if self.speed_cm_s is not None:
+            return self.speed_cm_s
+        return _CRAWL_CM * rate_hz if self.style == "crawl" else _SPEED_CM_S[self.style]
+
+
+class Script:
+    """Offset and speed along the road, drawn once."""
+
+    def __init__(self, settings: DriverSettings, rate_hz: float, rng: np.random.Generator) -> None:
+        """Draw what the settings leave open."""
+        self.settings = settings
+        self._speed_cm_s = settings.chosen_speed_cm_s(rate_hz)
+        lengths_cm = rng.uniform(settings.shortest_wander_cm, settings.longest_wander_cm, _WAVES)
+        self._waves = 2.0 * np.pi / lengths_cm
+        self._phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+        share = rng.uniform(0.5, 1.0, _WAVES)
+        self._amplitudes_cm = settings.wander_cm * share / share.sum()
+        # The order is part of the format: a new part takes a new child at the end.
+        excursion_rng, speed_rng, self._pause_rng = rng.spawn(3)
+        side = np.where(excursion_rng.random(_EXCURSIONS) < 0.5, 1.0, -1.0)
+        self._excursions_cm = settings.recover_cm * side * excursion_rng.uniform(0.5, 1.0, _EXCURSIONS)
+        self._speed_waves = 2.0 * np.pi / speed_rng.uniform(*_SPEED_WAVE_CM, _WAVES)
+        self._speed_phases = speed_rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+        self._pause_until_s = -math.inf
+        self._pause_at_cm: float | None = None
+
+    def offset_cm(self, s_cm: float) -> float:
+        """Offset that the driver aims for at a place along the road, left positive, [cm]."""
+        offset_cm = float(np.sum(self._amplitudes_cm * np.sin(self._waves * s_cm + self._phases)))
+        if self.settings.style == "recover":
+            number, share = divmod(s_cm / self.settings.recover_every_cm, 1.0)
+            if share < _EXCURSION_SHARE:
+                height_cm = float(self._excursions_cm[int(number) % _EXCURSIONS])
+                offset_cm += height_cm * math.sin(math.pi * share / _EXCURSION_SHARE) ** 2
+        return offset_cm
+
+    def slope(self, s_cm: float) -> float:
+        """Change of the offset per way along the road."""
+        return self.offset_cm(s_cm + 0.5) - self.offset_cm(s_cm - 0.5)
+
+    def speed_cm_s(self, s_cm: float, t_s: float) -> float:
+        """Commanded speed at a place and time; to be asked in the order of time, since pauses take their own.
+
+        Args:
+            s_cm: Way along the road.
+            t_s: Time since the start.
+        """
+        driver = self.settings
+        if driver.pauses_per_m > 0.0:
+            if self._pause_at_cm is None:
+                self._pause_at_cm = s_cm + self._to_next_pause_cm()
+            if s_cm >= self._pause_at_cm and t_s >= self._pause_until_s:
+                self._pause_until_s = t_s + driver.pause_s
+                self._pause_at_cm += self._to_next_pause_cm()
+            if t_s < self._pause_until_s:
+                return 0.0
+        varied = float(np.mean(np.sin(self._speed_waves * s_cm + self._speed_phases)))
+        return self._speed_cm_s * (1.0 + driver.speed_variation * varied)
+
+    def _to_next_pause_cm(self) -> float:
+        return float(self._pause_rng.exponential(100.0 / self.settings.pauses_per_m))

@@ -1,0 +1,173 @@
+"""Everything that one drive's settings stand for: road, look, camera, car and driver."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from datagen.world.car import Car, CarSettings
+from datagen.world.donkey import DonkeyCommands, DonkeySettings, draw_donkey
+from datagen.world.driver import Driver
+from datagen.world.look import LookSettings, random_look
+from datagen.world.renderer import Renderer
+from datagen.world.rig import CameraSettings
+from datagen.world.script import DriverSettings
+from datagen.world.track import Track, TrackSettings, check_drivable, random_track
+from lanenet.config import Settings
+from lanenet.errors import ConfigError
+from lanenet.geometry.camera import Camera
+
+_START_CM = 40.0  # rear axle at the start of an open road
+_SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
+_LOOP_CM = 1200.0
+
+
+class SimulationSettings(Settings):
+    """One synthetic drive.
+
+    Attributes:
+        seed: Decides everything random: road, look, driver and car each draw from a child of their own.
+        frames: Number of frames.
+        rate_hz: Frames per second.
+        camera: The camera.
+        track: The road.
+        car: The car and its errors.
+        driver: How it is driven.
+        look: What the drive looks like.
+        random_look: Draw what ``look`` does not name.
+        recording: ``commands`` records speed and steering; ``donkeycar`` throttle and angle only.
+        donkey: What those two do; recorded nowhere but in the resolved settings.
+    """
+
+    seed: int = Field(default=0, ge=0)
+    frames: int = Field(default=400, ge=1)
+    rate_hz: float = Field(default=20.0, gt=0.0)
+    camera: CameraSettings = CameraSettings()
+    track: TrackSettings = TrackSettings()
+    car: CarSettings = CarSettings()
+    driver: DriverSettings = DriverSettings()
+    look: LookSettings = LookSettings()
+    random_look: bool = True
+    recording: Literal["commands", "donkeycar"] = "commands"
+    donkey: DonkeySettings = DonkeySettings()
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What a drive's settings stand for.
+
+    Attributes:
+        settings: The same settings with the road's length and the look resolved; they give the same drive.
+        track: The road, in the direction in which it is driven.
+        camera: The camera on the car.
+        driver: At the start.
+        car: At the start.
+        build_renderer: Makes the renderer, once.
+        donkey: Set when throttle and angle are recorded.
+    """
+
+    settings: SimulationSettings
+    track: Track
+    camera: Camera
+    driver: Driver
+    car: Car
+    build_renderer: Callable[[], Renderer]
+    donkey: DonkeyCommands | None = None
+
+    @functools.cached_property
+    def renderer(self) -> Renderer:
+        """Draws the frames; built when it is asked for, since poses alone do not need it."""
+        return self.build_renderer()
+
+
+def build_world(settings: SimulationSettings, compress: bool = True) -> World:
+    """Draw road, look, driver and car.
+
+    Args:
+        settings: The drive.
+        compress: Whether the renderer applies the camera's JPEG compression.
+
+    Raises:
+        ConfigError: If the settings contradict each other, or the road is too short for the drive.
+    """
+    return assemble_world(resolve_length(settings), compress)
+
+
+def assemble_world(settings: SimulationSettings, compress: bool = True) -> World:
+    """Build a world whose road is as long as it is, whatever the number of frames.
+
+    Args:
+        settings: The drive.
+        compress: Whether the renderer applies the camera's JPEG compression.
+
+    Raises:
+        ConfigError: If the settings contradict each other.
+    """
+    # The order is part of the format: a new part of the world takes a new child at the end.
+    children = np.random.default_rng(settings.seed).spawn(6)
+    track_rng, look_rng, scene_rng, driver_rng, car_rng, donkey_rng = children
+    track = _drawn_track(settings, track_rng)
+    look = settings.look
+    if settings.track.floor_bgr is not None and "floor_bgr" not in look.model_fields_set:
+        look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})
+    if settings.random_look:
+        look = random_look(look, look_rng, tuple(marking.colour_bgr for marking in track.markings))
+    donkey = draw_donkey(settings.donkey, donkey_rng)
+    settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
+    camera = settings.camera.build(settings.car.wheelbase_cm)
+    start_cm = 0.0 if track.closed else _START_CM
+    driver = Driver(settings.driver, track, start_cm, settings.car, settings.rate_hz, driver_rng)
+    car = Car(settings.car, driver.start_pose(), car_rng)
+    car.place(car.pose, settings.driver.chosen_speed_cm_s(settings.rate_hz))
+    if not compress:
+        look = look.model_copy(update={"jpeg_quality": None})
+    build_renderer = functools.partial(Renderer, camera, track, look, scene_rng)
+    commands = DonkeyCommands(donkey) if settings.recording == "donkeycar" else None
+    return World(settings, track, camera, driver, car, build_renderer, commands)
+
+
+def draw_track(settings: SimulationSettings) -> Track:
+    """Draw the road alone, as it is in the world of these settings.
+
+    Raises:
+        ConfigError: If there is no such road.
+    """
+    return _drawn_track(settings, np.random.default_rng(settings.seed).spawn(1)[0])
+
+
+def resolve_length(settings: SimulationSettings) -> SimulationSettings:
+    """Write out how long the road is.
+
+    Raises:
+        ConfigError: If an open road is too short for the drive.
+    """
+    car, driver = settings.car, settings.driver
+    per_frame_cm = driver.chosen_speed_cm_s(settings.rate_hz) / settings.rate_hz * car.speed_gain
+    # The car may be faster than it should be for a while; a tenth covers that, and the wandering.
+    way_cm = settings.frames * per_frame_cm * (1.1 + car.speed_noise + driver.speed_variation)
+    needed_cm = float(np.ceil(_START_CM + way_cm + car.wheelbase_cm + _SIGHT_CM))
+    length_cm = settings.track.length_cm
+    if length_cm is None:
+        length_cm = _LOOP_CM if settings.track.closed else needed_cm
+    elif length_cm < needed_cm and not settings.track.closed:
+        raise ConfigError(
+            f"track: length_cm {length_cm:g} is too short for {settings.frames} frames of "
+            f"{per_frame_cm:.1f} cm, which need {needed_cm:g}; leave length_cm out to have it chosen"
+        )
+    track = settings.track.model_copy(update={"length_cm": length_cm})
+    return settings.model_copy(update={"track": track})
+
+
+def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
+    track = random_track(settings.track, rng)
+    car = settings.car
+    check_drivable(track, car.wheelbase_cm / math.tan(car.max_steering_rad))
+    if settings.driver.direction == "forward":
+        return track
+    return track.reversed()

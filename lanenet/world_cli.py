@@ -1,0 +1,59 @@
+"""The verbs for looking at synthetic worlds: track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet import console
+from lanenet.errors import ConfigError
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet track bfmc --out track.png --seed 3")
+def track(
+    road: Annotated[
+        str,
+        typer.Argument(metavar="FILE|PRESET", help="YAML file, or name of a preset.", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="Picture to write (.png).", show_default=False)],
+    seed: Annotated[int, typer.Option(min=0, help="Decides what the road leaves open.")] = 0,
+    size: Annotated[int, typer.Option(min=100, max=20_000, help="Longer side of the picture, px.")] = 1600,
+) -> None:
+    """Check a road and draw it from above."""
+    import numpy as np
+
+    from datagen.world.track import load_track_settings, preset, preset_names, random_track
+    from datagen.world.track_picture import draw_track, picture_scale
+    from lanenet.data.files import atomic_file
+    from lanenet.data.png import png_bytes
+
+    if out.suffix.lower() != ".png":
+        raise ConfigError(f"{out}: expected a name that ends in .png")
+    path = Path(road)
+    if path.suffix.lower() in (".yaml", ".yml") or path.exists():
+        settings = load_track_settings(path)
+    elif road in preset_names():
+        settings = preset(road)
+    else:
+        raise ConfigError(
+            f"{road}: expected a YAML file, or a preset: {', '.join(preset_names())}; found neither"
+        )
+    drawn = random_track(settings, np.random.default_rng(seed))
+    picture = draw_track(drawn, picture_scale(drawn, size), settings.floor_bgr)
+    tightest = float(np.max(np.abs(drawn.curvature_per_cm)))
+    radius = f"{1.0 / tightest:.0f} cm" if tightest > 1e-6 else "none"
+    typer.echo(
+        f"{'loop' if drawn.closed else 'road'} of {drawn.length_cm:.0f} cm, {settings.lanes} lane(s) of "
+        f"{drawn.lane_width_cm:g} cm, tightest bend {radius}, {len(drawn.markings)} lines, "
+        f"{len(drawn.boxes)} painted rectangles"
+    )
+    with atomic_file(out) as temporary:
+        temporary.write_bytes(png_bytes(picture))
+    console.wrote(out)
+    console.next_command(
+        "simulate", "CONFIG", f"track.{'file' if path.exists() else 'preset'}={road}", "--out", "DRIVE"
+    )

@@ -1,0 +1,181 @@
+"""Measures of one run: wheels over lines, departures as events, put-backs, the end of a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
+from datagen.judge.settings import JudgeSettings, road_names, road_simulation
+from datagen.judge.wheels import DepartureCounter, wheel_offsets_cm
+from datagen.world.rig import CameraSettings
+from datagen.world.track import Track, TrackSettings
+from datagen.world.world import SimulationSettings
+from lanenet.errors import ConfigError
+from lanenet.perception.estimate import LaneEstimate
+
+COMMON = SimulationSettings(
+    camera=CameraSettings(width=16, height=16),
+    track=TrackSettings(length_cm=800.0, min_radius_cm=50.0),
+    random_look=False,
+)
+SETTINGS = JudgeSettings(count=2, laps=1, simulation=COMMON)
+
+
+class Always:
+    """A detector that always gives one answer."""
+
+    def __init__(self, points_cm: np.ndarray) -> None:
+        self.points_cm = points_cm
+
+    def __call__(self, *camera_and_lane: object) -> Always:
+        return self
+
+    def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
+        return LaneEstimate(points_cm=self.points_cm)
+
+    def reset(self) -> None:
+        pass
+
+
+LEFT = Entrant("left", Always(np.repeat([-40.0, 0.0], 3)))
+BLIND = Entrant("blind", Always(np.full(6, np.nan)))
+
+
+def _straight(length_cm: float = 400.0) -> Track:
+    s = np.arange(0.0, length_cm)
+    zero = np.zeros(len(s))
+    return Track(s, np.stack([s, zero], axis=1), zero, zero, False, 40.0, ())
+
+
+def _ring(radius_cm: float = 100.0) -> Track:
+    n = 629
+    s = np.arange(n) * 2.0 * np.pi * radius_cm / n
+    turn = s / radius_cm
+    xy = radius_cm * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=1)
+    return Track(s, xy, turn, np.full(n, 1.0 / radius_cm), True, 40.0, ())
+
+
+def _run(
+    entrant: Entrant, settings: JudgeSettings = SETTINGS, index: int = 0
+) -> tuple[RunResult, Trajectory]:
+    kind, number = road_names(settings)[index]
+    return drive_run(settings, road_simulation(settings, index), entrant, kind, number)
+
+
+def test_wheels_on_a_straight_road_by_hand():
+    offsets = wheel_offsets_cm(_straight(), np.array([100.0, 3.0, 0.0]), 26.0, 16.0, 100.0)
+    np.testing.assert_allclose(offsets, [11.0, -5.0, 11.0, -5.0], atol=1e-9)
+    turned = wheel_offsets_cm(_straight(), np.array([100.0, 0.0, np.pi / 6.0]), 26.0, 16.0, 100.0)
+    across = 8.0 * np.cos(np.pi / 6.0)
+    np.testing.assert_allclose(turned, [13.0 + across, 13.0 - across, across, -across], atol=1e-9)
+
+
+def test_wheels_on_a_ring_by_hand():
+    # The rear axle is on the circle; front and rear wheels lie at other distances from its centre.
+    offsets = wheel_offsets_cm(_ring(), np.array([0.0, 0.0, 0.0]), 26.0, 16.0, 0.0)
+    expected = [100.0 - np.hypot(26.0, 92.0), 100.0 - np.hypot(26.0, 108.0), 8.0, -8.0]
+    np.testing.assert_allclose(offsets, expected, atol=1e-3)
+
+
+@given(st.floats(-15.0, 15.0), st.floats(-0.5, 0.5), st.floats(0.0, 6.2))
+def test_turning_the_world_leaves_the_wheels_where_they_are(offset_cm, heading, turn):
+    pose = np.array([150.0, offset_cm, heading])
+    c, s = np.cos(turn), np.sin(turn)
+    moved = np.array([c * pose[0] - s * pose[1] + 5.0, s * pose[0] + c * pose[1] - 9.0, heading + turn])
+    there = _straight().moved(np.array([5.0, -9.0, turn]))
+    np.testing.assert_allclose(
+        wheel_offsets_cm(there, moved, 26.0, 16.0, 150.0),
+        wheel_offsets_cm(_straight(), pose, 26.0, 16.0, 150.0),
+        atol=1e-6,
+    )
+
+
+def test_a_departure_is_an_event_and_ends_inside():
+    counter = DepartureCounter(40.0)
+    furthest = [19.9, 20.1, 25.0, 20.1, 19.5, 20.2, 18.9, 20.5, 10.0]
+    out = [counter.update(np.array([-value, 0.0])) for value in furthest]
+    # 19.5 is inside, but not by a centimetre: 20.2 belongs to the first departure.
+    assert out == [False, True, True, True, True, True, False, True, False]
+    assert counter.count == 2
+    counter.update(np.array([30.0]))
+    counter.put_back()
+    assert not counter.update(np.array([0.0])) and counter.count == 3
+
+
+def test_the_truth_drives_a_lap_cleanly():
+    for entrant in (Entrant(TRUTH), Entrant(TRUE_POINTS)):
+        result, trajectory = _run(entrant)
+        assert result.completed and result.ended == "completed" and result.laps == 1.0
+        assert result.departures == result.put_backs == 0 and result.unanswered == 0.0
+        assert result.mean_offset_cm == pytest.approx(np.abs(trajectory.offset_cm).mean())
+        assert result.frames == len(trajectory.t_s)
+        assert trajectory.s_cm[-1] - trajectory.s_cm[0] == pytest.approx(800.0, abs=4.0)
+        assert result.time_s == pytest.approx(800.0 / (60.0 * 0.94), rel=0.08)
+    assert _run(Entrant(TRUTH))[0].mean_offset_cm < 1.0
+
+
+def test_a_detector_that_always_answers_left_departs():
+    ended, _ = _run(LEFT, SETTINGS.model_copy(update={"put_back": False}))
+    assert ended.ended == "left the lane" and not ended.completed
+    assert ended.departures == 1 and ended.put_backs == 0 and ended.laps < 0.3
+    assert 30.0 < ended.worst_offset_cm < 34.0
+    result, trajectory = _run(LEFT)
+    assert result.put_backs == trajectory.put_back.sum() > 3
+    assert result.departures >= result.put_backs
+    # It is put back into the middle, left lines behind it.
+    after = np.flatnonzero(trajectory.put_back)[:-1] + 1
+    assert np.abs(trajectory.offset_cm[after]).max() < 0.5
+    assert (trajectory.offset_cm[trajectory.over] > 8.0).all()
+
+
+def test_without_an_answer_the_car_goes_straight_or_stands():
+    straight, _ = _run(BLIND, SETTINGS.model_copy(update={"put_back": False}))
+    assert straight.unanswered == 1.0 and straight.steering_rms_rad_s == 0.0
+    assert straight.ended == "left the lane"
+    stop = SETTINGS.pilot.model_copy(update={"keep_s": 0.0, "then": "stop"})
+    stopped, _ = _run(BLIND, SETTINGS.model_copy(update={"put_back": False, "pilot": stop}))
+    assert stopped.ended == "stuck" and stopped.time_s < 4.0
+    moved_on, _ = _run(BLIND, SETTINGS.model_copy(update={"pilot": stop}))
+    assert moved_on.put_backs > 10 and moved_on.departures == 0  # 50 cm further on each time
+
+
+def test_steering_is_measured_between_put_backs_only():
+    result, trajectory = _run(LEFT)
+    change = np.diff(trajectory.steering_rad) * 20.0
+    assert result.steering_rms_rad_s <= np.sqrt(np.mean(change**2)) + 1e-12
+
+
+def test_an_open_road_is_driven_once():
+    settings = JudgeSettings(tracks=("open",), count=1, laps=5, simulation=COMMON)
+    result, trajectory = _run(Entrant(TRUTH), settings)
+    assert result.completed and result.laps == 1.0 and result.road == "open_00"
+    assert 650.0 < trajectory.s_cm[-1] - trajectory.s_cm[0] < 700.0
+
+
+def test_roads_differ_and_do_not_depend_on_the_rest_of_the_contest():
+    first, second = (road_simulation(SETTINGS, index) for index in (0, 1))
+    assert first.seed != second.seed and first.track.closed
+    more = JudgeSettings(count=7, tracks=("open", "random"), simulation=COMMON)
+    assert road_simulation(more, 7) == first
+    assert road_simulation(more, 0).seed == first.seed and not road_simulation(more, 0).track.closed
+    assert road_simulation(SETTINGS.model_copy(update={"seed": 1}), 0).seed != first.seed
+    with pytest.raises(ConfigError, match="each may be named once"):
+        road_names(JudgeSettings(tracks=("open", "open")))
+
+
+def test_an_unknown_road_is_refused():
+    settings = JudgeSettings(tracks=("no-such-road",), simulation=COMMON)
+    with pytest.raises(ConfigError, match="no-such-road"):
+        from datagen.world.world import draw_track
+
+        draw_track(road_simulation(settings, 0))
+
+
+def test_common_track_settings_hold_for_random_roads():
+    common = COMMON.model_copy(update={"track": TrackSettings(lane_width_cm=36.0)})
+    settings = JudgeSettings(tracks=("random", "open"), count=1, simulation=common)
+    for index in (0, 1):
+        assert road_simulation(settings, index).track.lane_width_cm == 36.0

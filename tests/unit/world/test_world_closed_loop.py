@@ -1,0 +1,153 @@
+"""Closed loop: pilots, what happens when the lane is lost, drives written by a pilot or by processes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.world.closed_loop import ClosedLoop
+from datagen.world.look import LookSettings
+from datagen.world.pilot import (
+    DetectorPilot,
+    DriverPilot,
+    LostLane,
+    PilotSettings,
+    Sight,
+    TruePointsPilot,
+    steering_settings,
+)
+from datagen.world.rig import CameraSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.track import TrackSettings
+from datagen.world.world import SimulationSettings, World, assemble_world
+from lanenet.data.drive import open_drive
+from lanenet.perception.estimate import LaneEstimate
+
+SMALL = CameraSettings(width=64, height=48)
+STEERING = steering_settings(PilotSettings(), 26.0, 0.45, 40.0)
+
+
+class Recorder:
+    """A detector that keeps what it was shown and always answers the same."""
+
+    def __init__(self, estimate: LaneEstimate) -> None:
+        self.estimate, self.seen, self.resets = estimate, [], 0
+
+    def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
+        self.seen.append(np.array(frame_bgr))
+        return self.estimate
+
+    def reset(self) -> None:
+        self.resets += 1
+
+
+def _lane(shift_cm: float) -> LaneEstimate:
+    points = np.repeat([-20.0 + shift_cm, 20.0 + shift_cm], 3)
+    return LaneEstimate(points_cm=points, steering_rad=0.7)
+
+
+def _loop(
+    pilot: DetectorPilot | TruePointsPilot | DriverPilot, world: World, **changes: object
+) -> ClosedLoop:
+    return ClosedLoop(world, pilot, PilotSettings(**changes), 60.0)
+
+
+def _world(**changes: object) -> World:
+    settings = {"camera": SMALL, "track": TrackSettings(closed=True), "seed": 2, **changes}
+    return assemble_world(SimulationSettings(**settings))
+
+
+def test_a_lost_lane_keeps_the_steering_then_goes_straight_or_stops():
+    for then, speed_cm_s in (("straight", 60.0), ("stop", 0.0)):
+        lost = LostLane(PilotSettings(keep_s=0.3, then=then), rate_hz=10.0)
+        assert lost.command(math.nan, 60.0) == (60.0, 0.0)  # nothing to keep yet
+        assert lost.command(0.2, 60.0) == (60.0, 0.2)
+        assert [lost.command(math.nan, 60.0) for _ in range(3)] == [(60.0, 0.2)] * 3
+        assert lost.command(math.nan, 60.0) == (speed_cm_s, 0.0)
+        assert lost.command(-0.1, 60.0) == (60.0, -0.1)
+        lost.reset()
+        assert lost.command(math.nan, 60.0) == (60.0, 0.0)
+
+
+def test_a_detector_steers_by_its_points_or_by_its_own_target():
+    sight = Sight(np.zeros((4, 4, 3), np.uint8), np.zeros(3), 0.0)
+    pursuit = DetectorPilot(Recorder(_lane(-5.0)), PilotSettings(), STEERING)
+    assert pursuit.steer(sight) == pytest.approx(math.atan(26.0 * 10.0 / (41.0**2 + 25.0)))
+    paper = PilotSettings(law="proportional")
+    proportional = DetectorPilot(Recorder(_lane(-5.0)), paper, steering_settings(paper, 26.0, 0.45, 40.0))
+    assert proportional.steer(sight) == pytest.approx(math.atan(5.0 / 15.0))
+    own = DetectorPilot(Recorder(_lane(-5.0)), PilotSettings(law="own"), STEERING)
+    assert own.steer(sight) == 0.45  # 0.7 is more than the servo can
+    assert math.isnan(
+        DetectorPilot(Recorder(LaneEstimate()), PilotSettings(law="own"), STEERING).steer(sight)
+    )
+    with pytest.raises(ValueError, match="needs an image"):
+        pursuit.steer(Sight(None, np.zeros(3), 0.0))
+
+
+def test_a_perfect_detector_stays_in_the_lane():
+    world = _world()
+    loop = _loop(TruePointsPilot(world.track, STEERING), world)
+    frames = [loop.next_frame() for _ in range(200)]
+    assert all(frame.answered and frame.image_bgr is None for frame in frames)
+    assert max(abs(frame.offset_cm) for frame in frames) < 8.0
+    assert frames[-1].s_cm > 500.0
+
+
+def test_a_detector_that_sees_the_lane_on_the_left_leaves_it_there():
+    world = _world()
+    loop = _loop(DetectorPilot(Recorder(_lane(-15.0)), PilotSettings(), STEERING), world)
+    offsets_cm = [loop.next_frame().offset_cm for _ in range(24)]
+    assert offsets_cm[-1] > 15.0
+    loop.put_back()
+    assert abs(loop.next_frame().offset_cm) < 0.5
+
+
+def test_putting_back_resets_the_detector_and_keeps_the_place():
+    world, detector = _world(), Recorder(_lane(-15.0))
+    loop = _loop(DetectorPilot(detector, PilotSettings(), STEERING), world)
+    for _ in range(15):
+        before = loop.next_frame()
+    loop.put_back(ahead_cm=30.0)
+    after = loop.next_frame()
+    assert detector.resets == 1
+    assert after.s_cm == pytest.approx(before.s_cm + 30.0, abs=0.1)
+    assert after.state.true_speed_cm_s == pytest.approx(60.0 * 0.94, rel=0.12)
+    assert after.state.frame == 15
+
+
+def test_the_pilot_sees_what_the_file_holds(tmp_path: Path):
+    detector = Recorder(_lane(0.0))
+    settings = SimulationSettings(
+        seed=1, frames=5, camera=SMALL, random_look=False, look=LookSettings(noise_level=6.0, jpeg_quality=60)
+    )
+    out = simulate_drive(
+        settings, tmp_path / "d", pilot=lambda world: DetectorPilot(detector, PilotSettings(), STEERING)
+    )
+    drive = open_drive(out)
+    assert len(drive) == len(detector.seen) == 5
+    for i, seen in enumerate(detector.seen):
+        np.testing.assert_array_equal(drive.image(i), seen)
+    np.testing.assert_allclose(drive.commands.steering_rad, 0.0, atol=1e-9)
+
+
+def test_a_drive_by_a_pilot_without_eyes_has_images_too(tmp_path: Path):
+    settings = SimulationSettings(seed=1, frames=4, camera=SMALL)
+    out = simulate_drive(settings, tmp_path / "d", pilot=lambda world: DriverPilot(world.driver))
+    assert open_drive(out).image(3).shape == (48, 64, 3)
+
+
+def test_two_processes_write_the_same_bytes(tmp_path: Path):
+    settings = SimulationSettings(seed=9, frames=40, camera=SMALL)
+    calls: list[tuple[int, int]] = []
+    one = simulate_drive(settings, tmp_path / "one")
+    two = simulate_drive(settings, tmp_path / "two", lambda *done: calls.append(done), workers=2)
+    assert calls == [(k, 40) for k in range(1, 41)]
+    names = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
+    assert names == sorted(path.relative_to(two) for path in two.rglob("*") if path.is_file())
+    assert len(names) == 40 + 6
+    for name in names:
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
