@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from scipy.sparse import coo_matrix, csc_matrix, diags
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from datagen.slam.bundle_kernels import N_CAMERA, N_FRAME, accumulate, associate, lift_points
 from lanenet.config import Settings
@@ -51,8 +51,8 @@ class BundleSettings(Settings):
 
     lags: tuple[int, ...] = (1, 4, 9, 14)
     points: int = Field(default=60, ge=10)
-    gates_px: tuple[float, ...] = (5.0, 3.5, 2.5)
-    iterations: int = Field(default=4, ge=1)
+    gates_px: tuple[float, ...] = (5.0, 4.0, 3.0, 2.5, 2.5)
+    iterations: int = Field(default=2, ge=1)
     cauchy_px: float = Field(default=0.7, gt=0.0)
     pixel_sigma: float = Field(default=2.0, gt=0.0)
     focal: float = Field(default=0.3, gt=0.0)
@@ -133,7 +133,7 @@ def adjust(
         damping = 1e-4
         cost, normal, rhs, residual = problem.equations(state, links)
         for _ in range(settings.iterations):
-            trial = problem.moved(state, problem.solve(normal, rhs, damping)[0])
+            trial = problem.moved(state, problem.solve(normal, rhs, damping))
             new = problem.equations(trial, links)
             if new[0] < cost:
                 done = cost - new[0] < 1e-5 * cost
@@ -189,6 +189,8 @@ class _Problem:
         self.settings, self.camera, self.n = settings, camera, len(edges)
         self.fisheye = camera.model == "fisheye"
         self.free = np.array([name in free for name in CAMERA_NAMES])
+        # The frames' own tilts need the derivatives by pitch and roll in any case.
+        self.active = self.free | np.isin(CAMERA_NAMES, ("pitch", "roll"))
         counts = np.array([len(e.uv_px) for e in edges])
         self.edge_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.edge_uv = np.concatenate([e.uv_px for e in edges]).astype(np.float64)
@@ -250,7 +252,7 @@ class _Problem:
 
     def _lift(self, state: _State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         out, normal = np.empty((len(self.uv), 2)), np.empty((len(self.uv), 2))
-        by = np.empty((len(self.uv), N_CAMERA, 2))
+        by = np.zeros((len(self.uv), N_CAMERA, 2))
         lift_points(
             self.fisheye,
             state.lens,
@@ -260,6 +262,7 @@ class _Problem:
             self.uv,
             self.normals,
             _STEPS,
+            self.active,
             out,
             by,
             normal,
@@ -312,6 +315,7 @@ class _Problem:
             self.edge_normals,
             self.weight,
             _STEPS,
+            self.active,
             self.settings.cauchy_px,
             blocks,
             rhs,
@@ -398,22 +402,22 @@ class _Problem:
         ).tocsc()
         return 0.5 * float(e @ e), jac, e
 
-    def solve(self, normal: csc_matrix, rhs: np.ndarray, damping: float) -> tuple[np.ndarray, None]:
+    def solve(self, normal: csc_matrix, rhs: np.ndarray, damping: float) -> np.ndarray:
         """Solve with the camera's few dense columns eliminated last."""
         damped = (normal + damping * diags(normal.diagonal())).tocsc()
         k = N_FRAME * self.n
-        factor = splu(damped[:k, :k])
+        factor = _factorised(damped[:k, :k])
         border = damped[:k, k:].toarray()
         reduced = factor.solve(np.column_stack([rhs[:k], border]))
         schur = damped[k:, k:].toarray() - border.T @ reduced[:, 1:]
         camera = np.linalg.solve(schur, rhs[k:] - border.T @ reduced[:, 0])
-        return np.concatenate([reduced[:, 0] - reduced[:, 1:] @ camera, camera]), None
+        return np.concatenate([reduced[:, 0] - reduced[:, 1:] @ camera, camera])
 
     def camera_sigma(self, normal: csc_matrix) -> Float[np.ndarray, "8"]:
         """Standard deviations of the camera's numbers when all else is free."""
         k = N_FRAME * self.n
         border = normal[:k, k:].toarray()
-        schur = normal[k:, k:].toarray() - border.T @ splu(normal[:k, :k]).solve(border)
+        schur = normal[k:, k:].toarray() - border.T @ _factorised(normal[:k, :k]).solve(border)
         return np.sqrt(np.maximum(np.diag(np.linalg.inv(schur)), 0.0))
 
     def moved(self, state: _State, step: np.ndarray) -> _State:
@@ -424,3 +428,8 @@ class _Problem:
         lens[2:5] += camera[1:4]
         mount[:4] += camera[4:8]
         return _State(state.poses + frames[:, :3], state.tilt + frames[:, 3:], lens, mount)
+
+
+def _factorised(matrix: csc_matrix) -> SuperLU:
+    """Factors of a positive definite matrix: no pivoting, and an order that suits symmetry."""
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -115,7 +115,7 @@ def _project_point(fisheye, lens, mount, forward, left, which, amount):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def lift_points(fisheye, lens, mount, tilt, frame, uv, normals, steps, out, out_by, out_normal):
+def lift_points(fisheye, lens, mount, tilt, frame, uv, normals, steps, active, out, out_by, out_normal):
     """Lift pixels to the road, with derivatives.
 
     Args:
@@ -127,6 +127,7 @@ def lift_points(fisheye, lens, mount, tilt, frame, uv, normals, steps, out, out_
         uv: Pixels.
         normals: Unit gradients in the image.
         steps: Step of the difference for each number of the camera.
+        active: Which of them a derivative is wanted for.
         out: (ahead, left) of each pixel.
         out_by: Their derivatives by the camera's numbers.
         out_normal: A point of the road half a pixel further along the gradient.
@@ -141,6 +142,8 @@ def lift_points(fisheye, lens, mount, tilt, frame, uv, normals, steps, out, out_
         u, v = uv[p, 0] + 0.5 * normals[p, 0], uv[p, 1] + 0.5 * normals[p, 1]
         out_normal[p, 0], out_normal[p, 1] = _lift_pixel(fisheye, lens, m, u, v, -1, 0.0)
         for k in range(N_CAMERA):
+            if not active[k]:
+                continue
             a1, b1 = _lift_pixel(fisheye, lens, m, uv[p, 0], uv[p, 1], k, steps[k])
             out_by[p, k, 0], out_by[p, k, 1] = (a1 - a) / steps[k], (b1 - b) / steps[k]
 
@@ -227,6 +230,7 @@ def accumulate(
     edge_normals,
     point_weight,
     steps,
+    active,
     cauchy_px,
     blocks,
     rhs,
@@ -281,6 +285,9 @@ def accumulate(
             jac[5], jac[6] = -g_x, -g_y
             jac[7] = g_f * left - g_l * forward
             for c in range(N_CAMERA):
+                if not active[c]:
+                    jac[2 * N_FRAME + c] = 0.0
+                    continue
                 u1, v1 = _project_point(fisheye, lens, m, forward, left, c, steps[c])
                 direct = ((u1 - u) * nu + (v1 - v) * nv) / steps[c]
                 if c == 4:

@@ -19,7 +19,7 @@ from lanenet.perception.edges import to_gray
 
 _THUMB_WIDTH, _THUMB_HEIGHT = 24, 18
 #: Explanations of the drift that are worth a map of their own.
-_MAX_DRIFTS, _MIN_VOTE_SHARE = 2, 0.5
+_MAX_DRIFTS, _MIN_VOTE_SHARE = 3, 0.5
 
 
 class RevisitSettings(Settings):
@@ -28,7 +28,7 @@ class RevisitSettings(Settings):
     Attributes:
         min_gap_heights: Path between the two visits at least.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
-        max_drift_rad: Heading that the open loop may miss on the way from one visit to the next. Revisits
+        max_drift_rad: Heading that the open loop may miss in one lap. Revisits
             that no common drift per length explains are not believed: rooms repeat, and one false revisit
             bends a whole map.
         drift_tolerance_rad: What a revisit may miss of the common drift.
@@ -43,7 +43,7 @@ class RevisitSettings(Settings):
 
     min_gap_heights: float = Field(default=20.0, gt=0.0)
     min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
-    max_drift_rad: float = Field(default=3.8, gt=0.0)
+    max_drift_rad: float = Field(default=5.0, gt=0.0)
     drift_tolerance_rad: float = Field(default=0.45, gt=0.0)
     min_revisits: int = Field(default=3, ge=1)
     min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
@@ -165,8 +165,12 @@ def consistent_revisits(
     earlier, later = (np.array([getattr(r, name) for r in revisits]) for name in ("earlier", "later"))
     between = path[later] - path[earlier]
     missed = poses[later, 2] - poses[earlier, 2] - np.array([r.relative[2] for r in revisits])
-    limit = settings.max_drift_rad / float(np.median(between))
-    rates = np.linspace(-limit, limit, 521)
+    # Later visits may skip laps: the shortest gaps are those of one lap.
+    lap = float(np.percentile(between, 10))
+    limit = settings.max_drift_rad / lap
+    # A fifth of the tolerance apart at the longest gap.
+    count = int(10.0 * limit * between.max() / settings.drift_tolerance_rad)
+    rates = np.linspace(-limit, limit, 2 * count + 1)
     rest = wrap_angle(missed - rates[:, None] * between)
     votes = np.sum(np.exp(-0.5 * (rest / (0.5 * settings.drift_tolerance_rad)) ** 2), axis=1)
     found: list[tuple[list[Revisit], float]] = []
@@ -179,7 +183,7 @@ def consistent_revisits(
         if len(kept) >= settings.min_revisits:
             found.append((kept, float(rates[best])))
         # Another count of turns is half a turn per lap away, at least.
-        left[np.abs(rates - rates[best]) * np.median(between) < 0.5 * np.pi] = 0.0
+        left[np.abs(rates - rates[best]) * lap < 0.5 * np.pi] = 0.0
     return found
 
 
