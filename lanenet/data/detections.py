@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.files import require
+from lanenet.data.files import check_destination, require
 from lanenet.data.parquet import ParquetTable, float_array, write_parquet
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.errors import LabelFormatError
@@ -176,6 +176,19 @@ def read_detections(path: Path) -> Detections:
         radius_cm=columns["radius_cm"],
         offset_cm=columns["offset_cm"],
     )
+
+
+def check_table_path(path: Path) -> None:
+    """Refuse a table that could not be written at the end of a run.
+
+    Raises:
+        LabelFormatError: If the ending is unknown.
+        MissingExtraError: If the ending is ``.parquet`` and pyarrow is not installed.
+        LanenetError: If there is a folder of that name, or the file's folder cannot be written to.
+    """
+    if _ending(path) == ".parquet":
+        require("pyarrow", "data")
+    check_destination(path)
 
 
 def _ending(path: Path) -> str:
