@@ -21,6 +21,7 @@ from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 
 FORMAT = "lanenet-map/1"
+REPORT_FORMAT = "lanenet-map-report/1"
 
 
 class MapMeta(Settings):
@@ -28,7 +29,8 @@ class MapMeta(Settings):
 
     Attributes:
         format: Kind and version of the folder.
-        drive: The drive that was mapped, as given.
+        drive: The drive that was mapped. On disk its full path; older maps hold it as it was typed, from
+            the folder in which the command ran.
         lane_width_cm: Lane width that the user gave.
         mapped_lane_cm: Distance between the lines on this map.
         tape_cm: Width of the markings on this map.
@@ -113,8 +115,10 @@ def write_map(
     write_json(folder / "lanes.json", {"format": "lanenet-lanes/1", "lines": lines})
     pa, pq = require("pyarrow", "data"), require("pyarrow.parquet", "data")
     pq.write_table(pa.table(edges), folder / "edges.parquet")
-    write_json(folder / "report.json", report)
-    write_text(folder / "map.yaml", yaml.safe_dump(m.meta.model_dump(), sort_keys=False))
+    write_json(folder / "report.json", {"format": REPORT_FORMAT, **report})
+    # In full, so that the map leads to its drive from any folder.
+    meta = {**m.meta.model_dump(), "drive": str(Path(m.meta.drive).resolve())}
+    write_text(folder / "map.yaml", yaml.safe_dump(meta, sort_keys=False))
 
 
 def read_map(folder: Path) -> DriveMap:
