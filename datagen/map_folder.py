@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from datagen.lanes.fit import LaneLine
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.files import require, write_json, write_text
+from lanenet.data.files import write_json, write_text
+from lanenet.data.parquet import write_columns
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import ConfigError, MapFormatError
@@ -22,6 +23,7 @@ from lanenet.geometry.camera import Camera
 
 FORMAT = "lanenet-map/1"
 REPORT_FORMAT = "lanenet-map-report/1"
+EDGES_FORMAT = "lanenet-edges/1"
 
 
 class MapMeta(Settings):
@@ -113,8 +115,7 @@ def write_map(
         for line in pair
     ]
     write_json(folder / "lanes.json", {"format": "lanenet-lanes/1", "lines": lines})
-    pa, pq = require("pyarrow", "data"), require("pyarrow.parquet", "data")
-    pq.write_table(pa.table(edges), folder / "edges.parquet")
+    write_columns(folder / "edges.parquet", edges, {"format": EDGES_FORMAT})
     write_json(folder / "report.json", {"format": REPORT_FORMAT, **report})
     # In full, so that the map leads to its drive from any folder.
     meta = {**m.meta.model_dump(), "drive": str(Path(m.meta.drive).resolve())}

@@ -17,9 +17,9 @@ HEAVY = (
     *("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow"),
     *("onnx", "onnxscript", "safetensors", "tensorboard"),
 )
-#: What may be imported by its name in a text, which the import rules cannot see, and where. pyarrow is what
-#: the car's packages may ask for: a Parquet file is written only if the extra is there.
-NAMED_IMPORTS = {"lanenet/data": {"pyarrow"}, "datagen/map_folder.py": {"pyarrow"}}
+#: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
+#: written only if the extra is there.
+NAMED_IMPORTS = {"lanenet/data/": {"pyarrow"}}
 #: The one function that does it.
 IMPORTER = "lanenet/data/files.py"
 

@@ -117,6 +117,7 @@ def test_an_older_map_holds_the_drive_as_typed(folder):
 def test_other_tools_can_read_the_folder(folder):
     table = require("pyarrow.parquet", "data").read_table(folder / "edges.parquet")
     assert table.column("frame_index").to_pylist() == list(range(5))
+    assert json.loads(table.schema.metadata[b"lanenet"]) == {"format": "lanenet-edges/1"}
     # A trajectory in metres, by the TUM convention: time, position, quaternion.
     tum = np.loadtxt(folder / "trajectory.tum")
     assert tum.shape == (N, 8)
