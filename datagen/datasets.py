@@ -5,99 +5,27 @@ Training and validation labels come from maps, never from the simulator's truth;
 
 from __future__ import annotations
 
-import hashlib
-import json
-import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
 
+from datagen.dataset_settings import DataSettings, RecordedSettings
+from datagen.done import fingerprint, forget_done, is_done, key_of, mark_done
+from datagen.jobs import run_jobs
+from datagen.labels.truth import truth_labels
 from datagen.pipeline import MapSettings, label_map, map_drive
 from datagen.world.simulate import SimulationSettings, simulate_drive
-from lanenet.config import Settings
-from lanenet.data.drive import open_drive, read_truth
-from lanenet.data.files import write_json
-from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
-from lanenet.errors import ConfigError, DriveFormatError
+from lanenet.data.label_set import LabelSet, read_labels, write_labels
+from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import POINT_NAMES
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 
 Progress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
-
-_VERSION = 5  # of this module's outputs; raise it when the same settings give other labels
-
-
-class SyntheticSettings(Settings):
-    """Synthetic drives, each on a road, and with a look, of its own.
-
-    Attributes:
-        seed: Every drive's seed follows from this, its role and its number.
-        train: Drives to learn from.
-        validation: Drives to choose the epoch by.
-        test: Drives whose truth scores the result.
-        simulation: What all drives share; their ``seed`` is set here.
-    """
-
-    seed: int = Field(default=0, ge=0)
-    train: int = Field(default=0, ge=0)
-    validation: int = Field(default=0, ge=0)
-    test: int = Field(default=0, ge=0)
-    simulation: SimulationSettings = SimulationSettings()
-
-
-class RecordedSettings(Settings):
-    """A recorded drive, split along its time.
-
-    Attributes:
-        path: Drive folder, tub or video, from the folder in which the command runs.
-        lane_width_cm: Between the middles of the lines of the driven lane.
-        camera: Camera file; left out, the camera is found from the drive.
-        train_share: Share of the labelled frames, from the start, to learn from.
-        validation_share: Share of the frames after them to choose the epoch by; the rest is for the test.
-        gap_frames: Frames left out between the parts, so that neighbours are never on both sides.
-        map: Settings for mapping this drive.
-    """
-
-    path: Path
-    lane_width_cm: float = Field(gt=0.0)
-    camera: Path | None = None
-    train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
-    validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
-    gap_frames: int = Field(default=40, ge=0)
-    map: MapSettings = MapSettings()
-
-    @model_validator(mode="after")
-    def _leave_some_for_the_test(self) -> RecordedSettings:
-        if self.train_share + self.validation_share > 0.999:
-            raise ValueError("train_share and validation_share must sum to less than 1: the rest is the test")
-        return self
-
-
-class DataSettings(Settings):
-    """Where the label sets of a run come from.
-
-    Attributes:
-        synthetic: Synthetic drives.
-        drives: Recorded drives.
-        map: Settings for mapping the synthetic drives.
-        window: The patch of road that the network sees: wide enough for the lane's lines on either side.
-        workers: Processes that simulate and map; 0 takes one per core.
-    """
-
-    synthetic: SyntheticSettings = SyntheticSettings()
-    drives: tuple[RecordedSettings, ...] = ()
-    map: MapSettings = MapSettings()
-    window: BirdseyeWindow = BirdseyeWindow()
-    workers: int = Field(default=0, ge=0)
 
 
 @dataclass(frozen=True)
@@ -136,12 +64,12 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
 
     Raises:
         ConfigError: If no part has any drive.
-        LanenetError: What the first failing job raised.
+        LanenetError: What the first failing job raised; or that its process died, naming the drive.
     """
-    jobs: list[tuple[Role | None, dict[str, Any]]] = []
+    jobs: list[dict[str, Any]] = []
     for role in ("train", "validation", "test"):
         for number in range(getattr(settings.synthetic, role)):
-            jobs.append((role, _synthetic_job(settings, role, number, work_dir)))
+            jobs.append(_synthetic_job(settings, role, number, work_dir))
     for drive in settings.drives:
         job = {
             "kind": "recorded",
@@ -149,34 +77,16 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
             "window": settings.window,
             "folder": work_dir / "drives",
         }
-        jobs.append((None, job))
+        jobs.append(job)
     for role in ("train", "validation"):
         if not settings.drives and not getattr(settings.synthetic, role):
             raise ConfigError(f"data: no {role} drives; set data.synthetic.{role} or list data.drives")
-    workers = settings.workers or os.cpu_count() or 1
-    results: dict[int, dict[Role, Path]] = {}
-    if workers == 1 or len(jobs) == 1:
-        for i, (_, job) in enumerate(jobs):
-            results[i] = _run_job(job)
-            if progress is not None:
-                progress(i + 1, len(jobs))
-    else:
-        # Spawned, because forking a process that has started torch's or OpenCV's threads can hang.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            futures = {pool.submit(_run_job, job): i for i, (_, job) in enumerate(jobs)}
-            try:
-                for done, future in enumerate(as_completed(futures), start=1):
-                    results[futures[future]] = future.result()
-                    if progress is not None:
-                        progress(done, len(jobs))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+    named = [(_job_name(job), job) for job in jobs]
+    results = run_jobs(_run_job, named, settings.workers or os.cpu_count() or 1, progress)
     parts: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
     frames: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
-    for i, (_, job) in enumerate(jobs):
-        for role, path in results[i].items():
+    for job, result in zip(jobs, results, strict=True):
+        for role, path in result.items():
             parts[role].append(path)
             frames[role].append(_frames_of(job))
     camera = _shared_camera(settings, work_dir)
@@ -191,6 +101,13 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
         camera,
         example,
     )
+
+
+def _job_name(job: dict[str, Any]) -> str:
+    """What people know a drive by."""
+    if job["kind"] == "recorded":
+        return str(job["settings"].path)
+    return f"{job['name']} (seed {job['simulation'].seed})"
 
 
 def _frames_of(job: dict[str, Any]) -> Path:
@@ -212,7 +129,7 @@ def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:
 
 def _recorded_name(settings: RecordedSettings) -> str:
     """Name of a recording's outputs; two drives may have folders of the same name."""
-    return f"{settings.path.resolve().name}-{_key([str(settings.path.resolve())])[:6]}"
+    return f"{settings.path.resolve().name}-{key_of([str(settings.path.resolve())])[:6]}"
 
 
 def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Path) -> dict[str, Any]:
@@ -252,11 +169,11 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
     # The truth needs no map, but its edges are found in the same way.
     mapping: MapSettings = job["map"]
     parts.append((mapping.perception if job["role"] == "test" else mapping).model_dump(mode="json"))
-    key = _key(parts)
-    if _is_done(labels, key):
+    key = key_of(parts)
+    if is_done(labels, key):
         return labels
     # From here on, what lies there is neither the old labels nor the new ones.
-    _marker(labels).unlink(missing_ok=True)
+    forget_done(labels)
     simulate_drive(simulation, drive)
     if job["role"] == "test":
         truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
@@ -264,82 +181,30 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
     else:
         map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
         label_map(drive_map, labels, perception=job["map"].perception, window=job["window"])
-    _mark_done(labels, key)
+    mark_done(labels, key)
     return labels
-
-
-def truth_labels(
-    drive_path: Path,
-    perception: PerceptionSettings | None = None,
-    window: BirdseyeWindow | None = None,
-    marking_cm: float | None = None,
-) -> LabelSet:
-    """Make a label set from a simulator's truth, for scoring.
-
-    Args:
-        drive_path: Simulated drive.
-        perception: How edge points are found; None takes the defaults.
-        window: The network's window; None takes the default.
-        marking_cm: Width of the markings, if known.
-
-    Raises:
-        DriveFormatError: If the drive has no truth, or no camera or lane width.
-    """
-    drive, truth = open_drive(drive_path), read_truth(drive_path / "truth.csv")
-    if truth is None or drive.camera is None or drive.lane_width_cm is None:
-        raise DriveFormatError(f"{drive_path}: expected a simulated drive with truth, camera and lane width")
-    perception = PerceptionSettings() if perception is None else perception
-    extractor = RoadEdgeExtractor(drive.camera, perception)
-    edges = []
-    for i in range(len(drive)):
-        road = extractor.extract(drive.image(i))
-        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
-    n = len(drive)
-    window = BirdseyeWindow() if window is None else window
-    nothing = np.empty((0, 2))
-    return LabelSet(
-        meta=LabelMeta(
-            window=window,
-            camera_hash=drive.camera.hash,
-            wheelbase_cm=drive.camera.wheelbase_cm,
-            lane_width_cm=drive.lane_width_cm,
-            source="truth",
-            perception=perception,
-            marking_cm=marking_cm,
-        ),
-        drive=[drive.name] * n,
-        file=[""] * n,
-        frame=drive.frames,
-        t_s=drive.t_s,
-        lap=np.zeros(n, dtype=np.int64),
-        poses=np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1),
-        points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
-        edges=edges,
-        lines=[(nothing, nothing)] * n,
-        quality=np.ones(n),
-    )
 
 
 def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder: Path) -> dict[Role, Path]:
     """Map and label a recorded drive, and split it along time: to learn from, a gap, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
-    inputs = [settings.model_dump(mode="json"), asdict(window), _fingerprint(settings.path)]
+    inputs = [settings.model_dump(mode="json"), asdict(window), fingerprint(settings.path)]
     if settings.camera is not None and settings.camera.is_file():
-        inputs.append(_fingerprint(settings.camera))
-    key = _key(inputs)
+        inputs.append(fingerprint(settings.camera))
+    key = key_of(inputs)
     parts: dict[Role, Path] = {
         role: folder / "labels" / f"{name}.{role}.parquet" for role in ("train", "validation", "test")
     }
-    if not (_is_done(whole, key) and all(path.is_file() for path in parts.values())):
-        _marker(whole).unlink(missing_ok=True)
+    if not (is_done(whole, key) and all(path.is_file() for path in parts.values())):
+        forget_done(whole)
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
         label_map(drive_map, whole, window=window)
         shares = (settings.train_share, settings.validation_share)
         pieces = split_along_time(read_labels(whole), shares, settings.gap_frames)
         for path, piece in zip(parts.values(), pieces, strict=True):
             write_labels(path, piece)
-        _mark_done(whole, key)
+        mark_done(whole, key)
     return parts
 
 
@@ -371,32 +236,3 @@ def split_along_time(labels: LabelSet, shares: tuple[float, ...], gap_frames: in
         parts.append(labels.subset(rows))
         free_from = labels.frame[rows[-1]] + gap_frames
     return parts
-
-
-def _fingerprint(path: Path) -> str:
-    """Name, size and time of a recording's index files: cheap, and changes when the recording does."""
-    if not path.exists():
-        raise DriveFormatError(f"{path}: no such drive")
-    files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
-    return _key([(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files])
-
-
-def _key(parts: list[Any]) -> str:
-    text = json.dumps([_VERSION, parts], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _marker(path: Path) -> Path:
-    return path.with_name(f"{path.stem}.done.json")
-
-
-def _is_done(path: Path, key: str) -> bool:
-    try:
-        return path.is_file() and json.loads(_marker(path).read_text(encoding="utf-8")) == {"key": key}
-    except (OSError, ValueError):  # not there, not text, or not JSON
-        return False
-
-
-def _mark_done(path: Path, key: str) -> None:
-    """Written last: a job that was killed before this is done again."""
-    write_json(_marker(path), {"key": key})

@@ -14,13 +14,16 @@ from jaxtyping import Float, Int
 from datagen.lanes.fit import LaneLine
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.files import require, write_json, write_text
+from lanenet.data.files import write_json, write_text
+from lanenet.data.parquet import write_columns
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 
 FORMAT = "lanenet-map/1"
+REPORT_FORMAT = "lanenet-map-report/1"
+EDGES_FORMAT = "lanenet-edges/1"
 
 
 class MapMeta(Settings):
@@ -28,7 +31,8 @@ class MapMeta(Settings):
 
     Attributes:
         format: Kind and version of the folder.
-        drive: The drive that was mapped, as given.
+        drive: The drive that was mapped. On disk its full path; older maps hold it as it was typed, from
+            the folder in which the command ran.
         lane_width_cm: Lane width that the user gave.
         mapped_lane_cm: Distance between the lines on this map.
         tape_cm: Width of the markings on this map.
@@ -111,10 +115,11 @@ def write_map(
         for line in pair
     ]
     write_json(folder / "lanes.json", {"format": "lanenet-lanes/1", "lines": lines})
-    pa, pq = require("pyarrow", "data"), require("pyarrow.parquet", "data")
-    pq.write_table(pa.table(edges), folder / "edges.parquet")
-    write_json(folder / "report.json", report)
-    write_text(folder / "map.yaml", yaml.safe_dump(m.meta.model_dump(), sort_keys=False))
+    write_columns(folder / "edges.parquet", edges, {"format": EDGES_FORMAT})
+    write_json(folder / "report.json", {"format": REPORT_FORMAT, **report})
+    # In full, so that the map leads to its drive from any folder.
+    meta = {**m.meta.model_dump(), "drive": str(Path(m.meta.drive).resolve())}
+    write_text(folder / "map.yaml", yaml.safe_dump(meta, sort_keys=False))
 
 
 def read_map(folder: Path) -> DriveMap:

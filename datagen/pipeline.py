@@ -26,12 +26,11 @@ from lanenet.data.drive import Drive, open_drive
 from lanenet.data.files import atomic_folder, write_text
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.static import MAX_CAR_SHARE, hidden_rows, static_mask
+from lanenet.perception.static import find_static, spread_frames
 
 __all__ = ["MapSettings", "Report", "label_map", "map_drive"]
 
 _MIN_SEGMENT = 60  # frames
-_BUMPER_FRAMES = 150
 
 
 def map_drive(
@@ -118,19 +117,19 @@ def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSet
     """
     if not settings.find_bumper or settings.perception.range.bottom_rows:
         return settings
-    step = max(1, len(drive) // _BUMPER_FRAMES)
     try:
-        mask = static_mask(drive.image(k) for k in range(0, len(drive), step))
+        static = find_static(drive.image(k) for k in spread_frames(len(drive)))
     except DriveFormatError:  # too few frames of a moving car to tell it from the road
         return settings
-    hidden = hidden_rows(mask)
-    if not hidden:
+    if not static.rows:
         return settings
-    if hidden > MAX_CAR_SHARE * drive.height:
-        notes.append(f"something in the lowest {hidden} rows never moves; set bottom_rows if it is the car")
+    if static.is_too_high:
+        notes.append(
+            f"something in the lowest {static.rows} rows never moves; set bottom_rows if it is the car"
+        )
         return settings
-    notes.append(f"the car sees itself in the lowest {hidden} rows, which are left out")
-    limits = settings.perception.range.model_copy(update={"bottom_rows": hidden})
+    notes.append(f"the car sees itself in the lowest {static.rows} rows, which are left out")
+    limits = settings.perception.range.model_copy(update={"bottom_rows": static.rows})
     perception = settings.perception.model_copy(update={"range": limits})
     return settings.model_copy(update={"perception": perception})
 

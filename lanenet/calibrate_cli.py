@@ -11,18 +11,14 @@ import numpy as np
 import typer
 
 from lanenet import console
+from lanenet.calibrate_show import ground_pictures, lens_pictures, show_lens, show_mounting
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
-    from lanenet.calibration.chessboard_camera import ChessboardCalibration
-    from lanenet.calibration.ground import GroundCalibration
     from lanenet.geometry.camera import Camera
 
 app = typer.Typer(no_args_is_help=True, help="Find the camera: its lens, and where it sits on the car.")
-
-#: The bird's-eye picture's left, near, right and far edge, [cm].
-_AREA_CM = (-60.0, 0.0, 60.0, 120.0)
 
 _Board = Annotated[
     str | None, typer.Option(help="Inner corners of the board, for example 9x6.", show_default=False)
@@ -97,9 +93,9 @@ def chessboard(
     )
     if ros is not None:
         write_ros_camera_info(ros, result.camera, out.stem)
-    pictures = _lens_pictures(out, result)
+    pictures = lens_pictures(out, result)
     left_out = {**left_out, **result.dropped}
-    _show_lens(result, len(paths))
+    show_lens(result, len(paths))
     console.show_problems([f"left out {name}: {reason}" for name, reason in left_out.items()], limit=100)
     console.show_problems(notes)
     console.wrote(out, ros, *pictures)
@@ -162,8 +158,8 @@ def ground(
         {**_figures(camera), **result.residuals},
         datetime.date.today().isoformat(),
     )
-    pictures = [] if frame is None else _ground_pictures(out, frame, result, pixels_px)
-    _show_mounting(result, points_cm, pixels_px)
+    pictures = [] if frame is None else ground_pictures(out, frame, result, pixels_px)
+    show_mounting(result, points_cm, pixels_px)
     console.show_problems([] if image else ["no pictures without a photo; give --image"])
     console.wrote(out, *pictures)
     console.next_command("doctor", "--camera", out)
@@ -218,90 +214,3 @@ def _board_points(
     if isinstance(view, str):
         raise CalibrationError(f"{image}: {view}")
     return points_of_floor_board(view, wanted, (x_cm, y_cm))
-
-
-def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
-    """The view with the best spread: without distortion, and its board from above."""
-    from lanenet.calibration.chessboard import read_picture
-    from lanenet.calibration.chessboard_camera import reprojected
-    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
-
-    sizes = [float(np.prod(np.ptp(view.corners_px, axis=0))) for view in result.views]
-    index = int(np.argmax(sizes))
-    view = result.views[index]
-    frame = read_picture(Path(view.name))
-    marked = points_picture(frame, view.corners_px, reprojected(result, index))
-    (x0, y0), (x1, y1) = view.points_cm.min(axis=0), view.points_cm.max(axis=0)
-    margin = 0.4 * max(x1 - x0, y1 - y0)
-    area = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
-    return [
-        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
-        _write_picture(out, "board", plane_picture(frame, result.camera, result.fit.poses[index], area)),
-    ]
-
-
-def _ground_pictures(
-    out: Path, frame: np.ndarray, result: GroundCalibration, pixels_px: np.ndarray
-) -> list[Path]:
-    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
-    from lanenet.calibration.pose import pose_from_mounting
-
-    marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
-    pose = pose_from_mounting(result.camera.mounting)
-    return [
-        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
-        _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
-    ]
-
-
-def _write_picture(out: Path, what: str, picture: np.ndarray) -> Path:
-    import cv2
-
-    from lanenet.data.files import atomic_file
-
-    path = out.with_name(f"{out.stem}-{what}.png")
-    with atomic_file(path) as temporary:
-        cv2.imwrite(str(temporary), picture)
-    return path
-
-
-def _show_lens(result: ChessboardCalibration, pictures: int) -> None:
-    from lanenet.calibration.chessboard_camera import view_errors_px
-
-    rows = [[Path(name).name, f"{rms:.3f}"] for name, rms in view_errors_px(result).items()]
-    console.show_table("corners, measured minus projected", ("picture", "RMS px"), rows)
-    K, s, D = result.camera.K, result.fit.lens_sigma, result.camera.D
-    console.show_lines(
-        [
-            f"{result.camera.model} lens, {len(result.views)} of {pictures} pictures used, "
-            f"RMS {result.fit.rms_px:.3f} px",
-            f"focal lengths   {K[0, 0]:.2f} +- {s[0]:.2f}   {K[1, 1]:.2f} +- {s[1]:.2f} px",
-            f"principal point {K[0, 2]:.2f} +- {s[2]:.2f}   {K[1, 2]:.2f} +- {s[3]:.2f} px",
-            "distortion      " + "  ".join(f"{d:.4f} +- {e:.4f}" for d, e in zip(D, s[4:], strict=True)),
-        ]
-    )
-
-
-def _show_mounting(result: GroundCalibration, points_cm: np.ndarray, pixels_px: np.ndarray) -> None:
-    mounting, sigma = result.camera.mounting, result.sigma
-    lines = [f"{int(result.used.sum())} of {len(result.used)} points used, RMS {result.rms_px:.2f} px"]
-    for name in sigma:
-        value, spread = getattr(mounting, name), sigma[name]
-        label, _, unit = name.rpartition("_")
-        if unit == "rad":
-            value, spread, unit = np.rad2deg(value), np.rad2deg(spread), "degrees"
-        lines.append(f"{label.replace('_', ' '):20s}{value:8.2f} +- {spread:.2f} {unit}")
-    road_cm = result.camera.intersect_ground(pixels_px[result.used])
-    worst = float(np.nanmax(np.linalg.norm(road_cm - points_cm[result.used], axis=1)))
-    console.show_lines([*lines, f"{'worst point':20s}{worst:8.2f} cm off on the ground"])
-    console.show_problems(
-        [
-            f"left out point {k + 1}: "
-            + (
-                "behind the camera or out of its sight"
-                if result.behind[k]
-                else f"{np.linalg.norm(result.residuals_px[k]):.1f} px off"
-            )
-            for k in np.flatnonzero(~result.used)
-        ]
-    )

@@ -82,7 +82,7 @@ def main() -> None:
 @functools.cache
 def run_settings_schema() -> type[Settings]:
     """Return the schema of ``lanenet train CONFIG``; built here because its parts need the workstation."""
-    from datagen.datasets import DataSettings
+    from datagen.dataset_settings import DataSettings
     from lanenet.learn.config import LearnSettings
 
     class RunSettings(Settings):

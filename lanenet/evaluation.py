@@ -201,8 +201,7 @@ def _answer_labels(
             assert model is not None
             answers[name] = network_predictor(model)(labels)
         else:
-            width_cm = labels.meta.marking_cm if marking_cm is None else marking_cm
-            answers[name] = lane_filter_points_cm(
-                labels, filter_settings(labels.meta.lane_width_cm, width_cm)
-            )
+            meta = labels.meta
+            settings = filter_settings(meta.lane_width_cm, meta.marking_cm, marking_cm)
+            answers[name] = lane_filter_points_cm(labels, settings)
     return answers

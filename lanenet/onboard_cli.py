@@ -83,11 +83,13 @@ def detect(
 ) -> None:
     """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
     from lanenet.data.camera_file import read_camera
+    from lanenet.data.detections import check_table_path
     from lanenet.onboard.detect import run_detector
     from lanenet.onboard.detectors import WITHOUT_CAMERA, build_detector
     from lanenet.onboard.sources import open_source
 
     check_ending(out, ".parquet", ".csv")
+    check_table_path(out)
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
@@ -216,8 +218,12 @@ def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[
 
 def _frame_range(text: str) -> tuple[int, int]:
     first, colon, last = text.partition(":")
-    if not (colon and first.strip().isdigit() and last.strip().isdigit()):
+    if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
         raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
+    if int(last) < int(first):
+        raise ConfigError(
+            f"--frames {text!r}: found a last frame before the first, expected FIRST:LAST, as in 700:999"
+        )
     return int(first), int(last)
 
 

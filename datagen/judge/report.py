@@ -14,6 +14,8 @@ from datagen.judge.settings import JudgeSettings
 from lanenet.data.files import write_json, write_text
 from lanenet.data.tables import write_csv
 
+FORMAT = "lanenet-judge/1"
+
 #: Header, measure, decimals, factor; each shown as mean/worst over the runs.
 _MEASURES: tuple[tuple[str, str, int, float], ...] = (
     ("departures", "departures", 1, 1.0),
@@ -79,6 +81,7 @@ def write_report(out: Path, settings: JudgeSettings, results: Sequence[RunResult
     """Write ``results.json``, ``results.md`` and ``runs.csv`` (a row per run); returns their paths."""
     paths = [out / "results.json", out / "results.md", out / "runs.csv"]
     data = {
+        "format": FORMAT,
         "settings": settings.model_dump(mode="json"),
         "summary": summarise(results),
         "runs": [asdict(result) for result in results],

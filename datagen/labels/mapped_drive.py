@@ -56,7 +56,8 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
     drive_map = read_map(map_folder)
     source = drive_path if drive_path is not None else Path(drive_map.meta.drive)
     if not source.exists():
-        raise DriveFormatError(f"{source}: the drive of {map_folder} is not there")
+        hint = "" if source.is_absolute() else f", looked for from {Path.cwd()}"
+        raise DriveFormatError(f"{source}: the drive of {map_folder} is not there{hint}")
     drive = open_drive(source)
     if (drive_map.camera.width, drive_map.camera.height) != (drive.width, drive.height):
         raise CalibrationError(

@@ -10,6 +10,8 @@ from jaxtyping import Float
 from lanenet.data.label_set import LabelSet
 from lanenet.geometry.lane import POINT_NAMES
 
+REPORT_FORMAT = "lanenet-label-report/1"
+
 _REACH_CM = 60.0
 
 
@@ -61,6 +63,7 @@ def label_report(
         return float(np.percentile(finite, q)) if finite.size else float("nan")
 
     return {
+        "format": REPORT_FORMAT,
         "frames_mapped": mapped_frames,
         "frames_labelled": len(labels),
         "labelled_share": len(labels) / max(mapped_frames, 1),

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import N_DISTORTION, N_INTRINSIC, camera_of_lens, project_points
-from lanenet.calibration.pose import moved_points, pose_of_plane
+from lanenet.calibration.pose import moved_points, plane_points, pose_of_plane
 from lanenet.geometry.camera import CameraModel
 
 #: Angle between the axis and the picture's corner, [deg], from which a search starts.
@@ -152,7 +152,9 @@ def view_residuals(
     views: Sequence[BoardView],
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Return measured minus projected corners of each view, [px]."""
-    moved = [moved_points(pose, _solid(view))[0] for pose, view in zip(poses, views, strict=True)]
+    moved = [
+        moved_points(pose, plane_points(view.points_cm))[0] for pose, view in zip(poses, views, strict=True)
+    ]
     # All views in one call: many small ones cost more than their arithmetic.
     pixels = project_points(model, lens, np.concatenate(moved))[0]
     ends = np.cumsum([len(points) for points in moved])[:-1]
@@ -187,7 +189,7 @@ def refine(
     from scipy.optimize import least_squares
 
     n_free = int(np.count_nonzero(free))
-    solids = [_solid(view) for view in views]
+    solids = [plane_points(view.points_cm) for view in views]
     ends = 2 * np.cumsum([len(solid) for solid in solids])
 
     def unpack(x: Float[np.ndarray, "x"]) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "v 6"]]:
@@ -232,10 +234,6 @@ def refine(
         lens_sigma=_lens_sigma(jacobian(result.x), np.concatenate(errors).ravel(), free, n_free),
         robust_cost=2.0 * float(result.cost),
     )
-
-
-def _solid(view: BoardView) -> Float[np.ndarray, "n 3"]:
-    return np.concatenate([view.points_cm, np.zeros((len(view.points_cm), 1))], axis=1)
 
 
 def _lens_sigma(

@@ -19,7 +19,7 @@ from lanenet.calibration.lens_choice import (
     folds_inside,
     judged_fits,
 )
-from lanenet.calibration.pose import moved_points, rotation_from_vector
+from lanenet.calibration.pose import moved_points, plane_points, rotation_from_vector
 from lanenet.calibration.two_lenses import best_split, focal_scales
 from lanenet.calibration.views import check_count, usable_views
 from lanenet.errors import CalibrationError
@@ -208,5 +208,5 @@ def view_errors_px(result: ChessboardCalibration) -> dict[str, float]:
 def reprojected(result: ChessboardCalibration, index: int) -> Float[np.ndarray, "n 2"]:
     """Project the corners of a used view with the lens found, [px]."""
     view, pose = result.views[index], result.fit.poses[index]
-    solid = np.column_stack([view.points_cm, np.zeros(len(view.points_cm))])
-    return project_points(result.fit.model, result.fit.lens, moved_points(pose, solid)[0])[0]
+    points_cm = moved_points(pose, plane_points(view.points_cm))[0]
+    return project_points(result.fit.model, result.fit.lens, points_cm)[0]

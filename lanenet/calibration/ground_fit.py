@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from lanenet.calibration.ground_points import MIN_POINTS
 from lanenet.calibration.lens import N_DISTORTION, project_points
-from lanenet.calibration.pose import moved_points, pose_of_plane, rotation_from_vector
+from lanenet.calibration.pose import moved_points, plane_points, pose_of_plane, rotation_from_vector
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 
@@ -78,7 +78,8 @@ def pixel_residuals(
 ) -> Float[np.ndarray, "n 2"]:
     """Return measured minus projected pixels."""
     return (
-        pixels_px - project_points(camera.model, _lens(camera), moved_points(pose, _solid(points_cm))[0])[0]
+        pixels_px
+        - project_points(camera.model, _lens(camera), moved_points(pose, plane_points(points_cm))[0])[0]
     )
 
 
@@ -86,7 +87,7 @@ def residual_weights(
     camera: Camera, pose: Float[np.ndarray, "6"], points_cm: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Return the matrices that turn residuals into ones of equal spread, that of a clicked pixel."""
-    moved = moved_points(pose, _solid(points_cm))[0]
+    moved = moved_points(pose, plane_points(points_cm))[0]
     by_ground = project_points(camera.model, _lens(camera), moved)[1] @ rotation_from_vector(pose[:3])[:, :2]
     ground_sigma_cm = _GROUND_SIGMA_SHARE * float(np.linalg.norm(np.ptp(points_cm, axis=0)))
     # In front of the lens a point may move the image without limit; a finite weight is enough.
@@ -111,7 +112,7 @@ def _starts(
         pose = pose_of_plane(points_cm[list(chosen)], rays[list(chosen)])
         if pose is None:
             continue
-        moved = moved_points(pose, _solid(points_cm))[0]
+        moved = moved_points(pose, plane_points(points_cm))[0]
         directions = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
         angles = np.linalg.norm(np.cross(directions, rays), axis=1) + (
             np.sum(directions * rays, axis=1) < 0.0
@@ -131,7 +132,7 @@ def _refined(
 ) -> tuple[Float[np.ndarray, "6"], float]:
     from scipy.optimize import least_squares
 
-    lens, solid = _lens(camera), _solid(points_cm[used])
+    lens, solid = _lens(camera), plane_points(points_cm[used])
 
     def jacobian(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
         points, by_pose = moved_points(pose, solid)
@@ -157,10 +158,6 @@ def _weighted(
     residuals_px: Float[np.ndarray, "n 2"], weights: Float[np.ndarray, "n 2 2"]
 ) -> Float[np.ndarray, "n 2"]:
     return np.einsum("nij,nj->ni", weights, residuals_px)
-
-
-def _solid(points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    return np.concatenate([points_cm, np.zeros((len(points_cm), 1))], axis=1)
 
 
 def _lens(camera: Camera) -> Float[np.ndarray, "p"]:

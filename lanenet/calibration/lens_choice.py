@@ -19,7 +19,7 @@ from lanenet.calibration.bundle import (
 )
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens
-from lanenet.calibration.pose import moved_points
+from lanenet.calibration.pose import moved_points, plane_points
 from lanenet.calibration.views import MIN_VIEWS
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel
@@ -159,8 +159,12 @@ def check_wanted_model(
 
 def angles_rad(fit: LensFit, views: Sequence[BoardView]) -> Float[np.ndarray, "n"]:
     """Angle of each corner from the optical axis."""
-    solid = [np.column_stack([view.points_cm, np.zeros(len(view.points_cm))]) for view in views]
-    points = np.concatenate([moved_points(p, s)[0] for p, s in zip(fit.poses, solid, strict=True)])
+    points = np.concatenate(
+        [
+            moved_points(pose, plane_points(view.points_cm))[0]
+            for pose, view in zip(fit.poses, views, strict=True)
+        ]
+    )
     return np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
 
 

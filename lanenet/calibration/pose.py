@@ -33,6 +33,11 @@ def moved_points(
     return points @ rotation.T + pose[3:], derivatives
 
 
+def plane_points(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Return points of a board or of the ground with their z, which is 0."""
+    return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+
+
 def pose_of_plane(
     points: Float[np.ndarray, "n 2"], rays: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "6"] | None:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from lanenet.calibration.bundle import LensFit, neighbour_correlation
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import project_points
-from lanenet.calibration.pose import moved_points
+from lanenet.calibration.pose import moved_points, plane_points
 
 #: A view's own focal length is held to the common one as loosely as this, so that a board seen from straight
 #: ahead, which says nothing about it, stays finite; views known no better than the limit take no part.
@@ -91,7 +91,7 @@ def focal_scales(fit: LensFit, views: Sequence[BoardView]) -> FocalScales | None
         Gauss-Newton with soft-L1 weights; a view's focal length scales its pixels about the principal point.
     """
     n_lens, n_views = int(fit.free.sum()), len(views)
-    solids = [np.column_stack([view.points_cm, np.zeros(len(view.points_cm))]) for view in views]
+    solids = [plane_points(view.points_cm) for view in views]
     measured = np.concatenate([view.corners_px for view in views])
     owner = np.repeat(np.arange(n_views), [len(solid) for solid in solids])
     lens, poses, log_scale = fit.lens.copy(), fit.poses.copy(), np.zeros(n_views)

@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.files import require
+from lanenet.data.files import check_destination, require
 from lanenet.data.parquet import ParquetTable, float_array, write_parquet
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 from lanenet.perception.estimate import LaneEstimate
 
-FORMAT = "lanenet-detections/1"
+FORMAT_VERSION = 1
+FORMAT = f"lanenet-detections/{FORMAT_VERSION}"
+#: In a CSV, which has no other place for it; tables without it are older ones.
+VERSION_NAME = "format_version"
 
 SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
@@ -110,7 +113,7 @@ class DetectionTable:
         if ending == ".csv":
             write_csv(
                 path,
-                {"frame": frame, **columns},
+                {"frame": frame, **columns, VERSION_NAME: np.full(len(frame), FORMAT_VERSION)},
                 allow_empty=(*_OPEN_COLUMNS, *LANE_NAMES),
                 allow_infinite=_INFINITE_COLUMNS,
             )
@@ -147,7 +150,13 @@ def read_detections(path: Path) -> Detections:
             name: ColumnSpec(required=False, allow_empty=True, allow_infinite=name in _INFINITE_COLUMNS)
             for name in LANE_NAMES
         }
+        specs[VERSION_NAME] = ColumnSpec("int", required=False)
         columns = read_csv(path, specs, LabelFormatError)
+        others = set(columns.pop(VERSION_NAME, np.empty(0)).tolist()) - {FORMAT_VERSION}
+        if others:
+            raise LabelFormatError(
+                f"{path}: column {VERSION_NAME!r}: found {min(others)}, expected {FORMAT_VERSION}"
+            )
     else:
         table = ParquetTable(path)
         if table.meta.get("format") != FORMAT:
@@ -176,6 +185,19 @@ def read_detections(path: Path) -> Detections:
         radius_cm=columns["radius_cm"],
         offset_cm=columns["offset_cm"],
     )
+
+
+def check_table_path(path: Path) -> None:
+    """Refuse a table that could not be written at the end of a run.
+
+    Raises:
+        LabelFormatError: If the ending is unknown.
+        MissingExtraError: If the ending is ``.parquet`` and pyarrow is not installed.
+        LanenetError: If there is a folder of that name, or the file's folder cannot be written to.
+    """
+    if _ending(path) == ".parquet":
+        require("pyarrow", "data")
+    check_destination(path)
 
 
 def _ending(path: Path) -> str:

@@ -7,11 +7,20 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera
-from lanenet.data.recording import COMMAND_NAMES, Commands, Drive, ImageFiles, find_breaks, first_size
+from lanenet.data.recording import (
+    COMMAND_NAMES,
+    Commands,
+    Drive,
+    ImageFiles,
+    ImageSource,
+    find_breaks,
+    first_size,
+)
 from lanenet.data.tables import ColumnSpec, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
@@ -106,36 +115,51 @@ def read_times(path: Path, with_files: bool) -> tuple[dict[str, np.ndarray], Com
     return columns, Commands(**{name: columns.get(name) for name in COMMAND_NAMES})
 
 
-def open_folder(path: Path) -> Drive:
-    """Open a drive folder; images stay on disk.
+def drive_of(
+    path: Path,
+    frames: Int[np.ndarray, "n"],
+    t_s: Float[np.ndarray, "n"],
+    commands: Commands,
+    images: ImageSource,
+    problems: list[str],
+    *,
+    rows: Int[np.ndarray, "n"] | None = None,
+    times_trusted: bool = True,
+    deleted: Bool[np.ndarray, "n"] | None = None,
+    sessions: Bool[np.ndarray, "n"] | None = None,
+) -> Drive:
+    """Put together what a reader has found, with what a ``drive.yaml`` in the drive's folder says.
+
+    Args:
+        path: The drive: a folder, or a video, which has no ``drive.yaml``.
+        frames: Frame numbers.
+        t_s: Times.
+        commands: What the car was told.
+        images: Where the images come from.
+        problems: What was wrong with the recording.
+        rows: Row of each frame in ``images``; None for one after the other.
+        times_trusted: Whether the times are those of the frames.
+        deleted: Frames not to be learned from; None for none.
+        sessions: True where a session of the recording begins; None for a single one.
 
     Raises:
-        DriveFormatError: If ``frames.csv`` or ``drive.yaml`` cannot be used, or no image can be read.
-        CalibrationError: If the camera file that it names cannot be used.
+        DriveFormatError: If no image can be read, or ``drive.yaml`` or its camera's size does not fit.
+        CalibrationError: If the camera file that ``drive.yaml`` names cannot be used.
     """
-    columns, commands = read_times(path / FRAMES_FILE, with_files=True)
-    file, camera = read_drive_file(path)
-    frames, t_s = columns["frame"], columns["t_s"]
-    images = ImageFiles([path / name for name in columns["file"].tolist()])
-    missing = [i for i, image in enumerate(images.paths) if not image.is_file()]
-    problems = []
-    if missing:
-        problems.append(
-            f"{path / FRAMES_FILE}: {len(missing)} of {len(frames)} images are missing (first: frame "
-            f"{frames[missing[0]]}, {columns['file'][missing[0]]})"
-        )
-    rows = np.arange(len(frames))
+    rows = np.arange(len(frames)) if rows is None else rows
     width, height = first_size(images, rows, path)
+    file, camera = read_drive_file(path) if path.is_dir() else (DriveFile(format="lanenet-drive/1"), None)
     check_camera_size(camera, width, height, path)
+    breaks = find_breaks(frames, t_s, times_trusted)
     return Drive(
-        name=path.resolve().name,
+        name=path.resolve().name if path.is_dir() else path.stem,
         path=path,
         frames=frames,
         t_s=t_s,
-        times_trusted=True,
+        times_trusted=times_trusted,
         commands=commands,
-        deleted=np.zeros(len(frames), dtype=bool),
-        breaks=find_breaks(frames, t_s, True),
+        deleted=np.zeros(len(frames), dtype=bool) if deleted is None else deleted,
+        breaks=breaks if sessions is None else breaks | sessions,
         camera=camera,
         lane_width_cm=file.lane_width_cm,
         problems=tuple(problems),
@@ -146,6 +170,26 @@ def open_folder(path: Path) -> Drive:
         max_steering_rad=file.max_steering_rad,
         notes=file.notes,
     )
+
+
+def open_folder(path: Path) -> Drive:
+    """Open a drive folder; images stay on disk.
+
+    Raises:
+        DriveFormatError: If ``frames.csv`` or ``drive.yaml`` cannot be used, or no image can be read.
+        CalibrationError: If the camera file that it names cannot be used.
+    """
+    columns, commands = read_times(path / FRAMES_FILE, with_files=True)
+    frames, t_s = columns["frame"], columns["t_s"]
+    images = ImageFiles([path / name for name in columns["file"].tolist()])
+    missing = [i for i, image in enumerate(images.paths) if not image.is_file()]
+    problems: list[str] = []
+    if missing:
+        problems.append(
+            f"{path / FRAMES_FILE}: {len(missing)} of {len(frames)} images are missing (first: frame "
+            f"{frames[missing[0]]}, {columns['file'][missing[0]]})"
+        )
+    return drive_of(path, frames, t_s, commands, images, problems)
 
 
 def read_truth(path: Path) -> dict[str, np.ndarray] | None:

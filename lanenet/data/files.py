@@ -117,6 +117,23 @@ def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def check_destination(path: Path) -> None:
+    """Refuse a file that cannot be written, before the work whose result it is to hold; makes nothing.
+
+    Raises:
+        LanenetError: If the destination is a folder, or lies below a file or a folder that cannot be
+            written to.
+    """
+    path = Path(path).resolve()
+    if path.is_dir():
+        raise LanenetError(f"{path}: is a folder, expected a file to write")
+    parent = next(folder for folder in path.parents if folder.exists())
+    if not parent.is_dir():
+        raise LanenetError(f"{path}: cannot be written, {parent} is a file, expected a folder")
+    if not os.access(parent, os.W_OK):
+        raise LanenetError(f"{path}: cannot be written, the folder {parent} is read-only")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file (UTF-8) atomically."""
     with atomic_file(path) as temporary:

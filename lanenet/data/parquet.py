@@ -164,6 +164,12 @@ def write_parquet(
         parquet.write_table(table, temporary, compression="zstd")
 
 
+def write_columns(path: Path, columns: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+    """Write arrays of equal length as Parquet, atomically, each in the type that it has."""
+    arrow = require("pyarrow", "data")
+    write_parquet(path, {name: arrow.array(values) for name, values in columns.items()}, meta)
+
+
 def float_array(values: Float[np.ndarray, "n"]) -> Any:
     """Return a pyarrow column of float64 in which NaN is null."""
     arrow = require("pyarrow", "data")

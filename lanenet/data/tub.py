@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.drive_folder import check_camera_size, read_drive_file
-from lanenet.data.recording import Commands, Drive, ImageFiles, find_breaks, first_size
+from lanenet.data.drive_folder import drive_of
+from lanenet.data.recording import Commands, Drive, ImageFiles
 from lanenet.errors import DriveFormatError
 
 MANIFEST_FILE = "manifest.json"
@@ -69,9 +69,8 @@ def open_tub(path: Path) -> Drive:
     frames = np.array([record.index for record in records], dtype=np.int64)
     time_ms = np.array([record.time_ms for record in records])
     t_s, trusted = _times(path, frames, time_ms, problems)
-    breaks = find_breaks(frames, t_s, trusted)
-    sessions = [record.session for record in records]
-    breaks[1:] |= np.array([a != b for a, b in itertools.pairwise(sessions)], dtype=bool)
+    names = [record.session for record in records]
+    sessions = np.array([False, *(a != b for a, b in itertools.pairwise(names))])
     angle = np.array([record.angle for record in records])
     throttle = np.array([record.throttle for record in records])
     if np.isnan(angle).any():
@@ -80,31 +79,19 @@ def open_tub(path: Path) -> Drive:
             f"{frames[np.isnan(angle)][0]})"
         )
     images = ImageFiles([path / "images" / record.image for record in records])
-    rows = np.arange(len(frames))
-    width, height = first_size(images, rows, path)
-    file, camera = read_drive_file(path)
-    check_camera_size(camera, width, height, path)
-    return Drive(
-        name=path.resolve().name,
-        path=path,
-        frames=frames,
-        t_s=t_s,
-        times_trusted=trusted,
-        commands=Commands(
+    return drive_of(
+        path,
+        frames,
+        t_s,
+        Commands(
             angle=None if np.isnan(angle).all() else angle,
             throttle=None if np.isnan(throttle).all() else throttle,
         ),
+        images,
+        problems,
+        times_trusted=trusted,
         deleted=np.array([index in manifest.deleted for index in frames.tolist()], dtype=bool),
-        breaks=breaks,
-        camera=camera,
-        lane_width_cm=file.lane_width_cm,
-        problems=tuple(problems),
-        width=width,
-        height=height,
-        images=images,
-        rows=rows,
-        max_steering_rad=file.max_steering_rad,
-        notes=file.notes,
+        sessions=sessions,
     )
 
 

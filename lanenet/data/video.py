@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.drive_folder import read_times
-from lanenet.data.recording import Commands, Drive, find_breaks
+from lanenet.data.drive_folder import drive_of, read_times
+from lanenet.data.recording import Commands, Drive
 from lanenet.errors import DriveFormatError
 
 VIDEO_ENDINGS: tuple[str, ...] = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
@@ -134,21 +134,4 @@ def open_video(path: Path) -> Drive:
         frames = np.arange(n)
         t_s = frames / (fps or _DEFAULT_FPS)
         commands = Commands()
-    height, width = images.read(int(frames[0])).shape[:2]
-    return Drive(
-        name=path.stem,
-        path=path,
-        frames=frames,
-        t_s=t_s,
-        times_trusted=trusted,
-        commands=commands,
-        deleted=np.zeros(len(frames), dtype=bool),
-        breaks=find_breaks(frames, t_s, trusted),
-        camera=None,
-        lane_width_cm=None,
-        problems=tuple(problems),
-        width=int(width),
-        height=int(height),
-        images=images,
-        rows=frames,
-    )
+    return drive_of(path, frames, t_s, commands, images, problems, rows=frames, times_trusted=trusted)

@@ -71,8 +71,7 @@ def build_compared(
             detectors[name] = HoughTracker(frames.camera, brightness)
         elif name == "lane-filter":
             # The perception is the source's: it leaves out the rows in which a car sees itself.
-            thickness_cm = frames.marking_cm if marking_cm is None else marking_cm
-            settings = filter_settings(frames.lane_width_cm, thickness_cm)
+            settings = filter_settings(frames.lane_width_cm, frames.marking_cm, marking_cm)
             detectors[name] = LaneFilter(RoadEdgeExtractor(frames.camera, frames.perception), settings)
         else:
             detectors[name] = build_detector(name, frames.camera, model=model, any_camera=any_camera)

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.detections import DetectionTable
-from lanenet.data.files import atomic_file
+from lanenet.data.detections import DetectionTable, check_table_path
+from lanenet.data.files import atomic_file, check_destination
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.sources import Source
@@ -84,9 +84,14 @@ def run_detector(
         DriveFormatError: If a frame cannot be read; with ``skip_unreadable``, if none can.
         CalibrationError: If a frame does not fit the camera; the message names it.
         LabelFormatError: If the ending of ``out`` is unknown.
+        LanenetError: If ``out`` or ``video`` cannot be written there; found before the first frame.
     """
-    if video is not None and video.suffix.lower() not in VIDEO_ENDINGS:
-        raise DriveFormatError(f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}")
+    # Before the work, which may take an hour, and not after it.
+    check_table_path(out)
+    if video is not None:
+        if video.suffix.lower() not in VIDEO_ENDINGS:
+            raise DriveFormatError(f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}")
+        check_destination(video)
     table = DetectionTable()
     times_s: list[float] = []
     problems: list[str] = []

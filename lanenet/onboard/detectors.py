@@ -133,13 +133,22 @@ def lane_filter_settings(
     return check_settings(LaneFilterSettings, data, where), file.perception
 
 
-def filter_settings(lane_width_cm: float, marking_cm: float | None = None) -> LaneFilterSettings:
-    """Return the lane filter's settings for a lane, with its default thickness of tape if none is given.
+def filter_settings(
+    lane_width_cm: float, source_marking_cm: float | None = None, marking_cm: float | None = None
+) -> LaneFilterSettings:
+    """Return the lane filter's settings for a source of labelled frames or edge points.
+
+    Args:
+        lane_width_cm: Of the source.
+        source_marking_cm: Thickness of the tape that the source tells, if it does.
+        marking_cm: Thickness that is given in so many words, which goes before the source's; the filter's
+            default where there is neither.
 
     Raises:
         ConfigError: If a value is out of range.
     """
-    return lane_filter_settings(None, lane_width_cm, marking_cm=marking_cm)[0]
+    thickness_cm = source_marking_cm if marking_cm is None else marking_cm
+    return lane_filter_settings(None, lane_width_cm, marking_cm=thickness_cm)[0]
 
 
 def lane_filter_points_cm(

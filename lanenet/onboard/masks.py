@@ -12,10 +12,7 @@ from jaxtyping import UInt8
 
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.onboard.sources import Source
-from lanenet.perception.static import MAX_CAR_SHARE, hidden_rows, static_mask
-
-#: Frames looked at, from all over the source.
-_FRAMES = 150
+from lanenet.perception.static import find_static, spread_frames
 
 
 def find_mask(source: Source) -> tuple[UInt8[np.ndarray, "h w"] | None, str]:
@@ -29,18 +26,18 @@ def find_mask(source: Source) -> tuple[UInt8[np.ndarray, "h w"] | None, str]:
     """
 
     def frames() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-        for i in range(0, len(source), max(1, len(source) // _FRAMES)):
+        for i in spread_frames(len(source)):
             with contextlib.suppress(DriveFormatError):
                 yield source.image(i)
 
     try:
-        mask = static_mask(frames())
+        static = find_static(frames())
     except DriveFormatError as error:
         return None, f"no mask: {error}"
-    rows = hidden_rows(mask)
+    mask, rows = static.mask, static.rows
     if not rows:
         return None, "no mask: nothing stays in place at the bottom of the frames"
-    if rows > MAX_CAR_SHARE * mask.shape[0]:
+    if static.is_too_high:
         return None, (
             f"no mask: something in the lowest {rows} of {mask.shape[0]} rows never moves, which is too much "
             "to be taken for the car; if it is, give a picture of it"

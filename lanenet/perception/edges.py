@@ -108,6 +108,11 @@ def check_frame(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h 
     Raises:
         DriveFormatError: If the array is not an image of one or three uint8 channels.
     """
+    # A camera that has stopped gives None, and a list of lists is no image yet.
+    if not isinstance(frame_bgr, np.ndarray):
+        raise DriveFormatError(
+            f"frame: expected a uint8 image (h, w) or (h, w, 3), found {type(frame_bgr).__name__}"
+        )
     if frame_bgr.dtype != np.uint8 or frame_bgr.ndim not in (2, 3) or frame_bgr.size == 0:
         raise DriveFormatError(
             f"frame: expected a uint8 image (h, w) or (h, w, 3), found {frame_bgr.dtype} {frame_bgr.shape}"

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
-from lanenet.perception.edges import to_gray
+from lanenet.perception.edges import check_frame
 
 #: A line is continued towards the car by no more than this, nor by more than the length that is seen.
 _MAX_CONTINUED_CM = 30.0
@@ -47,11 +47,8 @@ def to_bgr(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]
     Raises:
         DriveFormatError: If the array is not an image of one or three uint8 channels.
     """
-    # Refuses what is not an image.
-    gray = to_gray(frame_bgr) if frame_bgr.ndim != 3 or frame_bgr.dtype != np.uint8 else frame_bgr
-    if gray.ndim == 3 and (gray.shape[2] != 3 or gray.size == 0):
-        to_gray(frame_bgr)
-    return gray if gray.ndim == 3 else np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
+    frame = check_frame(frame_bgr)
+    return frame if frame.ndim == 3 else np.asarray(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
 
 
 def check_size(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,9 +21,41 @@ _LEAST_FRAMES = 20
 _STATIC_SHARE = 0.7
 #: What never moves but covers more of the rows than this is not taken for the car: it may as well be a lane
 #: that the car follows without a curve.
-MAX_CAR_SHARE = 0.2
+_MAX_CAR_SHARE = 0.2
 #: The car is looked for in this share of the rows, from the bottom.
 _CAR_SHARE = 0.4
+#: So many frames, from all over a drive, tell the car from the road.
+_ENOUGH_FRAMES = 150
+
+
+@dataclass(frozen=True, eq=False)
+class StaticPart:
+    """What never moves at the bottom of a drive's frames.
+
+    Attributes:
+        mask: 255 on it, 0 elsewhere.
+        rows: Rows at or below the highest one that it touches; 0 if everything moves.
+    """
+
+    mask: UInt8[np.ndarray, "h w"]
+    rows: int
+
+    @property
+    def is_too_high(self) -> bool:
+        """Whether it covers more rows than are taken for the car."""
+        return self.rows > _MAX_CAR_SHARE * self.mask.shape[0]
+
+
+def spread_frames(count: int) -> range:
+    """Return which of a drive's ``count`` frames to look at."""
+    return range(0, count, max(1, count // _ENOUGH_FRAMES))
+
+
+def find_static(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> StaticPart:
+    """Find the car's own parts, and how high they reach; as :func:`static_mask`."""
+    mask = static_mask(frames)
+    touched = np.flatnonzero(mask.any(axis=1))
+    return StaticPart(mask, mask.shape[0] - int(touched[0]) if touched.size else 0)
 
 
 def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarray, "h w"]:
@@ -71,12 +104,6 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
     height = static.shape[0]
     static[: round((1.0 - _CAR_SHARE) * height)] = 0
     return _down_to_the_border(static)
-
-
-def hidden_rows(mask: UInt8[np.ndarray, "h w"]) -> int:
-    """Return how many rows lie at or below the highest one that a mask touches."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    return mask.shape[0] - int(rows[0]) if rows.size else 0
 
 
 def _down_to_the_border(static: np.ndarray) -> np.ndarray:

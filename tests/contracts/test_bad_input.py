@@ -149,6 +149,35 @@ def test_a_camera_file_with_a_nan(tmp_path, drive):
     assert "camera.yaml" in line and "height_cm" in line and "NaN" in line
 
 
+@pytest.mark.parametrize("text", ["5:2", "5", ":", "5:", "-3:7", "1.5:7", "\u00b2:\u00b2", "a:b"])
+def test_a_range_of_frames_that_is_none(tmp_path, drive, text):
+    line = run(
+        tmp_path, "detect", drive, "--detector", "hough", "--out", tmp_path / "o.csv", "--frames", text
+    )
+    assert "FIRST:LAST" in line and text in line
+
+
+def test_frames_that_the_drive_does_not_have(tmp_path, drive):
+    words = ("detect", drive, "--detector", "hough", "--out", tmp_path / "o.csv", "--frames", "500:600")
+    line = run(tmp_path, *words)
+    assert "500" in line and "0 to 69" in line
+
+
+def test_an_output_that_cannot_be_written_is_found_before_the_work(tmp_path, drive):
+    (tmp_path / "folder.csv").mkdir()
+    for out, what in (("folder.csv", "is a folder"), ("drive/frames.csv/o.csv", "frames.csv is a file")):
+        # A drive that is not there would be found next.
+        words = ("detect", tmp_path / "nowhere", "--detector", "hough", "--out", tmp_path / out)
+        assert what in run(tmp_path, *words)
+    words = ("detect", drive, "--detector", "hough", "--out", tmp_path / "o.csv")
+    assert "is a folder" in run(tmp_path, *words, "--video", make_folder(tmp_path / "v.mp4"))
+
+
+def make_folder(path):
+    path.mkdir()
+    return path
+
+
 def test_a_map_without_its_drive(tmp_path):
     (tmp_path / "m").mkdir()
     assert "map.yaml" in run(tmp_path, "label", tmp_path / "m", "--out", tmp_path / "l.parquet")

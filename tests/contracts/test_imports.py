@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -12,7 +13,15 @@ REPO = Path(__file__).resolve().parents[2]
 LINT_IMPORTS = Path(sys.executable).parent / "lint-imports"
 #: Modules that start on the car, and the packages that the base installation does not have.
 ONBOARD_MODULES = ("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network")
-HEAVY = ("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow", "onnx")
+HEAVY = (
+    *("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow"),
+    *("onnx", "onnxscript", "safetensors", "tensorboard"),
+)
+#: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
+#: written only if the extra is there.
+NAMED_IMPORTS = {"lanenet/data/": {"pyarrow"}}
+#: The one function that does it.
+IMPORTER = "lanenet/data/files.py"
 
 
 def lint_imports(tree: Path) -> subprocess.CompletedProcess[str]:
@@ -50,6 +59,8 @@ def test_the_import_rules_hold(tree: Path) -> None:
         ("lanenet.geometry", "lanenet.data"),
         ("lanenet.onboard", "torch"),
         ("lanenet.perception", "scipy"),
+        ("lanenet.onboard", "onnx"),
+        ("lanenet.control", "tensorboard"),
         ("datagen", "lanenet.learn"),
         ("lanenet.learn", "datagen"),
         ("datagen", "torch"),
@@ -84,3 +95,45 @@ def test_what_starts_on_the_car_loads_no_heavy_package(module: str) -> None:
 
 def test_the_check_for_heavy_packages_can_fail() -> None:
     assert "torch" in loaded_packages("lanenet.learn.network")
+
+
+def hidden_imports(source: str) -> list[str]:
+    """Packages that a module imports by their names in a text; "?" where the name is not a plain text."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if called in ("require", "import_module", "__import__"):
+            name = node.args[0] if node.args else None
+            plain = isinstance(name, ast.Constant) and isinstance(name.value, str)
+            found.append(name.value.partition(".")[0] if plain else "?")  # type: ignore[union-attr]
+    return found
+
+
+def test_no_import_goes_past_the_rules_by_its_name() -> None:
+    seen = set()
+    for path in sorted([*(REPO / "lanenet").rglob("*.py"), *(REPO / "datagen").rglob("*.py")]):
+        name = path.relative_to(REPO).as_posix()
+        found = set(hidden_imports(path.read_text(encoding="utf-8")))
+        if name == IMPORTER:
+            assert found == {"?"}
+            continue
+        allowed = {p for place, packages in NAMED_IMPORTS.items() if name.startswith(place) for p in packages}
+        assert found <= allowed, f"{name}: imports {found - allowed} past the import rules"
+        seen |= found
+    assert seen == {"pyarrow"}
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("def f():\n    return require('torch.nn', 'train')", ["torch"]),
+        ("import importlib\nx = importlib.import_module('scipy')", ["scipy"]),
+        ("files.require('onnx', 'train'); __import__('numba')", ["onnx", "numba"]),
+        ("require(name, extra)", ["?"]),
+        ("required('torch')", []),
+    ],
+)
+def test_the_check_for_named_imports_can_fail(source: str, found: list[str]) -> None:
+    assert sorted(hidden_imports(source)) == sorted(found)

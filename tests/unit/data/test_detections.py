@@ -50,6 +50,7 @@ def test_round_trip(tmp_path: Path, name: str) -> None:
 def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
     make_table().write(tmp_path / "seen.csv")
     header = (tmp_path / "seen.csv").read_text().splitlines()[0].split(",")
+    assert header.pop() == "format_version"
     assert header == [
         *("frame", "t_s"),
         *POINT_NAMES,
@@ -81,8 +82,8 @@ def test_radius_and_offset_where_a_detector_knows_them(tmp_path: Path, name: str
     np.testing.assert_allclose(new.points_cm[:3], old.points_cm)
     if name.endswith(".csv"):
         lines = (tmp_path / name).read_text().splitlines()
-        assert lines[0].endswith(",steering_rad,confidence,radius_cm,offset_cm")
-        assert lines[1].endswith(",0.875,,") and lines[5].endswith(",0,inf,0.5")
+        assert lines[0].endswith(",steering_rad,confidence,radius_cm,offset_cm,format_version")
+        assert lines[1].endswith(",0.875,,,1") and lines[5].endswith(",0,inf,0.5,1")
     table.add(10, 0.5, LaneEstimate(offset_cm=float("inf")))
     with pytest.raises(LabelFormatError, match="frame 10, column 'offset_cm': found inf"):
         table.write(tmp_path / name)
@@ -137,6 +138,18 @@ def test_a_wrong_cell_is_named(tmp_path: Path) -> None:
         read_detections(path)
     path.write_text(path.read_text().replace("left_30_cm", "left_31_cm"))
     with pytest.raises(LabelFormatError, match="column 'left_30_cm' is missing"):
+        read_detections(path)
+
+
+def test_the_version_of_a_csv_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "seen.csv"
+    make_table().write(path)
+    lines = [line.rpartition(",")[0] for line in path.read_text().splitlines()]
+    # Older tables do not tell.
+    path.write_text("\n".join(lines) + "\n")
+    assert len(read_detections(path)) == 3
+    path.write_text("\n".join([f"{lines[0]},format_version", *(f"{line},2" for line in lines[1:])]) + "\n")
+    with pytest.raises(LabelFormatError, match=r"seen\.csv: column 'format_version': found 2, expected 1"):
         read_detections(path)
 
 

@@ -1,8 +1,7 @@
-"""Splits along time, and what counts as done."""
+"""Splits along time, and when a drive is made again."""
 
 from __future__ import annotations
 
-import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,22 +11,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from datagen.dataset_settings import DataSettings, RecordedSettings, SyntheticSettings
 from datagen.datasets import (
-    DataSettings,
-    RecordedSettings,
-    SyntheticSettings,
-    _fingerprint,
     _frames_of,
-    _is_done,
-    _key,
-    _mark_done,
+    _job_name,
     _recorded_labels,
     _synthetic_job,
     prepare,
     split_along_time,
 )
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
-from lanenet.errors import ConfigError, DriveFormatError
+from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
 
@@ -110,65 +104,6 @@ def test_shares_that_leave_nothing_for_the_test_are_refused_before_any_work():
     assert RecordedSettings(path=Path("drive"), lane_width_cm=40.0, train_share=0.8, validation_share=0.1)
 
 
-@pytest.fixture
-def labels_file(tmp_path: Path) -> Path:
-    path = tmp_path / "labels" / "drive.parquet"
-    path.parent.mkdir()
-    path.write_bytes(b"labels")
-    _mark_done(path, "0123abcd")
-    return path
-
-
-def test_what_is_marked_is_done(labels_file):
-    assert _is_done(labels_file, "0123abcd")
-
-
-def test_another_key_or_a_missing_file_is_not_done(labels_file):
-    assert not _is_done(labels_file, "0123abce")
-    labels_file.unlink()
-    assert not _is_done(labels_file, "0123abcd")
-
-
-def test_without_a_marker_nothing_is_done(tmp_path):
-    path = tmp_path / "drive.parquet"
-    path.write_bytes(b"labels")
-    assert not _is_done(path, "0123abcd")
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b'{"key": 7}', b"{}", b"[1, 2]", b"null", b'"0123abcd"', b"\xff\xfe\x00"]
-)
-def test_a_damaged_marker_means_not_done(labels_file, content):
-    (marker,) = labels_file.parent.glob("*.json")
-    marker.write_bytes(content)
-    assert not _is_done(labels_file, "0123abcd")
-
-
-def test_parts_of_one_drive_have_markers_of_their_own(tmp_path):
-    for name in ("a.parquet", "a.train.parquet"):
-        (tmp_path / name).write_bytes(b"labels")
-    _mark_done(tmp_path / "a.parquet", "k")
-    assert not _is_done(tmp_path / "a.train.parquet", "k")
-
-
-def test_a_key_depends_on_every_setting_and_not_on_their_order():
-    first = _key([{"a": 1, "b": 2.0}, "train"])
-    assert first == _key([{"b": 2.0, "a": 1}, "train"])
-    assert first != _key([{"a": 1, "b": 2.5}, "train"])
-    assert first != _key([{"a": 1, "b": 2.0}, "test"])
-    json.loads(json.dumps(first))
-
-
-def test_a_recording_that_changes_has_another_fingerprint(tmp_path):
-    (tmp_path / "frames.csv").write_text("frame\n1\n")
-    first = _fingerprint(tmp_path)
-    assert first == _fingerprint(tmp_path)
-    (tmp_path / "frames.csv").write_text("frame\n1\n2\n")
-    assert first != _fingerprint(tmp_path)
-    with pytest.raises(DriveFormatError, match="no such drive"):
-        _fingerprint(tmp_path / "nowhere")
-
-
 def test_every_synthetic_drive_has_a_seed_of_its_own_that_stays(tmp_path):
     def seeds(**counts: int) -> dict[str, int]:
         data = DataSettings(synthetic=SyntheticSettings(seed=5, **counts))
@@ -199,6 +134,14 @@ def test_test_drives_lead_to_their_frames(tmp_path):
     recorded = RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0)
     job = {"kind": "recorded", "settings": recorded, "folder": tmp_path / "drives"}
     assert _frames_of(job).parent == tmp_path / "drives/maps" and _frames_of(job).name.startswith("tub-")
+
+
+def test_drives_have_names_for_people(tmp_path):
+    data = DataSettings(synthetic=SyntheticSettings(train=2))
+    job = _synthetic_job(data, "train", 1, tmp_path)
+    assert _job_name(job) == f"train_01 (seed {job['simulation'].seed})"
+    recorded = RecordedSettings(path=Path("drives/tub"), lane_width_cm=40.0)
+    assert _job_name({"kind": "recorded", "settings": recorded}) == "drives/tub"
 
 
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):

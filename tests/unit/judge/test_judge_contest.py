@@ -162,6 +162,7 @@ def test_the_verb_judges_writes_and_draws(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "painter" in result.stdout and "furthest" in result.stdout
     data = json.loads((out / "results.json").read_text())
+    assert data["format"] == "lanenet-judge/1"
     assert data["settings"]["tracks"] == ["open"] and data["settings"]["simulation"]["camera"]["width"] == 48
     assert [run["entrant"] for run in data["runs"]] == ["truth", "painter"]
     picture = cv2.imread(str(out / "pictures" / "open_00.png"))

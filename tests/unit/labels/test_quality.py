@@ -92,6 +92,7 @@ def test_report_gives_shares_of_all_mapped_frames():
     points[:, 5] = np.nan
     residual = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 2.0, np.nan, np.nan])
     report = label_report(_labels(points), residual, 10, {"deleted": 2})
+    assert report["format"] == "lanenet-label-report/1"
     assert report["frames_mapped"] == 10
     assert report["frames_labelled"] == 8
     assert report["labelled_share"] == pytest.approx(0.8)

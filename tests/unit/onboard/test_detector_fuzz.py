@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -14,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from typer.testing import CliRunner
 
 from lanenet import cli
-from lanenet.data.camera_file import write_camera
+from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
@@ -74,18 +76,32 @@ def test_plain_frames_and_noise_of_a_calibrated_camera(name: str) -> None:
         assert_empty(detector.detect(noise))
 
 
-def test_wrong_type_is_refused_without_the_checks_of_the_tests() -> None:
-    # The tests' own type checks would answer first; what they wrap is what users call.
-    from lanenet.perception.image_lane import to_bgr
+@pytest.fixture
+def without_type_checks() -> Iterator[None]:
+    """As on the car: the tests' own checks of types would answer first."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
 
-    plain = getattr(to_bgr, "__wrapped__", to_bgr)
-    for frame in (
-        np.zeros((240, 320, 3)),
-        np.zeros((240, 320, 3), np.float32),
-        np.zeros((0, 0, 3), np.uint8),
-    ):
-        with pytest.raises((DriveFormatError, TypeError), match=r"frame|frame_bgr"):
-            plain(frame)
+
+@pytest.mark.parametrize("name", [*NAMES, "lane-filter", "network"])
+@pytest.mark.parametrize(
+    ("frame", "found"),
+    [
+        (None, "NoneType"),
+        ([[0, 0], [0, 0]], "list"),
+        ("frame.jpg", "str"),
+        (np.zeros((240, 320, 3)), r"float64 \(240, 320, 3\)"),
+        (np.zeros((0, 0, 3), np.uint8), r"uint8 \(0, 0, 3\)"),
+    ],
+)
+def test_what_is_no_image_is_named(without_type_checks: None, name: str, frame: object, found: str) -> None:
+    folder = Path(__file__).resolve().parents[3] / "checkpoints" / "small"
+    model = folder / "model.onnx" if name == "network" else None
+    detector = build_detector(name, read_camera(folder / "camera.yaml"), model=model, lane_width_cm=40.0)  # type: ignore[arg-type]
+    with pytest.raises(DriveFormatError, match=rf"expected a uint8 image .* found {found}"):
+        detector.detect(frame)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["network", "lane-filter"])

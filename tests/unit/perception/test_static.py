@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lanenet.errors import DriveFormatError
-from lanenet.perception.static import static_mask
+from lanenet.perception.static import find_static, spread_frames, static_mask
 
 
 def drive(count: int, bumper: bool, seed: int = 0) -> list[np.ndarray]:
@@ -55,3 +55,26 @@ def test_standing_in_between_does_no_harm() -> None:
 def test_frames_of_two_sizes_are_refused() -> None:
     with pytest.raises(DriveFormatError, match=r"frame 30: 80x40 px.*80x60"):
         static_mask([*drive(30, bumper=True), np.zeros((40, 80, 3), np.uint8)])
+
+
+def test_how_high_the_car_reaches_decides() -> None:
+    found = find_static(drive(60, bumper=True))
+    np.testing.assert_array_equal(found.mask, static_mask(drive(60, bumper=True)))
+    # A row or two of dilated edge above the bumper's ten.
+    assert 10 <= found.rows <= 13
+    assert not found.mask[: 60 - found.rows].any() and found.mask[60 - found.rows].any()
+    assert found.is_too_high == (found.rows > 12)
+    high = drive(60, bumper=True)
+    for frame in high:
+        frame[40:, 20:60] = 20
+    assert find_static(high).is_too_high
+    road = find_static(drive(60, bumper=False))
+    assert road.rows == 0 and not road.is_too_high
+
+
+def test_frames_are_taken_from_all_over_a_drive() -> None:
+    assert list(spread_frames(5)) == [0, 1, 2, 3, 4]
+    assert len(spread_frames(0)) == 0
+    for count in (150, 299, 300, 1000, 1001):
+        frames = spread_frames(count)
+        assert 150 <= len(frames) < 300 and frames[0] == 0 and frames[-1] >= count - frames.step

@@ -1,0 +1,76 @@
+"""Settings of a training run's data: which drives, and how they are made, mapped and split."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from datagen.map_settings import MapSettings
+from datagen.world.simulate import SimulationSettings
+from lanenet.config import Settings
+from lanenet.geometry.birdseye import BirdseyeWindow
+
+
+class SyntheticSettings(Settings):
+    """Synthetic drives, each on a road, and with a look, of its own.
+
+    Attributes:
+        seed: Every drive's seed follows from this, its role and its number.
+        train: Drives to learn from.
+        validation: Drives to choose the epoch by.
+        test: Drives whose truth scores the result.
+        simulation: What all drives share; their ``seed`` is set here.
+    """
+
+    seed: int = Field(default=0, ge=0)
+    train: int = Field(default=0, ge=0)
+    validation: int = Field(default=0, ge=0)
+    test: int = Field(default=0, ge=0)
+    simulation: SimulationSettings = SimulationSettings()
+
+
+class RecordedSettings(Settings):
+    """A recorded drive, split along its time.
+
+    Attributes:
+        path: Drive folder, tub or video, from the folder in which the command runs.
+        lane_width_cm: Between the middles of the lines of the driven lane.
+        camera: Camera file; left out, the camera is found from the drive.
+        train_share: Share of the labelled frames, from the start, to learn from.
+        validation_share: Share of the frames after them to choose the epoch by; the rest is for the test.
+        gap_frames: Frames left out between the parts, so that neighbours are never on both sides.
+        map: Settings for mapping this drive.
+    """
+
+    path: Path
+    lane_width_cm: float = Field(gt=0.0)
+    camera: Path | None = None
+    train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
+    validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
+    gap_frames: int = Field(default=40, ge=0)
+    map: MapSettings = MapSettings()
+
+    @model_validator(mode="after")
+    def _leave_some_for_the_test(self) -> RecordedSettings:
+        if self.train_share + self.validation_share > 0.999:
+            raise ValueError("train_share and validation_share must sum to less than 1: the rest is the test")
+        return self
+
+
+class DataSettings(Settings):
+    """Where the label sets of a run come from.
+
+    Attributes:
+        synthetic: Synthetic drives.
+        drives: Recorded drives.
+        map: Settings for mapping the synthetic drives.
+        window: The patch of road that the network sees: wide enough for the lane's lines on either side.
+        workers: Processes that simulate and map; 0 takes one per core.
+    """
+
+    synthetic: SyntheticSettings = SyntheticSettings()
+    drives: tuple[RecordedSettings, ...] = ()
+    map: MapSettings = MapSettings()
+    window: BirdseyeWindow = BirdseyeWindow()
+    workers: int = Field(default=0, ge=0)

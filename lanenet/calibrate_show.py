@@ -1,0 +1,107 @@
+"""What ``lanenet calibrate`` shows of its results: tables, and pictures beside the camera file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lanenet import console
+
+if TYPE_CHECKING:
+    from lanenet.calibration.chessboard_camera import ChessboardCalibration
+    from lanenet.calibration.ground import GroundCalibration
+
+#: The bird's-eye picture's left, near, right and far edge, [cm].
+_AREA_CM = (-60.0, 0.0, 60.0, 120.0)
+
+
+def lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
+    """Write the largest view without distortion, and its board from above; returns their paths."""
+    from lanenet.calibration.chessboard import read_picture
+    from lanenet.calibration.chessboard_camera import reprojected
+    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+
+    sizes = [float(np.prod(np.ptp(view.corners_px, axis=0))) for view in result.views]
+    index = int(np.argmax(sizes))
+    view = result.views[index]
+    frame = read_picture(Path(view.name))
+    marked = points_picture(frame, view.corners_px, reprojected(result, index))
+    (x0, y0), (x1, y1) = view.points_cm.min(axis=0), view.points_cm.max(axis=0)
+    margin = 0.4 * max(x1 - x0, y1 - y0)
+    area = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
+    return [
+        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "board", plane_picture(frame, result.camera, result.fit.poses[index], area)),
+    ]
+
+
+def ground_pictures(
+    out: Path, frame: np.ndarray, result: GroundCalibration, pixels_px: np.ndarray
+) -> list[Path]:
+    """Write the photo of the ground without distortion, and from above; returns their paths."""
+    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+    from lanenet.calibration.pose import pose_from_mounting
+
+    marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
+    pose = pose_from_mounting(result.camera.mounting)
+    return [
+        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
+    ]
+
+
+def _write_picture(out: Path, what: str, picture: np.ndarray) -> Path:
+    import cv2
+
+    from lanenet.data.files import atomic_file
+
+    path = out.with_name(f"{out.stem}-{what}.png")
+    with atomic_file(path) as temporary:
+        cv2.imwrite(str(temporary), picture)
+    return path
+
+
+def show_lens(result: ChessboardCalibration, pictures: int) -> None:
+    """Print a lens with its spreads, and how far each picture's corners lie off."""
+    from lanenet.calibration.chessboard_camera import view_errors_px
+
+    rows = [[Path(name).name, f"{rms:.3f}"] for name, rms in view_errors_px(result).items()]
+    console.show_table("corners, measured minus projected", ("picture", "RMS px"), rows)
+    K, s, D = result.camera.K, result.fit.lens_sigma, result.camera.D
+    console.show_lines(
+        [
+            f"{result.camera.model} lens, {len(result.views)} of {pictures} pictures used, "
+            f"RMS {result.fit.rms_px:.3f} px",
+            f"focal lengths   {K[0, 0]:.2f} +- {s[0]:.2f}   {K[1, 1]:.2f} +- {s[1]:.2f} px",
+            f"principal point {K[0, 2]:.2f} +- {s[2]:.2f}   {K[1, 2]:.2f} +- {s[3]:.2f} px",
+            "distortion      " + "  ".join(f"{d:.4f} +- {e:.4f}" for d, e in zip(D, s[4:], strict=True)),
+        ]
+    )
+
+
+def show_mounting(result: GroundCalibration, points_cm: np.ndarray, pixels_px: np.ndarray) -> None:
+    """Print a mounting with its spreads, and the points that do not agree with it."""
+    mounting, sigma = result.camera.mounting, result.sigma
+    lines = [f"{int(result.used.sum())} of {len(result.used)} points used, RMS {result.rms_px:.2f} px"]
+    for name in sigma:
+        value, spread = getattr(mounting, name), sigma[name]
+        label, _, unit = name.rpartition("_")
+        if unit == "rad":
+            value, spread, unit = np.rad2deg(value), np.rad2deg(spread), "degrees"
+        lines.append(f"{label.replace('_', ' '):20s}{value:8.2f} +- {spread:.2f} {unit}")
+    road_cm = result.camera.intersect_ground(pixels_px[result.used])
+    worst = float(np.nanmax(np.linalg.norm(road_cm - points_cm[result.used], axis=1)))
+    console.show_lines([*lines, f"{'worst point':20s}{worst:8.2f} cm off on the ground"])
+    console.show_problems(
+        [
+            f"left out point {k + 1}: "
+            + (
+                "behind the camera or out of its sight"
+                if result.behind[k]
+                else f"{np.linalg.norm(result.residuals_px[k]):.1f} px off"
+            )
+            for k in np.flatnonzero(~result.used)
+        ]
+    )

@@ -1,0 +1,41 @@
+"""Jobs in processes: order, and what is said when a process dies."""
+
+from __future__ import annotations
+
+import math
+import os
+
+import pytest
+
+from datagen.jobs import run_jobs
+from lanenet.errors import LanenetError
+
+HUGE = 2**60  # bytes
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_the_order_of_the_jobs(workers):
+    seen = []
+    jobs = [(str(n), n) for n in (9, 3, 7)]
+    found = run_jobs(math.factorial, jobs, workers, lambda done, total: seen.append((done, total)))
+    assert found == [362880, 6, 5040]
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_errors_of_the_work_are_passed_on(workers):
+    with pytest.raises(ValueError, match="factorial"):
+        run_jobs(math.factorial, [("good", 3), ("bad", -1)], workers)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_lack_of_memory_names_the_drive(workers):
+    with pytest.raises(LanenetError, match=r"^train_01 \(seed 5\): the memory does not suffice"):
+        run_jobs(bytearray, [("train_00 (seed 4)", 8), ("train_01 (seed 5)", HUGE)], workers)
+
+
+def test_a_process_that_is_killed_names_its_drives():
+    jobs = [(f"train_0{k} (seed {k})", 9) for k in range(4)]
+    with pytest.raises(LanenetError, match=r"train_00 \(seed 0\) or train_01 \(seed 1\): .*killed") as found:
+        run_jobs(os._exit, jobs, 2)
+    assert "train_03" not in str(found.value) and "data.workers" in str(found.value)
