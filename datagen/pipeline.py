@@ -24,6 +24,7 @@ from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
 from lanenet.data.files import atomic_folder, write_text
+from lanenet.data.trajectory import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.static import find_static, spread_frames
@@ -97,6 +98,8 @@ def map_drive(
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
+        opened = np.concatenate([part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
+        write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
         scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
         draw_map(folder / "map.png", drive_map, scaled)
         numbers = [int(drive_map.frames[k]) for k in shown]

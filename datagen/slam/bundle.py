@@ -432,4 +432,6 @@ class _Problem:
 
 def _factorised(matrix: csc_matrix) -> SuperLU:
     """Factors of a positive definite matrix: no pivoting, and an order that suits symmetry."""
-    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )

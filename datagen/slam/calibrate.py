@@ -1,7 +1,7 @@
 """A coarse camera from the drive alone: focal length and pitch by match score at held speed.
 
-This is a start for the bundle adjustment. The lens is taken as an equidistant fisheye with its axis in the image's middle.
-Scale is not observable: the camera's height is nominal until the lane width sets it.
+This is a start for the bundle adjustment. The lens is taken as an equidistant fisheye with its axis in the
+image's middle. Scale is not observable: the camera's height is nominal until the lane width sets it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
+from datagen.slam.filter import FilterSettings
 from datagen.slam.scans import Progress, scans_of
 from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
 from lanenet.config import Settings
@@ -43,6 +44,8 @@ class GuessSettings(Settings):
 
 #: Steps tried with each camera, relative to the one that suits the camera in the middle of the grid.
 _AROUND = np.array([0.75, 1.0, 1.33])
+#: A coarse answer is enough: the adjustment starts from it.
+_SEARCH = FilterSettings(particles=80, max_points=100)
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 
@@ -136,7 +139,7 @@ def _best_step(
     height = camera.mounting.height_cm
     scans = scans_of(pixels, camera, mapping_range(height, perception.range))
     profile = profile_speed(
-        scans, np.ones(len(scans)), height * steps_heights, height, camera.wheelbase_cm, seed
+        scans, np.ones(len(scans)), height * steps_heights, height, camera.wheelbase_cm, seed, _SEARCH
     )
     return profile.step_cm / height, float(np.max(profile.match))
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.map_settings import MapSettings
-from datagen.slam.bundle import CAMERA_NAMES, BundleResult, adjust
+from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import SteeringFit, commands_of, track
@@ -26,11 +27,14 @@ from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import RoadTable
+from lanenet.perception.edges import EdgePixels
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
+#: The camera is adjusted until its focal length moves by less than this share, or so often.
+_SETTLED, _MAX_CAMERA_ROUNDS = 0.01, 4
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class SolvedSegment:
         camera: The camera, adjusted where it was not known.
         scans: Edge points per frame, with the camera as it nodded in each.
         trajectory: Open-loop trajectory of the particle filter.
-        poses: Rear-axle poses after closing loops, frame map.
+        open_poses: Rear-axle poses, adjusted, before loops were closed.
+        poses: The same after closing loops, frame map.
         steering: How curvature answers to the command, where it does.
         revisits: Places seen twice.
         residuals: What each revisit misses after closing: ahead, left, heading.
@@ -52,6 +57,7 @@ class SolvedSegment:
     camera: Camera
     scans: Scans
     trajectory: Trajectory
+    open_poses: Float[np.ndarray, "n 3"]
     poses: Float[np.ndarray, "n 3"]
     steering: SteeringFit | None
     revisits: list[Revisit]
@@ -99,58 +105,70 @@ def solve_segment(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
-    bundle = adjust(
-        edges, trajectory.poses, camera, settings.bundle, rng, free=_OPEN_LOOP if find_camera else ()
-    )
-    scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
-    pairs = propose_revisits(thumbnails(drive), bundle.poses, height, settings.revisits)
+    free = _OPEN_LOOP if find_camera else ()
+    opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free)
+    scans = scans_of(edges, opened.camera, limits, opened.tilt)
+    pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
     found = [
-        match_places(scans, bundle.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
+        match_places(scans, opened.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    revisits: list[Revisit] = []
-    residuals, drift = np.empty((0, 3)), None
-    open_bundle = bundle
-    for kept, rate in consistent_revisits(bundle.poses, matched, settings.revisits):
-        poses, missed = close_loops(open_bundle.poses, kept, height)
-        closed = adjust(
-            edges,
-            poses,
-            open_bundle.camera,
-            settings.bundle,
-            rng,
-            free=_OPEN_LOOP if find_camera else (),
-            loops=_loops(kept, len(drive)),
-            tilt=open_bundle.tilt,
-        )
-        if not revisits or closed.misfit < bundle.misfit:
-            bundle, revisits, residuals, drift = closed, kept, missed, rate
-    if revisits and find_camera:
-        loops = _loops(revisits, len(drive))
-        bundle = adjust(
-            edges,
-            bundle.poses,
-            bundle.camera,
-            settings.bundle,
-            rng,
-            free=CAMERA_NAMES,
-            loops=loops,
-            tilt=bundle.tilt,
-        )
-    if revisits:
+    closure = _close(edges, opened, matched, settings, rng, free)
+    bundle = opened if closure is None else closure.bundle
+    if closure is not None and find_camera:
+        for _ in range(_MAX_CAMERA_ROUNDS):
+            # A camera that has changed sees other edges on the road.
+            edges = edges_of_drive(drive, settings.perception.edges, RoadTable(bundle.camera, limits))
+            before, loops = bundle.camera.K[0, 0], _loops(closure.revisits, len(drive))
+            start = bundle.camera
+            bundle = adjust(edges, bundle.poses, start, settings.bundle, rng, loops=loops, tilt=bundle.tilt)
+            if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
+                break
+    if closure is not None:
         scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
     return SolvedSegment(
-        bundle.camera,
-        scans,
-        trajectory,
-        bundle.poses,
-        steering,
-        revisits,
-        residuals,
-        drift,
-        bundle,
+        camera=bundle.camera,
+        scans=scans,
+        trajectory=trajectory,
+        open_poses=opened.poses,
+        poses=bundle.poses,
+        steering=steering,
+        revisits=[] if closure is None else closure.revisits,
+        residuals=np.empty((0, 3)) if closure is None else closure.residuals,
+        drift_rad_per_cm=None if closure is None else closure.drift_rad_per_cm,
+        bundle=bundle,
     )
+
+
+@dataclass(frozen=True)
+class _Closure:
+    """A way to close the loops: its revisits, what each misses, the drift that it found, and the map."""
+
+    revisits: list[Revisit]
+    residuals: Float[np.ndarray, "r 3"]
+    drift_rad_per_cm: float
+    bundle: BundleResult
+
+
+def _close(
+    edges: list[EdgePixels],
+    opened: BundleResult,
+    matched: list[Revisit],
+    settings: MapSettings,
+    rng: np.random.Generator,
+    free: Sequence[str],
+) -> _Closure | None:
+    """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
+    best: _Closure | None = None
+    height = opened.camera.mounting.height_cm
+    for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
+        poses, missed = close_loops(opened.poses, revisits, height)
+        loops = _loops(revisits, len(poses))
+        closed = adjust(edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt)
+        if best is None or closed.misfit < best.bundle.misfit:
+            best = _Closure(revisits, missed, drift, closed)
+    return best
 
 
 def _loops(revisits: list[Revisit], frames: int) -> list[tuple[int, int]]:

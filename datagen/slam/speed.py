@@ -20,8 +20,7 @@ from datagen.slam.scans import Progress, Scans
 #: Steps to try, in camera heights per frame: 1 cm of the paper's crawl up to a fast car at 10 Hz.
 STEPS_HEIGHTS = tuple(0.05 * 1.25**k for k in range(13))
 _FRAMES = 300
-_PARTICLES = 150
-_POINTS = 150
+_SETTINGS = FilterSettings(particles=150, max_points=150)
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ def profile_speed(
     height_cm: float,
     wheelbase_cm: float,
     seed: int,
+    settings: FilterSettings = _SETTINGS,
     progress: Progress | None = None,
 ) -> SpeedProfile:
     """Match a stretch of the drive with each of some held steps.
@@ -79,11 +79,11 @@ def profile_speed(
         height_cm: Of the camera.
         wheelbase_cm: Of the car.
         seed: The same for every step, so that chance favours none.
+        settings: Of the filter.
         progress: Called with (done, total).
     """
     stretch = middle_stretch(scans, _FRAMES)
     part, relative = scans.cut(stretch), relative_cm[stretch]
-    settings = FilterSettings(particles=_PARTICLES, max_points=_POINTS)
     match = np.zeros(len(steps_cm))
     for i, step_cm in enumerate(steps_cm):
         motion = held_motion(float(step_cm), relative, height_cm)
