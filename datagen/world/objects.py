@@ -55,7 +55,9 @@ def place_objects(
     solids: list[list[float]] = []
     for _ in range(object_rng.poisson(look.objects_per_m * track.length_cm / 100.0)):
         # Each object has a stream of its own, so that one that finds no room leaves the others as they are.
-        solids += _object(track, borders, look.objects_on_road, object_rng.spawn(1)[0])
+        rows = _object(track, borders, look.objects_on_road, object_rng.spawn(1)[0])
+        if not any(_overlap(row, other) for row in rows for other in solids):
+            solids += rows
     shadows = [_cast(row, light, self_cot, look.shadow_depth) for row in solids]
     for _ in range(shadow_rng.poisson(look.shadows_per_m * track.length_cm / 100.0)):
         shadows += _person_shadow(track, look.shadow_depth, shadow_rng.spawn(1)[0])
@@ -129,6 +131,26 @@ def _has_room(
         if not partly and not past_the_end and borders[0] - extra_cm < left < borders[1] + extra_cm:
             return False
     return True
+
+
+def _overlap(one: list[float], other: list[float]) -> bool:
+    """Whether the footprints of two solids meet, as rectangles and wherever they swing to."""
+    gap = np.array(one[:2]) - np.array(other[:2])
+    swings = float(np.hypot(one[-4], one[-3]) + np.hypot(other[-4], other[-3]))
+    if np.hypot(*gap) > np.hypot(*one[4:6]) + np.hypot(*other[4:6]) + swings:
+        return False
+    # Rectangles are apart if, seen along a side of one of them, their shadows are.
+    for c, s in (one[2:4], other[2:4]):
+        for axis in (np.array([c, s]), np.array([-s, c])):
+            if abs(float(axis @ gap)) > _half_span(one, axis) + _half_span(other, axis) + swings:
+                return False
+    return True
+
+
+def _half_span(row: list[float], axis: Float[np.ndarray, "2"]) -> float:
+    """Half the length of a solid's footprint along an axis."""
+    c, s, a, b = row[2:6]
+    return abs(a * (c * axis[0] + s * axis[1])) + abs(b * (c * axis[1] - s * axis[0]))
 
 
 def _row(

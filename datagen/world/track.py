@@ -80,7 +80,10 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
     things = listed_furniture(track, items, width_cm, settings.origin)
     # Of the same paint as the line on the right, except that a yellow road has white bars.
     colour: Colour = "black" if settings.right.colour == "black" else "white"
-    things += random_furniture(track, settings.random_furniture, items, width_cm, colour, furniture_rng)
+    middle = None if settings.middle is None or settings.middle.colour == "random" else settings.middle.colour
+    things += random_furniture(
+        track, settings.random_furniture, items, width_cm, colour, furniture_rng, middle
+    )
     markings = [
         marking
         for name in settings.lines

@@ -145,6 +145,9 @@ def choose_lane(
         lines: Tolerances of straight lines.
         settings: What is asked for.
     """
+    if camera_height_cm is not None:
+        widest_cm = settings.max_width_heights * camera_height_cm
+        lefts, rights = ([m for m in side if _is_beside(m, widest_cm)] for side in (lefts, rights))
     pairs = [
         (left, right)
         for left in lefts
@@ -196,6 +199,11 @@ def _is_convincing(left: Marking, right: Marking, settings: EvidenceSettings) ->
         m.evidence.extent >= settings.min_extent or m.evidence.contrast >= settings.clear_contrast
         for m in pair
     )
+
+
+def _is_beside(marking: Marking, widest_cm: float) -> bool:
+    """Whether a line can bound the lane that the car is in: no line of it is further than the lane is wide."""
+    return len(marking.points) > 0 and abs(float(marking.points[0, 0])) <= widest_cm
 
 
 def _is_lane(
