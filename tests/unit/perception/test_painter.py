@@ -299,6 +299,35 @@ def test_choice_of_the_lane() -> None:
     assert choose([marking(60.0, 135.0, 0.5)], []) == (None, None)
 
 
+def test_a_line_further_away_than_a_lane_is_wide_does_not_bound_the_lane() -> None:
+    def at(x_cm: float) -> Marking:
+        points = np.stack([np.full(5, x_cm), np.linspace(0.0, 60.0, 5)], axis=1)
+        line = SolidLine(60.0, 135.0) if x_cm < 0.0 else SolidLine(260.0, 185.0)
+        return Marking(line, None, straight_px(line, TRAPEZOID), points, LineEvidence(0.9, 0.0, 0.9, 0.9))
+
+    # Six camera heights of 20 cm: a wall's foot three metres away is as strong a line as any.
+    settings = EvidenceSettings()
+    for far in ([at(-344.0)], []), ([], [at(121.0)]), ([at(-344.0)], [at(-300.0)]):
+        assert choose_lane(*far, TRAPEZOID, 20.0, LINES, settings) == (None, None)
+    near = at(-119.0)
+    assert choose_lane([at(-344.0), near], [], TRAPEZOID, 20.0, LINES, settings) == (near, None)
+    # A plane that is no road has no centimetres.
+    assert choose_lane([at(-344.0)], [], TRAPEZOID, None, LINES, settings)[0] is not None
+
+
+def test_a_row_is_answered_where_its_line_is_seen() -> None:
+    frame = lane_frame()
+    painter = LanePainter(CAMERA, PainterSettings(mode="photo"))
+    assert painter.detect(frame).mask.all()
+    # The left line ends 22 cm ahead: the road may bend from there on.
+    end_px = round(float(CAMERA.project_ground(np.array([[-20.0, 22.0]]))[0, 1]))
+    frame[:end_px, :160] = frame[-1, 160]
+    points_cm = painter.detect(frame).points_cm
+    assert np.isfinite(points_cm).tolist() == [True, True, False, True, True, True]
+    # A straight line lies on an edge of the 3 cm tape, a curve on its middle.
+    np.testing.assert_allclose(points_cm[[0, 1, 3, 4, 5]], [-20.0, -20.0, 20.0, 20.0, 20.0], atol=1.8)
+
+
 def test_the_papers_plain_behaviour_by_settings() -> None:
     # Every segment of a side counts, and whatever comes of it is answered.
     plain = check_settings(
