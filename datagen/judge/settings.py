@@ -10,7 +10,7 @@ from pydantic import Field
 
 from datagen.world.pilot import PilotSettings
 from datagen.world.script import DriverSettings
-from datagen.world.track import TrackSettings
+from datagen.world.track import TrackSettings, load_track_settings
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings, check_settings
 from lanenet.errors import ConfigError
@@ -86,5 +86,6 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
 def _track_settings(kind: str, common: TrackSettings) -> TrackSettings:
     if kind in ("random", "open"):
         return common.model_copy(update={"closed": kind == "random"})
-    key = "file" if kind.endswith(_FILE_ENDINGS) else "preset"
-    return check_settings(TrackSettings, {key: kind}, f"tracks: {kind}")
+    if kind.endswith(_FILE_ENDINGS):
+        return load_track_settings(Path(kind))
+    return check_settings(TrackSettings, {"preset": kind}, f"tracks: {kind}")
