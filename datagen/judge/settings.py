@@ -16,6 +16,7 @@ from lanenet.config import Settings, check_settings
 from lanenet.errors import ConfigError
 
 _FILE_ENDINGS = (".yaml", ".yml")
+_STREAM = 3  # of seeds; the drives of a training run take 0 to 2, so that its roads are never judged on
 
 
 class JudgeSettings(Settings):
@@ -77,7 +78,7 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
     """
     kind, number = settings.tracks[index // settings.count], index % settings.count
     # The number alone decides the seed: another kind of road in the list leaves the others as they are.
-    seed = int(np.random.SeedSequence([settings.seed, number]).generate_state(1)[0])
+    seed = int(np.random.SeedSequence([settings.seed, _STREAM, number]).generate_state(1)[0])
     driver = DriverSettings(speed_cm_s=settings.speed_cm_s, wander_cm=0.0)
     changes: dict[str, Any] = {"seed": seed, "track": _track_settings(kind, settings.simulation.track)}
     return settings.simulation.model_copy(update={**changes, "driver": driver})

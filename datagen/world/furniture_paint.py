@@ -70,9 +70,7 @@ class _Strips:
         x, y = self._origin[0] + x_cm * c - y_cm * s, self._origin[1] + x_cm * s + y_cm * c
         direction = self._heading + angle_rad
         bgr = self._colour if colour is None else COLOURS[colour]
-        self._rows.append(
-            [x, y, np.cos(direction), np.sin(direction), 0.5 * length_cm, 0.5 * width_cm, *bgr]
-        )
+        self._rows.append([x, y, np.cos(direction), np.sin(direction), 0.5 * length_cm, 0.5 * width_cm, *bgr])
 
     def strip(
         self, start: tuple[float, float], end: tuple[float, float], width_cm: float, overlap_cm: float = 0.0

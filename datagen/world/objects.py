@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,22 +136,23 @@ def _has_room(
 
 def _overlap(one: list[float], other: list[float]) -> bool:
     """Whether the footprints of two solids meet, as rectangles and wherever they swing to."""
-    gap = np.array(one[:2]) - np.array(other[:2])
-    swings = float(np.hypot(one[-4], one[-3]) + np.hypot(other[-4], other[-3]))
-    if np.hypot(*gap) > np.hypot(*one[4:6]) + np.hypot(*other[4:6]) + swings:
+    dx, dy = one[0] - other[0], one[1] - other[1]
+    swings = math.hypot(one[-4], one[-3]) + math.hypot(other[-4], other[-3])
+    # On a long road nearly all are far from each other, and this is all that is looked at.
+    if math.hypot(dx, dy) > math.hypot(one[4], one[5]) + math.hypot(other[4], other[5]) + swings:
         return False
     # Rectangles are apart if, seen along a side of one of them, their shadows are.
     for c, s in (one[2:4], other[2:4]):
-        for axis in (np.array([c, s]), np.array([-s, c])):
-            if abs(float(axis @ gap)) > _half_span(one, axis) + _half_span(other, axis) + swings:
+        for u, v in ((c, s), (-s, c)):
+            if abs(u * dx + v * dy) > _half_span(one, u, v) + _half_span(other, u, v) + swings:
                 return False
     return True
 
 
-def _half_span(row: list[float], axis: Float[np.ndarray, "2"]) -> float:
-    """Half the length of a solid's footprint along an axis."""
+def _half_span(row: list[float], u: float, v: float) -> float:
+    """Half the length of a solid's footprint along a direction of the map."""
     c, s, a, b = row[2:6]
-    return abs(a * (c * axis[0] + s * axis[1])) + abs(b * (c * axis[1] - s * axis[0]))
+    return abs(a * (c * u + s * v)) + abs(b * (c * v - s * u))
 
 
 def _row(

@@ -29,7 +29,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 
 Bgr = tuple[int, int, int]
-Image = UInt8[np.ndarray, "h w 3"]
+Image = UInt8[np.ndarray, "_ _ 3"]
 Progress = Callable[[int, int], None]
 
 _SPEED_CM_S = 60.0

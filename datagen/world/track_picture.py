@@ -78,7 +78,9 @@ def paint_track(
         fill(box_corners_cm(box), (float(box[6]), float(box[7]), float(box[8])))
 
 
-def painted_bounds_cm(track: Track, margin_cm: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+def painted_bounds_cm(
+    track: Track, margin_cm: float
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return the corners of all that is painted, frame map, with a margin around the road."""
     reach_cm = track.half_width_cm + abs(track.middle_cm) + margin_cm
     points = [track.xy_cm - reach_cm, track.xy_cm + reach_cm]

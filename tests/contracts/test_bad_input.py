@@ -188,7 +188,10 @@ BAD_ROADS = {
         {"pieces": [STRAIGHT, bend(70, 180), bend(70, 90), bend(70, 80)], "lanes": 2, "lane_width_cm": 40},
         ("pieces.", "meets itself"),
     ),
-    "no radius left inside": ({"pieces": [STRAIGHT, bend(15, 90), STRAIGHT]}, ("'pieces.1.arc.radius_cm'", "15")),
+    "no radius left inside": (
+        {"pieces": [STRAIGHT, bend(15, 90), STRAIGHT]},
+        ("'pieces.1.arc.radius_cm'", "15"),
+    ),
     "no lane": ({"lane_width_cm": 0}, ("'lane_width_cm'", "found 0")),
     "no tape": ({"line_width_cm": 0}, ("'line_width_cm'", "found 0")),
     "no dash": ({"right": {"kind": "dashed", "dash_cm": 0}}, ("'right.dash_cm'", "found 0")),

@@ -202,7 +202,7 @@ def _is_convincing(left: Marking, right: Marking, settings: EvidenceSettings) ->
 
 
 def _is_beside(marking: Marking, widest_cm: float) -> bool:
-    """Whether a line can bound the lane that the car is in: its near end is no further than a lane is wide."""
+    """Whether a line can bound the car's lane: its near end is no further away than a lane is wide."""
     return len(marking.points) > 0 and abs(float(marking.points[0, 0])) <= widest_cm
 
 

@@ -77,11 +77,11 @@ class PainterSettings(Settings):
 class LanePainter:
     """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
 
-    With a camera the lines are moved to the road and answered up to where they are seen, and the steering aims
-    at the lane's middle some camera heights ahead. Without one the points are NaN, and the steering is the
-    angle in the image between straight up and the lane's middle, halfway up the region, seen from the middle
-    of its bottom. The confidence is the share of the two lines that this frame shows; a line that is only
-    remembered is drawn as a memory, not answered.
+    With a camera the lines are moved to the road and answered up to where they are seen, and the steering
+    aims at the lane's middle some camera heights ahead. Without one the points are NaN, and the steering is
+    the angle in the image between straight up and the lane's middle, halfway up the region, seen from the
+    middle of its bottom. The confidence is the share of the two lines that this frame shows; a line that is
+    only remembered is drawn as a memory, not answered.
 
     Attributes:
         last: Lines of the last frame in the image, for drawing.

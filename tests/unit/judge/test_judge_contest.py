@@ -20,7 +20,7 @@ from datagen.world.rig import CameraSettings
 from datagen.world.track import TrackSettings
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli import app
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.judge_cli import NamedDetector
 
 # Short open roads: a run is a few dozen frames.
@@ -166,6 +166,26 @@ def test_the_verb_judges_writes_and_draws(tmp_path: Path) -> None:
     assert [run["entrant"] for run in data["runs"]] == ["truth", "painter"]
     picture = cv2.imread(str(out / "pictures" / "open_00.png"))
     assert picture is not None and picture.shape[1] >= 700
+
+
+def test_everybody_drives_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+
+    def refuse(settings: JudgeSettings, entrants: list[Entrant], *_: object) -> None:
+        asked.append([entrant.name for entrant in entrants])
+        raise LanenetError("no time to drive")
+
+    monkeypatch.setattr("datagen.judge.contest.judge", refuse)
+    monkeypatch.chdir(tmp_path)
+    # Without the network where there is none, and it says so.
+    result = CliRunner().invoke(app, ["judge"])
+    assert asked == [["truth", "lane-filter", "hough", "painter"]]
+    assert "checkpoints/small is not there" in result.stderr
+    # A model that is asked for has to be there; the one that ships drives with the others.
+    assert "mine.onnx: no such file" in CliRunner().invoke(app, ["judge", "--model", "mine.onnx"]).stderr
+    (tmp_path / "checkpoints").symlink_to(Path(__file__).parents[3] / "checkpoints")
+    CliRunner().invoke(app, ["judge"])
+    assert asked[1:] == [["truth", "network", "lane-filter", "hough", "painter"]]
 
 
 @pytest.mark.parametrize(
