@@ -55,8 +55,8 @@ class EvidenceSettings(Settings):
         curve_share: A curve is taken instead of its straight line from this share of the latter's score on.
         inner_share: A narrower lane is taken instead of a wider one from this share of the latter's score on.
         max_width_ratio: The lane's width at its far end may differ by this factor from that at its near end.
-        max_width_heights: With a camera: the widest lane, in camera heights. A line whose near end lies
-            further beside the car cannot bound the lane that the car is in.
+        max_width_heights: With a camera: the widest lane, in camera heights. A line that comes no
+            nearer than that to the car does not bound the lane that the car is in.
     """
 
     required: bool = True

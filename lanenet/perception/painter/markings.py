@@ -145,9 +145,6 @@ def choose_lane(
         lines: Tolerances of straight lines.
         settings: What is asked for.
     """
-    if camera_height_cm is not None:
-        widest_cm = settings.max_width_heights * camera_height_cm
-        lefts, rights = ([m for m in side if _is_beside(m, widest_cm)] for side in (lefts, rights))
     pairs = [
         (left, right)
         for left in lefts
@@ -201,9 +198,31 @@ def _is_convincing(left: Marking, right: Marking, settings: EvidenceSettings) ->
     )
 
 
-def _is_beside(marking: Marking, widest_cm: float) -> bool:
-    """Whether a line can bound the car's lane: its near end is no further away than a lane is wide."""
-    return len(marking.points) > 0 and abs(float(marking.points[0, 0])) <= widest_cm
+def can_bound_the_lane(
+    markings: Sequence[Marking],
+    plane: Plane,
+    width_px: int,
+    camera_height_cm: float,
+    settings: EvidenceSettings,
+) -> list[Marking]:
+    """Leave out lines that are further beside the car than the widest lane is wide, where they come nearest.
+
+    Only what lies in the image counts: a line that leaves it sideways may go anywhere from there.
+
+    Args:
+        markings: Lines of one side.
+        plane: The road.
+        width_px: Of the image.
+        camera_height_cm: Unit of the lane's width.
+        settings: The widest lane.
+    """
+    widest_cm = settings.max_width_heights * camera_height_cm
+    visible = [m.line_px[(m.line_px[:, 0] >= 0.0) & (m.line_px[:, 0] <= width_px - 1.0)] for m in markings]
+    kept = []
+    for marking, seen in zip(markings, move_lines(plane.from_image, visible), strict=True):
+        if len(seen) and abs(float(seen[np.argmin(seen[:, 1]), 0])) <= widest_cm:
+            kept.append(marking)
+    return kept
 
 
 def _is_lane(

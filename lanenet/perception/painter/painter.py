@@ -33,6 +33,7 @@ from lanenet.perception.painter.lines import (
 from lanenet.perception.painter.markings import (
     Marking,
     Pair,
+    can_bound_the_lane,
     choose_lane,
     follow_lines,
     straight_px,
@@ -178,6 +179,9 @@ class LanePainter:
                     for line, again in zip(lines, known, strict=True)
                 ]
             )
+        if height_cm is not None:
+            width = frame_bgr.shape[1]
+            sides = [can_bound_the_lane(side, plane, width, height_cm, chosen.evidence) for side in sides]
         return choose_lane(sides[0], sides[1], trapezoid_px, height_cm, chosen.lines, chosen.evidence)
 
     def _smooth(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
@@ -209,13 +213,17 @@ class LanePainter:
         return smooth[0], smooth[1]
 
     def _seen(self, marking: Marking) -> Float[np.ndarray, "n 2"]:
-        """The points of a line up to where an edge lies along it: further on it may bend."""
+        """The points of a line in the image, up to where an edge lies along it: further on it may bend."""
         far_px = marking.evidence.far_px
-        if self._road is None or not math.isfinite(far_px):
+        if self._road is None or self._shape is None or not math.isfinite(far_px):
             return marking.points
-        seen = self._road.from_image(marking.line_px[marking.line_px[:, 1] >= far_px - 1.0])
-        ahead = finite_rows(seen)[:, 1]
-        return marking.points[marking.points[:, 1] <= ahead.max(initial=0.0)]
+        u, v = marking.line_px.T
+        seen = (v >= far_px - 1.0) & (u >= 0.0) & (u <= self._shape[1] - 1.0)
+        ahead = finite_rows(self._road.from_image(marking.line_px[seen]))[:, 1]
+        if len(ahead) == 0:
+            return ahead.reshape(0, 2)
+        y = marking.points[:, 1]
+        return marking.points[(y >= ahead.min()) & (y <= ahead.max())]
 
     def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> ImageLane:
         left, right = (None if marking is None else marking.line_px for marking in found)

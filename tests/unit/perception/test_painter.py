@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ from lanenet.perception.painter.evidence import (
     measure_evidence,
 )
 from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, find_two_lines, join_side
-from lanenet.perception.painter.markings import Marking, choose_lane, straight_px
+from lanenet.perception.painter.markings import Marking, can_bound_the_lane, choose_lane, straight_px
 from lanenet.perception.painter.measure import find_aim_cm, measure_lane
 from lanenet.perception.painter.painter import LanePainter, PainterSettings
 from lanenet.perception.painter.plane import RoadPlane, SquarePlane, finite_rows, move_lines
@@ -300,19 +301,25 @@ def test_choice_of_the_lane() -> None:
 
 
 def test_a_line_further_away_than_a_lane_is_wide_does_not_bound_the_lane() -> None:
-    def at(x_cm: float) -> Marking:
-        points = np.stack([np.full(5, x_cm), np.linspace(0.0, 60.0, 5)], axis=1)
-        line = SolidLine(60.0, 135.0) if x_cm < 0.0 else SolidLine(260.0, 185.0)
-        return Marking(line, None, straight_px(line, TRAPEZOID), points, LineEvidence(0.9, 0.0, 0.9, 0.9))
+    plane = RoadPlane(CAMERA)
+
+    def at(x_cm: float, from_cm: float = 0.0) -> Marking:
+        points = np.stack([np.full(30, x_cm), np.linspace(from_cm, 90.0, 30)], axis=1)
+        line_px = finite_rows(CAMERA.project_ground(points))
+        return Marking(SolidLine(60.0, 135.0), None, line_px, points, LineEvidence(0.9, 0.0, 0.9, 0.9))
+
+    def kept(*markings: Marking) -> list[Marking]:
+        return can_bound_the_lane(markings, plane, CAMERA.width, 20.0, EvidenceSettings())
 
     # Six camera heights of 20 cm: a wall's foot three metres away is as strong a line as any.
-    settings = EvidenceSettings()
-    for far in ([at(-344.0)], []), ([], [at(121.0)]), ([at(-344.0)], [at(-300.0)]):
-        assert choose_lane(*far, TRAPEZOID, 20.0, LINES, settings) == (None, None)
-    near = at(-119.0)
-    assert choose_lane([at(-344.0), near], [], TRAPEZOID, 20.0, LINES, settings) == (near, None)
-    # A plane that is no road has no centimetres.
-    assert choose_lane([at(-344.0)], [], TRAPEZOID, None, LINES, settings)[0] is not None
+    near, neighbour, wall = at(-20.0), at(-110.0, 30.0), at(-340.0, 30.0)
+    assert kept(wall, near, neighbour) == [near, neighbour]
+    assert kept(at(340.0, 30.0)) == [] and kept() == []
+    # A line that leaves the image sideways may go anywhere from there: only what is in it counts.
+    outside = np.array([[-300.0, 239.0], [-100.0, 200.0]])
+    leaving = replace(near, line_px=np.concatenate([outside, near.line_px]))
+    assert kept(leaving) == [leaving]
+    assert kept(replace(near, line_px=outside)) == []
 
 
 def test_a_row_is_answered_where_its_line_is_seen() -> None:
