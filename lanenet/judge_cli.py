@@ -70,13 +70,19 @@ class NamedDetector:
 )
 def judge(
     detectors: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Who drives, separated by commas; hough and painter as NAME=SETTINGS.yaml too; truth is the "
-            "scripted driver, true-points the steering law with perfect sight."
+            f"scripted driver, true-points the steering law with perfect sight. Default: {_DETECTORS}.",
+            show_default=False,
         ),
-    ] = _DETECTORS,
-    model: Annotated[Path, typer.Option(help="Model (.onnx) or checkpoint folder of the network.")] = _MODEL,
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"Model (.onnx) or checkpoint folder of the network; default {_MODEL}.", show_default=False
+        ),
+    ] = None,
     tracks: Annotated[
         str | None,
         typer.Option(help="random (loops), open, presets or track files (.yaml), separated by commas."),
@@ -119,6 +125,12 @@ def judge(
     data |= {key: value for key, value in given.items() if value is not None}
     data = apply_overrides(data, [] if law is None else [f"pilot.law={law}"])
     settings = check_settings(JudgeSettings, data, "judge" if config is None else str(config))
+    if detectors is None:
+        detectors = _DETECTORS
+        if model is None and not _MODEL.exists():
+            detectors = ",".join(name for name in _DETECTORS.split(",") if name != "network")
+            console.show_problems([f"{_MODEL} is not there: without the network; --model names one"])
+    model = _MODEL if model is None else model
     entrants = [_entrant(text.strip(), model, any_camera) for text in detectors.split(",")]
     _try_out(settings, entrants)
     with console.progress_bar("judge") as progress:

@@ -1,4 +1,4 @@
-"""The verbs for looking at synthetic worlds: track."""
+"""The verbs for looking at synthetic worlds: track, sheets."""
 
 from __future__ import annotations
 
@@ -57,3 +57,33 @@ def track(
     console.next_command(
         "simulate", "CONFIG", f"track.{'file' if path.exists() else 'preset'}={road}", "--out", "DRIVE"
     )
+
+
+@app.command(epilog="Example: lanenet sheets bfmc light --out sheets")
+def sheets(
+    out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).", show_default=False)],
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Presets and groups of effects; default all.")
+    ] = None,
+    max_kb: Annotated[
+        int | None, typer.Option(min=5, help="Shrink each picture to so many kB.", show_default=False)
+    ] = None,
+) -> None:
+    """Draw sheets of frames to look at: presets in random looks, and effects switched on one by one."""
+    from datagen.world.sheets import draw_sheet, encode_sheet, sheet_names
+    from lanenet.data.files import atomic_file
+
+    chosen = sheet_names() if not names else list(dict.fromkeys(names))
+    for name in chosen:
+        if name not in sheet_names():
+            raise ConfigError(f"no sheet {name!r}, expected some of {', '.join(sheet_names())}")
+    paths = [out / f"{name}.jpg" for name in chosen]
+    with console.progress_bar("sheets") as progress:
+        for done, (name, path) in enumerate(zip(chosen, paths, strict=True)):
+            progress(done, len(chosen))
+            data = encode_sheet(draw_sheet(name), None if max_kb is None else 1000 * max_kb)
+            with atomic_file(path) as temporary:
+                temporary.write_bytes(data)
+        progress(len(chosen), len(chosen))
+    console.wrote(*paths)
+    console.next_command("track", "PRESET", "--out", "PICTURE.png")

@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from datagen.judge.run import RunResult, Trajectory
-from datagen.world.track import Marking, Track
+from datagen.world.track import Track
+from datagen.world.track_picture import FIXED_BITS, box_corners_cm, paint_track, painted_bounds_cm
 
 _SIDE_PX = 1100  # of the longer side of the road
 _MARGIN_CM = 50.0
+_BESIDE_PAINT_CM = 3.0
 _ROW_PX = 26
-_SHIFT = 4  # OpenCV draws in fixed point: this many bits below a pixel
 _GROUND_BGR, _ROAD_BGR, _TEXT_BGR = (225, 228, 225), (120, 120, 120), (30, 30, 30)
 #: BGR by place among the entrants; more of them start over.
 COLOURS_BGR: tuple[tuple[int, int, int], ...] = (
@@ -40,7 +41,7 @@ class _View:
     def fixed(self, xy_cm: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Points in OpenCV's fixed point; y of the map is up."""
         px = (xy_cm - self.origin_cm) * [self.px_per_cm, -self.px_per_cm] + [0.0, self.top_px]
-        return np.rint(px * (1 << _SHIFT)).astype(np.int32)
+        return np.rint(px * (1 << FIXED_BITS)).astype(np.int32)
 
 
 def draw_top_view(
@@ -58,8 +59,7 @@ def draw_top_view(
     # Markings reach beyond the driven lane where the road has another one.
     half_cm = 0.5 * track.lane_width_cm
     sides_cm = [-half_cm, half_cm, *(marking.offset_cm for marking in track.markings)]
-    reach_cm = max(abs(side_cm) for side_cm in sides_cm) + _MARGIN_CM
-    low_cm, high_cm = track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm
+    low_cm, high_cm = painted_bounds_cm(track, _MARGIN_CM)
     size_cm = high_cm - low_cm
     scale = _SIDE_PX / float(size_cm.max())
     header_px = _ROW_PX * (len(runs) + 1) + 12
@@ -68,9 +68,9 @@ def draw_top_view(
     view = _View(np.array([low_cm[0], high_cm[1]]), scale, header_px)
     road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
     points = view.fixed(_beside(track, 0.5 * (max(sides_cm) + min(sides_cm))))
-    cv2.polylines(picture, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, _SHIFT)
-    for marking in track.markings:
-        _draw_marking(picture, track, marking, view)
+    cv2.polylines(picture, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, FIXED_BITS)
+    _pave_furniture(picture, track, view)
+    paint_track(picture, track, view.fixed)
     for index, (_, trajectory) in enumerate(runs):
         # Later ones are thinner, so that those who drove the same way stay visible below.
         thickness = min(2 + len(runs) - 1 - index, 7)
@@ -92,16 +92,18 @@ def _beside(track: Track, offset_cm: float) -> Float[np.ndarray, "n 2"]:
     return track.xy_cm + offset_cm * normal
 
 
-def _draw_marking(picture: UInt8[np.ndarray, "h w 3"], track: Track, marking: Marking, view: _View) -> None:
-    line_cm = _beside(track, marking.offset_cm)
-    colour = tuple(int(v) for v in marking.colour_bgr)
-    thickness = max(1, round(view.px_per_cm * marking.width_cm))
-    n = len(line_cm)
-    for start_cm, end_cm in marking.painted_cm:
-        rows = np.arange(int(np.ceil(start_cm / track.step_cm)), int(end_cm / track.step_cm) + 1)
-        rows = rows[: n + 1] % n if track.closed else rows[(rows >= 0) & (rows < n)]
-        if rows.size:
-            cv2.polylines(picture, [view.fixed(line_cm[rows])], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+def _pave_furniture(picture: UInt8[np.ndarray, "h w 3"], track: Track, view: _View) -> None:
+    """Bays and side roads lie beside the road, where white paint needs something darker below it."""
+    paved = np.zeros(picture.shape[:2], np.uint8)
+    for box in track.boxes:
+        cv2.fillPoly(paved, [view.fixed(box_corners_cm(box, _BESIDE_PAINT_CM))], 255, cv2.LINE_8, FIXED_BITS)
+    # What lies between the lines of a side road and the road itself is road as well.
+    side_px = 1 + round(2.0 * track.half_width_cm * view.px_per_cm)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px))
+    paved = cv2.morphologyEx(paved, cv2.MORPH_CLOSE, disc)
+    road = (picture == _ROAD_BGR).all(axis=2).astype(np.uint8) * 255
+    joined = cv2.morphologyEx(paved | road, cv2.MORPH_CLOSE, disc)
+    picture[(joined & cv2.dilate(paved, disc)) > 0] = _ROAD_BGR
 
 
 def _draw_run(
@@ -114,12 +116,12 @@ def _draw_run(
     points = view.fixed(trajectory.xy_cm)
     for piece in np.split(points, np.flatnonzero(trajectory.put_back) + 1):
         if len(piece):
-            cv2.polylines(picture, [piece], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(picture, [piece], False, colour, thickness, cv2.LINE_AA, FIXED_BITS)
     begins = np.flatnonzero(trajectory.over & ~np.concatenate([[False], trajectory.over[:-1]]))
     for x, y in points[begins].tolist():
-        cv2.circle(picture, (x, y), 5 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
-        cv2.circle(picture, (x, y), 5 << _SHIFT, (255, 255, 255), 1, cv2.LINE_AA, _SHIFT)
-    for x, y in (points[trajectory.put_back] >> _SHIFT).tolist():
+        cv2.circle(picture, (x, y), 5 << FIXED_BITS, colour, -1, cv2.LINE_AA, FIXED_BITS)
+        cv2.circle(picture, (x, y), 5 << FIXED_BITS, (255, 255, 255), 1, cv2.LINE_AA, FIXED_BITS)
+    for x, y in (points[trajectory.put_back] >> FIXED_BITS).tolist():
         cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_TILTED_CROSS, 14, 3)
 
 
@@ -128,7 +130,7 @@ def _draw_start(picture: UInt8[np.ndarray, "h w 3"], track: Track, offset_cm: fl
     heading = float(track.heading_rad[0])
     ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     tail_cm = track.xy_cm[0] + offset_cm * left
-    tail, tip = (view.fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> _SHIFT).tolist()
+    tail, tip = (view.fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> FIXED_BITS).tolist()
     cv2.arrowedLine(picture, tail, tip, _TEXT_BGR, 2, cv2.LINE_AA, tipLength=0.35)
 
 

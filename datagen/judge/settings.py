@@ -10,12 +10,13 @@ from pydantic import Field
 
 from datagen.world.pilot import PilotSettings
 from datagen.world.script import DriverSettings
-from datagen.world.track import TrackSettings
+from datagen.world.track import TrackSettings, load_track_settings
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings, check_settings
 from lanenet.errors import ConfigError
 
 _FILE_ENDINGS = (".yaml", ".yml")
+_STREAM = 3  # of seeds; the drives of a training run take 0 to 2, so that its roads are never judged on
 
 
 class JudgeSettings(Settings):
@@ -77,7 +78,7 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
     """
     kind, number = settings.tracks[index // settings.count], index % settings.count
     # The number alone decides the seed: another kind of road in the list leaves the others as they are.
-    seed = int(np.random.SeedSequence([settings.seed, number]).generate_state(1)[0])
+    seed = int(np.random.SeedSequence([settings.seed, _STREAM, number]).generate_state(1)[0])
     driver = DriverSettings(speed_cm_s=settings.speed_cm_s, wander_cm=0.0)
     changes: dict[str, Any] = {"seed": seed, "track": _track_settings(kind, settings.simulation.track)}
     return settings.simulation.model_copy(update={**changes, "driver": driver})
@@ -86,5 +87,6 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
 def _track_settings(kind: str, common: TrackSettings) -> TrackSettings:
     if kind in ("random", "open"):
         return common.model_copy(update={"closed": kind == "random"})
-    key = "file" if kind.endswith(_FILE_ENDINGS) else "preset"
-    return check_settings(TrackSettings, {key: kind}, f"tracks: {kind}")
+    if kind.endswith(_FILE_ENDINGS):
+        return load_track_settings(Path(kind))
+    return check_settings(TrackSettings, {"preset": kind}, f"tracks: {kind}")

@@ -83,6 +83,8 @@ class Junction(Settings):
         corner_radius_cm: Of the curve from line to line.
         length_cm: Of the side road, from the line of this one.
         stop: Bars at the ends of the side road.
+        stop_colour: Of the bars; None: that of the paint.
+        middle_colour: Of the dashes between the lanes of the side road; None: that of the paint.
         colour: Of the paint.
     """
 
@@ -92,6 +94,8 @@ class Junction(Settings):
     corner_radius_cm: float = Field(default=15.0, gt=0.0)
     length_cm: float = Field(default=100.0, gt=0.0)
     stop: bool = True
+    stop_colour: Colour | None = None
+    middle_colour: Colour | None = None
     colour: Colour = "white"
 
 
@@ -126,13 +130,23 @@ class Furniture(OneOf):
 
 
 class FurnitureRates(Settings):
-    """How many things are placed at random, per metre of road."""
+    """How many things are placed at random, per metre of road.
+
+    Attributes:
+        stop_line_per_m: Stop lines.
+        zebra_per_m: Crossings.
+        arrow_per_m: Arrows.
+        junction_per_m: Junctions.
+        parking_per_m: Rows of parking bays.
+        junction_stop_colour: Of the bars at junctions; None: that of the paint.
+    """
 
     stop_line_per_m: float = Field(default=0.0, ge=0.0, le=2.0)
     zebra_per_m: float = Field(default=0.0, ge=0.0, le=2.0)
     arrow_per_m: float = Field(default=0.0, ge=0.0, le=2.0)
     junction_per_m: float = Field(default=0.0, ge=0.0, le=2.0)
     parking_per_m: float = Field(default=0.0, ge=0.0, le=2.0)
+    junction_stop_colour: Colour | None = None
 
 
 def extent_cm(item: Furniture) -> float:

@@ -27,6 +27,7 @@ _TRIES = 15
 _APART_CM = 30.0  # least gap between random things along the road
 _BESIDE_CM = 10.0  # and beside it
 _OUTLINE_CM = 5.0  # spacing of the points that are compared
+_BAR_BESIDE_CM = 2.0  # how far the end of a random crossing's bar may lie beside the bend that it is on
 _BEND_RAD = 0.1  # how much the road may turn over a junction
 
 
@@ -59,6 +60,7 @@ def random_furniture(
     line_width_cm: float,
     colour: Colour,
     rng: np.random.Generator,
+    middle_colour: Colour | None = None,
 ) -> list[Painted]:
     """Draw things where there is room; what finds none is left out.
 
@@ -69,7 +71,11 @@ def random_furniture(
         line_width_cm: Width of the tape.
         colour: Of the paint.
         rng: Source of randomness; each kind of thing has its own child.
+        middle_colour: Of the line between two lanes; None: that of the paint.
     """
+    colours: dict[str, dict[str, Any]] = {
+        "junction": {"stop_colour": rates.junction_stop_colour, "middle_colour": middle_colour}
+    }
     occupied = [(item.value.at_cm, extent_cm(item)) for item in taken]
     # Side roads and bays may meet beside the road, also where their mouths are far apart along it.
     outlines = [_outline(paint_furniture(track, item, line_width_cm).boxes) for item in taken]
@@ -87,9 +93,12 @@ def random_furniture(
         for _ in range(kind_rng.poisson(expected)):
             for _ in range(_TRIES):
                 at_cm = float(kind_rng.uniform(0.0, track.length_cm))
-                thing = _random_thing(track, kind, at_cm, kind_rng).model_copy(update={"colour": colour})
+                thing = _random_thing(track, kind, at_cm, kind_rng)
+                thing = thing.model_copy(update={"colour": colour, **colours.get(kind, {})})
                 item = Furniture(**{kind: thing})
                 if not _is_free(track, item, occupied) or _misplaced(track, item) is not None:
+                    continue
+                if kind == "zebra" and _leaves_the_bend(track, item):
                     continue
                 painted = paint_furniture(track, item, line_width_cm)
                 outline = _outline(painted.boxes)
@@ -135,6 +144,14 @@ def _random_thing(track: Track, kind: str, at_cm: float, rng: np.random.Generato
         length_cm=lane_cm * (0.6 + 0.4 * size),
         strip_cm=1.5 + 2.0 * share,
     )
+
+
+def _leaves_the_bend(track: Track, item: Furniture) -> bool:
+    """Whether straight bars would reach over the lines of a bent road."""
+    at_cm, length_cm = item.value.at_cm, extent_cm(item)
+    places = np.arange(at_cm - 0.5 * length_cm, at_cm + 0.5 * length_cm, track.step_cm)
+    tightest = max(abs(track.curvature(float(s))) for s in places)
+    return tightest * length_cm**2 / 8.0 > _BAR_BESIDE_CM
 
 
 def _is_free(track: Track, item: Furniture, occupied: Sequence[tuple[float, float]]) -> bool:

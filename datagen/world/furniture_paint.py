@@ -11,6 +11,7 @@ from jaxtyping import Float
 from datagen.world.furniture import COLOURS, Arrow, Furniture, Junction, Parking, StopLine, Zebra, extent_cm
 from datagen.world.road import Bgr, Side, Track
 
+_LINE_STOP_CM = 5.0  # stop bars of side roads are twice as thick as lines, but wide lines stay as they are
 _CORNER_STEP_RAD = 0.2  # arc per strip of tape; at 15 cm radius a strip leaves the arc by 0.02 cm
 
 
@@ -56,13 +57,20 @@ class _Strips:
         self._colour: Bgr = COLOURS[colour]
         self._rows: list[list[float]] = []
 
-    def box(self, x_cm: float, y_cm: float, angle_rad: float, length_cm: float, width_cm: float) -> None:
+    def box(
+        self,
+        x_cm: float,
+        y_cm: float,
+        angle_rad: float,
+        length_cm: float,
+        width_cm: float,
+        colour: str | None = None,
+    ) -> None:
         c, s = np.cos(self._heading), np.sin(self._heading)
         x, y = self._origin[0] + x_cm * c - y_cm * s, self._origin[1] + x_cm * s + y_cm * c
         direction = self._heading + angle_rad
-        self._rows.append(
-            [x, y, np.cos(direction), np.sin(direction), 0.5 * length_cm, 0.5 * width_cm, *self._colour]
-        )
+        bgr = self._colour if colour is None else COLOURS[colour]
+        self._rows.append([x, y, np.cos(direction), np.sin(direction), 0.5 * length_cm, 0.5 * width_cm, *bgr])
 
     def strip(
         self, start: tuple[float, float], end: tuple[float, float], width_cm: float, overlap_cm: float = 0.0
@@ -150,14 +158,14 @@ def _junction(track: Track, junction: Junction, line_width_cm: float) -> Painted
             dash_cm = 0.25 * junction.width_cm
             for start_cm in np.arange(radius_cm + dash_cm, junction.length_cm - dash_cm, 2.0 * dash_cm):
                 y_cm = line_cm + sign * (float(start_cm) + 0.5 * dash_cm)
-                strips.box(0.0, y_cm, 0.5 * np.pi, dash_cm, line_width_cm)
+                strips.box(0.0, y_cm, 0.5 * np.pi, dash_cm, line_width_cm, junction.middle_colour)
         if junction.stop:
             # Across the lane that comes towards this road: on its right.
             width_cm = half_cm if track.oncoming_cm is not None else junction.width_cm
             x_cm = -sign * 0.5 * half_cm if track.oncoming_cm is not None else 0.0
-            strips.box(
-                x_cm, line_cm + sign * (radius_cm + 2.0 * line_width_cm), 0.0, width_cm, 2.0 * line_width_cm
-            )
+            y_cm = line_cm + sign * (radius_cm + 2.0 * line_width_cm)
+            thick_cm = max(line_width_cm, min(2.0 * line_width_cm, _LINE_STOP_CM))
+            strips.box(x_cm, y_cm, 0.0, width_cm, thick_cm, junction.stop_colour)
     if junction.sides == "both" and track.oncoming_cm is not None:
         cuts.append((track.middle_cm, *between))
     return Painted(strips.boxes, tuple(cuts))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +56,9 @@ def place_objects(
     solids: list[list[float]] = []
     for _ in range(object_rng.poisson(look.objects_per_m * track.length_cm / 100.0)):
         # Each object has a stream of its own, so that one that finds no room leaves the others as they are.
-        solids += _object(track, borders, look.objects_on_road, object_rng.spawn(1)[0])
+        rows = _object(track, borders, look.objects_on_road, object_rng.spawn(1)[0])
+        if not any(_overlap(row, other) for row in rows for other in solids):
+            solids += rows
     shadows = [_cast(row, light, self_cot, look.shadow_depth) for row in solids]
     for _ in range(shadow_rng.poisson(look.shadows_per_m * track.length_cm / 100.0)):
         shadows += _person_shadow(track, look.shadow_depth, shadow_rng.spawn(1)[0])
@@ -129,6 +132,27 @@ def _has_room(
         if not partly and not past_the_end and borders[0] - extra_cm < left < borders[1] + extra_cm:
             return False
     return True
+
+
+def _overlap(one: list[float], other: list[float]) -> bool:
+    """Whether the footprints of two solids meet, as rectangles and wherever they swing to."""
+    dx, dy = one[0] - other[0], one[1] - other[1]
+    swings = math.hypot(one[-4], one[-3]) + math.hypot(other[-4], other[-3])
+    # On a long road nearly all are far from each other, and this is all that is looked at.
+    if math.hypot(dx, dy) > math.hypot(one[4], one[5]) + math.hypot(other[4], other[5]) + swings:
+        return False
+    # Rectangles are apart if, seen along a side of one of them, their shadows are.
+    for c, s in (one[2:4], other[2:4]):
+        for u, v in ((c, s), (-s, c)):
+            if abs(u * dx + v * dy) > _half_span(one, u, v) + _half_span(other, u, v) + swings:
+                return False
+    return True
+
+
+def _half_span(row: list[float], u: float, v: float) -> float:
+    """Half the length of a solid's footprint along a direction of the map."""
+    c, s, a, b = row[2:6]
+    return abs(a * (c * u + s * v)) + abs(b * (c * v - s * u))
 
 
 def _row(

@@ -80,7 +80,10 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
     things = listed_furniture(track, items, width_cm, settings.origin)
     # Of the same paint as the line on the right, except that a yellow road has white bars.
     colour: Colour = "black" if settings.right.colour == "black" else "white"
-    things += random_furniture(track, settings.random_furniture, items, width_cm, colour, furniture_rng)
+    middle = None if settings.middle is None or settings.middle.colour == "random" else settings.middle.colour
+    things += random_furniture(
+        track, settings.random_furniture, items, width_cm, colour, furniture_rng, middle
+    )
     markings = [
         marking
         for name in settings.lines
@@ -106,13 +109,19 @@ def load_track(path: Path, rng: np.random.Generator | None = None) -> Track:
     return random_track(load_track_settings(path), np.random.default_rng(0) if rng is None else rng)
 
 
-def check_drivable(track: Track, min_radius_cm: float, where: str = "track") -> None:
+def check_drivable(
+    track: Track,
+    min_radius_cm: float,
+    settings: TrackSettings | None = None,
+    car: str = "the car",
+) -> None:
     """Refuse a road with bends that a car cannot turn.
 
     Args:
-        track: The road.
+        track: The road, in the direction in which it is driven.
         min_radius_cm: Of the car: wheelbase over the tangent of the largest steering angle.
-        where: Named in the error.
+        settings: What the road was built from, whose file and piece the error names.
+        car: Named in the error.
 
     Raises:
         ConfigError: With the tightest bend and its place.
@@ -120,9 +129,16 @@ def check_drivable(track: Track, min_radius_cm: float, where: str = "track") -> 
     i = int(np.argmax(np.abs(track.curvature_per_cm)))
     tightest = abs(float(track.curvature_per_cm[i]))
     if tightest * min_radius_cm > 1.001:
+        where, s_cm = "track", float(track.s_cm[i])
+        place = f"at {s_cm:.0f} cm"
+        if settings is not None:
+            where = settings.origin
+            # The pieces are listed in the direction of the driven lane of the file.
+            if settings.pieces and abs(track.length_cm - length_of(settings.pieces)) < 1.0:
+                place = f"in {_piece_at(settings, s_cm)}"
         raise ConfigError(
-            f"{where}: found a bend of radius {1.0 / tightest:.1f} cm at {track.s_cm[i]:.0f} cm, expected at "
-            f"least {min_radius_cm:.1f}, which is what the car turns"
+            f"{where}: found a bend of radius {1.0 / tightest:.1f} cm {place}, expected at least "
+            f"{min_radius_cm:.1f}, which is what {car} turns"
         )
 
 

@@ -156,9 +156,11 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     if length_cm is None:
         length_cm = _LOOP_CM if settings.track.closed else needed_cm
     elif length_cm < needed_cm and not settings.track.closed:
+        # The pieces of a file have the length that they have.
+        advice = "drive fewer frames" if settings.track.pieces else "leave length_cm out to have it chosen"
         raise ConfigError(
-            f"track: length_cm {length_cm:g} is too short for {settings.frames} frames of "
-            f"{per_frame_cm:.1f} cm, which need {needed_cm:g}; leave length_cm out to have it chosen"
+            f"{settings.track.origin}: length_cm {length_cm:g} is too short for {settings.frames} frames of "
+            f"{per_frame_cm:.1f} cm, which need {needed_cm:g}; {advice}"
         )
     track = settings.track.model_copy(update={"length_cm": length_cm})
     return settings.model_copy(update={"track": track})
@@ -167,7 +169,12 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
 def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
     track = random_track(settings.track, rng)
     car = settings.car
-    check_drivable(track, car.wheelbase_cm / math.tan(car.max_steering_rad))
+    named = f"a car of wheelbase {car.wheelbase_cm:g} cm and {math.degrees(car.max_steering_rad):.0f} degrees"
+    min_radius_cm = car.wheelbase_cm / math.tan(car.max_steering_rad)
     if settings.driver.direction == "forward":
+        check_drivable(track, min_radius_cm, settings.track, named)
         return track
-    return track.reversed()
+    # On two lanes it is the other one that is driven, whose bends are others.
+    track = track.reversed()
+    check_drivable(track, min_radius_cm, settings.track, named)
+    return track

@@ -198,3 +198,82 @@ def test_a_drive_that_shows_nothing_is_not_mapped(tmp_path, drive):
         cv2.imwrite(str(drive / "images" / f"{k:06d}.jpg"), np.full((48, 64, 3), 90, np.uint8))
     line = run(tmp_path, "map", drive, "--lane-width", 40, "--out", tmp_path / "m")
     assert "edge points" in line
+
+
+STRAIGHT = {"straight": {"length_cm": 300}}
+
+
+def bend(radius_cm, angle_deg, direction="left", **more):
+    return {"arc": {"radius_cm": radius_cm, "angle_deg": angle_deg, "direction": direction, **more}}
+
+
+#: What a road's file holds, and what the one line must name beside the file.
+BAD_ROADS = {
+    "a figure of eight": (
+        {"pieces": [STRAIGHT, bend(80, 270), STRAIGHT, bend(80, 270, "right")]},
+        ("pieces.0 (straight", "pieces.2 (straight", "meets itself"),
+    ),
+    "lanes that overlap": (
+        {"pieces": [STRAIGHT, bend(70, 180), bend(70, 90), bend(70, 80)], "lanes": 2, "lane_width_cm": 40},
+        ("pieces.", "meets itself"),
+    ),
+    "no radius left inside": (
+        {"pieces": [STRAIGHT, bend(15, 90), STRAIGHT]},
+        ("'pieces.1.arc.radius_cm'", "15"),
+    ),
+    "no lane": ({"lane_width_cm": 0}, ("'lane_width_cm'", "found 0")),
+    "no tape": ({"line_width_cm": 0}, ("'line_width_cm'", "found 0")),
+    "no dash": ({"right": {"kind": "dashed", "dash_cm": 0}}, ("'right.dash_cm'", "found 0")),
+    "a misspelt key": ({"lane_wdth_cm": 40}, ("'lane_wdth_cm'", "'lane_width_cm'")),
+    "an unknown key of a piece": (
+        {"pieces": [STRAIGHT, bend(80, 90, colour="red")]},
+        ("'pieces.1.arc.colour'", "radius_cm"),
+    ),
+    "an unknown piece": ({"pieces": [STRAIGHT, {"ark": {}}]}, ("'pieces.1.ark'", "'arc'")),
+    "not a mapping": ([1, 2], ("mapping", "list")),
+}
+#: The car of the defaults turns 53.8 cm.
+TOO_TIGHT = {"pieces": [STRAIGHT, bend(45, 90), {"straight": {"length_cm": 500}}]}
+
+
+def road_words(tmp_path, verb, data):
+    """The command by which a verb meets a road's file."""
+    road, config = tmp_path / "road.yaml", tmp_path / "drive.yaml"
+    road.write_text(yaml.safe_dump(data))
+    config.write_text("frames: 3\ncamera: {width: 48, height: 36}\n")
+    return {
+        "track": ("track", road, "--out", tmp_path / "road.png"),
+        "simulate": ("simulate", config, f"track.file={road}", "--out", tmp_path / "d"),
+        "judge": ("judge", "--detectors", "truth", "--tracks", road, "--out", tmp_path / "j"),
+    }[verb]
+
+
+@pytest.mark.parametrize("verb", ["track", "simulate", "judge"])
+@pytest.mark.parametrize("kind", BAD_ROADS)
+def test_a_bad_road_is_refused_by_file_and_place(tmp_path, kind, verb):
+    data, named = BAD_ROADS[kind]
+    line = run(tmp_path, *road_words(tmp_path, verb, data))
+    for word in ("road.yaml", *named):
+        assert word in line
+
+
+@pytest.mark.parametrize("verb", ["simulate", "judge"])
+def test_a_bend_that_the_car_cannot_turn_is_refused_by_piece_and_car(tmp_path, verb):
+    line = run(tmp_path, *road_words(tmp_path, verb, TOO_TIGHT))
+    for word in ("road.yaml", "radius 45.0 cm", "pieces.1 (arc", "at least 53.8", "wheelbase 26 cm"):
+        assert word in line
+
+
+def test_a_road_that_is_too_short_for_the_drive_is_named(tmp_path):
+    words = road_words(tmp_path, "simulate", {"pieces": [STRAIGHT]})
+    line = run(tmp_path, *words, "frames=300")
+    assert "road.yaml" in line and "length_cm 300" in line and "fewer frames" in line
+
+
+def test_the_other_lane_is_checked_where_it_is_driven(tmp_path):
+    # 90 cm in the driven lane are 50 cm in the oncoming one, inside of a left bend.
+    words = road_words(
+        tmp_path, "simulate", {**TOO_TIGHT, "pieces": [STRAIGHT, bend(90, 90), STRAIGHT], "lanes": 2}
+    )
+    line = run(tmp_path, *words, "driver.direction=backward")
+    assert "radius 50.0 cm" in line and "road.yaml" in line

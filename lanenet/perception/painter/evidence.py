@@ -55,7 +55,8 @@ class EvidenceSettings(Settings):
         curve_share: A curve is taken instead of its straight line from this share of the latter's score on.
         inner_share: A narrower lane is taken instead of a wider one from this share of the latter's score on.
         max_width_ratio: The lane's width at its far end may differ by this factor from that at its near end.
-        max_width_heights: With a camera: the widest lane, in camera heights.
+        max_width_heights: With a camera: the widest lane, in camera heights. A line that comes no
+            nearer than that to the car does not bound the lane that the car is in.
     """
 
     required: bool = True
@@ -107,12 +108,14 @@ class LineEvidence:
         clutter: Mean of that share over parallel strips beside it.
         aligned: Share of the edges in the line's strip that run along it.
         extent: Stretch between the first and the last supported row, as a share of the visible rows.
+        far_px: The first supported row of the image; NaN without one.
     """
 
     support: float = 0.0
     clutter: float = 0.0
     aligned: float = 0.0
     extent: float = 0.0
+    far_px: float = float("nan")
 
     @property
     def contrast(self) -> float:
@@ -220,6 +223,7 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
         clutter=float(shares[1:].mean()),
         aligned=len(supported) / int(np.count_nonzero(near)),
         extent=min(float(np.ptp(supported)) / (len(visible) - 1), 1.0),
+        far_px=float(supported.min()),
     )
 
 

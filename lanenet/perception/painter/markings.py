@@ -198,6 +198,33 @@ def _is_convincing(left: Marking, right: Marking, settings: EvidenceSettings) ->
     )
 
 
+def can_bound_the_lane(
+    markings: Sequence[Marking],
+    plane: Plane,
+    width_px: int,
+    camera_height_cm: float,
+    settings: EvidenceSettings,
+) -> list[Marking]:
+    """Leave out lines that are further beside the car than the widest lane is wide, where they come nearest.
+
+    Only what lies in the image counts: a line that leaves it sideways may go anywhere from there.
+
+    Args:
+        markings: Lines of one side.
+        plane: The road.
+        width_px: Of the image.
+        camera_height_cm: Unit of the lane's width.
+        settings: The widest lane.
+    """
+    widest_cm = settings.max_width_heights * camera_height_cm
+    visible = [m.line_px[(m.line_px[:, 0] >= 0.0) & (m.line_px[:, 0] <= width_px - 1.0)] for m in markings]
+    kept = []
+    for marking, seen in zip(markings, move_lines(plane.from_image, visible), strict=True):
+        if len(seen) and abs(float(seen[np.argmin(seen[:, 1]), 0])) <= widest_cm:
+            kept.append(marking)
+    return kept
+
+
 def _is_lane(
     left: Marking, right: Marking, camera_height_cm: float | None, settings: EvidenceSettings
 ) -> bool:

@@ -33,6 +33,7 @@ from lanenet.perception.painter.lines import (
 from lanenet.perception.painter.markings import (
     Marking,
     Pair,
+    can_bound_the_lane,
     choose_lane,
     follow_lines,
     straight_px,
@@ -77,11 +78,11 @@ class PainterSettings(Settings):
 class LanePainter:
     """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
 
-    With a camera the lines are moved to the road, and the steering aims at the lane's middle some camera
-    heights ahead. Without one the points are NaN, and the steering is the angle in the image between straight
-    up and the lane's middle, halfway up the region, seen from the middle of its bottom. The confidence is the
-    share of the two lines that this frame shows; a line that is only remembered is drawn as a memory, not
-    answered.
+    With a camera the lines are moved to the road and answered up to where they are seen, and the steering
+    aims at the lane's middle some camera heights ahead. Without one the points are NaN, and the steering is
+    the angle in the image between straight up and the lane's middle, halfway up the region, seen from the
+    middle of its bottom. The confidence is the share of the two lines that this frame shows; a line that is
+    only remembered is drawn as a memory, not answered.
 
     Attributes:
         last: Lines of the last frame in the image, for drawing.
@@ -129,7 +130,7 @@ class LanePainter:
         if self.camera is not None:
             for side, marking in enumerate(found):
                 if marking is not None:
-                    rows[side] = rows_of_points(marking.points)
+                    rows[side] = rows_of_points(self._seen(marking))
         self.lane = PaintedLane() if self.camera is None else measure_lane(found, rows)
         self.last = self._image_lane(found, trapezoid)
         return LaneEstimate(
@@ -178,6 +179,9 @@ class LanePainter:
                     for line, again in zip(lines, known, strict=True)
                 ]
             )
+        if height_cm is not None:
+            width = frame_bgr.shape[1]
+            sides = [can_bound_the_lane(side, plane, width, height_cm, chosen.evidence) for side in sides]
         return choose_lane(sides[0], sides[1], trapezoid_px, height_cm, chosen.lines, chosen.evidence)
 
     def _smooth(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
@@ -207,6 +211,19 @@ class LanePainter:
                 marking = replace(marking, line=line, line_px=line_px, points=points)
             smooth.append(marking)
         return smooth[0], smooth[1]
+
+    def _seen(self, marking: Marking) -> Float[np.ndarray, "n 2"]:
+        """The points of a line in the image, up to where an edge lies along it: further on it may bend."""
+        far_px = marking.evidence.far_px
+        if self._road is None or self._shape is None or not math.isfinite(far_px):
+            return marking.points
+        u, v = marking.line_px.T
+        seen = (v >= far_px - 1.0) & (u >= 0.0) & (u <= self._shape[1] - 1.0)
+        ahead = finite_rows(self._road.from_image(marking.line_px[seen]))[:, 1]
+        if len(ahead) == 0:
+            return ahead.reshape(0, 2)
+        y = marking.points[:, 1]
+        return marking.points[(y >= ahead.min()) & (y <= ahead.max())]
 
     def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> ImageLane:
         left, right = (None if marking is None else marking.line_px for marking in found)

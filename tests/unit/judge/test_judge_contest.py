@@ -17,10 +17,10 @@ from datagen.judge.report import summarise, tables, write_report
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings
 from datagen.world.rig import CameraSettings
-from datagen.world.track import TrackSettings
+from datagen.world.track import TrackSettings, random_track
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli import app
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.judge_cli import NamedDetector
 
 # Short open roads: a run is a few dozen frames.
@@ -153,6 +153,35 @@ def test_the_top_view_shows_who_drove_where(tmp_path: Path) -> None:
     assert 900 < max(plain.shape[:2]) < 1400
 
 
+def test_the_top_view_shows_what_is_painted_beside_the_lines() -> None:
+    # A road of 400 cm along +x with two bays on its right, 30 cm deep, and a red bar.
+    settings = TrackSettings.model_validate(
+        {
+            "pieces": [{"straight": {"length_cm": 400}}],
+            "furniture": [
+                {"parking": {"at_cm": 200, "bays": 2, "bay_cm": 60}},
+                {"stop_line": {"at_cm": 320, "colour": "red"}},
+            ],
+        }
+    )
+    track = random_track(settings, np.random.default_rng(0))
+    picture = draw_top_view(track, [], "road")
+    # The picture goes on for 50 cm beyond the lines, which lie 20 cm beside the centre line.
+    scale = 1100 / (400.0 + 2 * 70.0)
+    top_px = 26 + 12
+
+    def at(x_cm: float, y_cm: float) -> list[int]:
+        column, row = round((x_cm + 70.0) * scale), round(top_px + (70.0 - y_cm) * scale)
+        return picture[row, column].tolist()
+
+    assert at(320.0, 5.0) == [45, 40, 190] and at(300.0, 5.0) == [120, 120, 120]
+    # Separators and back edges white, the bay between them paved, the ground beyond it not.
+    for x_cm, y_cm in ((140.0, -35.0), (200.0, -35.0), (170.0, -50.0)):
+        assert at(x_cm, y_cm) == [235, 235, 235]
+    assert at(170.0, -35.0) == [120, 120, 120]
+    assert at(170.0, -62.0) == at(60.0, -35.0) == [225, 228, 225]
+
+
 def test_the_verb_judges_writes_and_draws(tmp_path: Path) -> None:
     config = tmp_path / "judge.yaml"
     config.write_text("simulation: {camera: {width: 48, height: 36}, rate_hz: 10, track: {length_cm: 320}}\n")
@@ -167,6 +196,26 @@ def test_the_verb_judges_writes_and_draws(tmp_path: Path) -> None:
     assert [run["entrant"] for run in data["runs"]] == ["truth", "painter"]
     picture = cv2.imread(str(out / "pictures" / "open_00.png"))
     assert picture is not None and picture.shape[1] >= 700
+
+
+def test_everybody_drives_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+
+    def refuse(settings: JudgeSettings, entrants: list[Entrant], *_: object) -> None:
+        asked.append([entrant.name for entrant in entrants])
+        raise LanenetError("no time to drive")
+
+    monkeypatch.setattr("datagen.judge.contest.judge", refuse)
+    monkeypatch.chdir(tmp_path)
+    # Without the network where there is none, and it says so.
+    result = CliRunner().invoke(app, ["judge"])
+    assert asked == [["truth", "lane-filter", "hough", "painter"]]
+    assert "checkpoints/small is not there" in result.stderr
+    # A model that is asked for has to be there; the one that ships drives with the others.
+    assert "mine.onnx: no such file" in CliRunner().invoke(app, ["judge", "--model", "mine.onnx"]).stderr
+    (tmp_path / "checkpoints").symlink_to(Path(__file__).parents[3] / "checkpoints")
+    CliRunner().invoke(app, ["judge"])
+    assert asked[1:] == [["truth", "network", "lane-filter", "hough", "painter"]]
 
 
 @pytest.mark.parametrize(

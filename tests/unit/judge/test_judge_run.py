@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from datagen.datasets import DataSettings, SyntheticSettings, _synthetic_job
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
 from datagen.judge.wheels import DepartureCounter, wheel_offsets_cm
@@ -164,6 +165,19 @@ def test_roads_differ_and_do_not_depend_on_the_rest_of_the_contest():
     assert road_simulation(SETTINGS.model_copy(update={"seed": 1}), 0).seed != first.seed
     with pytest.raises(ConfigError, match="each may be named once"):
         road_names(JudgeSettings(tracks=("open", "open")))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_road_is_one_of_a_training_run_with_the_same_seed(seed, tmp_path):
+    data = DataSettings(synthetic=SyntheticSettings(seed=seed, train=20, validation=4, test=20))
+    trained = {
+        _synthetic_job(data, role, number, tmp_path)["simulation"].seed
+        for role in ("train", "validation", "test")
+        for number in range(getattr(data.synthetic, role))
+    }
+    settings = JudgeSettings(seed=seed, count=20)
+    judged = {road_simulation(settings, index).seed for index in range(20)}
+    assert len(judged) == 20 and not judged & trained
 
 
 def test_an_unknown_road_is_refused():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ from lanenet.perception.painter.evidence import (
     measure_evidence,
 )
 from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, find_two_lines, join_side
-from lanenet.perception.painter.markings import Marking, choose_lane, straight_px
+from lanenet.perception.painter.markings import Marking, can_bound_the_lane, choose_lane, straight_px
 from lanenet.perception.painter.measure import find_aim_cm, measure_lane
 from lanenet.perception.painter.painter import LanePainter, PainterSettings
 from lanenet.perception.painter.plane import RoadPlane, SquarePlane, finite_rows, move_lines
@@ -297,6 +298,41 @@ def test_choice_of_the_lane() -> None:
     faint = marking(260.0, 185.0, 0.3, 0.5)
     assert choose([left], [faint]) == (60.0, 260.0) and choose([], [faint]) == (None, None)
     assert choose([marking(60.0, 135.0, 0.5)], []) == (None, None)
+
+
+def test_a_line_further_away_than_a_lane_is_wide_does_not_bound_the_lane() -> None:
+    plane = RoadPlane(CAMERA)
+
+    def at(x_cm: float, from_cm: float = 0.0) -> Marking:
+        points = np.stack([np.full(30, x_cm), np.linspace(from_cm, 90.0, 30)], axis=1)
+        line_px = finite_rows(CAMERA.project_ground(points))
+        return Marking(SolidLine(60.0, 135.0), None, line_px, points, LineEvidence(0.9, 0.0, 0.9, 0.9))
+
+    def kept(*markings: Marking) -> list[Marking]:
+        return can_bound_the_lane(markings, plane, CAMERA.width, 20.0, EvidenceSettings())
+
+    # Six camera heights of 20 cm: a wall's foot three metres away is as strong a line as any.
+    near, neighbour, wall = at(-20.0), at(-110.0, 30.0), at(-340.0, 30.0)
+    assert kept(wall, near, neighbour) == [near, neighbour]
+    assert kept(at(340.0, 30.0)) == [] and kept() == []
+    # A line that leaves the image sideways may go anywhere from there: only what is in it counts.
+    outside = np.array([[-300.0, 239.0], [-100.0, 200.0]])
+    leaving = replace(near, line_px=np.concatenate([outside, near.line_px]))
+    assert kept(leaving) == [leaving]
+    assert kept(replace(near, line_px=outside)) == []
+
+
+def test_a_row_is_answered_where_its_line_is_seen() -> None:
+    frame = lane_frame()
+    painter = LanePainter(CAMERA, PainterSettings(mode="photo"))
+    assert painter.detect(frame).mask.all()
+    # The left line ends 22 cm ahead: the road may bend from there on.
+    end_px = round(float(CAMERA.project_ground(np.array([[-20.0, 22.0]]))[0, 1]))
+    frame[:end_px, :160] = frame[-1, 160]
+    points_cm = painter.detect(frame).points_cm
+    assert np.isfinite(points_cm).tolist() == [True, True, False, True, True, True]
+    # A straight line lies on an edge of the 3 cm tape, a curve on its middle.
+    np.testing.assert_allclose(points_cm[[0, 1, 3, 4, 5]], [-20.0, -20.0, 20.0, 20.0, 20.0], atol=1.8)
 
 
 def test_the_papers_plain_behaviour_by_settings() -> None:

@@ -1,0 +1,289 @@
+"""Sheets of frames for the eye: every preset in random looks, every group of effects on several roads.
+
+A sheet of a preset shows each frame with the true lines of the driven lane drawn over it, and the bird's-eye
+edges that perception makes of it. A sheet of effects shows one place per road, without the effects and with
+each of them, and the true lines nowhere, so that nothing hides the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from datagen.world.furniture import FurnitureRates
+from datagen.world.ground import PixelGround
+from datagen.world.look import LookSettings
+from datagen.world.renderer import Renderer
+from datagen.world.rig import CameraSettings
+from datagen.world.track import Track, TrackSettings, preset, preset_names, random_track
+from datagen.world.world import SimulationSettings, assemble_world, resolve_length
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera
+from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+
+Bgr = tuple[int, int, int]
+Image = UInt8[np.ndarray, "_ _ 3"]
+Progress = Callable[[int, int], None]
+
+_SPEED_CM_S = 60.0
+_BEFORE_CM = 45.0  # from the front axle to the thing that a frame is to show
+_BESIDE_CM = 2.0
+_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
+_TRUTH_BGR: tuple[Bgr, Bgr] = ((255, 200, 0), (60, 60, 255))  # left, right
+_TEXT_BGR, _PAPER_BGR = (30, 30, 30), (245, 245, 245)
+_GAP_PX, _TITLE_PX = 4, 18
+_ROAD_COLUMNS, _ROAD_ROWS = 2, 4
+#: Quality of the JPEG files, and by how much they shrink where even the least quality is too large.
+_QUALITIES, _SHRINK = (90, 80, 70, 60, 50, 42), 0.88
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What one column of a sheet switches on.
+
+    Attributes:
+        name: Its title.
+        look: Keys of :class:`LookSettings`.
+        furniture_per_m: Rate of each kind of furniture; 0: none.
+        frame: Number of the frame, for what varies with time.
+        speed: Speed and turning as multiples of a frame's usual ones.
+    """
+
+    name: str
+    look: dict[str, Any] = field(default_factory=dict)
+    furniture_per_m: float = 0.0
+    frame: int = 7
+    speed: float = 1.0
+
+
+_DULL: dict[str, Any] = {"texture_level": 2.0, "wall_level": 25.0}
+_LAMPS: dict[str, Any] = {"lamps_per_m": 0.7, "lamp_level": 150.0}
+_THINGS: dict[str, Any] = {"objects_per_m": 3.0, "objects_on_road": 0.0, "shadow_depth": 0.45}
+
+
+def _floor(kind: str, **more: Any) -> Effect:
+    return Effect(kind, {"floor": kind, **more})
+
+
+#: Sheets of effects: the roads of the rows, and the columns; the first column is the road without them.
+EFFECT_SHEETS: dict[str, tuple[tuple[str, ...], tuple[Effect, ...]]] = {
+    "floors": (
+        ("paper", "carolo_cup", "donkey_tape"),
+        (
+            Effect("plain", {"texture_level": 0.0}),
+            _floor("asphalt", texture_level=9.0, texture_scale_cm=0.4, floor_bgr=(58, 56, 55)),
+            _floor(
+                "wood",
+                texture_level=7.0,
+                texture_scale_cm=0.5,
+                texture_stretch=12.0,
+                floor_bgr=(70, 100, 135),
+            ),
+            _floor("tile", texture_level=3.0, joint_u_cm=40.0, joint_v_cm=40.0, floor_bgr=(135, 130, 130)),
+            _floor("carpet", texture_level=7.0, texture_scale_cm=0.4, floor_bgr=(95, 70, 60)),
+            _floor("mat", texture_level=4.0, floor_bgr=(80, 80, 80), verge_bgr=(70, 120, 60)),
+            _floor("grass", texture_level=10.0, texture_scale_cm=0.4, floor_bgr=(45, 90, 62)),
+        ),
+    ),
+    "light": (
+        ("garage", "bfmc", "duckietown"),
+        (
+            Effect("even light"),
+            Effect("lamps", _LAMPS),
+            Effect("lamps, hard and long", {**_LAMPS, "lamp_streak": 2.0, "lamp_edge": 5.0}),
+            Effect("shadows", {"shadows_per_m": 2.5, "shadow_depth": 0.5}),
+            Effect("dark", {"exposure": 0.55}),
+            Effect("bright", {"exposure": 1.35}),
+            Effect("white balance", {"white_balance": (0.85, 1.0, 1.18)}),
+        ),
+    ),
+    "motion": (
+        ("paper", "bfmc", "mat"),
+        (
+            Effect("at rest", speed=0.0),
+            Effect("exposed for 25 ms", {"exposure_s": 0.025}, speed=2.0),
+            Effect("read out in 30 ms", {"readout_s": 0.03}, speed=2.0),
+            Effect(
+                "shake, frame 7",
+                {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02},
+            ),
+            Effect("shake, frame 9", {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02}, frame=9),
+        ),
+    ),
+    "things": (
+        ("carolo_cup", "bfmc", "donkey_tape"),
+        (
+            Effect("lines only"),
+            Effect("furniture", furniture_per_m=0.5),
+            Effect("clutter", {"clutter_per_m": 6.0}),
+            Effect("things beside the road", _THINGS),
+            Effect("things partly on it", {**_THINGS, "objects_on_road": 1.0}),
+            Effect("all, with shadows", {**_THINGS, "clutter_per_m": 3.0, "shadows_per_m": 0.6}, 0.5),
+        ),
+    ),
+    "sensor": (
+        ("duckietown", "garage", "paper"),
+        (
+            Effect("ideal"),
+            Effect("vignetting", {"vignetting": 0.5}),
+            Effect("blur of 1.2 px", {"blur_px": 1.2}),
+            Effect("noise of 7", {"noise_level": 7.0}),
+            Effect("JPEG, quality 40", {"jpeg_quality": 40}),
+            Effect("all", {"vignetting": 0.5, "blur_px": 1.0, "noise_level": 5.0, "jpeg_quality": 60}),
+        ),
+    ),
+}
+
+
+def sheet_names() -> list[str]:
+    """Names of all sheets: the presets, then the groups of effects."""
+    return [*preset_names(), *EFFECT_SHEETS]
+
+
+def draw_sheet(name: str, progress: Progress | None = None) -> Image:
+    """Draw a sheet; the same name gives the same picture.
+
+    Args:
+        name: One of :func:`sheet_names`.
+        progress: Called with the number of frames drawn and the number of all.
+
+    Raises:
+        ConfigError: If there is no such sheet.
+    """
+    if name in EFFECT_SHEETS:
+        return _effect_sheet(name, progress)
+    if name in preset_names():
+        return _road_sheet(name, progress)
+    raise ConfigError(f"no sheet {name!r}, expected one of {', '.join(sheet_names())}")
+
+
+def encode_sheet(sheet: Image, max_bytes: int | None = None) -> bytes:
+    """Return a sheet as JPEG, of lower quality and then smaller until it fits."""
+    while True:
+        for quality in _QUALITIES:
+            _, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            if max_bytes is None or data.size <= max_bytes or min(sheet.shape[:2]) < 50:
+                return bytes(data)
+        sheet = np.asarray(cv2.resize(sheet, None, fx=_SHRINK, fy=_SHRINK, interpolation=cv2.INTER_AREA))
+
+
+def _road_sheet(name: str, progress: Progress | None) -> Image:
+    """A preset in several looks: frame with the true lines, and the edges from above."""
+    total = _ROAD_COLUMNS * _ROAD_ROWS
+    # Seeds of its own, so that no two presets show the same looks.
+    first = total * preset_names().index(name)
+    tiles: list[Image] = []
+    for seed in range(first, first + total):
+        world = assemble_world(resolve_length(SimulationSettings(seed=seed, track=preset(name))))
+        # Every other frame faces something that is painted on the road, where there is anything.
+        s_cm = _place(world.track, np.random.default_rng([seed, 1]), facing=seed % 2 == 0)
+        pose, yaw_rate = _pose_at(world.track, s_cm, world.camera)
+        frame = world.renderer.render(pose, seed, _SPEED_CM_S, yaw_rate)
+        lines_cm = world.track.lines_car(pose, world.camera.wheelbase_cm)
+        above = _from_above(frame, world.camera, lines_cm)
+        for line_cm, colour in zip(lines_cm, _TRUTH_BGR, strict=True):
+            _draw_line(frame, world.camera.project_ground(line_cm), colour)
+        title = f"{name}, seed {seed}, {world.settings.look.floor}, at {s_cm:.0f} cm"
+        tiles.append(_titled(np.concatenate([frame, above], axis=1), title))
+        if progress is not None:
+            progress(len(tiles), total)
+    return _grid(tiles, _ROAD_COLUMNS)
+
+
+def _effect_sheet(name: str, progress: Progress | None) -> Image:
+    """A row per road, a column per effect, all of a row at one place."""
+    roads, effects = EFFECT_SHEETS[name]
+    camera = CameraSettings().build(SimulationSettings().car.wheelbase_cm)
+    ground = PixelGround.of(camera)
+    tiles: list[Image] = []
+    for row, road in enumerate(roads):
+        settings = preset(road)
+        tracks = {
+            rate: random_track(_with_furniture(settings, rate), np.random.default_rng(row))
+            for rate in {effect.furniture_per_m for effect in effects}
+        }
+        # The richest road decides the place; furniture does not move the road.
+        s_cm = _place(tracks[max(tracks)], np.random.default_rng([row, 2]), facing=True)
+        for effect in effects:
+            track = tracks[effect.furniture_per_m]
+            floor = {} if settings.floor_bgr is None else {"floor_bgr": settings.floor_bgr}
+            look = check_settings(LookSettings, {**_DULL, **floor, **effect.look}, effect.name)
+            renderer = Renderer(camera, track, look, np.random.default_rng(row), ground)
+            pose, yaw_rate = _pose_at(track, s_cm, camera)
+            frame = renderer.render(pose, effect.frame, _SPEED_CM_S * effect.speed, yaw_rate * effect.speed)
+            tiles.append(_titled(frame, f"{road}: {effect.name}"))
+            if progress is not None:
+                progress(len(tiles), len(roads) * len(effects))
+    return _grid(tiles, len(effects))
+
+
+def _with_furniture(settings: TrackSettings, per_m: float) -> TrackSettings:
+    kinds = [name for name in FurnitureRates.model_fields if name.endswith("_per_m")]
+    rates = settings.random_furniture.model_copy(update=dict.fromkeys(kinds, per_m))
+    return settings.model_copy(update={"random_furniture": rates})
+
+
+def _place(track: Track, rng: np.random.Generator, facing: bool) -> float:
+    """A place on the road; ``facing`` one that has something painted on the road ahead, if there is any."""
+    share, choice = rng.random(2)
+    s_cm = share * track.length_cm
+    if not facing or not len(track.boxes):
+        return float(s_cm)
+    box = track.boxes[int(choice * len(track.boxes))]
+    return track.nearest(box[:2])[0] - _BEFORE_CM
+
+
+def _pose_at(track: Track, s_cm: float, camera: Camera) -> tuple[Float[np.ndarray, "3"], float]:
+    """Pose of the car whose front axle is there, a little beside the middle, and its yaw rate."""
+    rear_cm, heading = track.point(s_cm - camera.wheelbase_cm, _BESIDE_CM)
+    return np.array([*rear_cm, heading]), _SPEED_CM_S * track.curvature(s_cm)
+
+
+def _from_above(
+    frame_bgr: Image, camera: Camera, lines_cm: tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
+) -> Image:
+    """The edges that the network would see, and the true lines, as large as the frame."""
+    window = BirdseyeWindow()
+    edges = RoadEdgeExtractor(camera, PerceptionSettings()).extract(frame_bgr)
+    raster = 255 - window.rasterise(edges.points_cm)
+    height, width = frame_bgr.shape[:2]
+    above = cv2.resize(raster, (width, height), interpolation=cv2.INTER_NEAREST)
+    above = np.asarray(cv2.cvtColor(above, cv2.COLOR_GRAY2BGR))
+    scale = np.array([width / window.columns, height / window.rows])
+    for line_cm, colour in zip(lines_cm, _TRUTH_BGR, strict=True):
+        _draw_line(above, (window.cells(line_cm)[:, ::-1] + 0.5) * scale - 0.5, colour)
+    return above
+
+
+def _draw_line(image: Image, points_px: Float[np.ndarray, "n 2"], colour: Bgr) -> None:
+    """Draw a thin line between the points that lie in the picture or near it."""
+    limit = 2.0 * max(image.shape)
+    with np.errstate(invalid="ignore"):
+        seen = (np.abs(points_px) < limit).all(axis=1)
+    fixed = np.rint(np.where(seen[:, None], points_px, 0.0) * 2**_SHIFT).astype(np.int32)
+    for k in np.flatnonzero(seen[:-1] & seen[1:]):
+        cv2.line(image, fixed[k].tolist(), fixed[k + 1].tolist(), colour, 1, cv2.LINE_AA, _SHIFT)
+
+
+def _titled(tile: Image, title: str) -> Image:
+    bar = np.full((_TITLE_PX, tile.shape[1], 3), _PAPER_BGR, np.uint8)
+    cv2.putText(bar, title, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT_BGR, 1, cv2.LINE_AA)
+    return np.concatenate([bar, tile], axis=0)
+
+
+def _grid(tiles: list[Image], columns: int) -> Image:
+    height, width = tiles[0].shape[:2]
+    rows = -(-len(tiles) // columns)
+    size = (rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX, 3)
+    sheet = np.full(size, _PAPER_BGR, np.uint8)
+    for index, tile in enumerate(tiles):
+        top, left = index // columns * (height + _GAP_PX), index % columns * (width + _GAP_PX)
+        sheet[top : top + height, left : left + width] = tile
+    return sheet
