@@ -33,7 +33,7 @@ from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 Progress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
 
-_VERSION = 5  # of this module's outputs; raise it when the same settings give other labels
+_VERSION = 6  # of this module's outputs; raise it when the same settings give other labels
 
 
 class SyntheticSettings(Settings):
