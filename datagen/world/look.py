@@ -12,6 +12,8 @@ from lanenet.config import Settings
 
 Bgr = tuple[float, float, float]
 _CONTRAST = 60.0  # grey levels between floor and paint, at least
+_DULL_CONTRAST = 45.0  # between floor and paint that has lost its brightness
+_DULLEST = 0.6
 
 
 class LookSettings(Settings):
@@ -142,8 +144,10 @@ def random_look(
     # What came later draws from a child of its own, so that the draws above stay as they were.
     later = rng.spawn(1)[0]
     drawn |= _random_motion(later) | _random_surroundings(later) | _other_floor(later)
-    drawn |= _random_marks(drawn, rng.spawn(1)[0])
+    newer = rng.spawn(1)[0]
+    drawn |= _random_marks(drawn, newer)
     drawn |= _lightened(drawn, paint_bgr)
+    drawn |= _dulled(drawn, paint_bgr, newer)
     kept = {name: getattr(fixed, name) for name in fixed.model_fields_set}
     return LookSettings(**{**drawn, **kept})
 
@@ -192,6 +196,16 @@ def _random_marks(drawn: dict[str, Any], rng: np.random.Generator) -> dict[str, 
         "glints_per_m": max(0.0, 4.0 * glint),
         "lamp_size": 0.4 + 0.8 * size,
     }
+
+
+def _dulled(drawn: dict[str, Any], paint_bgr: tuple[Bgr, ...], rng: np.random.Generator) -> dict[str, Any]:
+    """Make the paint of every other drive duller, as thin or dirty tape is, but never hard to see."""
+    dull = max(0.0, rng.uniform(-1.0, 1.0))
+    paint = min((colour[1] for colour in paint_bgr), default=225.0)
+    least = max(_DULLEST, (drawn["floor_bgr"][1] + _DULL_CONTRAST) / max(paint, 1.0))
+    brightness = drawn["line_brightness"]
+    # Dark paint, or a light floor, leaves no room for it.
+    return {"line_brightness": brightness - dull * max(0.0, brightness - least)}
 
 
 def _other_floor(rng: np.random.Generator) -> dict[str, Any]:

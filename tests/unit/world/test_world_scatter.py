@@ -98,3 +98,16 @@ def test_random_looks_draw_marks_on_some_drives_only():
         share = np.mean([getattr(look, name) != 0.0 for look in looks])
         assert 0.15 < share < 0.65, name
     assert all(look.texture_level > 0.0 for look in looks)
+
+
+def test_dull_paint_still_stands_out_from_the_floor():
+    white, black = (230.0, 230.0, 230.0), (30.0, 30.0, 30.0)
+    dull = 0
+    for seed in range(200):
+        look = random_look(LookSettings(), np.random.default_rng(seed), (white,))
+        paint = 230.0 * look.line_brightness
+        assert paint >= min(look.floor_bgr[1] + 45.0, 230.0 * 0.85) - 1e-6
+        dull += look.line_brightness < 0.85
+        dark = random_look(LookSettings(), np.random.default_rng(seed), (black,))
+        assert dark.line_brightness >= 0.85
+    assert 40 < dull < 110
