@@ -67,6 +67,18 @@ def floor_pattern(kind: FloorKind, scale_cm: float, stretch: float, rng: np.rand
     return np.clip(base / max(float(base.std()), 1e-9), -_MAX_DEVIATION, _MAX_DEVIATION)
 
 
+def stains(rng: np.random.Generator) -> Cells:
+    """Draw spots with a ragged border, as of oil, water or mended floor: 1 inside, 0 outside."""
+    shape = noise(float(rng.uniform(1.5, 5.0)), 1.0, rng) + 0.2 * noise(0.6, 1.0, rng)
+    least = np.quantile(shape, rng.uniform(0.8, 0.97))
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip((shape - least) / rng.uniform(0.03, 0.25), -30.0, 30.0))))
+
+
+def cracks(rng: np.random.Generator) -> Cells:
+    """Draw a few cracks that wander over the floor: 1 inside, 0 outside."""
+    return np.minimum(_cracks(int(rng.integers(1, 6)), 0.5, 1.0, rng), 1.0)
+
+
 def level_starts() -> Int[np.ndarray, "starts"]:
     """Where each level starts in a packed texture, and where the last one ends."""
     sizes = [(_CELLS >> level) ** 2 for level in range(TEXTURE_LEVELS)]
