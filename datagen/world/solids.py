@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from datagen.world.compiled import compiled
 from datagen.world.ground import TILE
 
 BOX, CYLINDER, CONE = 0.0, 1.0, 2.0
@@ -22,7 +22,7 @@ _CURVED_RAD = 0.03  # by how much an outline may bend between a tile's corners
 _TOP_GAIN, _SIDE_GAIN = 1.12, 0.22  # how much brighter tops are, and sides that face the light
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def outline(solid, ex, ey, height, planes):
     """Find the planes through the eye that touch a solid on the left and on the right.
@@ -88,7 +88,7 @@ def outline(solid, ex, ey, height, planes):
     return distance - radius, distance + radius
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def pierce(solid, ex, ey, height, rx, ry, rz):
     """Find where a ray enters and leaves a solid, taken as endless upwards and downwards (a cone: downwards).
@@ -132,14 +132,14 @@ def pierce(solid, ex, ey, height, rx, ry, rz):
     return enter, leave, px / length, py / length
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def soft(distance, width):
     """Share of a pixel on the inner side of an edge, as a ramp."""
     return min(max(0.5 + distance / max(width, 1e-9), 0.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def mark_outside(lattice, planes, low, high, margin, marks):
     """Mark on which sides of a solid's outline the rays at the tiles' corners lie.
@@ -164,7 +164,7 @@ def mark_outside(lattice, planes, low, high, margin, marks):
             marks[j, k] = mark
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, turn, slack, solids, light):
     """Paint solids over what is already there, the far ones first.
@@ -175,7 +175,7 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
         rays: See :class:`datagen.world.ground.PixelGround`, in one row.
         width: Pixels per row, filled up.
         image_width: Pixels per row that are part of the image.
-        shake: See :func:`datagen.world.ground.cast_rays`.
+        shake: See :func:`datagen.world.ground.cast_tile`.
         rows: See there.
         eye: See there.
         way: See there.
@@ -235,7 +235,7 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
                     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def _paint_row(out, depth, rays, start, shake, rows, v, eye, way, turn, solid, band, at, light, inner):
     """Paint one solid into ``TILE`` pixels of an image row."""
