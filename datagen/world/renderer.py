@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.ground import NEAR_CM, NOT_FLOOR, WALL_CM, PixelGround
+from datagen.world.ground import NEAR_CM, NOT_FLOOR, TILE, WALL_CM, PixelGround
 from datagen.world.kernels import paint_floor
 from datagen.world.light import mirror_lamps, moved
 from datagen.world.look import LookSettings
@@ -117,7 +117,11 @@ class Renderer:
         # Filled anew for each frame; what no ray reaches stays black.
         self._level = np.full(camera.height * self._ground.stride, NOT_FLOOR, np.uint8)
         self._depth = np.zeros(len(self._level), np.float32)
-        self._pixel = np.zeros(4, np.float32)
+        self._room_buffers = (
+            np.zeros(2 * TILE, np.int32),
+            np.zeros(4 * TILE, np.float32),
+            np.zeros(4 * TILE, np.float32),
+        )
         self._blurred = np.zeros((camera.height, camera.width, 3), np.float32)
         self._light = np.zeros((len(self._level), 3), np.float32)
 
@@ -160,7 +164,7 @@ class Renderer:
         tilt = np.array([-shake[0], shake[1]])
         paint_room(
             self._light, self._level, ground.azimuth_rad, ground.elevation_rad, ground.toward, float(pose[2]),
-            tilt, view.turn_rad, self._scene.room, self._pixel,
+            tilt, view.turn_rad, self._scene.room, self._room_buffers,
         )  # fmt: skip
         self._paint_solids(view)
         light = np.ascontiguousarray(self._light.reshape(height, -1, 3)[:, :width])

@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from datagen.world.compiled import compiled
+from datagen.world.compiled import compiled, compiled_bare
 from datagen.world.ground import TILE
 
 BOX, CYLINDER, CONE = 0.0, 1.0, 2.0
@@ -22,7 +22,7 @@ _CURVED_RAD = 0.03  # by how much an outline may bend between a tile's corners
 _TOP_GAIN, _SIDE_GAIN = 1.12, 0.22  # how much brighter tops are, and sides that face the light
 
 
-@compiled
+@compiled_bare
 @no_type_check
 def outline(solid, ex, ey, height, planes):
     """Find the planes through the eye that touch a solid on the left and on the right.
@@ -88,7 +88,7 @@ def outline(solid, ex, ey, height, planes):
     return distance - radius, distance + radius
 
 
-@compiled
+@compiled_bare
 @no_type_check
 def pierce(solid, ex, ey, height, rx, ry, rz):
     """Find where a ray enters and leaves a solid, taken as endless upwards and downwards (a cone: downwards).
@@ -132,14 +132,14 @@ def pierce(solid, ex, ey, height, rx, ry, rz):
     return enter, leave, px / length, py / length
 
 
-@compiled
+@compiled_bare
 @no_type_check
 def soft(distance, width):
     """Share of a pixel on the inner side of an edge, as a ramp."""
     return min(max(0.5 + distance / max(width, 1e-9), 0.0), 1.0)
 
 
-@compiled
+@compiled_bare
 @no_type_check
 def mark_outside(lattice, planes, low, high, margin, marks):
     """Mark on which sides of a solid's outline the rays at the tiles' corners lie.
@@ -184,14 +184,28 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
         solids: Sorted, see ``SOLID_COLUMNS``; x and y from the frame's pose.
         light: cos and sin of the direction from which the light comes.
     """
+    tile_rows, tile_columns = (rows.shape[0] + TILE - 1) // TILE, width // TILE
+    buffers = (
+        np.empty((TILE, 8)), np.empty(8), np.empty(2 * TILE, np.float32),
+        np.empty((tile_rows + 1, tile_columns + 1, 4)), np.empty((tile_rows + 1, tile_columns + 1), np.uint8),
+    )  # fmt: skip
+    _paint_all(
+        out, depth, rays, width, image_width, shake, rows, eye, way, turn, slack, solids, light, buffers
+    )
+
+
+@compiled_bare
+@no_type_check
+def _paint_all(
+    out, depth, rays, width, image_width, shake, rows, eye, way, turn, slack, solids, light, buffers
+):
+    """Paint with buffers at hand; see :func:`paint_solids`."""
+    band, planes, inner, lattice, marks = buffers
     height = rows.shape[0]
-    tile_rows, tile_columns = (height + TILE - 1) // TILE, width // TILE
+    tile_rows, tile_columns = marks.shape[0] - 1, marks.shape[1] - 1
     depth[:] = np.inf
-    band, planes, inner = np.empty((TILE, 8)), np.empty(8), np.empty(2 * TILE, np.float32)
     c, s = rows[height // 2, 2], rows[height // 2, 3]
     mid_x, mid_y = eye[1] * c + eye[0] * s, eye[1] * s - eye[0] * c
-    lattice = np.empty((tile_rows + 1, tile_columns + 1, 4))
-    marks = np.empty((tile_rows + 1, tile_columns + 1), np.uint8)
     for j in range(tile_rows + 1):
         for k in range(tile_columns + 1):
             i = min(j * TILE, height - 1) * width + min(k * TILE, image_width - 1)
@@ -235,7 +249,7 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
                     )  # fmt: skip
 
 
-@compiled
+@compiled_bare
 @no_type_check
 def _paint_row(out, depth, rays, start, shake, rows, v, eye, way, turn, solid, band, at, light, inner):
     """Paint one solid into ``TILE`` pixels of an image row."""
