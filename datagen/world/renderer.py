@@ -122,6 +122,7 @@ class Renderer:
             np.zeros(4 * TILE, np.float32),
             np.zeros(4 * TILE, np.float32),
         )
+        self._image = np.zeros((camera.height, camera.width, 3), np.uint8)
         self._blurred = np.zeros((camera.height, camera.width, 3), np.float32)
         self._light = np.zeros((len(self._level), 3), np.float32)
 
@@ -170,7 +171,7 @@ class Renderer:
         light = np.ascontiguousarray(self._light.reshape(height, -1, 3)[:, :width])
         if look.blur_px > 0.0:
             light = cv2.GaussianBlur(light, (0, 0), look.blur_px, dst=self._blurred)
-        image = np.empty((height, width, 3), dtype=np.uint8)
+        image = np.empty((height, width, 3), np.uint8) if look.jpeg_quality is None else self._image
         gains = self._gains_at(frame)
         noise = self._noise[first : first + image.size]
         develop(light.ravel(), self._falloff, gains, noise, look.noise_level, image.ravel())

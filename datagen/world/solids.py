@@ -145,7 +145,7 @@ def mark_outside(lattice, planes, low, high, margin, marks):
     """Mark on which sides of a solid's outline the rays at the tiles' corners lie.
 
     Args:
-        lattice: Rays at the corners, and the length of their horizontal part.
+        lattice: Rays at the corners, row by row, and the length of their horizontal part.
         planes: See :func:`outline`.
         low: Slope of the solid's lower end.
         high: Slope of its upper end.
@@ -154,14 +154,15 @@ def mark_outside(lattice, planes, low, high, margin, marks):
             the lens does not see has none.
     """
     lower, higher = margin * (1.0 + abs(low)), margin * (1.0 + abs(high))
-    for j in range(lattice.shape[0]):
-        for k in range(lattice.shape[1]):
-            x, y, z, flat = lattice[j, k, 0], lattice[j, k, 1], lattice[j, k, 2], lattice[j, k, 3]
-            mark = np.uint8(x * planes[0] + y * planes[1] + z * planes[2] < -margin)
-            mark |= np.uint8(x * planes[3] + y * planes[4] + z * planes[5] < -margin) << 1
-            mark |= np.uint8(z + lower < low * flat) << 2
-            mark |= np.uint8(z - higher > high * flat) << 3
-            marks[j, k] = mark
+    p0, p1, p2, p3, p4, p5 = planes[0], planes[1], planes[2], planes[3], planes[4], planes[5]
+    xs, ys, zs, flats = lattice[0], lattice[1], lattice[2], lattice[3]
+    for k in range(marks.shape[0]):
+        x, y, z, flat = xs[k], ys[k], zs[k], flats[k]
+        mark = np.uint8(x * p0 + y * p1 + z * p2 < -margin)
+        mark |= np.uint8(x * p3 + y * p4 + z * p5 < -margin) << np.uint8(1)
+        mark |= np.uint8(z + lower < low * flat) << np.uint8(2)
+        mark |= np.uint8(z - higher > high * flat) << np.uint8(3)
+        marks[k] = mark
 
 
 @compiled
@@ -185,9 +186,10 @@ def paint_solids(out, depth, rays, width, image_width, shake, rows, eye, way, tu
         light: cos and sin of the direction from which the light comes.
     """
     tile_rows, tile_columns = (rows.shape[0] + TILE - 1) // TILE, width // TILE
+    corners = tile_columns + 1
     buffers = (
         np.empty((TILE, 8)), np.empty(8), np.empty(2 * TILE, np.float32),
-        np.empty((tile_rows + 1, tile_columns + 1, 4)), np.empty((tile_rows + 1, tile_columns + 1), np.uint8),
+        np.empty((4, (tile_rows + 1) * corners)), np.empty((tile_rows + 1) * corners, np.uint8),
     )  # fmt: skip
     _paint_all(
         out, depth, rays, width, image_width, shake, rows, eye, way, turn, slack, solids, light, buffers
@@ -202,7 +204,8 @@ def _paint_all(
     """Paint with buffers at hand; see :func:`paint_solids`."""
     band, planes, inner, lattice, marks = buffers
     height = rows.shape[0]
-    tile_rows, tile_columns = marks.shape[0] - 1, marks.shape[1] - 1
+    tile_rows, tile_columns = (height + TILE - 1) // TILE, width // TILE
+    corners = tile_columns + 1
     depth[:] = np.inf
     c, s = rows[height // 2, 2], rows[height // 2, 3]
     mid_x, mid_y = eye[1] * c + eye[0] * s, eye[1] * s - eye[0] * c
@@ -213,9 +216,10 @@ def _paint_all(
             right, ahead, up = rays[n], rays[n + TILE], rays[n + 2 * TILE]
             a = shake[0, 0] * right + shake[0, 1] * ahead + shake[0, 2] * up
             b = shake[1, 0] * right + shake[1, 1] * ahead + shake[1, 2] * up
-            lattice[j, k, 0], lattice[j, k, 1] = b * c + a * s, b * s - a * c
-            lattice[j, k, 2] = shake[2, 0] * right + shake[2, 1] * ahead + shake[2, 2] * up
-            lattice[j, k, 3] = np.hypot(a, b)
+            corner = j * corners + k
+            lattice[0, corner], lattice[1, corner] = b * c + a * s, b * s - a * c
+            lattice[2, corner] = shake[2, 0] * right + shake[2, 1] * ahead + shake[2, 2] * up
+            lattice[3, corner] = np.hypot(a, b)
     for q in range(solids.shape[0]):
         solid = solids[q]
         nearest, farthest = outline(solid, mid_x, mid_y, eye[2], planes)
@@ -229,7 +233,9 @@ def _paint_all(
             top, bottom = j * TILE, min(j * TILE + TILE, height)
             known = False
             for k in range(tile_columns):
-                if marks[j, k] & marks[j, k + 1] & marks[j + 1, k] & marks[j + 1, k + 1]:
+                corner = j * corners + k
+                upper, lower = marks[corner] & marks[corner + 1], marks[corner + corners]
+                if upper & lower & marks[corner + corners + 1]:
                     continue
                 if not known:
                     known = True
