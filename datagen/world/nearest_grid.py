@@ -88,16 +88,6 @@ class NearestGrid:
             self._blocks[row, column] = block
 
 
-def nearest_sample_grid(track: Track) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
-    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid.
-
-    Over the whole road at once: for short ones only.
-    """
-    grid = NearestGrid(track)
-    reach_cm = grid.reach_cm
-    return grid.around(track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm)
-
-
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _fill_grid(nodes_xy, index, origin_x, origin_y, cell, reach, best, grid):

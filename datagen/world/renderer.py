@@ -22,7 +22,8 @@ from datagen.world.nearby import Nearby
 from datagen.world.nearest_grid import NearestGrid
 from datagen.world.scene import Scene, build_scene
 from datagen.world.sensor import as_jpeg, corner_falloff, develop, paint_room
-from datagen.world.solids import SOLID_COLUMNS, paint_solids
+from datagen.world.solid_shapes import SOLID_COLUMNS
+from datagen.world.solids import paint_solids
 from datagen.world.textures import PATTERN_BGR, level_starts
 from datagen.world.track import Track
 from datagen.world.variation import Steps, Wander
