@@ -1,7 +1,7 @@
 """Where to start looking for a point's place along the road: a grid of nearest samples.
 
-The grid comes in square blocks, filled when the car comes near them and kept for a while: a road of 200 m needs
-hardly more memory than one of 10 m. The renderer gets the blocks around the car, as one array.
+The grid comes in square blocks, filled when the car comes near them and kept for a while: a road of 200 m
+needs hardly more memory than one of 10 m. The renderer gets the blocks around the car, as one array.
 """
 
 from __future__ import annotations

@@ -256,6 +256,11 @@ def test_a_long_road_costs_its_length_only():
     assert grid.blocks < 300
     window, _ = grid.around(track.xy_cm[500] - 280.0, track.xy_cm[500] + 280.0)
     assert window.size <= (5 * 128) ** 2
+    first = window.copy()
+    for xy in track.xy_cm[::400]:
+        grid.around(xy - 280.0, xy + 280.0)
+    assert 5 <= len(grid._blocks) <= 32  # the rest was let go, and comes back as it was
+    np.testing.assert_array_equal(grid.around(track.xy_cm[500] - 280.0, track.xy_cm[500] + 280.0)[0], first)
 
 
 def test_track_files_keep_the_new_parts_and_old_ones_are_read(tmp_path):
