@@ -38,7 +38,8 @@ class Scene:
         joint_shift_cm: Where the joints start.
         lamps: x, y, height above the floor, angular size, [cm], [rad].
         clutter: Rectangles: x, y, cos and sin of the direction, half length, half width, blue, green, red.
-        room: The walls, rows of elevation (0..90 degrees, from the floor up) by columns of azimuth.
+        room: The walls, rows of elevation (0..90 degrees, from the floor up) by columns of azimuth; a fourth
+            value fills up the colours.
         objects: Things above the floor, and shadows on it.
     """
 
@@ -48,7 +49,7 @@ class Scene:
     joint_shift_cm: Float[np.ndarray, "2"]
     lamps: Float[np.ndarray, "lamps 4"]
     clutter: Float[np.ndarray, "things 9"]
-    room: Float32[np.ndarray, "r c 3"]
+    room: Float32[np.ndarray, "r c 4"]
     objects: Objects
 
 
@@ -118,7 +119,7 @@ def _clutter(track: Track, per_m: float, rng: np.random.Generator) -> Float[np.n
     return np.concatenate([places, shape, np.clip(colour, 0.0, 255.0)], axis=1)
 
 
-def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 3"]:
+def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 4"]:
     """Soft light on the walls, with doors, windows and furniture as upright rectangles."""
     azimuth = np.linspace(0.0, 2.0 * np.pi, _ROOM_COLUMNS, endpoint=False)
     shade = sum(np.cos(k * azimuth + rng.uniform(0.0, 2.0 * np.pi)) / k for k in range(1, 5))
@@ -134,4 +135,4 @@ def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 3"
             rng.uniform(-1.5, 1.5) + rng.uniform(-0.3, 0.3, 3)
         )
     base = rng.uniform(90.0, 170.0) + rng.uniform(-10.0, 10.0, 3)
-    return np.clip(base + room, 0.0, 255.0).astype(np.float32)
+    return np.pad(np.clip(base + room, 0.0, 255.0).astype(np.float32), ((0, 0), (0, 0), (0, 1)))

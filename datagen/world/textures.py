@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from datagen.world.ground import TEXTURE_CELL_CM, TEXTURE_LEVELS
+from datagen.world.ground import TEXTURE_CELL_CM, TEXTURE_LEVELS, TEXTURE_SIDE
 
 FloorKind = Literal["plain", "asphalt", "wood", "tile", "carpet", "mat", "grass"]
 #: Factor on the pattern in blue, green and red: a floor's spots differ in colour too.
@@ -22,7 +22,7 @@ PATTERN_BGR: dict[str, tuple[float, float, float]] = {
     "mat": (1.0, 1.0, 1.0),
     "grass": (0.5, 1.25, 0.8),
 }
-_CELLS = 512  # the pattern repeats every 256 cm
+_CELLS = TEXTURE_SIDE
 _MAX_DEVIATION = 6.0
 
 Cells = Float[np.ndarray, "n n"]
