@@ -15,7 +15,7 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, judge_cli, onboard_cli, val_cli, world_cli
+from lanenet import calibrate_cli, console, judge_cli, onboard_cli, reality_cli, val_cli, world_cli
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption, check_ending
@@ -72,6 +72,7 @@ app.add_typer(onboard_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)
 app.add_typer(judge_cli.app)
+app.add_typer(reality_cli.app)
 
 
 def main() -> None:

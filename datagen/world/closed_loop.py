@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from datagen.world.drive_loop import DriveState, obeyed
 from datagen.world.driver import place_on_track
 from datagen.world.pilot import LostLane, Pilot, PilotSettings, Sight
+from datagen.world.sensor import as_jpeg
 from datagen.world.world import World
 from lanenet.geometry.frames import map_from_car
 
@@ -77,7 +77,7 @@ class ClosedLoop:
         image = None
         if self._pilot.needs_image:
             image = world.renderer.render(pose, frame, *moving)
-        seen = image if image is None or self._jpeg_quality is None else _as_jpeg(image, self._jpeg_quality)
+        seen = image if image is None or self._jpeg_quality is None else as_jpeg(image, self._jpeg_quality)
         wished_rad = self._pilot.steer(Sight(seen, pose, self.s_cm))
         speed_cm_s, steering_rad = obeyed(world, *self._lost.command(wished_rad, self._speed_cm_s))
         points_cm = world.track.truth(pose, self._wheelbase_cm, self.s_cm)
@@ -97,8 +97,3 @@ class ClosedLoop:
         self._world.car.place(self._world.driver.pose_at(self.s_cm), self._speed_cm_s)
         self._pilot.reset()
         self._lost.reset()
-
-
-def _as_jpeg(image_bgr: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
-    _, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))

@@ -10,17 +10,19 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
-from numba import njit
+from jaxtyping import Bool, Float, Float32
 
+from datagen.world.compiled import compiled_bare
 from lanenet.geometry.camera import Camera
 
 NEAR_CM = 250.0  # markings and things on the floor are painted up to here
 WALL_CM = 450.0  # the floor ends here
 TEXTURE_CELL_CM = 0.5
 TEXTURE_LEVELS = 6
+TEXTURE_BITS = 9
+TEXTURE_SIDE = 1 << TEXTURE_BITS  # cells; the pattern repeats every 256 cm
 TILE = 16  # side of the blocks of pixels that share a list of what lies near, [px]
-NOT_FLOOR, FAR = 255, 8  # values of a pixel's level, see cast_rays
+NOT_FLOOR, FAR = 255, 8  # values of a pixel's level, see cast_tile
 _HALF_PX = 0.5
 
 
@@ -93,34 +95,6 @@ class PixelGround:
             return np.asarray((up < -1e-6) & (reach_cm < WALL_CM))[:, : self.width]
 
 
-@dataclass(frozen=True, eq=False)
-class FloorHits:
-    """Buffers for what the pixels of a frame see of the floor, filled anew by :func:`cast_rays`.
-
-    Attributes:
-        numbers: In blocks like the rays: x and y of the pixel's point of the floor from the rear axle, axes
-            of the map, [cm]; what the pixel covers, as change of x and y per pixel in u, in v, and during the
-            exposure, [cm].
-        level: Level of the floor's texture that fits; plus ``FAR`` beyond the painted part of the floor;
-            ``NOT_FLOOR`` where the ray does not meet the floor.
-        tiles: Box of floor that each tile of pixels covers, row by row: lowest x and y, highest x and y from
-            the rear axle; the lowest exceed the highest where a tile sees no floor.
-    """
-
-    numbers: Float32[np.ndarray, "n8"]
-    level: UInt8[np.ndarray, "n"]
-    tiles: Float[np.ndarray, "tiles 4"]
-
-    @classmethod
-    def empty(cls, ground: PixelGround) -> FloorHits:
-        """Return buffers for a camera's image."""
-        pixels = ground.height * ground.stride
-        tiles = -(-ground.height // TILE) * (ground.stride // TILE)
-        return cls(
-            np.zeros(8 * pixels, np.float32), np.full(pixels, NOT_FLOOR, np.uint8), np.zeros((tiles, 4))
-        )
-
-
 def _rays(camera: Camera, u: Float[np.ndarray, "n"], v: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
     return camera.unproject(np.stack([u, v], axis=1)) @ camera.mounting.camera_from_car
 
@@ -134,98 +108,128 @@ def _difference(
     return np.asarray(np.where(np.isfinite(whole), whole, np.where(np.isfinite(half), half, 0.0)))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_bare
 @no_type_check
-def cast_rays(rays, lowest, width, shake, rows, eye, way, turn, numbers, level):
-    """Meet every pixel's ray with the floor.
+def cast_tile(rays, lowest, width, view, top, left, numbers, level):
+    """Meet the rays of a tile of pixels with the floor.
 
     Args:
         rays: See :class:`PixelGround`, in one row.
         lowest: See there.
         width: Pixels per row, filled up.
-        shake: Rotation of the camera in the frame car.
-        rows: For each image row the car when it was read: x and y of its rear axle from the frame's pose, cos
-            and sin of its heading.
-        eye: Optical centre: right and ahead of the rear axle, height.
-        way: How far the car drives during the exposure.
-        turn: By how much it turns meanwhile.
-        numbers: Filled, see :class:`FloorHits`.
-        level: Filled.
+        view: Rotation of the camera in the frame car by which it shakes; for each image row the car when it
+            was read: x and y of its rear axle from the frame's pose, cos and sin of its heading; optical
+            centre: right and ahead of the rear axle, height; how far the car drives during the exposure, and
+            by how much it turns meanwhile.
+        top: First row of the tile.
+        left: First pixel of its rows.
+        numbers: Filled. Row by row, eight blocks of ``TILE`` numbers: x and y of the pixel's point of the
+            floor from the rear axle, axes of the map, [cm]; what the pixel covers, as change of x and y per
+            pixel in u, in v, and during the exposure, [cm].
+        level: Of all pixels of the image, filled: level of the floor's texture that fits; plus ``FAR`` beyond
+            the painted part of the floor; ``NOT_FLOOR`` where the ray does not meet the floor.
+
+    Returns:
+        Whether any pixel sees the floor.
     """
     f = np.float32
+    shake, rows, eye, way, turn = view
     near2, wall2, cell2 = f(NEAR_CM * NEAR_CM), f(WALL_CM * WALL_CM), f(TEXTURE_CELL_CM * TEXTURE_CELL_CM)
     s00, s01, s02 = f(shake[0, 0]), f(shake[0, 1]), f(shake[0, 2])
     s10, s11, s12 = f(shake[1, 0]), f(shake[1, 1]), f(shake[1, 2])
     s20, s21, s22 = f(shake[2, 0]), f(shake[2, 1]), f(shake[2, 2])
     eye_right, eye_ahead, height, way, turn = f(eye[0]), f(eye[1]), f(eye[2]), f(way), f(turn)
     tip = np.hypot(shake[2, 0], shake[2, 1])
-    for v in range(rows.shape[0]):
+    any_floor = np.uint8(0)
+    for v in range(top, min(top + TILE, rows.shape[0])):
+        i = v * width + left
+        # Slices, so that no index can be negative as far as the compiler knows.
+        r, n, seen = rays[9 * i : 9 * (i + TILE)], numbers[(v - top) * 8 * TILE :], level[i : i + TILE]
         if shake[2, 2] * lowest[v] - tip > 0.0:  # no ray of the row goes down
-            level[v * width : (v + 1) * width] = NOT_FLOOR
+            seen[:] = NOT_FLOOR
             continue
         x0, y0, c, s = f(rows[v, 0]), f(rows[v, 1]), f(rows[v, 2]), f(rows[v, 3])
-        for block in range(v * width // TILE, (v + 1) * width // TILE):
-            # Slices, so that no index can be negative as far as the compiler knows.
-            r, n = rays[block * 9 * TILE : (block + 1) * 9 * TILE], numbers[block * 8 * TILE :]
-            out = level[block * TILE : (block + 1) * TILE]
-            # No branches and nothing but float32: the compiler takes many pixels at a time.
-            for j in range(TILE):
-                a, b, d = r[j], r[TILE + j], r[2 * TILE + j]
-                rx, ry = s00 * a + s01 * b + s02 * d, s10 * a + s11 * b + s12 * d
-                rz = s20 * a + s21 * b + s22 * d
-                per_z = f(1.0) / rz
-                t, slope_x, slope_y = -height * per_z, rx * per_z, ry * per_z
-                right, ahead = rx * t, ry * t
-                reach2 = right * right + ahead * ahead
-                a, b, d = r[3 * TILE + j], r[4 * TILE + j], r[5 * TILE + j]
-                dz = s20 * a + s21 * b + s22 * d
-                right_u = t * (s00 * a + s01 * b + s02 * d - slope_x * dz)
-                ahead_u = t * (s10 * a + s11 * b + s12 * d - slope_y * dz)
-                a, b, d = r[6 * TILE + j], r[7 * TILE + j], r[8 * TILE + j]
-                dz = s20 * a + s21 * b + s22 * d
-                right_v = t * (s00 * a + s01 * b + s02 * d - slope_x * dz)
-                ahead_v = t * (s10 * a + s11 * b + s12 * d - slope_y * dz)
-                right, ahead = right + eye_right, ahead + eye_ahead
-                x, y = ahead * c + right * s, ahead * s - right * c
-                n[j], n[TILE + j] = x0 + x, y0 + y
-                n[2 * TILE + j] = ahead_u * c + right_u * s
-                n[3 * TILE + j] = ahead_u * s - right_u * c
-                n[4 * TILE + j] = ahead_v * c + right_v * s
-                n[5 * TILE + j] = ahead_v * s - right_v * c
-                # The pixel keeps its place on the car, so its point sweeps over the floor.
-                n[6 * TILE + j], n[7 * TILE + j] = way * c - turn * y, way * s + turn * x
-                # The texture's cells double from level to level, their areas are four times as large.
-                area = abs(right_u * ahead_v - right_v * ahead_u) / cell2
-                fits = f(0.0)
-                fits += f(1.0) if area > f(1.0) else f(0.0)
-                fits += f(1.0) if area > f(4.0) else f(0.0)
-                fits += f(1.0) if area > f(16.0) else f(0.0)
-                fits += f(1.0) if area > f(64.0) else f(0.0)
-                fits += f(1.0) if area > f(256.0) else f(0.0)
-                fits += f(0.0) if reach2 < near2 else f(FAR)
-                meets = (rz < f(-1e-6)) & (reach2 < wall2)
-                out[j] = np.uint8(fits if meets else f(NOT_FLOOR))
+        # No branches and nothing but float32: the compiler takes many pixels at a time.
+        for j in range(TILE):
+            a, b, d = r[j], r[TILE + j], r[2 * TILE + j]
+            rx, ry = s00 * a + s01 * b + s02 * d, s10 * a + s11 * b + s12 * d
+            rz = s20 * a + s21 * b + s22 * d
+            per_z = f(1.0) / rz
+            t, slope_x, slope_y = -height * per_z, rx * per_z, ry * per_z
+            right, ahead = rx * t, ry * t
+            reach2 = right * right + ahead * ahead
+            a, b, d = r[3 * TILE + j], r[4 * TILE + j], r[5 * TILE + j]
+            dz = s20 * a + s21 * b + s22 * d
+            right_u = t * (s00 * a + s01 * b + s02 * d - slope_x * dz)
+            ahead_u = t * (s10 * a + s11 * b + s12 * d - slope_y * dz)
+            a, b, d = r[6 * TILE + j], r[7 * TILE + j], r[8 * TILE + j]
+            dz = s20 * a + s21 * b + s22 * d
+            right_v = t * (s00 * a + s01 * b + s02 * d - slope_x * dz)
+            ahead_v = t * (s10 * a + s11 * b + s12 * d - slope_y * dz)
+            right, ahead = right + eye_right, ahead + eye_ahead
+            x, y = ahead * c + right * s, ahead * s - right * c
+            n[j], n[TILE + j] = x0 + x, y0 + y
+            n[2 * TILE + j] = ahead_u * c + right_u * s
+            n[3 * TILE + j] = ahead_u * s - right_u * c
+            n[4 * TILE + j] = ahead_v * c + right_v * s
+            n[5 * TILE + j] = ahead_v * s - right_v * c
+            # The pixel keeps its place on the car, so its point sweeps over the floor.
+            n[6 * TILE + j], n[7 * TILE + j] = way * c - turn * y, way * s + turn * x
+            # The texture's cells double from level to level, their areas are four times as large.
+            area = abs(right_u * ahead_v - right_v * ahead_u) / cell2
+            fits = f(0.0)
+            fits += f(1.0) if area > f(1.0) else f(0.0)
+            fits += f(1.0) if area > f(4.0) else f(0.0)
+            fits += f(1.0) if area > f(16.0) else f(0.0)
+            fits += f(1.0) if area > f(64.0) else f(0.0)
+            fits += f(1.0) if area > f(256.0) else f(0.0)
+            fits += f(0.0) if reach2 < near2 else f(FAR)
+            meets = (rz < f(-1e-6)) & (reach2 < wall2)
+            seen[j] = np.uint8(fits if meets else f(NOT_FLOOR))
+        for j in range(TILE):
+            any_floor |= seen[j] ^ NOT_FLOOR
+    return any_floor != 0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_bare
 @no_type_check
-def bound_tiles(width, numbers, level, tiles):
-    """Find the box of floor that each tile of pixels covers, see :class:`FloorHits`; ``tiles`` is filled."""
-    columns, height = width // TILE, level.shape[0] // width
-    for tile in range(tiles.shape[0]):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        low_x, low_y, high_x, high_y, spread = 1e18, 1e18, -1e18, -1e18, 0.0
-        for v in range(top, min(top + TILE, height)):
-            n, seen = numbers[(v * width + left) * 8 :], level[v * width + left :]
-            for j in range(TILE):
-                if seen[j] != NOT_FLOOR:
-                    x, y = n[j], n[TILE + j]
-                    low_x, high_x = min(low_x, x), max(high_x, x)
-                    low_y, high_y = min(low_y, y), max(high_y, y)
-                    wide = abs(n[2 * TILE + j]) + abs(n[4 * TILE + j])
-                    long = abs(n[3 * TILE + j]) + abs(n[5 * TILE + j])
-                    sweep = abs(n[6 * TILE + j]) + abs(n[7 * TILE + j])
-                    spread = max(spread, wide + long + sweep)
-        # Half the sums would do along the axes, but things lie across them.
-        tiles[tile, 0], tiles[tile, 1] = low_x - spread, low_y - spread
-        tiles[tile, 2], tiles[tile, 3] = high_x + spread, high_y + spread
+def bound_tile(width, height, top, left, numbers, level, lanes):
+    """Find the box of floor that a tile of pixels covers.
+
+    Args:
+        width: Pixels per row, filled up.
+        height: Rows of the image.
+        top: See :func:`cast_tile`.
+        left: See there.
+        numbers: See there.
+        level: See there.
+        lanes: Buffer, five float32 per pixel of a tile's row.
+
+    Returns:
+        Lowest x and y, highest x and y from the rear axle, axes of the map.
+    """
+    far = np.float32(1e18)
+    for j in range(TILE):
+        lanes[j], lanes[TILE + j], lanes[2 * TILE + j], lanes[3 * TILE + j] = far, far, -far, -far
+        lanes[4 * TILE + j] = np.float32(0.0)
+    for v in range(top, min(top + TILE, height)):
+        n, seen = numbers[(v - top) * 8 * TILE :], level[v * width + left :]
+        # Each column of the tile for itself: the compiler takes many of them at a time.
+        for j in range(TILE):
+            floor = seen[j] != NOT_FLOOR
+            x, y = n[j], n[TILE + j]
+            wide = abs(n[2 * TILE + j]) + abs(n[4 * TILE + j])
+            long = abs(n[3 * TILE + j]) + abs(n[5 * TILE + j])
+            spread = wide + long + (abs(n[6 * TILE + j]) + abs(n[7 * TILE + j]))
+            lanes[j] = x if floor & (x < lanes[j]) else lanes[j]
+            lanes[TILE + j] = y if floor & (y < lanes[TILE + j]) else lanes[TILE + j]
+            lanes[2 * TILE + j] = x if floor & (x > lanes[2 * TILE + j]) else lanes[2 * TILE + j]
+            lanes[3 * TILE + j] = y if floor & (y > lanes[3 * TILE + j]) else lanes[3 * TILE + j]
+            lanes[4 * TILE + j] = spread if floor & (spread > lanes[4 * TILE + j]) else lanes[4 * TILE + j]
+    low_x, low_y, high_x, high_y, spread = 1e18, 1e18, -1e18, -1e18, 0.0
+    for j in range(TILE):
+        low_x, low_y = min(low_x, lanes[j]), min(low_y, lanes[TILE + j])
+        high_x, high_y = max(high_x, lanes[2 * TILE + j]), max(high_y, lanes[3 * TILE + j])
+        spread = max(spread, lanes[4 * TILE + j])
+    # Half the sums would do along the axes, but things lie across them.
+    return low_x - spread, low_y - spread, high_x + spread, high_y + spread

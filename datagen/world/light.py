@@ -6,8 +6,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
+from datagen.world.compiled import compiled_bare
 from datagen.world.ground import NOT_FLOOR, TILE
 
 _LAMP_REACH = 3.46  # distance, in widths, at which a lamp's glow ends
@@ -59,78 +59,83 @@ def mirror_lamps(
     return np.column_stack([eye_cm[:2] + towards, direction, along_cm, size_rad * slant, levels])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_bare
 @no_type_check
-def light_floor(out, width, numbers, level, tiles, origin, shadows, lamps, lamp_edge):
-    """Darken and brighten every pixel that sees the floor, in place.
+def light_tile(out, width, top, left, box, numbers, level, origin, lights, buffer):
+    """Darken and brighten every pixel of a tile that sees the floor, in place.
 
     Args:
         out: Image as rows of pixels, float32.
         width: Pixels per row, filled up.
-        numbers: See :class:`datagen.world.ground.FloorHits`.
+        top: See :func:`datagen.world.ground.cast_tile`.
+        left: See there.
+        box: See :func:`datagen.world.ground.bound_tile`.
+        numbers: See :func:`datagen.world.ground.cast_tile`.
         level: See there.
-        tiles: See there.
         origin: Rear-axle centre x and y.
-        shadows: x, y, cos and sin of the direction, half length, half width, softness, depth.
-        lamps: See :func:`mirror_lamps`.
-        lamp_edge: How hard their border is, from 1 on.
+        lights: Shadows: x, y, cos and sin of the direction, half length, half width, softness, depth; lamps,
+            see :func:`mirror_lamps`; how hard the lamps' border is, from 1 on.
+        buffer: Two float32 per pixel of a tile.
     """
     f = np.float32
-    columns, height = width // TILE, level.shape[0] // width
-    dark, bright = np.empty(TILE * TILE, np.float32), np.empty(TILE * TILE, np.float32)
-    for tile in range(tiles.shape[0]):
-        low_x, low_y, high_x, high_y = tiles[tile, 0], tiles[tile, 1], tiles[tile, 2], tiles[tile, 3]
-        if low_x > high_x:
+    shadows, lamps, lamp_edge = lights
+    dark, bright = buffer[: TILE * TILE], buffer[TILE * TILE :]
+    low_x, low_y, high_x, high_y = box
+    middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
+    half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
+    rows = min(TILE, level.shape[0] // width - top)
+    touched = False
+    for q in range(shadows.shape[0] + lamps.shape[0]):
+        is_shadow = q < shadows.shape[0]
+        thing = shadows[q] if is_shadow else lamps[q - shadows.shape[0]]
+        c, s = thing[2], thing[3]
+        x, y = middle_x - (thing[0] - origin[0]), middle_y - (thing[1] - origin[1])
+        soft = thing[6]
+        reach_a = thing[4] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[4]
+        reach_b = thing[5] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[5]
+        if abs(x * c + y * s) > reach_a + half_x * abs(c) + half_y * abs(s):
             continue
-        middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
-        half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
-        top, left = tile // columns * TILE, tile % columns * TILE
-        rows = min(TILE, height - top)
-        touched = False
-        for q in range(shadows.shape[0] + lamps.shape[0]):
-            is_shadow = q < shadows.shape[0]
-            thing = shadows[q] if is_shadow else lamps[q - shadows.shape[0]]
-            c, s = thing[2], thing[3]
-            x, y = middle_x - (thing[0] - origin[0]), middle_y - (thing[1] - origin[1])
-            soft = thing[6]
-            reach_a = thing[4] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[4]
-            reach_b = thing[5] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[5]
-            if abs(x * c + y * s) > reach_a + half_x * abs(c) + half_y * abs(s):
-                continue
-            if abs(y * c - x * s) > reach_b + half_x * abs(s) + half_y * abs(c):
-                continue
-            if not touched:
-                dark[:], bright[:] = 0.0, 0.0
-                touched = True
-            # Plain float32 loops over a row: the compiler takes many pixels at a time.
-            x0, y0, c, s = f(thing[0] - origin[0]), f(thing[1] - origin[1]), f(c), f(s)
-            if is_shadow:
-                reach_a, reach_b, per_soft, depth = f(reach_a), f(reach_b), f(1.0 / soft), f(thing[7])
-                for r in range(rows):
-                    n, row = numbers[8 * ((top + r) * width + left) :], dark[r * TILE :]
-                    for k in range(TILE):
-                        x, y = n[k] - x0, n[TILE + k] - y0
-                        a = min(max((reach_a - abs(x * c + y * s)) * per_soft, f(0.0)), f(1.0))
-                        b = min(max((reach_b - abs(y * c - x * s)) * per_soft, f(0.0)), f(1.0))
-                        share = depth * a * a * (f(3.0) - f(2.0) * a) * b * b * (f(3.0) - f(2.0) * b)
-                        # Shadows of one light do not add up.
-                        row[k] = max(row[k], share)
-            else:
-                per_a, per_b, glow, edge = f(1.0 / thing[4]), f(1.0 / thing[5]), f(thing[6]), f(lamp_edge)
-                for r in range(rows):
-                    n, row = numbers[8 * ((top + r) * width + left) :], bright[r * TILE :]
-                    for k in range(TILE):
-                        x, y = n[k] - x0, n[TILE + k] - y0
-                        a, b = (x * c + y * s) * per_a, (y * c - x * s) * per_b
-                        # Close to exp(-r^2 / 2), and it ends.
-                        fade = max(f(1.0) - (a * a + b * b) * f(1.0 / _LAMP_REACH**2), f(0.0))
-                        fade = fade * fade * fade
-                        row[k] += glow * min(edge * fade * fade, f(1.0))
-        if touched:
+        if abs(y * c - x * s) > reach_b + half_x * abs(s) + half_y * abs(c):
+            continue
+        if not touched:
+            dark[:], bright[:] = 0.0, 0.0
+            touched = True
+        # Plain float32 loops over a row: the compiler takes many pixels at a time.
+        x0, y0, c, s = f(thing[0] - origin[0]), f(thing[1] - origin[1]), f(c), f(s)
+        if is_shadow:
+            reach_a, reach_b, per_soft, depth = f(reach_a), f(reach_b), f(1.0 / soft), f(thing[7])
             for r in range(rows):
+                n, row = numbers[8 * TILE * r :], dark[r * TILE :]
                 for k in range(TILE):
-                    i = (top + r) * width + left + k
-                    if level[i] != NOT_FLOOR:
-                        keep, add = f(1.0) - dark[r * TILE + k], bright[r * TILE + k]
-                        for channel in range(3):
-                            out[i, channel] = out[i, channel] * keep + add
+                    x, y = n[k] - x0, n[TILE + k] - y0
+                    a = min(max((reach_a - abs(x * c + y * s)) * per_soft, f(0.0)), f(1.0))
+                    b = min(max((reach_b - abs(y * c - x * s)) * per_soft, f(0.0)), f(1.0))
+                    share = depth * a * a * (f(3.0) - f(2.0) * a) * b * b * (f(3.0) - f(2.0) * b)
+                    # Shadows of one light do not add up.
+                    row[k] = max(row[k], share)
+        else:
+            per_a, per_b, glow, edge = f(1.0 / thing[4]), f(1.0 / thing[5]), f(thing[6]), f(lamp_edge)
+            for r in range(rows):
+                n, row = numbers[8 * TILE * r :], bright[r * TILE :]
+                for k in range(TILE):
+                    x, y = n[k] - x0, n[TILE + k] - y0
+                    a, b = (x * c + y * s) * per_a, (y * c - x * s) * per_b
+                    # Close to exp(-r^2 / 2), and it ends.
+                    fade = max(f(1.0) - (a * a + b * b) * f(1.0 / _LAMP_REACH**2), f(0.0))
+                    fade = fade * fade * fade
+                    row[k] += glow * min(edge * fade * fade, f(1.0))
+    if not touched:
+        return
+    for r in range(rows):
+        i = (top + r) * width + left
+        seen, colours, shade, glow = (
+            level[i : i + TILE],
+            out[i : i + TILE],
+            dark[r * TILE :],
+            bright[r * TILE :],
+        )
+        for k in range(TILE):
+            if seen[k] != NOT_FLOOR:
+                keep, add = f(1.0) - shade[k], glow[k]
+                for channel in range(3):
+                    colours[k, channel] = colours[k, channel] * keep + add

@@ -12,6 +12,8 @@ from lanenet.config import Settings
 
 Bgr = tuple[float, float, float]
 _CONTRAST = 60.0  # grey levels between floor and paint, at least
+_DULL_CONTRAST = 45.0  # between floor and paint that has lost its brightness
+_DULLEST = 0.6
 
 
 class LookSettings(Settings):
@@ -54,6 +56,13 @@ class LookSettings(Settings):
         readout_s: Time from the first row of the image to the last.
         shake_pitch_rad: Standard deviation of the camera's pitch from frame to frame.
         shake_roll_rad: Standard deviation of its roll.
+        lamp_size: Factor on the size of the lamps overhead.
+        glints_per_m: Windows and lights far around, mirrored in the floor ahead, per metre of road.
+        specks_per_m: Crumbs, chips and drops on the floor, per metre of road.
+        prints_per_m: Figures printed or painted beside the road, clear of its lines, per metre of road.
+        stain_level: How much brighter (or darker, below 0) stains of the floor are; it needs a pattern, which
+            is to say a texture_level above 0, and so do cracks.
+        crack_level: How much darker cracks of the floor are.
     """
 
     floor: FloorKind = "plain"
@@ -92,6 +101,12 @@ class LookSettings(Settings):
     readout_s: float = Field(default=0.0, ge=0.0, le=0.2)
     shake_pitch_rad: float = Field(default=0.0, ge=0.0, le=0.2)
     shake_roll_rad: float = Field(default=0.0, ge=0.0, le=0.2)
+    lamp_size: float = Field(default=1.0, gt=0.0, le=5.0)
+    glints_per_m: float = Field(default=0.0, ge=0.0)
+    specks_per_m: float = Field(default=0.0, ge=0.0)
+    prints_per_m: float = Field(default=0.0, ge=0.0)
+    stain_level: float = Field(default=0.0, ge=-100.0, le=100.0)
+    crack_level: float = Field(default=0.0, ge=0.0, le=100.0)
 
 
 def random_look(
@@ -117,17 +132,22 @@ def random_look(
         "lamp_level": rng.uniform(40.0, 190.0),
         "clutter_per_m": max(0.0, rng.uniform(-0.5, 4.0)),
         "wall_level": rng.uniform(10.0, 45.0),
-        "exposure": float(np.exp(rng.uniform(np.log(0.7), np.log(1.2)))),
+        # Cameras that choose the exposure themselves make dark floors gray.
+        "exposure": float(np.exp(rng.uniform(np.log(0.7), np.log(1.45)))),
         "white_balance": tuple(float(v) for v in rng.uniform(0.9, 1.1, 3)),
         "vignetting": rng.uniform(0.0, 0.5),
         "blur_px": rng.uniform(0.0, 1.2),
-        "noise_level": rng.uniform(0.5, 7.0),
+        # Even in the logarithm: in good light most cameras show hardly any noise.
+        "noise_level": float(np.exp(rng.uniform(np.log(0.4), np.log(7.0)))),
         "jpeg_quality": int(rng.integers(60, 96)),
     }
     # What came later draws from a child of its own, so that the draws above stay as they were.
     later = rng.spawn(1)[0]
     drawn |= _random_motion(later) | _random_surroundings(later) | _other_floor(later)
+    newer = rng.spawn(1)[0]
+    drawn |= _random_marks(drawn, newer)
     drawn |= _lightened(drawn, paint_bgr)
+    drawn |= _dulled(drawn, paint_bgr, newer)
     kept = {name: getattr(fixed, name) for name in fixed.model_fields_set}
     return LookSettings(**{**drawn, **kept})
 
@@ -157,6 +177,35 @@ def _random_surroundings(rng: np.random.Generator) -> dict[str, Any]:
         "lamp_streak": rng.uniform(1.0, 2.0),
         "lamp_edge": float(np.exp(rng.uniform(0.0, np.log(5.0)))),
     }
+
+
+def _random_marks(drawn: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Specks, stains and cracks on two floors of five each, lights mirrored far ahead on every other one.
+
+    Mats mostly have something printed beside the road, other floors now and then. Real drives in
+    large rooms show several times the clutter of clean ones, see ``docs/reality.md``.
+    """
+    stain, crack, printed, glint = rng.uniform(-1.0, 1.0, 4)
+    specks, size, darker = rng.random(3)
+    prints = max(0.0, 0.5 + 1.5 * printed if drawn["floor"] == "mat" else 2.5 * (printed - 0.5))
+    return {
+        "specks_per_m": max(0.0, 14.0 * specks - 8.0),
+        "stain_level": (-1.0 if darker < 0.6 else 1.0) * max(0.0, 35.0 * stain - 5.0),
+        "crack_level": max(0.0, 50.0 * crack - 10.0),
+        "prints_per_m": prints,
+        "glints_per_m": max(0.0, 4.0 * glint),
+        "lamp_size": 0.4 + 0.8 * size,
+    }
+
+
+def _dulled(drawn: dict[str, Any], paint_bgr: tuple[Bgr, ...], rng: np.random.Generator) -> dict[str, Any]:
+    """Make the paint of every other drive duller, as thin or dirty tape is, but never hard to see."""
+    dull = max(0.0, rng.uniform(-1.0, 1.0))
+    paint = min((colour[1] for colour in paint_bgr), default=225.0)
+    least = max(_DULLEST, (drawn["floor_bgr"][1] + _DULL_CONTRAST) / max(paint, 1.0))
+    brightness = drawn["line_brightness"]
+    # Dark paint, or a light floor, leaves no room for it.
+    return {"line_brightness": brightness - dull * max(0.0, brightness - least)}
 
 
 def _other_floor(rng: np.random.Generator) -> dict[str, Any]:

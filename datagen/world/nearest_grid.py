@@ -1,7 +1,7 @@
 """Where to start looking for a point's place along the road: a grid of nearest samples.
 
-The grid is kept in square blocks, and only those that the road touches: a road of 200 m needs as much as its
-length, not the area that it spans. The renderer gets the blocks around the car, as one array.
+The grid comes in square blocks, filled when the car comes near them and kept for a while: a road of 200 m
+needs hardly more memory than one of 10 m. The renderer gets the blocks around the car, as one array.
 """
 
 from __future__ import annotations
@@ -10,33 +10,35 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
+from datagen.world.compiled import compiled
 from datagen.world.track import Track
 
 _GRID_CELL_CM = 2.0
 _GRID_MARGIN_CM = 10.0  # around the markings, for pixels that reach over from outside
 _BLOCK_CELLS = 128
+_MAX_BLOCKS = 32  # some more than lie around a car
 
 
 class NearestGrid:
     """The nearest sample of the centre line for places near a road."""
 
     def __init__(self, track: Track) -> None:
-        """Find the nearest samples of a whole road."""
+        """Find which blocks each stretch of a road touches."""
         #: How far from the centre line it answers.
         self.reach_cm = _GRID_MARGIN_CM + max(
             (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
         )
         self._low = track.xy_cm.min(axis=0) - self.reach_cm - _GRID_CELL_CM
+        self._xy_cm = track.xy_cm
+        self._samples = self._samples_by_block(track)
         self._blocks: dict[tuple[int, int], Int[np.ndarray, "b b"]] = {}
         self._window: tuple[tuple[int, ...], Int[np.ndarray, "r c"]] | None = None
-        self._fill(track)
 
     @property
     def blocks(self) -> int:
         """How many blocks the road touches."""
-        return len(self._blocks)
+        return len(self._samples)
 
     def around(
         self, low_cm: Float[np.ndarray, "2"], high_cm: Float[np.ndarray, "2"]
@@ -64,13 +66,27 @@ class NearestGrid:
         grid = np.full(((row1 - row0 + 1) * n, (column1 - column0 + 1) * n), -1, np.int32)
         for row in range(row0, row1 + 1):
             for column in range(column0, column1 + 1):
-                block = self._blocks.get((row, column))
-                if block is not None:
+                if (row, column) in self._samples:
                     i, j = (row - row0) * n, (column - column0) * n
-                    grid[i : i + n, j : j + n] = block
+                    grid[i : i + n, j : j + n] = self._block(row, column)
         return grid
 
-    def _fill(self, track: Track) -> None:
+    def _block(self, row: int, column: int) -> Int[np.ndarray, "b b"]:
+        """Return a block that the road touches."""
+        block = self._blocks.get((row, column))
+        if block is None:
+            if len(self._blocks) >= _MAX_BLOCKS:  # the oldest goes: memory stays flat on a long road
+                del self._blocks[next(iter(self._blocks))]
+            block = np.full((_BLOCK_CELLS, _BLOCK_CELLS), -1, np.int32)
+            x, y = self._low + np.array([column, row]) * (_BLOCK_CELLS * _GRID_CELL_CM)
+            best = np.full(block.shape, 1e18)
+            samples = self._samples[row, column]
+            _fill_grid(self._xy_cm, samples, x, y, _GRID_CELL_CM, self.reach_cm, best, block)
+            self._blocks[row, column] = block
+        return block
+
+    def _samples_by_block(self, track: Track) -> dict[tuple[int, int], Int[np.ndarray, "samples"]]:
+        """Return for each block that the road touches which samples of the centre line it may answer with."""
         size_cm = _BLOCK_CELLS * _GRID_CELL_CM
         low = np.floor((track.xy_cm - self.reach_cm - self._low) / size_cm).astype(int)
         high = np.floor((track.xy_cm + self.reach_cm - self._low) / size_cm).astype(int)
@@ -79,26 +95,10 @@ class NearestGrid:
             for row in range(low[i, 1], high[i, 1] + 1):
                 for column in range(low[i, 0], high[i, 0] + 1):
                     samples.setdefault((row, column), []).append(i)
-        best = np.empty((_BLOCK_CELLS, _BLOCK_CELLS))
-        for (row, column), index in samples.items():
-            block = np.full((_BLOCK_CELLS, _BLOCK_CELLS), -1, np.int32)
-            best.fill(1e18)
-            x, y = self._low + np.array([column, row]) * size_cm
-            _fill_grid(track.xy_cm, np.array(index), x, y, _GRID_CELL_CM, self.reach_cm, best, block)
-            self._blocks[row, column] = block
+        return {key: np.array(index) for key, index in samples.items()}
 
 
-def nearest_sample_grid(track: Track) -> tuple[Int[np.ndarray, "r c"], Float[np.ndarray, "3"]]:
-    """Nearest sample of the centre line by cell, -1 away from the road; origin and cell of the grid.
-
-    Over the whole road at once: for short ones only.
-    """
-    grid = NearestGrid(track)
-    reach_cm = grid.reach_cm
-    return grid.around(track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm)
-
-
-@njit(cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def _fill_grid(nodes_xy, index, origin_x, origin_y, cell, reach, best, grid):
     """Write into each cell within ``reach`` of the centre line the index of the nearest of some samples."""

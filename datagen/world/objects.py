@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.world.look import LookSettings
-from datagen.world.solids import BOX, CONE, CYLINDER, SOLID_COLUMNS
+from datagen.world.solid_shapes import BOX, CONE, CYLINDER, SOLID_COLUMNS
 from datagen.world.track import Track
 
 _STILL = (0.0, 0.0, 1.0, 0.0)  # swing in x and y, its period and phase, see datagen.world.light.moved
@@ -30,7 +30,7 @@ class Objects:
     """Things above the floor of one drive, and the shadows on it, frame map.
 
     Attributes:
-        solids: See :data:`datagen.world.solids.SOLID_COLUMNS`, then the swing, see
+        solids: See :data:`datagen.world.solid_shapes.SOLID_COLUMNS`, then the swing, see
             :func:`datagen.world.light.moved`.
         shadows: x, y, cos and sin of the direction, half length, half width, softness, depth, then the swing.
         light: cos and sin of the direction from which the light comes.

@@ -25,6 +25,11 @@ _CHUNKS_AHEAD = 2  # tasks per process that may wait: more would only fill the m
 _renderers: list[Renderer] = []
 
 
+def draw_state(renderer: Renderer, state: DriveState) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the frame of a drive at which the car is in this state."""
+    return renderer.render(state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s)
+
+
 def render_states(
     world: World, states: Sequence[DriveState], workers: int = 1
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
@@ -44,7 +49,7 @@ def render_states(
         LanenetError: If a process ends before its time.
     """
     if workers <= 1 or len(states) <= _CHUNK:
-        yield from (_draw(world.renderer, state) for state in states)
+        yield from (draw_state(world.renderer, state) for state in states)
         return
     # Spawned, because forking a process that has started OpenCV's threads can hang.
     context = multiprocessing.get_context("spawn")
@@ -76,8 +81,4 @@ def prepare_process() -> None:
 
 
 def _draw_chunk(states: Sequence[DriveState]) -> list[UInt8[np.ndarray, "h w 3"]]:
-    return [_draw(_renderers[0], state) for state in states]
-
-
-def _draw(renderer: Renderer, state: DriveState) -> UInt8[np.ndarray, "h w 3"]:
-    return renderer.render(state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s)
+    return [draw_state(_renderers[0], state) for state in states]

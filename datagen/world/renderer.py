@@ -6,26 +6,29 @@ a colour; walls and things above the floor are painted over; and the sensor make
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.ground import NEAR_CM, WALL_CM, FloorHits, PixelGround, bound_tiles, cast_rays
+from datagen.world.ground import NEAR_CM, NOT_FLOOR, TILE, WALL_CM, PixelGround
 from datagen.world.kernels import paint_floor
-from datagen.world.light import light_floor, mirror_lamps, moved
+from datagen.world.light import mirror_lamps, moved
 from datagen.world.look import LookSettings
 from datagen.world.motion import row_poses, shake_rotation
 from datagen.world.nearby import Nearby
 from datagen.world.nearest_grid import NearestGrid
 from datagen.world.scene import Scene, build_scene
-from datagen.world.sensor import corner_falloff, develop, paint_room
-from datagen.world.solids import SOLID_COLUMNS, paint_solids
+from datagen.world.sensor import as_jpeg, corner_falloff, develop, paint_room
+from datagen.world.solid_shapes import SOLID_COLUMNS
+from datagen.world.solids import paint_solids
 from datagen.world.textures import PATTERN_BGR, level_starts
 from datagen.world.track import Track
 from datagen.world.variation import Steps, Wander
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
 
 __all__ = ["PixelGround", "Renderer"]
 
@@ -33,6 +36,31 @@ _JOINT_WIDTH_CM = 0.4
 _NOISE_VALUES = 2**20
 _SHAKE_FRAMES = (3.0, 30.0)
 _JITTER = 0.5  # share of the shake's deviation that is new in every frame
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One frame's view.
+
+    Attributes:
+        pose: Rear-axle centre x, y and heading in the middle of the frame's time, frame map.
+        frame: Number of the frame.
+        eye_map_cm: Optical centre.
+        rotation: How the camera shakes, see :func:`datagen.world.motion.shake_rotation`.
+        rows: Where the car is when each image row is read, see :func:`datagen.world.motion.row_poses`.
+        way_cm: How far the car drives during the exposure.
+        turn_rad: By how much it turns meanwhile.
+        slack_rad: By how much it turns, at most, between the middle row and any other.
+    """
+
+    pose: Float[np.ndarray, "3"]
+    frame: int
+    eye_map_cm: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    rows: Float[np.ndarray, "h 4"]
+    way_cm: float
+    turn_rad: float
+    slack_rad: float
 
 
 class Renderer:
@@ -86,10 +114,18 @@ class Renderer:
         self._solids = _nearby_movers(objects.solids, WALL_CM)
         self._falloff = corner_falloff(camera.height, camera.width, look.vignetting)
         self._rays = self._ground.rays.ravel()
+        self._eye_car_cm = camera.mounting.position_car_cm
         # Filled anew for each frame; what no ray reaches stays black.
-        self._hits = FloorHits.empty(self._ground)
-        self._depth = np.zeros(len(self._hits.level), np.float32)
-        self._light = np.zeros((len(self._hits.level), 3), np.float32)
+        self._level = np.full(camera.height * self._ground.stride, NOT_FLOOR, np.uint8)
+        self._depth = np.zeros(len(self._level), np.float32)
+        self._room_buffers = (
+            np.zeros(2 * TILE, np.int32),
+            np.zeros(4 * TILE, np.float32),
+            np.zeros(4 * TILE, np.float32),
+        )
+        self._image = np.zeros((camera.height, camera.width, 3), np.uint8)
+        self._blurred = np.zeros((camera.height, camera.width, 3), np.float32)
+        self._light = np.zeros((len(self._level), 3), np.float32)
 
     def render(
         self,
@@ -114,103 +150,77 @@ class Renderer:
         frame_rng = np.random.default_rng((self._noise_seed, frame))
         first = int(frame_rng.integers(_NOISE_VALUES))
         shake = self._shake_at(frame, frame_rng.standard_normal(2))
-        heading = float(pose[2])
-        rows = row_poses(height, heading, speed_cm_s, yaw_rate_rad_s, look.readout_s)
-        way_cm, turn_rad = speed_cm_s * look.exposure_s, yaw_rate_rad_s * look.exposure_s
-        rotation = shake_rotation(shake[0], shake[1])
-        self._cast(pose, frame, rotation, rows, way_cm, turn_rad)
-        room, ground = self._scene.room, self._ground
+        eye_cm = map_from_car(self._eye_car_cm[None, :2], pose, self.camera.wheelbase_cm)[0]
+        view = _View(
+            pose=pose,
+            frame=frame,
+            eye_map_cm=np.array([*eye_cm, self._eye_car_cm[2]]),
+            rotation=shake_rotation(shake[0], shake[1]),
+            rows=row_poses(height, float(pose[2]), speed_cm_s, yaw_rate_rad_s, look.readout_s),
+            way_cm=speed_cm_s * look.exposure_s,
+            turn_rad=yaw_rate_rad_s * look.exposure_s,
+            slack_rad=0.5 * abs(yaw_rate_rad_s) * look.readout_s,
+        )
+        self._paint_floor(view)
+        ground = self._ground
         tilt = np.array([-shake[0], shake[1]])
         paint_room(
-            self._light, self._hits.level, ground.azimuth_rad, ground.elevation_rad, ground.toward, heading,
-            tilt, turn_rad, room,
+            self._light, self._level, ground.azimuth_rad, ground.elevation_rad, ground.toward, float(pose[2]),
+            tilt, view.turn_rad, self._scene.room, self._room_buffers,
         )  # fmt: skip
-        slack_rad = 0.5 * abs(yaw_rate_rad_s) * look.readout_s
-        self._paint_solids(pose, frame, rotation, rows, way_cm, turn_rad, slack_rad)
+        self._paint_solids(view)
         light = np.ascontiguousarray(self._light.reshape(height, -1, 3)[:, :width])
         if look.blur_px > 0.0:
-            light = cv2.GaussianBlur(light, (0, 0), look.blur_px)
-        image = np.empty((height, width, 3), dtype=np.uint8)
+            light = cv2.GaussianBlur(light, (0, 0), look.blur_px, dst=self._blurred)
+        image = np.empty((height, width, 3), np.uint8) if look.jpeg_quality is None else self._image
         gains = self._gains_at(frame)
         noise = self._noise[first : first + image.size]
         develop(light.ravel(), self._falloff, gains, noise, look.noise_level, image.ravel())
-        if look.jpeg_quality is not None:
-            _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, look.jpeg_quality])
-            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
-        return image
+        return image if look.jpeg_quality is None else as_jpeg(image, look.jpeg_quality)
 
-    def _cast(
-        self,
-        pose: Float[np.ndarray, "3"],
-        frame: int,
-        rotation: Float[np.ndarray, "3 3"],
-        rows: Float[np.ndarray, "h 4"],
-        way_cm: float,
-        turn_rad: float,
-    ) -> None:
+    def _paint_floor(self, view: _View) -> None:
         """Paint the floor: where the rays meet it, what lies there, and the light on it."""
-        ground, hits, width, x, y = self._ground, self._hits, self._ground.stride, pose[0], pose[1]
-        numbers, level, tiles = hits.numbers, hits.level, hits.tiles
-        cast_rays(
-            self._rays, ground.lowest, width, rotation, rows, ground.eye_cm, way_cm, turn_rad, numbers, level
-        )
-        bound_tiles(width, numbers, level, tiles)
+        ground, look, x, y = self._ground, self.look, view.pose[0], view.pose[1]
         origin = np.array([x, y])
-        road = (*self._grid.around(origin - 2.0 * NEAR_CM, origin + 2.0 * NEAR_CM), *self._road)
-        things = (*self._boxes.at(x, y), *self._clutter.at(x, y))
-        paint_floor(
-            self._light,
-            width,
-            numbers,
-            level,
-            tiles,
-            origin,
-            self._floor_bgr,
-            self._patterns,
-            road,
-            things,
-        )
-        shadows = moved(self._shadows.at(x, y)[0], frame)[:, :8]
-        look = self.look
+        grid = self._grid.around(origin - 2.0 * NEAR_CM, origin + 2.0 * NEAR_CM)
+        shadows = moved(self._shadows.at(x, y)[0], view.frame)[:, :8]
         if look.shadow_depth == 0.0:
             shadows = shadows[:0]
         lamps = mirror_lamps(
-            self._lamps.at(x, y)[0], self._eye_map_cm(pose), look.lamp_level, NEAR_CM, look.lamp_streak
+            self._lamps.at(x, y)[0], view.eye_map_cm, look.lamp_level, NEAR_CM, look.lamp_streak
         )
-        light_floor(self._light, width, numbers, level, tiles, origin, shadows, lamps, look.lamp_edge)
+        paint_floor(
+            self._light,
+            self._level,
+            self._rays,
+            ground.lowest,
+            ground.stride,
+            (view.rotation, view.rows, ground.eye_cm, view.way_cm, view.turn_rad),
+            origin,
+            self._floor_bgr,
+            self._patterns,
+            (*grid, *self._road),
+            (*self._boxes.at(x, y), *self._clutter.at(x, y)),
+            (shadows, lamps, look.lamp_edge),
+        )
 
-    def _paint_solids(
-        self,
-        pose: Float[np.ndarray, "3"],
-        frame: int,
-        rotation: Float[np.ndarray, "3 3"],
-        rows: Float[np.ndarray, "h 4"],
-        way_cm: float,
-        turn_rad: float,
-        slack_rad: float,
-    ) -> None:
+    def _paint_solids(self, view: _View) -> None:
         """Paint the things above the floor, the far ones first."""
-        near = self._solids.at(pose[0], pose[1])[0]
+        near = self._solids.at(view.pose[0], view.pose[1])[0]
         if not len(near):
             return
-        solids = moved(near, frame)[:, :SOLID_COLUMNS]
-        gap = solids[:, :2] - self._eye_map_cm(pose)[:2]
+        solids = moved(near, view.frame)[:, :SOLID_COLUMNS]
+        gap = solids[:, :2] - view.eye_map_cm[:2]
         distance = np.hypot(gap[:, 0], gap[:, 1])
         order = np.argsort(-distance, kind="stable")
         # What stands beyond the walls is not seen.
         order = order[distance[order] < WALL_CM + np.hypot(solids[order, 4], solids[order, 5])]
-        solids[:, :2] -= pose[:2]
+        solids[:, :2] -= view.pose[:2]
         ground, light = self._ground, self._scene.objects.light
         paint_solids(
-            self._light, self._depth, self._rays, ground.stride, ground.width, rotation, rows, ground.eye_cm,
-            way_cm, turn_rad, slack_rad, solids[order], light,
+            self._light, self._depth, self._rays, ground.stride, ground.width, view.rotation, view.rows,
+            ground.eye_cm, view.way_cm, view.turn_rad, view.slack_rad, solids[order], light,
         )  # fmt: skip
-
-    def _eye_map_cm(self, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Optical centre, frame map."""
-        right, ahead, height = self._ground.eye_cm
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        return np.array([pose[0] + ahead * c + right * s, pose[1] + ahead * s - right * c, height])
 
     def _shake_at(self, frame: int, jitter: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """Pitch (down) and roll of the camera at a frame: smooth, and a part that is new every time."""

@@ -9,7 +9,8 @@ from jaxtyping import Float, Float32
 
 from datagen.world.look import LookSettings
 from datagen.world.objects import Objects, place_objects
-from datagen.world.textures import floor_pattern, level_starts, noise, pack_levels
+from datagen.world.scatter import glints, places_beside, prints, specks
+from datagen.world.textures import cracks, floor_pattern, level_starts, noise, pack_levels, stains
 from datagen.world.track import Track
 
 _ROOM_COLUMNS, _ROOM_ROWS = 512, 64
@@ -37,7 +38,8 @@ class Scene:
         joint_shift_cm: Where the joints start.
         lamps: x, y, height above the floor, angular size, [cm], [rad].
         clutter: Rectangles: x, y, cos and sin of the direction, half length, half width, blue, green, red.
-        room: The walls, rows of elevation (0..90 degrees, from the floor up) by columns of azimuth.
+        room: The walls, rows of elevation (0..90 degrees, from the floor up) by columns of azimuth; a fourth
+            value fills up the colours.
         objects: Things above the floor, and shadows on it.
     """
 
@@ -47,7 +49,7 @@ class Scene:
     joint_shift_cm: Float[np.ndarray, "2"]
     lamps: Float[np.ndarray, "lamps 4"]
     clutter: Float[np.ndarray, "things 9"]
-    room: Float32[np.ndarray, "r c 3"]
+    room: Float32[np.ndarray, "r c 4"]
     objects: Objects
 
 
@@ -55,14 +57,21 @@ def build_scene(track: Track, look: LookSettings, rng: np.random.Generator) -> S
     """Draw the surroundings; each part has its own child of ``rng``, so that none moves another."""
     # The order is part of the format: a new part of the scene takes a new child at the end.
     texture_rng, joint_rng, lamp_rng, clutter_rng, room_rng, object_rng, shadow_rng = rng.spawn(7)
+    speck_rng, print_rng, glint_rng = rng.spawn(3)
+    lamps = _lamps(track, look.lamps_per_m, lamp_rng) * [1.0, 1.0, 1.0, look.lamp_size]
+    clutter = [
+        prints(track, look.prints_per_m, print_rng),
+        _clutter(track, look.clutter_per_m, clutter_rng),
+        specks(track, look.specks_per_m, look.floor_bgr, speck_rng),
+    ]
     texture, wear = _textures(look, texture_rng)
     return Scene(
         texture=texture,
         wear=wear,
         joint_rad=float(joint_rng.uniform(0.0, np.pi)),
         joint_shift_cm=joint_rng.uniform(0.0, 100.0, 2),
-        lamps=_lamps(track, look.lamps_per_m, lamp_rng),
-        clutter=_clutter(track, look.clutter_per_m, clutter_rng),
+        lamps=np.concatenate([lamps, glints(track, look.glints_per_m, glint_rng)]),
+        clutter=np.concatenate(clutter),
         room=_room(look.wall_level, room_rng),
         objects=place_objects(track, look, object_rng, shadow_rng),
     )
@@ -75,23 +84,31 @@ def _textures(
     if look.texture_level == 0.0 and look.line_wear == 0.0:
         nothing = np.zeros(level_starts()[-1], np.float32)
         return nothing, nothing
-    kind_rng = rng.spawn(1)[0]
-    wear = pack_levels(noise(look.texture_scale_cm, look.texture_stretch, rng))
-    if look.floor == "plain" or look.texture_level == 0.0:
+    kind_rng, stain_rng, crack_rng = rng.spawn(3)
+    worn = noise(look.texture_scale_cm, look.texture_stretch, rng)
+    wear = pack_levels(worn)
+    if look.texture_level == 0.0:
         return wear, wear
-    pattern = floor_pattern(look.floor, look.texture_scale_cm, look.texture_stretch, kind_rng)
-    return pack_levels(pattern), wear
+    pattern = worn
+    if look.floor != "plain":
+        pattern = floor_pattern(look.floor, look.texture_scale_cm, look.texture_stretch, kind_rng)
+    # The pattern is counted in texture levels.
+    if look.stain_level:
+        pattern = pattern + look.stain_level / look.texture_level * stains(stain_rng)
+    if look.crack_level:
+        pattern = pattern - look.crack_level / look.texture_level * cracks(crack_rng)
+    return (wear, wear) if pattern is worn else (pack_levels(pattern), wear)
 
 
 def _lamps(track: Track, per_m: float, rng: np.random.Generator) -> Float[np.ndarray, "lamps 4"]:
-    places = _places(track, per_m, 150.0, rng)
+    places = places_beside(track, per_m, 150.0, rng)
     height_cm = rng.uniform(150.0, 300.0, len(places))
     size_rad = rng.uniform(0.03, 0.1, len(places))
     return np.concatenate([places, height_cm[:, None], size_rad[:, None]], axis=1)
 
 
 def _clutter(track: Track, per_m: float, rng: np.random.Generator) -> Float[np.ndarray, "things 9"]:
-    places = _places(track, per_m, 70.0, rng)
+    places = places_beside(track, per_m, 70.0, rng)
     n = len(places)
     angle = rng.uniform(0.0, np.pi, n)
     strip = rng.random(n) < 0.5
@@ -102,18 +119,7 @@ def _clutter(track: Track, per_m: float, rng: np.random.Generator) -> Float[np.n
     return np.concatenate([places, shape, np.clip(colour, 0.0, 255.0)], axis=1)
 
 
-def _places(
-    track: Track, per_m: float, beside_cm: float, rng: np.random.Generator
-) -> Float[np.ndarray, "n 2"]:
-    """Random places within ``beside_cm`` of the centre line, [cm], frame map."""
-    n = int(rng.poisson(per_m * track.length_cm / 100.0))
-    i = rng.integers(len(track.s_cm), size=n)
-    offset_cm = rng.uniform(-beside_cm, beside_cm, n)
-    heading = track.heading_rad[i]
-    return track.xy_cm[i] + offset_cm[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-
-
-def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 3"]:
+def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 4"]:
     """Soft light on the walls, with doors, windows and furniture as upright rectangles."""
     azimuth = np.linspace(0.0, 2.0 * np.pi, _ROOM_COLUMNS, endpoint=False)
     shade = sum(np.cos(k * azimuth + rng.uniform(0.0, 2.0 * np.pi)) / k for k in range(1, 5))
@@ -129,4 +135,4 @@ def _room(level: float, rng: np.random.Generator) -> Float32[np.ndarray, "r c 3"
             rng.uniform(-1.5, 1.5) + rng.uniform(-0.3, 0.3, 3)
         )
     base = rng.uniform(90.0, 170.0) + rng.uniform(-10.0, 10.0, 3)
-    return np.clip(base + room, 0.0, 255.0).astype(np.float32)
+    return np.pad(np.clip(base + room, 0.0, 255.0).astype(np.float32), ((0, 0), (0, 0), (0, 1)))

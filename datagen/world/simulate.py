@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from datagen.world.closed_loop import ClosedLoop
 from datagen.world.drive_loop import DriveState, recorded_commands, scripted_states
 from datagen.world.pilot import Pilot, PilotSettings
-from datagen.world.render_pool import render_states
+from datagen.world.render_pool import draw_state, render_states
 from datagen.world.track_file import write_track
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import dump_settings
@@ -142,9 +142,7 @@ def frames_of(world: World) -> Iterator[SimulatedFrame]:
         yield SimulatedFrame(
             frame=state.frame,
             t_s=state.t_s,
-            image_bgr=world.renderer.render(
-                state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s
-            ),
+            image_bgr=draw_state(world.renderer, state),
             speed_cm_s=state.speed_cm_s,
             steering_rad=state.steering_rad,
             pose=state.pose,
@@ -168,7 +166,5 @@ def _piloted(
         frame = loop.next_frame()
         state, image = frame.state, frame.image_bgr
         if image is None:
-            image = world.renderer.render(
-                state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s
-            )
+            image = draw_state(world.renderer, state)
         yield state, image

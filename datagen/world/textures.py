@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from datagen.world.ground import TEXTURE_CELL_CM, TEXTURE_LEVELS
+from datagen.world.ground import TEXTURE_CELL_CM, TEXTURE_LEVELS, TEXTURE_SIDE
 
 FloorKind = Literal["plain", "asphalt", "wood", "tile", "carpet", "mat", "grass"]
 #: Factor on the pattern in blue, green and red: a floor's spots differ in colour too.
@@ -22,7 +22,7 @@ PATTERN_BGR: dict[str, tuple[float, float, float]] = {
     "mat": (1.0, 1.0, 1.0),
     "grass": (0.5, 1.25, 0.8),
 }
-_CELLS = 512  # the pattern repeats every 256 cm
+_CELLS = TEXTURE_SIDE
 _MAX_DEVIATION = 6.0
 
 Cells = Float[np.ndarray, "n n"]
@@ -65,6 +65,18 @@ def floor_pattern(kind: FloorKind, scale_cm: float, stretch: float, rng: np.rand
         base = 0.5 * base + _blades(rng)
     base = base - base.mean()
     return np.clip(base / max(float(base.std()), 1e-9), -_MAX_DEVIATION, _MAX_DEVIATION)
+
+
+def stains(rng: np.random.Generator) -> Cells:
+    """Draw spots with a ragged border, as of oil, water or mended floor: 1 inside, 0 outside."""
+    shape = noise(float(rng.uniform(1.5, 5.0)), 1.0, rng) + 0.2 * noise(0.6, 1.0, rng)
+    least = np.quantile(shape, rng.uniform(0.8, 0.97))
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip((shape - least) / rng.uniform(0.03, 0.25), -30.0, 30.0))))
+
+
+def cracks(rng: np.random.Generator) -> Cells:
+    """Draw a few cracks that wander over the floor: 1 inside, 0 outside."""
+    return np.minimum(_cracks(int(rng.integers(1, 6)), 0.5, 1.0, rng), 1.0)
 
 
 def level_starts() -> Int[np.ndarray, "starts"]:

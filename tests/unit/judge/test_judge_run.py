@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.datasets import DataSettings, SyntheticSettings, _synthetic_job
+from datagen.dataset_settings import DataSettings, SyntheticSettings
+from datagen.datasets import _synthetic_job
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
 from datagen.judge.wheels import DepartureCounter, wheel_offsets_cm

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from datagen.world.furniture import Furniture, Junction, StopLine
-from datagen.world.nearest_grid import NearestGrid, nearest_sample_grid
+from datagen.world.nearest_grid import NearestGrid
 from datagen.world.paint import is_painted, paint_solid, subtract, wear_off
 from datagen.world.track import MarkingSettings, Track, TrackSettings, preset, random_track
 from datagen.world.track_file import read_track, write_track
@@ -234,7 +234,8 @@ def test_the_grid_answers_with_the_nearest_sample(key):
     track = _TRACKS[key]
     grid = NearestGrid(track)
     rng = np.random.default_rng(2)
-    whole, frame = nearest_sample_grid(track)
+    reach_cm = grid.reach_cm
+    whole, frame = grid.around(track.xy_cm.min(axis=0) - reach_cm, track.xy_cm.max(axis=0) + reach_cm)
     for s in rng.uniform(0.0, track.length_cm, 20):
         xy, _ = track.point(s, rng.uniform(-20.0, 20.0))
         window, origin = grid.around(xy - 200.0, xy + 200.0)
@@ -255,6 +256,11 @@ def test_a_long_road_costs_its_length_only():
     assert grid.blocks < 300
     window, _ = grid.around(track.xy_cm[500] - 280.0, track.xy_cm[500] + 280.0)
     assert window.size <= (5 * 128) ** 2
+    first = window.copy()
+    for xy in track.xy_cm[::400]:
+        grid.around(xy - 280.0, xy + 280.0)
+    assert 5 <= len(grid._blocks) <= 32  # the rest was let go, and comes back as it was
+    np.testing.assert_array_equal(grid.around(track.xy_cm[500] - 280.0, track.xy_cm[500] + 280.0)[0], first)
 
 
 def test_track_files_keep_the_new_parts_and_old_ones_are_read(tmp_path):

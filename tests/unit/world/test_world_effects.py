@@ -8,6 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from datagen.world.bare_floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
+from datagen.world.ground import FAR, NOT_FLOOR, TEXTURE_SIDE, TILE
 from datagen.world.look import LookSettings, random_look
 from datagen.world.motion import row_poses, shake_rotation
 from datagen.world.nearby import Nearby
@@ -272,8 +274,11 @@ def test_dark_paint_gets_a_light_floor():
         both = random_look(LookSettings(), np.random.default_rng(seed), (black, white))
         assert np.mean(only_black.floor_bgr) - 25.0 >= 55.0
         assert np.mean(both.floor_bgr) - 25.0 >= 55.0 and 235.0 - np.mean(both.floor_bgr) >= 55.0
-        assert only_black.model_copy(update={"floor_bgr": free.floor_bgr}) == free
-        assert random_look(LookSettings(), np.random.default_rng(seed), (white,)) == free
+        # Paint has a say in how light the floor is and how dull the paint, and in nothing else.
+        paint = {"line_brightness": free.line_brightness}
+        assert only_black.model_copy(update={"floor_bgr": free.floor_bgr, **paint}) == free
+        only_white = random_look(LookSettings(), np.random.default_rng(seed), (white,))
+        assert only_white.model_copy(update=paint) == free
 
 
 @pytest.mark.parametrize("width", [50, 96])
@@ -282,3 +287,23 @@ def test_any_width_is_drawn_to_its_last_column(width):
     image = _renderer(camera=camera, texture_level=5.0).render(_pose(), 0)
     assert image.shape == (37, width, 3)
     assert image[30:, -1].min() > 30
+
+
+@pytest.mark.parametrize("motion_cm", [0.0, 0.4, 1.2, 4.0, 20.0])
+def test_a_row_of_pixels_takes_the_same_pattern_as_each_of_them_alone(motion_cm):
+    rng = np.random.default_rng(3)
+    starts, cj, sj = level_starts(), np.cos(0.7), np.sin(0.7)
+    texture = pack_levels(rng.standard_normal((TEXTURE_SIDE, TEXTURE_SIDE)))
+    row, index = np.zeros(ROW_NUMBERS), np.zeros(ROW_INDICES, np.int64)
+    for fits in (0, 2, 5, FAR + 1):
+        numbers = rng.uniform(-300.0, 300.0, 8 * TILE).astype(np.float32)
+        numbers[6 * TILE :] = motion_cm
+        alike, mixed = np.full(TILE, fits, np.uint8), np.full(TILE, fits, np.uint8)
+        mixed[-1] = NOT_FLOOR
+        shades = []
+        for seen in (alike, mixed):  # the quick way for neighbours of one level, and one by one
+            place_row(seen, numbers, 2000.0, -700.0, cj, sj, row, index)
+            shade_row(seen, numbers, texture, starts, 7.0, cj, sj, row, index)
+            shades.append(row[SHADE : SHADE + TILE - 1].copy())
+        np.testing.assert_array_equal(shades[0], shades[1])
+        assert np.abs(shades[0]).max() > 0.01

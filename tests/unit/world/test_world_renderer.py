@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.world.kernels import box_share, locate, painted_share
+from datagen.world.coverage import box_share, painted_share
+from datagen.world.kernels import locate
 from datagen.world.light import mirror_lamps
 from datagen.world.look import LookSettings, random_look
 from datagen.world.renderer import PixelGround, Renderer

@@ -11,7 +11,7 @@ from datagen.world.nearby import Nearby
 from datagen.world.objects import place_objects
 from datagen.world.renderer import Renderer
 from datagen.world.rig import CameraSettings
-from datagen.world.solids import BOX, CONE, CYLINDER, SOLID_COLUMNS
+from datagen.world.solid_shapes import BOX, CONE, CYLINDER, SOLID_COLUMNS
 from datagen.world.track import TrackSettings, random_track
 from lanenet.geometry.camera import Camera
 

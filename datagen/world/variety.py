@@ -1,0 +1,106 @@
+"""Drives of many cars on many roads: cameras near a given one, roads of all kinds, other speeds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from datagen.world.rig import CameraSettings
+from datagen.world.script import DriverSettings
+from datagen.world.track_settings import TrackSettings, preset
+from lanenet.geometry.camera import Camera
+
+#: Share of the drives on roads drawn from scratch; the others are on presets.
+_DRAWN_SHARE = 0.5
+#: Presets of roads that home-made cars are driven on.
+_PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
+
+
+def camera_like(camera: Camera) -> CameraSettings:
+    """Return the settings of a camera with the lens, the image size and the mounting of another.
+
+    The principal point goes to the middle of the image; a pinhole's fifth coefficient is left out.
+    """
+    mounting, half_px = camera.mounting, 0.5 * camera.width
+    centre = np.array([[camera.K[0, 2] + half_px, camera.K[1, 2]]])
+    ray = camera.unproject(centre)[0]
+    half_rad = (
+        math.atan2(math.hypot(ray[0], ray[1]), ray[2]) if np.isfinite(ray).all() else camera.max_angle_rad
+    )
+    coefficients = [*map(float, camera.D[:4]), 0.0, 0.0, 0.0, 0.0]
+    return CameraSettings(
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        field_of_view_rad=2.0 * half_rad,
+        distortion=(coefficients[0], coefficients[1], coefficients[2], coefficients[3]),
+        height_cm=mounting.height_cm,
+        pitch_down_rad=mounting.pitch_down_rad,
+        roll_rad=mounting.roll_rad,
+        yaw_rad=mounting.yaw_rad,
+        ahead_of_front_axle_cm=mounting.ahead_of_front_axle_cm,
+        right_of_centre_cm=mounting.right_of_centre_cm,
+    )
+
+
+def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSettings:
+    """Draw a camera near another: what differs between two cars built from the same parts.
+
+    Field of view within a tenth, pitch within 4 degrees, roll and yaw within 1.5, height 13 to 25 cm.
+    """
+    wider, pitch, roll, yaw = rng.uniform(-1.0, 1.0, 4)
+    height_cm = float(np.exp(rng.uniform(np.log(13.0), np.log(25.0))))
+    return camera.model_copy(
+        update={
+            "field_of_view_rad": camera.field_of_view_rad * (1.0 + 0.1 * wider),
+            "pitch_down_rad": camera.pitch_down_rad + math.radians(4.0) * pitch,
+            "roll_rad": camera.roll_rad + math.radians(1.5) * roll,
+            "yaw_rad": camera.yaw_rad + math.radians(1.5) * yaw,
+            "height_cm": height_cm,
+        }
+    )
+
+
+def vary_road(rng: np.random.Generator) -> TrackSettings:
+    """Draw a kind of road: one of the presets, or tape laid out on a floor.
+
+    Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm;
+    every other road has two lanes, on one of eight the line on the right is dashed too, and from every other
+    one up to a sixth of the tape has come off in short stretches.
+    """
+    drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
+    two_lanes, width, tape, gaps, dash, gap, right, worn = rng.random(8)
+    if drawn >= _DRAWN_SHARE:
+        return preset(_PRESETS[number])
+    lane_cm = float(30.0 * 2.3**width)
+    dashes = {
+        "dash_cm": 8.0 + 22.0 * dash,
+        "gap_cm": 5.0 + 25.0 * gap,
+        "wear": max(0.0, 0.32 * worn - 0.16),
+    }
+    road = {
+        "lane_width_cm": lane_cm,
+        "line_width_cm": float(1.5 * 3.4**tape),
+        "min_radius_cm": max(60.0, 1.1 * lane_cm),
+        "interruptions_per_m": 0.2 * gaps,
+        "right": {"kind": "dashed" if right < 0.125 else "solid", **dashes},
+    }
+    left = {"kind": "random", "colour": "random", **dashes}
+    road |= {"lanes": 2, "middle": left} if two_lanes < 0.5 else {"left": left}
+    return TrackSettings.model_validate(road)
+
+
+def vary_driver(lane_width_cm: float, rng: np.random.Generator) -> DriverSettings:
+    """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every fourth one further.
+
+    People who drive by hand keep to no line: for stretches they have one wheel on a marking.
+    """
+    speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(150.0))))
+    recovers, wander, recover = rng.random(3)
+    return DriverSettings(
+        style="recover" if recovers < 0.25 else "wander",
+        speed_cm_s=speed_cm_s,
+        wander_cm=lane_width_cm * (0.08 + 0.22 * wander),
+        recover_cm=lane_width_cm * (0.2 + 0.2 * recover),
+    )

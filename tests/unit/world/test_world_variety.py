@@ -1,0 +1,62 @@
+"""Cameras near a given one, and roads of all kinds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from datagen.world.rig import CameraSettings
+from datagen.world.track import random_track
+from datagen.world.variety import camera_like, vary_camera, vary_driver, vary_road
+from lanenet.geometry.camera import Camera, Mounting
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [("fisheye", [-0.03, 0.0, 0.0, 0.0]), ("pinhole", [-0.2, 0.03, 0.0, 0.0, 0.0])],
+)
+def test_a_camera_comes_back_from_its_settings(model, D):
+    K = np.array([[105.0, 0.0, 79.5], [0.0, 105.0, 59.5], [0.0, 0.0, 1.0]])
+    mounting = Mounting(17.0, 0.3, 0.02, -0.01, 3.0, 1.0)
+    camera = Camera(model, 160, 120, K, np.array(D), mounting, 24.0)
+    again = camera_like(camera).build(24.0)
+    np.testing.assert_allclose(again.K, K, rtol=1e-4)
+    assert again.mounting == mounting
+    np.testing.assert_allclose(again.D, D[:4])
+
+
+def test_cameras_vary_around_the_given_one():
+    base = CameraSettings(width=160, height=120, field_of_view_rad=2.0, pitch_down_rad=0.3)
+    drawn = [vary_camera(base, np.random.default_rng(seed)) for seed in range(60)]
+    pitch = np.array([camera.pitch_down_rad for camera in drawn])
+    assert np.abs(pitch - 0.3).max() <= math.radians(4.0) and pitch.std() > 0.02
+    fields = np.array([camera.field_of_view_rad for camera in drawn])
+    assert 1.8 <= fields.min() < 1.85 and 2.15 < fields.max() <= 2.2
+    heights = np.array([camera.height_cm for camera in drawn])
+    assert heights.min() >= 13.0 and heights.max() <= 25.0
+    assert all((camera.width, camera.height) == (160, 120) for camera in drawn)
+    assert vary_camera(base, np.random.default_rng(3)) == drawn[3]
+
+
+def test_roads_vary_and_can_be_laid():
+    roads = [vary_road(np.random.default_rng(seed)) for seed in range(60)]
+    widths = {round(road.lane_width_cm, 2) for road in roads}
+    assert len(widths) > 20 and {road.lanes for road in roads} == {1, 2}
+    assert sum(road.preset is not None for road in roads) in range(18, 43)
+    own = [road for road in roads if road.preset is None]
+    assert all(30.0 <= road.lane_width_cm <= 69.0 and 1.5 <= road.line_width_cm <= 5.1 for road in own)
+    assert {road.right.kind for road in own} == {"solid", "dashed"}
+    for seed, road in enumerate(own[:4]):
+        track = random_track(road.model_copy(update={"length_cm": 400.0}), np.random.default_rng(seed))
+        assert len(track.markings) >= 2
+
+
+def test_drivers_keep_to_their_lane():
+    drivers = [vary_driver(40.0, np.random.default_rng(seed)) for seed in range(60)]
+    assert {driver.style for driver in drivers} == {"wander", "recover"}
+    speeds = [driver.speed_cm_s for driver in drivers]
+    assert all(40.0 <= speed <= 150.0 for speed in speeds if speed is not None) and None not in speeds
+    # The middle of the car stays between the lines.
+    assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 16.0 for driver in drivers)
