@@ -165,11 +165,17 @@ def associate(
     edge_normals,
     gate_px,
     min_dot,
+    width,
+    height,
+    in_view,
+    matched,
     out_point,
     out_edge,
     out_pair,
 ):
     """Find for every point of frame i the nearest edge of frame j that brightens the same way.
+
+    ``in_view`` and ``matched`` count how often each point fell into the other picture, and met an edge there.
 
     Returns:
         Number of associations written.
@@ -199,6 +205,8 @@ def associate(
             length = np.hypot(nu, nv)
             if not length > 1e-9:
                 continue
+            if 0.0 <= u < width and 0.0 <= v < height:
+                in_view[p] += 1
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
             for q in range(edge_starts[j], edge_starts[j + 1]):
@@ -207,6 +215,7 @@ def associate(
                 if d < best and edge_normals[q, 0] * nu + edge_normals[q, 1] * nv > min_dot:
                     best, chosen = d, q
             if chosen >= 0:
+                matched[p] += 1
                 out_point[count], out_edge[count], out_pair[count] = p, chosen, k
                 count += 1
     return count
