@@ -47,7 +47,7 @@ class BundleSettings(Settings):
         frame_pitch: Of each frame's pitch about the mounting's.
         frame_roll: Of each frame's roll.
         slip: Of the rear axle's sideways motion per frame.
-        speed_change: Of the change of the way per frame, from one frame to the next.
+        speed_change: Of the change of the way per frame, from one frame to the next, against the commanded.
         turn_change: Of the change of turn per frame, from one frame to the next.
     """
 
@@ -67,7 +67,7 @@ class BundleSettings(Settings):
     frame_pitch: float = Field(default=0.012, gt=0.0)
     frame_roll: float = Field(default=0.006, gt=0.0)
     slip: float = Field(default=0.004, gt=0.0)
-    speed_change: float = Field(default=0.01, gt=0.0)
+    speed_change: float = Field(default=0.003, gt=0.0)
     turn_change: float = Field(default=0.01, gt=0.0)
 
 
@@ -110,6 +110,7 @@ def adjust(
     loops: Sequence[tuple[int, int]] = (),
     tilt: Float[np.ndarray, "n 2"] | None = None,
     breaks: Bool[np.ndarray, "n"] | None = None,
+    expected: Float[np.ndarray, "n"] | None = None,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
@@ -123,11 +124,12 @@ def adjust(
         loops: More pairs of frames that show the same place.
         tilt: Start of the frames' tilts; None for level.
         breaks: Frames that do not follow the one before them.
+        expected: Commanded way from the frame before, 1 where it is the usual one; None for the same all along.
 
     Returns:
         The adjusted drive.
     """
-    problem = _Problem(edges, camera, settings, rng, free, loops, breaks)
+    problem = _Problem(edges, camera, settings, rng, free, loops, breaks, expected)
     height = camera.mounting.height_cm
     state = problem.start(poses / [height, height, 1.0], tilt)
     for gate_px in settings.gates_px:
@@ -174,6 +176,7 @@ class _Links:
 
     point: Int[np.ndarray, "r"]
     edge: Int[np.ndarray, "r"]
+    sigma: Float[np.ndarray, "r"]
     pair_starts: Int[np.ndarray, "p1"]
 
 
@@ -187,6 +190,7 @@ class _Problem:
         free: Sequence[str],
         loops: Sequence[tuple[int, int]],
         breaks: Bool[np.ndarray, "n"] | None,
+        expected: Float[np.ndarray, "n"] | None = None,
     ) -> None:
         self.settings, self.camera, self.n = settings, camera, len(edges)
         self.fisheye = camera.model == "fisheye"
@@ -218,8 +222,8 @@ class _Problem:
         self.pairs = np.concatenate(pairs).astype(np.int64)
         self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
-        weight = 1.0 / settings.pixel_sigma**2
-        self.weight = np.full(len(self.uv), weight)
+        self.weight = np.full(len(self.uv), 1.0 / settings.pixel_sigma**2)
+        self.expected = np.ones(self.n) if expected is None else expected
         scale = camera.width / 160.0
         s = settings
         self.camera_sigmas = np.array(
@@ -274,6 +278,7 @@ class _Problem:
     def associate(self, state: _State, gate_px: float) -> _Links:
         lifted, _, normal = self._lift(state)
         point, edge, pair = (np.empty(self.moved_points, np.int64) for _ in range(3))
+        sigma = np.empty(self.moved_points)
         in_view, matched = np.zeros(len(self.uv), np.int64), np.zeros(len(self.uv), np.int64)
         count = associate(
             self.fisheye,
@@ -297,10 +302,11 @@ class _Problem:
             point,
             edge,
             pair,
+            sigma,
         )
         self.weight = point_trust(in_view, matched) / self.settings.pixel_sigma**2
         starts = np.searchsorted(pair[:count], np.arange(len(self.pairs) + 1))
-        return _Links(point[:count], edge[:count], starts.astype(np.int64))
+        return _Links(point[:count], edge[:count], sigma[:count], starts.astype(np.int64))
 
     def equations(self, state: _State, links: _Links) -> tuple[float, csc_matrix, np.ndarray, np.ndarray]:
         lifted, by, _ = self._lift(state)
@@ -321,6 +327,7 @@ class _Problem:
             by,
             self.edge_uv,
             self.edge_normals,
+            links.sigma,
             self.weight,
             _STEPS,
             self.active,
@@ -380,15 +387,18 @@ class _Problem:
         add(across, s.slip, (xi, sm), (yi, -cm), (xj, -sm), (yj, cm), (ti, -0.5 * along), (tj, -0.5 * along))
         follows = np.flatnonzero(j[:-1] == i[1:])
         a, b = follows, follows + 1
+        # Ways in proportion to what was commanded; where the car was told to stand, its way is left alone.
+        per = np.where(self.expected[j] > 0.0, 1.0 / np.maximum(self.expected[j], 0.1), 0.0)
+        per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
         add(
-            along[b] - along[a],
+            per_b * along[b] - per_a * along[a],
             s.speed_change,
-            (xj[b], cm[b]),
-            (yj[b], sm[b]),
-            (xi[b], -cm[b] - cm[a]),
-            (yi[b], -sm[b] - sm[a]),
-            (xi[a], cm[a]),
-            (yi[a], sm[a]),
+            (xj[b], per_b * cm[b]),
+            (yj[b], per_b * sm[b]),
+            (xi[b], -per_b * cm[b] - per_a * cm[a]),
+            (yi[b], -per_b * sm[b] - per_a * sm[a]),
+            (xi[a], per_a * cm[a]),
+            (yi[a], per_a * sm[a]),
         )
         add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
         # The first pose stays; camera priors, hard where a number is not free.
@@ -438,9 +448,7 @@ class _Problem:
         return _State(state.poses + frames[:, :3], state.tilt + frames[:, 3:], lens, mount)
 
 
-def point_trust(
-    in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]
-) -> Float[np.ndarray, "m"]:
+def point_trust(in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
     """Trust in each moved point by how often it met an edge.
 
     Noise meets an edge by chance, wherever it is moved; its residual then only says that all may stay as it

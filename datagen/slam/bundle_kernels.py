@@ -17,6 +17,8 @@ N_CAMERA = 8
 #: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
 N_FRAME = 5
 _NEWTON_STEPS = 8
+#: Points that would be drawn out more than this, across their edge, are not moved.
+_MAX_STRETCH = 4.0
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -172,10 +174,12 @@ def associate(
     out_point,
     out_edge,
     out_pair,
+    out_sigma,
 ):
     """Find for every point of frame i the nearest edge of frame j that brightens the same way.
 
-    ``in_view`` and ``matched`` count how often each point fell into the other picture, and met an edge there.
+    ``out_sigma`` is the standard deviation of the residual to come in that of an edge's place in its own picture:
+    an edge seen far ahead is a wide band where the road is near. ``in_view`` and ``matched`` count how often each point fell into the other picture, and met an edge there.
 
     Returns:
         Number of associations written.
@@ -203,7 +207,9 @@ def associate(
                 else:
                     nu, nv = u1 - u, v1 - v
             length = np.hypot(nu, nv)
-            if not length > 1e-9:
+            # The moved point is half a pixel long: how uncertain its place in the other picture is.
+            stretch = 2.0 * length
+            if not 1e-9 < stretch < _MAX_STRETCH:
                 continue
             if 0.0 <= u < width and 0.0 <= v < height:
                 in_view[p] += 1
@@ -217,6 +223,7 @@ def associate(
             if chosen >= 0:
                 matched[p] += 1
                 out_point[count], out_edge[count], out_pair[count] = p, chosen, k
+                out_sigma[count] = np.sqrt(0.5 * (1.0 + stretch * stretch))
                 count += 1
     return count
 
@@ -237,6 +244,7 @@ def accumulate(
     lifted_by,
     edge_uv,
     edge_normals,
+    link_sigma,
     point_weight,
     steps,
     active,
@@ -276,9 +284,9 @@ def accumulate(
                 residual[r] = np.nan
                 continue
             residual[r] = e
-            s = e / cauchy_px
+            s = e / (link_sigma[r] * cauchy_px)
             cost += 0.5 * point_weight[p] * cauchy_px * cauchy_px * np.log1p(s * s)
-            w = point_weight[p] / (1.0 + s * s)
+            w = point_weight[p] / ((1.0 + s * s) * link_sigma[r] * link_sigma[r])
             h = 1e-4
             u1, v1 = _project_point(fisheye, lens, m, forward + h, left, -1, 0.0)
             g_f = ((u1 - u) * nu + (v1 - v) * nv) / h

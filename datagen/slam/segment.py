@@ -12,7 +12,7 @@ from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
-from datagen.slam.mapper import SteeringFit, commands_of, track
+from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
 from datagen.slam.places import (
     Revisit,
     consistent_revisits,
@@ -106,7 +106,8 @@ def solve_segment(
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
     free = _OPEN_LOOP if find_camera else ()
-    opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free)
+    expected = _relative_ways(commands)
+    opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected)
     scans = scans_of(edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
     found = [
@@ -114,15 +115,17 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    closure = _close(edges, opened, matched, settings, rng, free)
+    closure = _close(edges, opened, matched, settings, rng, free, expected)
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
             edges = edges_of_drive(drive, settings.perception.edges, RoadTable(bundle.camera, limits))
             before, loops = bundle.camera.K[0, 0], _loops(closure.revisits, len(drive))
-            start = bundle.camera
-            bundle = adjust(edges, bundle.poses, start, settings.bundle, rng, loops=loops, tilt=bundle.tilt)
+            bundle = adjust(
+                edges, bundle.poses, bundle.camera, settings.bundle, rng,
+                loops=loops, tilt=bundle.tilt, expected=expected,
+            )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
     if closure is not None:
@@ -158,6 +161,7 @@ def _close(
     settings: MapSettings,
     rng: np.random.Generator,
     free: Sequence[str],
+    expected: Float[np.ndarray, "n"],
 ) -> _Closure | None:
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
     best: _Closure | None = None
@@ -165,10 +169,18 @@ def _close(
     for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
         poses, missed = close_loops(opened.poses, revisits, height)
         loops = _loops(revisits, len(poses))
-        closed = adjust(edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt)
+        closed = adjust(
+            edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt, expected=expected
+        )
         if best is None or closed.misfit < best.bundle.misfit:
             best = _Closure(revisits, missed, drift, closed)
     return best
+
+
+def _relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
+    """Commanded way per frame relative to the usual one; 0 where the car was told to stand."""
+    moving = commands.distance_cm[commands.distance_cm > 0.0]
+    return commands.distance_cm / (float(np.median(moving)) if moving.size else 1.0)
 
 
 def _loops(revisits: list[Revisit], frames: int) -> list[tuple[int, int]]:
