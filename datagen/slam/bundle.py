@@ -124,7 +124,7 @@ def adjust(
         loops: More pairs of frames that show the same place.
         tilt: Start of the frames' tilts; None for level.
         breaks: Frames that do not follow the one before them.
-        expected: Commanded way from the frame before, 1 where it is the usual one; None for the same all along.
+        expected: Commanded way from the frame before, 1 where it is usual; None for the same all along.
 
     Returns:
         The adjusted drive.
@@ -403,7 +403,7 @@ class _Problem:
         add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
         # The first pose stays; camera priors, hard where a number is not free.
         add(np.zeros(3), 1e-6, (np.arange(3), np.ones(3)))
-        sigma = np.where(self.free, self.camera_sigmas, 1e-9)
+        camera_sigma = np.where(self.free, self.camera_sigmas, 1e-9)
         lens, mount = self.prior
         off = np.array(
             [
@@ -412,7 +412,7 @@ class _Problem:
                 *(state.mount[:4] - mount[:4]),
             ]
         )
-        add(off, sigma, (N_FRAME * n + np.arange(N_CAMERA), np.ones(N_CAMERA)))
+        add(off, camera_sigma, (N_FRAME * n + np.arange(N_CAMERA), np.ones(N_CAMERA)))
         e = np.concatenate(errors)
         jac = coo_matrix(
             (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),

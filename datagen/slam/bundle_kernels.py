@@ -178,8 +178,9 @@ def associate(
 ):
     """Find for every point of frame i the nearest edge of frame j that brightens the same way.
 
-    ``out_sigma`` is the standard deviation of the residual to come in that of an edge's place in its own picture:
-    an edge seen far ahead is a wide band where the road is near. ``in_view`` and ``matched`` count how often each point fell into the other picture, and met an edge there.
+    ``out_sigma`` is the standard deviation of the residual to come, in that of an edge's place in its own
+    picture: an edge seen far ahead is a wide band where the road is near. ``in_view`` and ``matched`` count
+    how often each point fell into the other picture, and met an edge there.
 
     Returns:
         Number of associations written.
