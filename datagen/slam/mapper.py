@@ -18,6 +18,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import left_from_donkey
 
 _MAX_LAG = 10  # frames
+_LONGEST_STEP = 3.0  # usual times between frames
 #: Factors to try on a recorded speed, whose gain is not known exactly.
 _GAINS = np.array([0.75, 0.82, 0.9, 1.0, 1.1, 1.21, 1.33])
 
@@ -70,11 +71,13 @@ def commands_of(drive: Drive, wheelbase_cm: float) -> CommandedMotion:
         for values in (recorded.speed_cm_s, recorded.steering_rad, recorded.angle, recorded.yaw_rate_rad_s)
     )
     step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
-    usual = float(np.median(step_s[1:])) if len(step_s) > 1 else 1.0
+    usual = max(float(np.median(step_s[1:])) if len(step_s) > 1 else 1.0, 1e-6)
+    # A longer step is a stop, whose frames were left out: the car has not driven on all the while.
+    step_s = np.minimum(step_s, _LONGEST_STEP * usual)
     if speed_cm_s is not None:
         distance, known = speed_cm_s * step_s, True
     else:
-        distance, known = np.clip(step_s / max(usual, 1e-6), 0.0, 5.0), False
+        distance, known = step_s / usual, False
     turn = None
     if steering_rad is not None:
         turn = np.tan(steering_rad) / wheelbase_cm

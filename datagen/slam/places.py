@@ -12,12 +12,11 @@ from pydantic import Field
 from datagen.slam.field import DirectionField
 from datagen.slam.filter import thin_scan
 from datagen.slam.scans import Progress, Scans
+from datagen.slam.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
-from lanenet.perception.edges import to_gray
 
-_THUMB_WIDTH, _THUMB_HEIGHT = 24, 18
 #: Explanations of the drift that are worth a map of their own.
 _MAX_DRIFTS, _MIN_VOTE_SHARE = 3, 0.5
 
@@ -76,17 +75,11 @@ def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarr
     The whole frame counts, also what stands above the road: walls and people tell places apart that have the
     same markings.
     """
-    rows = np.empty((len(drive), _THUMB_HEIGHT * _THUMB_WIDTH), np.float32)
-    for k in range(len(drive)):
-        small = cv2.resize(
-            to_gray(drive.image(k)), (_THUMB_WIDTH, _THUMB_HEIGHT), interpolation=cv2.INTER_AREA
-        )
-        flat = small.astype(np.float32)
-        flat -= cv2.GaussianBlur(flat, (0, 0), 6.0)
+    rows = np.empty((len(drive), SMALL_HEIGHT * SMALL_WIDTH), np.float32)
+    for k, small in enumerate(small_pictures(drive, progress)):
+        flat = small - cv2.GaussianBlur(small, (0, 0), 6.0)
         # Less than a tenth of a gray level is rounding: blank pictures would be alike by it.
         rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 2.0)
-        if progress is not None:
-            progress(k + 1, len(drive))
     return rows
 
 
@@ -108,7 +101,7 @@ def propose_revisits(
         settings: Bounds.
     """
     n = len(thumbs)
-    picture = thumbs.reshape(n, _THUMB_HEIGHT, _THUMB_WIDTH)
+    picture = thumbs.reshape(n, SMALL_HEIGHT, SMALL_WIDTH)
     similarity = np.full((n, n), -1.0, np.float32)
     for shift in (-2, -1, 0, 1, 2):
         shifted = np.roll(picture, shift, axis=2).reshape(n, -1)

@@ -121,10 +121,11 @@ class Drive:
             )
         return image
 
-    def subset(self, keep: slice | Bool[np.ndarray, "_"]) -> Drive:
+    def subset(self, keep: slice | Bool[np.ndarray, "_"] | Int[np.ndarray, "_"]) -> Drive:
         """Return a part of the drive.
 
-        Frames that a mask leaves out make a break. A slice with a step thins the drive out, which makes none.
+        Frames that a mask leaves out make a break. A slice with a step, or rows in ascending order, thin the
+        drive out, which makes none.
 
         Raises:
             DriveFormatError: If nothing is left.
@@ -134,7 +135,7 @@ class Drive:
             raise DriveFormatError(f"{self.path}: the chosen part of the drive has no frames")
         piece = np.cumsum(self.breaks)[rows]
         breaks = np.diff(piece, prepend=piece[0]) > 0
-        if not isinstance(keep, slice):
+        if not isinstance(keep, slice) and keep.dtype == bool:
             breaks |= np.diff(rows, prepend=rows[0] - 1) > 1
             breaks[0] = False
         return replace(
