@@ -146,7 +146,7 @@ class Asked:
         self._patch.setitem(sys.modules, name, module)
 
     def function(self, name: str, answer: Any = None) -> Any:
-        def call(*args: Any) -> Any:
+        def call(*args: Any, **options: Any) -> Any:
             self.calls[name] = args
             self.order.append(name)
             if isinstance(answer, Exception):

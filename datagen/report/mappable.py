@@ -1,0 +1,113 @@
+"""Drives of which no map can be made: found early, and said with what to drive instead."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
+from datagen.map_report import MappedSegment
+from lanenet.data.drive import Drive
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.lane import SIDES
+from lanenet.perception.edges import to_gray
+
+#: What to do about a drive that cannot be mapped.
+DRIVE_INSTEAD = "record one or two laps without a pause, with the car between two lines that the camera sees"
+
+_LOOKS = 40
+_SIZE = (24, 18)
+#: Pictures from all over a drive that differ by less than this [gray levels, means of blocks] are the same.
+_SAME = 1.0
+#: Noise and flicker change neighbours as much as frames far apart; a moving car changes these more.
+_NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
+#: A line that is there along less of the way than this does not bound a lane.
+_LEAST_SEEN = 0.2
+
+
+def check_moving(drive: Drive) -> None:
+    """Refuse a drive whose pictures do not change.
+
+    Raises:
+        TrackingLostError: If the car stands still; says how little changes.
+    """
+    at = np.unique(np.linspace(0, len(drive) - 2, _LOOKS).astype(int))
+    looks = np.array([[_blocks(drive, int(k) + d) for d in (0, 1)] for k in at])
+    neighbours = float(np.median(_difference(looks[:, 0], looks[:, 1])))
+    # Half the drive apart, so that a lap driven twice is not compared with itself.
+    spread = float(np.median(_difference(looks[:, 0], np.roll(looks[:, 0], len(at) // 3, axis=0))))
+    if spread < _SAME or (spread < _NOISY_SAME and spread < _NOISY_RATIO * neighbours):
+        raise TrackingLostError(
+            f"{drive.path}: the car stands still: {len(drive)} frames, which differ by {spread:.1f} gray "
+            f"levels from others far away and by {neighbours:.1f} from their neighbours; mapping needs a "
+            "moving car"
+        )
+
+
+def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:
+    """Means of blocks of a frame, without its brightness: noise is gone, and so is most of flicker."""
+    small = cv2.resize(to_gray(drive.image(k)), _SIZE, interpolation=cv2.INTER_AREA).astype(np.float64)
+    return (small - small.mean()).ravel()
+
+
+def _difference(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(np.abs(a - b).mean(axis=1))
+
+
+def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
+    """Refuse a map in which one of the lines is hardly ever seen.
+
+    Raises:
+        TrackingLostError: Says how much of the way each line was seen.
+    """
+    way = sum(float(part.s_frames_cm[-1] - part.s_frames_cm[0]) for part in parts)
+    seen = dict.fromkeys(SIDES, 0.0)
+    for part in parts:
+        for line in part.lines:
+            stretches = np.clip(line.supported_cm, part.s_frames_cm[0], part.s_frames_cm[-1])
+            seen[line.side] += float(np.sum(stretches[:, 1] - stretches[:, 0]))
+    share = {side: seen[side] / max(way, 1e-9) for side in SIDES}
+    if min(share.values()) >= _LEAST_SEEN:
+        return
+    found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the way" for side in SIDES)
+    what = "no line" if max(share.values()) < _LEAST_SEEN else "one line only"
+    raise TrackingLostError(
+        f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * _LEAST_SEEN:.0f} % for each"
+    )
+
+
+def trace_known_lane(
+    path: Path, edges: PathEdges, height_cm: float, lane_width_cm: float, settings: TraceSettings
+) -> tuple[TracedLane, float | None]:
+    """Trace the lane of the given width, and look for the lane's width without that number too.
+
+    Returns:
+        The lane, and the width of the lane that is found freely; None where none is, or where the lane of the
+        given width has clearly more of its lines on the road.
+
+    Raises:
+        TrackingLostError: If there is no lane of this width; names the width that there is.
+    """
+    try:
+        free: TracedLane | None = trace_lane(path, edges, height_cm, None, settings)
+    except TrackingLostError:
+        free = None
+    try:
+        lane = trace_lane(path, edges, height_cm, lane_width_cm, settings)
+    except TrackingLostError as lost:
+        if free is None:
+            raise
+        raise TrackingLostError(
+            f"no two lines {lane_width_cm:g} cm apart run along the drive, but two that are "
+            f"{free.lane_cm:.0f} cm apart with this camera: check the lane width and the camera's height"
+        ) from lost
+    if free is None or _seen(free) < 0.8 * _seen(lane):
+        return lane, None
+    return lane, free.lane_cm
+
+
+def _seen(lane: TracedLane) -> float:
+    """How much of both lines was seen, 0 to 2."""
+    return float(np.isfinite(lane.left_cm).mean() + np.isfinite(lane.right_cm).mean())
