@@ -147,18 +147,25 @@ def steering_plot(
         step = np.hypot(delta[:, 0], delta[:, 1])
         moving = step > 0.3 * np.median(step)
         command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
-        axes.plot(command, 100.0 * delta[moving, 2] / step[moving], ".", ms=2, alpha=0.5, color=f"C{segment}")
+        curvature = 100.0 * delta[moving, 2] / step[moving]
+        axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
+        if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
+            continue
+        # Once more, since the filter's own fit came before the adjustment, with another camera and speed.
+        gain, trim = np.polyfit(command, curvature, 1)
+        r = float(np.corrcoef(command, curvature)[0, 1])
         ends = np.array([command.min(), command.max()])
         axes.plot(
             ends,
-            100.0 * (fit.gain * ends + fit.trim_per_cm),
+            gain * ends + trim,
             "k-",
             lw=1.0,
-            label=f"delay {fit.lag_frames} frames, r = {fit.correlation:.2f}",
+            label=f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}",
         )
     axes.set_xlabel("steering command, positive left")
     axes.set_ylabel("curvature, 1/m")
-    axes.legend(fontsize=8)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
     return _png(figure)
 
 
