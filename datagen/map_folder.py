@@ -172,7 +172,7 @@ def read_map(folder: Path) -> DriveMap:
             # Older maps lack these.
             "pitch_rad": ColumnSpec(required=False),
             "roll_rad": ColumnSpec(required=False),
-            "held_out": ColumnSpec("int", required=False, low=0, high=1),
+            "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
         },
         error=MapFormatError,
     )

@@ -20,7 +20,7 @@ from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, m
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.held_out import held_out_frames, without_frames
-from datagen.report.mappable import DRIVE_INSTEAD, check_lane, check_moving, trace_known_lane
+from datagen.report.mappable import DRIVE_INSTEAD, check_edges, check_lane, check_moving, trace_known_lane
 from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
 from datagen.report.residuals import ResidualSettings
@@ -68,7 +68,8 @@ def map_drive(
     try:
         return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress)
     except TrackingLostError as error:
-        raise TrackingLostError(f"{error}; {DRIVE_INSTEAD}") from error
+        where = "" if str(drive_path) in str(error) else f"{drive_path}: "
+        raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}") from error
 
 
 def _map_drive(
@@ -94,6 +95,7 @@ def _map_drive(
     else:
         longest_rows = max(segments, key=lambda s: s.stop - s.start)
         longest = drive.subset(longest_rows)
+        check_edges(longest, settings.perception.edges)
         camera, candidates = coarse_camera(longest, settings.perception, settings.guess, rng, progress)
         how = "from the drive: coarse by match score, then bundle adjustment, scale by lane width"
         solved = solve_segment(longest, camera, settings, rng, progress, find_camera=True)

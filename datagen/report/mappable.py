@@ -12,7 +12,7 @@ from datagen.map_report import MappedSegment
 from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.lane import SIDES
-from lanenet.perception.edges import to_gray
+from lanenet.perception.edges import EdgeSettings, find_edges, to_gray
 
 #: What to do about a drive that cannot be mapped.
 DRIVE_INSTEAD = "record one or two laps without a pause, with the car between two lines that the camera sees"
@@ -23,6 +23,7 @@ _SIZE = (24, 18)
 _SAME = 1.0
 #: Noise and flicker change neighbours as much as frames far apart; a moving car changes these more.
 _NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
+_LEAST_EDGES = 20
 #: A line that is there along less of the way than this does not bound a lane.
 _LEAST_SEEN = 0.2
 
@@ -43,6 +44,24 @@ def check_moving(drive: Drive) -> None:
             f"{drive.path}: the car stands still: {len(drive)} frames, which differ by {spread:.1f} gray "
             f"levels from others far away and by {neighbours:.1f} from their neighbours; mapping needs a "
             "moving car"
+        )
+
+
+def check_edges(drive: Drive, settings: EdgeSettings) -> None:
+    """Refuse a drive that shows hardly an edge where the road is, before a camera is looked for with them.
+
+    Raises:
+        TrackingLostError: Says how many edge points there are.
+    """
+    counts = []
+    for k in np.unique(np.linspace(0, len(drive) - 1, _LOOKS).astype(int)).tolist():
+        # Without a camera nobody knows the horizon; most cameras on cars show road in the lower half.
+        image = drive.image(k)
+        counts.append(len(find_edges(image[image.shape[0] // 2 :], settings).uv_px))
+    if np.median(counts) < _LEAST_EDGES:
+        raise TrackingLostError(
+            f"{drive.path}: {np.median(counts):.0f} edge points in the lower half of a frame, expected "
+            f"{_LEAST_EDGES}: no line to be seen"
         )
 
 
@@ -94,20 +113,29 @@ def trace_known_lane(
         free: TracedLane | None = trace_lane(path, edges, height_cm, None, settings)
     except TrackingLostError:
         free = None
+    lane: TracedLane | None
     try:
         lane = trace_lane(path, edges, height_cm, lane_width_cm, settings)
-    except TrackingLostError as lost:
+    except TrackingLostError:
         if free is None:
             raise
+        lane = None
+    if (
+        free is not None
+        and min(_seen(free)) >= _LEAST_SEEN
+        and (lane is None or min(_seen(lane)) < _LEAST_SEEN)
+    ):
         raise TrackingLostError(
             f"no two lines {lane_width_cm:g} cm apart run along the drive, but two that are "
             f"{free.lane_cm:.0f} cm apart with this camera: check the lane width and the camera's height"
-        ) from lost
-    if free is None or _seen(free) < 0.8 * _seen(lane):
+        )
+    if lane is None:
+        raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
+    if free is None or sum(_seen(free)) < 0.8 * sum(_seen(lane)):
         return lane, None
     return lane, free.lane_cm
 
 
-def _seen(lane: TracedLane) -> float:
-    """How much of both lines was seen, 0 to 2."""
-    return float(np.isfinite(lane.left_cm).mean() + np.isfinite(lane.right_cm).mean())
+def _seen(lane: TracedLane) -> tuple[float, float]:
+    """Share of the way along which the left and the right line were seen."""
+    return float(np.isfinite(lane.left_cm).mean()), float(np.isfinite(lane.right_cm).mean())

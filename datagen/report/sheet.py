@@ -14,7 +14,7 @@ from datagen.report.quality import MapQuality
 from datagen.report.residuals import REFERENCE_WIDTH
 
 _TILES = 8
-_TILE_WIDTH, _COLUMNS = 320, 4
+_TILE_WIDTH, _TITLE_HEIGHT, _COLUMNS = 320, 22, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,17 @@ def _sheet(
     for i in picks:
         k = int(quality.held_out[i])
         known = np.isfinite(medians[i])
-        text = f"{drive_map.frames[k]}: " + (f"{medians[i] * scale:.2f} px" if known else "nothing found")
+        text = f"frame {drive_map.frames[k]}: " + (
+            f"{medians[i] * scale:.2f} px" if known else "nothing found"
+        )
         image = mapped.drive.image(int(mapped.rows[k]))
-        tile = draw_lines(image, lines_at(drive_map, k), drive_map.camera_at(k), text)
+        tile = draw_lines(image, lines_at(drive_map, k), drive_map.camera_at(k), "")
         height = round(tile.shape[0] * _TILE_WIDTH / tile.shape[1])
-        tiles.append(cv2.resize(tile, (_TILE_WIDTH, height), interpolation=cv2.INTER_AREA))
+        title = np.full((_TITLE_HEIGHT, _TILE_WIDTH, 3), 255, np.uint8)
+        cv2.putText(title, text, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        tiles.append(
+            np.vstack([title, cv2.resize(tile, (_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)])
+        )
     while len(tiles) % _COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
