@@ -28,6 +28,7 @@ from datagen.report.verdict import judge
 from datagen.slam.calibrate import coarse_camera, with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
@@ -63,7 +64,8 @@ def map_drive(
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
-        CalibrationError: If the camera does not fit the images.
+        CalibrationError: If the camera does not fit the images, or the lane on the road is another one than
+            camera and lane width say.
     """
     try:
         return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress)
@@ -130,6 +132,7 @@ def _map_drive(
     figures["notes"] = notes
     index = {int(frame): i for i, frame in enumerate(drive.frames)}
     shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
+    clear_unfinished(out)
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))

@@ -10,7 +10,7 @@ from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
 from datagen.map_report import MappedSegment
 from lanenet.data.drive import Drive
-from lanenet.errors import TrackingLostError
+from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.lane import SIDES
 from lanenet.perception.edges import EdgeSettings, find_edges, to_gray
 
@@ -26,6 +26,8 @@ _NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
 _LEAST_EDGES = 20
 #: A line that is there along less of the way than this does not bound a lane.
 _LEAST_SEEN = 0.2
+#: Less than this of one line is clutter that happens to lie along the way.
+_WHOLE_LINE = 0.5
 
 
 def check_moving(drive: Drive) -> None:
@@ -91,7 +93,7 @@ def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
     if min(share.values()) >= _LEAST_SEEN:
         return
     found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the way" for side in SIDES)
-    what = "no line" if max(share.values()) < _LEAST_SEEN else "one line only"
+    what = "no line" if max(share.values()) < _WHOLE_LINE else "one line only"
     raise TrackingLostError(
         f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * _LEAST_SEEN:.0f} % for each"
     )
@@ -107,7 +109,8 @@ def trace_known_lane(
         given width has clearly more of its lines on the road.
 
     Raises:
-        TrackingLostError: If there is no lane of this width; names the width that there is.
+        CalibrationError: If there is no lane of this width but one of another; names both.
+        TrackingLostError: If there is no lane.
     """
     try:
         free: TracedLane | None = trace_lane(path, edges, height_cm, None, settings)
@@ -125,7 +128,7 @@ def trace_known_lane(
         and min(_seen(free)) >= _LEAST_SEEN
         and (lane is None or min(_seen(lane)) < _LEAST_SEEN)
     ):
-        raise TrackingLostError(
+        raise CalibrationError(
             f"no two lines {lane_width_cm:g} cm apart run along the drive, but two that are "
             f"{free.lane_cm:.0f} cm apart with this camera: check the lane width and the camera's height"
         )
