@@ -20,7 +20,14 @@ from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, m
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.held_out import held_out_frames, without_frames
-from datagen.report.mappable import DRIVE_INSTEAD, check_edges, check_lane, check_moving, trace_known_lane
+from datagen.report.mappable import (
+    DRIVE_INSTEAD,
+    check_edges,
+    check_lane,
+    check_lines_seen,
+    check_moving,
+    trace_known_lane,
+)
 from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
 from datagen.report.residuals import ResidualSettings
@@ -125,6 +132,7 @@ def _map_drive(
     rows_of_map = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in parts])
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
     quality = measure_map(mapped, ResidualSettings())
+    check_lines_seen(quality, drive)
     figures |= quality_figures(quality, drive.width, ResidualSettings())
     verdict = judge(map_evidence(drive_map, parts, figures), settings.verdict)
     drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
 from datagen.map_report import MappedSegment
+from datagen.report.quality import MapQuality
+from datagen.report.residuals import summarise
 from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.lane import SIDES
@@ -26,6 +28,8 @@ _NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
 _LEAST_EDGES = 20
 #: A line that is there along less of the way than this does not bound a lane.
 _LEAST_SEEN = 0.2
+#: Dashes and worn lines show at least this share of their borders.
+_LEAST_SHOWN = 0.2
 #: Less than this of one line is clutter that happens to lie along the way.
 _WHOLE_LINE = 0.5
 
@@ -97,6 +101,21 @@ def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
     raise TrackingLostError(
         f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * _LEAST_SEEN:.0f} % for each"
     )
+
+
+def check_lines_seen(quality: MapQuality, drive: Drive) -> None:
+    """Refuse lines that held-out frames do not show: clutter that happened to lie along the way.
+
+    Raises:
+        TrackingLostError: Says how much of the lines the frames show.
+    """
+    coverage = summarise(quality.near).coverage
+    if coverage < _LEAST_SHOWN:
+        raise TrackingLostError(
+            f"{drive.path}: no lane: frames held out from the map show an edge along "
+            f"{100.0 * coverage:.0f} % of what would be the borders of its lines, expected "
+            f"{100.0 * _LEAST_SHOWN:.0f} %"
+        )
 
 
 def trace_known_lane(
