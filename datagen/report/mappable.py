@@ -125,7 +125,7 @@ def trace_known_lane(
 
     Returns:
         The lane, and the width of the lane that is found freely; None where none is, or where the lane of the
-        given width has clearly more of its lines on the road.
+        given width fits the road as well.
 
     Raises:
         CalibrationError: If there is no lane of this width but one of another; names both.
@@ -153,9 +153,20 @@ def trace_known_lane(
         )
     if lane is None:
         raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
-    if free is None or sum(_seen(free)) < 0.8 * sum(_seen(lane)):
-        return lane, None
-    return lane, free.lane_cm
+    return lane, free.lane_cm if free is not None and _fits_better(free, lane) else None
+
+
+def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
+    """Whether the lane that was found freely is more likely the driven one than that of the given width.
+
+    The free search alone is no proof: clutter beside a line makes a narrower lane. It counts where its weaker
+    line is better seen, or where the car keeps to its middle and not to that of the given lane, as on a road
+    of two lanes whose whole width was given.
+    """
+    if min(_seen(free)) > min(_seen(lane)):
+        return True
+    aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
+    return min(_seen(free)) >= _LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
 
 
 def _seen(lane: TracedLane) -> tuple[float, float]:
