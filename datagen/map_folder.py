@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.fit import LaneLine
 from lanenet.config import Settings, check_settings, read_yaml
@@ -38,6 +38,7 @@ class MapMeta(Settings):
         tape_cm: Width of the markings on this map.
         scale_from: What sets the scale: the camera's height or the lane width.
         laps: Whole laps between revisits, 0 where no place was seen twice.
+        verdict: How far the map can be trusted, see :mod:`datagen.report.verdict`; older maps have none.
     """
 
     format: str
@@ -47,6 +48,7 @@ class MapMeta(Settings):
     tape_cm: float
     scale_from: str
     laps: int
+    verdict: Literal["good", "usable", "reject"] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class DriveMap:
         s_cm: Position along the segment's path.
         match: Matched share of each frame's edges, 0..1.
         lines: Left and right line of each segment.
+        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for level.
+        held_out: Frames whose edge points had no say in the lines; None where there were none.
     """
 
     meta: MapMeta
@@ -76,6 +80,16 @@ class DriveMap:
     s_cm: Float[np.ndarray, "n"]
     match: Float[np.ndarray, "n"]
     lines: dict[int, list[LaneLine]]
+    tilt_rad: Float[np.ndarray, "n 2"] | None = None
+    held_out: Bool[np.ndarray, "n"] | None = None
+
+    def camera_at(self, k: int) -> Camera:
+        """Return the camera as it nodded in the k-th frame."""
+        if self.tilt_rad is None:
+            return self.camera
+        m = self.camera.mounting
+        pitch, roll = (float(angle) for angle in self.tilt_rad[k])
+        return self.camera.with_mounting(pitch_down_rad=m.pitch_down_rad + pitch, roll_rad=m.roll_rad + roll)
 
 
 def write_map(
@@ -98,6 +112,10 @@ def write_map(
         "s_cm": m.s_cm,
         "match": m.match,
     }
+    if m.tilt_rad is not None:
+        columns |= {"pitch_rad": m.tilt_rad[:, 0], "roll_rad": m.tilt_rad[:, 1]}
+    if m.held_out is not None:
+        columns["held_out"] = m.held_out
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -151,9 +169,15 @@ def read_map(folder: Path) -> DriveMap:
             "segment": ColumnSpec("int"),
             "s_cm": ColumnSpec(),
             "match": ColumnSpec(allow_empty=True),
+            # Older maps lack these.
+            "pitch_rad": ColumnSpec(required=False),
+            "roll_rad": ColumnSpec(required=False),
+            "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
         },
         error=MapFormatError,
     )
+    n = len(table["frame"])
+    tilt = [table.get(name, np.zeros(n)) for name in ("pitch_rad", "roll_rad")]
     return DriveMap(
         meta=meta,
         camera=read_camera(folder / "camera.yaml"),
@@ -165,6 +189,8 @@ def read_map(folder: Path) -> DriveMap:
         s_cm=table["s_cm"],
         match=table["match"],
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
+        tilt_rad=np.stack(tilt, axis=1),
+        held_out=table.get("held_out", np.zeros(n)) > 0,
     )
 
 

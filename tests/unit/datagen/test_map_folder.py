@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,8 @@ def _drive_map() -> DriveMap:
             0: [_line("left", 18.0), _line("right", -18.0)],
             1: [_line("left", 18.0), never_seen],
         },
+        tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
+        held_out=np.arange(N) % 10 == 3,
     )
 
 
@@ -88,7 +91,8 @@ def test_round_trip(folder):
     for name in ("frames", "lap", "segment"):
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
     # Nine digits on paper.
-    for name in ("t_s", "poses", "s_cm", "match"):
+    np.testing.assert_array_equal(found.held_out, written.held_out)
+    for name in ("t_s", "poses", "s_cm", "match", "tilt_rad"):
         np.testing.assert_allclose(getattr(found, name), getattr(written, name), rtol=1e-7)
     assert found.lines.keys() == written.lines.keys()
     s = np.linspace(-10.0, 210.0, 45)
@@ -97,6 +101,24 @@ def test_round_trip(folder):
         for line, again in zip(pair, found.lines[segment], strict=True):
             np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
             np.testing.assert_allclose(again.residual_cm, line.residual_cm)
+
+
+def test_the_camera_nods_with_the_frame(folder):
+    found = read_map(folder)
+    for name, change in zip(("pitch_down_rad", "roll_rad"), found.tilt_rad[7], strict=True):
+        mounted, nodded = (getattr(c.mounting, name) for c in (found.camera, found.camera_at(7)))
+        assert nodded - mounted == pytest.approx(change) and change != 0.0
+
+
+def test_an_older_map_has_no_tilt_no_held_out_frames_and_no_verdict(tmp_path):
+    older = replace(_drive_map(), tilt_rad=None, held_out=None)
+    write_map(tmp_path, older, {"frame_index": np.arange(2)}, {}, "given")
+    assert "pitch_rad" not in (tmp_path / "poses.csv").read_text()
+    path = tmp_path / "map.yaml"
+    path.write_text(re.sub(r"^verdict:.*\n", "", path.read_text(), flags=re.MULTILINE))
+    found = read_map(tmp_path)
+    assert not found.tilt_rad.any() and not found.held_out.any() and found.meta.verdict is None
+    assert found.camera_at(3).hash == found.camera.hash
 
 
 def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
