@@ -399,6 +399,8 @@ class _Problem:
             (yi[b], -per_b * sm[b] - per_a * sm[a]),
             (xi[a], per_a * cm[a]),
             (yi[a], per_a * sm[a]),
+            *((k, 0.5 * per_b * across[b]) for k in (ti[b], tj[b])),
+            *((k, -0.5 * per_a * across[a]) for k in (ti[a], tj[a])),
         )
         add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
         # The first pose stays; camera priors, hard where a number is not free.
