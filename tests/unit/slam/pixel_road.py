@@ -19,7 +19,9 @@ _MOST = 220
 def fisheye(**mounting: float) -> Camera:
     """A wide lens that looks a little to the side, tilted, beside the middle of the car."""
     K = np.array([[80.0, 0.0, 78.5], [0.0, 81.0, 60.5], [0.0, 0.0, 1.0]])
-    return Camera("fisheye", WIDTH, HEIGHT, K, np.array([-0.03, 0.004, 0.0, 0.0]), _mount(mounting), WHEELBASE_CM)
+    return Camera(
+        "fisheye", WIDTH, HEIGHT, K, np.array([-0.03, 0.004, 0.0, 0.0]), _mount(mounting), WHEELBASE_CM
+    )
 
 
 def pinhole(**mounting: float) -> Camera:
@@ -48,6 +50,13 @@ def mirrored(camera: Camera) -> Camera:
     return replace(camera, K=K).with_mounting(
         roll_rad=-m.roll_rad, yaw_rad=-m.yaw_rad, right_of_centre_cm=-m.right_of_centre_cm
     )
+
+
+def camera_numbers(camera: Camera) -> np.ndarray:
+    """What an adjustment may change, in its order: focal length, cx, cy, k1, pitch, roll, yaw, lever."""
+    m = camera.mounting
+    mount = [m.pitch_down_rad, m.roll_rad, m.yaw_rad, m.ahead_of_front_axle_cm]
+    return np.array([camera.K[0, 0], camera.K[0, 2], camera.K[1, 2], camera.D[0], *mount])
 
 
 def tape_loop(frames: int, lap_frames: int = 60, lap_cm: float = 330.0) -> TapeRoad:

@@ -19,7 +19,9 @@ SMALL = BundleSettings(lags=(1, 4), points=40)
 
 
 def _problem(camera: Camera, frames: int = 2, free: tuple[str, ...] = CAMERA_NAMES) -> _Problem:
-    return _Problem(pixels(tape_road(frames), camera), camera, SMALL, np.random.default_rng(0), free, (), None)
+    return _Problem(
+        pixels(tape_road(frames), camera), camera, SMALL, np.random.default_rng(0), free, (), None
+    )
 
 
 def _vectors(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -52,5 +52,3 @@ def test_the_mapping_range_grows_with_the_camera():
     assert (small.far_cm, small.side_cm, small.max_cm_per_px) == pytest.approx((60.0, 60.0, 3.0))
     assert large.far_cm == pytest.approx(2.0 * small.far_cm)
     assert (large.top_row, large.bottom_rows) == (40, 7)
-
-
