@@ -1,0 +1,440 @@
+"""The loops of the shared map: writing, looking up along lineages, pruning.
+
+Resampling keeps the order of the particles (systematic resampling draws ascending indices), so that the living
+descendants of a node are always neighbours: one interval of particles. Whether a particle descends from a node
+is two comparisons, and what a cell holds for each particle is a sum over intervals.
+
+An entry whose interval is empty is dead; one whose interval holds everybody is the same for all particles and
+moves into the root. Both happen where a cell is visited, and at the latest when its frame leaves the tree.
+
+The entries of a cell stand in pages, each of which is one run of memory, and the loops over points are
+outermost: chasing entries one by one through memory would take longer than all the arithmetic.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+from numba import njit
+
+#: Entries per page.
+PAGE_SIZE = 16
+# Columns of a cell's state.
+_OWNER_X, _OWNER_Y, _PAGE, _STAMP, _PRUNED = range(5)
+_BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
+_FEW = 4  # particles that ask for the same cell and are yet looked up singly
+_NOTHING, _SINGLY = -1, -2
+
+
+class Tree(NamedTuple):
+    """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
+
+    Attributes:
+        first: First living particle that descends from the node.
+        last: One behind the last; equal to ``first`` for a dead node.
+        count: Nodes per row.
+        frame: Frame that the row belongs to.
+        pose: Rear-axle pose of each node, frame map.
+        points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
+        size: How many points each frame wrote.
+    """
+
+    first: Int32[np.ndarray, "w p"]
+    last: Int32[np.ndarray, "w p"]
+    count: Int32[np.ndarray, "w"]
+    frame: Int32[np.ndarray, "w"]
+    pose: Float[np.ndarray, "w p 3"]
+    points: Float[np.ndarray, "w m 5"]
+    size: Int32[np.ndarray, "w"]
+
+
+class Cells(NamedTuple):
+    """A wrapping grid; each cell has a root, which all particles share, and entries of single lineages.
+
+    Attributes:
+        state: Per cell: which cell of the unbounded plane it holds (ix, iy), its first page (-1: none), the
+            frame of the newest content of its root (-1: none), and the frame when it was last pruned.
+        root: Sum of what all particles agree on, faded to the frame of its newest content.
+    """
+
+    state: Int32[np.ndarray, "s s 8"]
+    root: Float[np.ndarray, "s s 2"]
+
+
+class Pages(NamedTuple):
+    """Entries of the cells, by the page: what one node saw in one cell.
+
+    Attributes:
+        following: Next page of the cell, or of the free ones; -1 at the end.
+        used: Entries in each page.
+        node: Who saw it: row * particles + number in the row.
+        vector: What was seen.
+        free: First free page, and how many are free.
+    """
+
+    following: Int32[np.ndarray, "n"]
+    used: Int32[np.ndarray, "n"]
+    node: Int32[np.ndarray, "n e"]
+    vector: Float32[np.ndarray, "n e 2"]
+    free: Int32[np.ndarray, "2"]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def grow(tree, row, frame, states, chosen, node_of):
+    """Follow a resampling: give every node its new interval, and the survivors nodes of their own.
+
+    Args:
+        tree: The tree.
+        row: Row of the new nodes.
+        frame: Their frame.
+        states: Particles before resampling; the first three columns are poses.
+        chosen: Ascending index of each new particle's parent among them.
+        node_of: Filled with the number of each new particle's node.
+    """
+    first, last, particles = tree.first, tree.last, len(chosen)
+    # How many new particles stand before the copies of each old one.
+    before = np.zeros(particles + 1, np.int32)
+    for p in range(particles):
+        before[chosen[p] + 1] += 1
+    for p in range(particles):
+        before[p + 1] += before[p]
+    for r in range(first.shape[0]):
+        for i in range(tree.count[r]):
+            first[r, i] = before[first[r, i]]
+            last[r, i] = before[last[r, i]]
+    count = 0
+    for p in range(particles):
+        if before[p + 1] > before[p]:
+            first[row, count] = before[p]
+            last[row, count] = before[p + 1]
+            tree.pose[row, count] = states[p, :3]
+            node_of[before[p] : before[p + 1]] = count
+            count += 1
+    tree.count[row] = count
+    tree.frame[row] = frame
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _prune(tree, cells, pages, a, b, newest, memory):
+    """Take the dead entries out of a cell, and move those that all particles share into its root."""
+    first, last, state, root = tree.first, tree.last, cells.state, cells.root
+    following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
+    particles = first.shape[1]
+    state[a, b, _PRUNED] = newest
+    # Entries that stay move up to the front; ``into`` is the page that is being filled.
+    into, filled = state[a, b, _PAGE], 0
+    page = into
+    while page >= 0:
+        for e in range(used[page]):
+            node = nodes[page, e]
+            row = node // particles
+            start, stop = first[row, node - row * particles], last[row, node - row * particles]
+            if stop - start == particles:
+                frame, stamp = tree.frame[row], state[a, b, _STAMP]
+                fade = 1.0
+                if stamp < frame:
+                    old = np.exp((stamp - frame) / memory) if stamp >= 0 else 0.0
+                    root[a, b, 0] *= old
+                    root[a, b, 1] *= old
+                    state[a, b, _STAMP] = frame
+                else:
+                    fade = np.exp((frame - stamp) / memory)
+                root[a, b, 0] += fade * vector[page, e, 0]
+                root[a, b, 1] += fade * vector[page, e, 1]
+            elif stop > start:
+                if filled == PAGE_SIZE:
+                    used[into] = PAGE_SIZE
+                    into, filled = following[into], 0
+                nodes[into, filled] = node
+                vector[into, filled, 0] = vector[page, e, 0]
+                vector[into, filled, 1] = vector[page, e, 1]
+                filled += 1
+        page = following[page]
+    rest = state[a, b, _PAGE]
+    if filled:
+        used[into] = filled
+        rest = following[into]
+        following[into] = -1
+    else:
+        state[a, b, _PAGE] = -1
+    _free(pages, rest)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _free(pages, page):
+    """Give a chain of pages back."""
+    while page >= 0:
+        following = pages.following[page]
+        pages.following[page] = pages.free[0]
+        pages.free[0] = page
+        pages.free[1] += 1
+        page = following
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
+    """Enter the points of a row, seen from each of its nodes.
+
+    Args:
+        tree: The tree.
+        cells: The grid.
+        pages: The pages.
+        row: Row to enter.
+        start: First point to enter.
+        wheelbase: Distance between the axles, [cm].
+        cell_cm: Side of a cell.
+        plain: Enter (weight, 0) into the point's own cell instead of blurred normals, for counting.
+
+    Returns:
+        First point that was not entered, because the pages might not suffice for it.
+    """
+    pose, points = tree.pose, tree.points
+    state, root = cells.state, cells.root
+    following, used, entered, vector, free = (
+        pages.following,
+        pages.used,
+        pages.node,
+        pages.vector,
+        pages.free,
+    )
+    particles, nodes = tree.first.shape[1], tree.count[row]
+    mask = state.shape[0] - 1
+    wx, wy = np.zeros(3), np.zeros(3)
+    wx[1], wy[1] = 1.0, 1.0
+    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    for i in range(start, tree.size[row]):
+        if free[1] < 9 * nodes:
+            return i
+        right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
+        weight = points[row, i, 4]
+        for node in range(nodes):
+            c, s = cosines[node], sines[node]
+            gx = (pose[row, node, 0] + forward * c + right * s) / cell_cm
+            gy = (pose[row, node, 1] + forward * s - right * c) / cell_cm
+            cx, cy = int(np.floor(gx)), int(np.floor(gy))
+            nx, ny = 1.0, 0.0
+            if not plain:
+                nx = points[row, i, 3] * c + points[row, i, 2] * s
+                ny = points[row, i, 3] * s - points[row, i, 2] * c
+                # Quadratic B-spline over three cells each way; the shares sum to one.
+                tx, ty = gx - cx, gy - cy
+                wx[0], wx[1], wx[2] = 0.5 * (1.0 - tx) ** 2, 0.75 - (tx - 0.5) ** 2, 0.5 * tx**2
+                wy[0], wy[1], wy[2] = 0.5 * (1.0 - ty) ** 2, 0.75 - (ty - 0.5) ** 2, 0.5 * ty**2
+            for jy in range(3):
+                for jx in range(3):
+                    share = weight * wx[jx] * wy[jy]
+                    if share == 0.0:
+                        continue
+                    ix, iy = cx + jx - 1, cy + jy - 1
+                    a, b = iy & mask, ix & mask
+                    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
+                        # Another patch of road takes the cell over; what it held is forgotten.
+                        _free(pages, state[a, b, _PAGE])
+                        state[a, b, _PAGE], state[a, b, _STAMP] = -1, -1
+                        root[a, b, 0], root[a, b, 1] = 0.0, 0.0
+                        state[a, b, _OWNER_X], state[a, b, _OWNER_Y] = ix, iy
+                    page = state[a, b, _PAGE]
+                    if page < 0 or used[page] == PAGE_SIZE:
+                        fresh = free[0]
+                        free[0] = following[fresh]
+                        free[1] -= 1
+                        following[fresh] = page
+                        used[fresh] = 0
+                        state[a, b, _PAGE] = page = fresh
+                    e = used[page]
+                    entered[page, e] = row * particles + node
+                    vector[page, e, 0] = share * nx
+                    vector[page, e, 1] = share * ny
+                    used[page] = e + 1
+    return tree.size[row]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory):
+    """Free a row of the tree: its entries move into the roots or are dropped.
+
+    Where particles still disagree on the frame, the ancestor of most of them is taken for all.
+
+    Args:
+        tree: The tree.
+        cells: The grid.
+        pages: The pages.
+        row: Row to free.
+        newest: Newest frame of the ancestry.
+        wheelbase: Distance between the axles, [cm].
+        cell_cm: Side of a cell.
+        memory: Frames after which what was mapped has faded to 1/e.
+
+    Returns:
+        Whether they disagreed.
+    """
+    first, last, pose, points, state = tree.first, tree.last, tree.pose, tree.points, cells.state
+    particles, nodes, mask = first.shape[1], tree.count[row], state.shape[0] - 1
+    sizes = last[row, :nodes] - first[row, :nodes]
+    best = np.argmax(sizes)
+    forced = sizes[best] < particles
+    first[row, :nodes] = 0
+    last[row, :nodes] = 0
+    last[row, best] = particles
+    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    for i in range(tree.size[row]):
+        right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
+        for node in range(nodes):
+            c, s = cosines[node], sines[node]
+            cx = int(np.floor((pose[row, node, 0] + forward * c + right * s) / cell_cm))
+            cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm))
+            for iy in range(cy - 1, cy + 2):
+                for ix in range(cx - 1, cx + 2):
+                    a, b = iy & mask, ix & mask
+                    # Forcing changes intervals, so that what was pruned is pruned once more.
+                    if state[a, b, _PAGE] >= 0 and (forced or state[a, b, _PRUNED] != newest):
+                        _prune(tree, cells, pages, a, b, newest, memory)
+    tree.count[row] = 0
+    tree.size[row] = 0
+    return forced
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _expand(tree, cells, pages, ix, iy, frame, memory, fades, values):
+    """What a cell holds for each particle: the root and the entries of its lineage, faded to this frame.
+
+    Returns:
+        Whether it holds anything; ``values`` is filled only then.
+    """
+    first, last, state, root = tree.first, tree.last, cells.state, cells.root
+    mask, particles = state.shape[0] - 1, first.shape[1]
+    a, b = iy & mask, ix & mask
+    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
+        return False
+    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != frame - 1:
+        _prune(tree, cells, pages, a, b, frame - 1, memory)
+    page, stamp = state[a, b, _PAGE], state[a, b, _STAMP]
+    if page < 0 and stamp < 0:
+        return False
+    x, y = 0.0, 0.0
+    if stamp >= 0:
+        fade = np.exp((stamp - frame) / memory)
+        x, y = fade * root[a, b, 0], fade * root[a, b, 1]
+    if page < 0:
+        values[:, 0] = x
+        values[:, 1] = y
+        return True
+    values[:, :] = 0.0
+    while page >= 0:
+        for e in range(pages.used[page]):
+            node = pages.node[page, e]
+            row = node // particles
+            start, stop = first[row, node - row * particles], last[row, node - row * particles]
+            fade = fades[frame - tree.frame[row]]
+            vx, vy = fade * pages.vector[page, e, 0], fade * pages.vector[page, e, 1]
+            # Steps at both ends of the interval; the running sum below makes them plateaus.
+            values[start, 0] += vx
+            values[start, 1] += vy
+            values[stop, 0] -= vx
+            values[stop, 1] -= vy
+        page = pages.following[page]
+    for p in range(particles):
+        x += values[p, 0]
+        y += values[p, 1]
+        values[p, 0], values[p, 1] = x, y
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _look(tree, cells, pages, ix, iy, frame, memory, fades, particle):
+    """What a cell holds for one particle; slower than :func:`_expand` where many particles ask."""
+    state, particles = cells.state, tree.first.shape[1]
+    a, b = iy & (state.shape[0] - 1), ix & (state.shape[0] - 1)
+    x, y = 0.0, 0.0
+    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
+        return x, y
+    if state[a, b, _STAMP] >= 0:
+        fade = np.exp((state[a, b, _STAMP] - frame) / memory)
+        x, y = fade * cells.root[a, b, 0], fade * cells.root[a, b, 1]
+    page = state[a, b, _PAGE]
+    while page >= 0:
+        for e in range(pages.used[page]):
+            node = pages.node[page, e]
+            row = node // particles
+            if tree.first[row, node - row * particles] <= particle < tree.last[row, node - row * particles]:
+                fade = fades[frame - tree.frame[row]]
+                x += fade * pages.vector[page, e, 0]
+                y += fade * pages.vector[page, e, 1]
+        page = pages.following[page]
+    return x, y
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores):
+    """Score each particle's view of a frame against the map of its own lineage.
+
+    Args:
+        tree: The tree.
+        cells: The grid.
+        pages: The pages.
+        poses: Predicted poses, frame map.
+        points: Edge points as in :class:`Tree`.
+        frame: Number of the frame, one more than the newest in the tree.
+        wheelbase: Distance between the axles, [cm].
+        cell_cm: Side of a cell.
+        memory: Frames after which what was mapped has faded to 1/e.
+        fades: Fade by age in frames.
+        occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
+        scores: Filled.
+    """
+    particles = len(poses)
+    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    values = np.empty((particles // _FEW + 1, particles + 1, 2))
+    asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
+    ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
+    scores[:] = 0.0
+    for i in range(len(points)):
+        right, forward = points[i, 0], points[i, 1] + wheelbase
+        for p in range(particles):
+            ix[p] = int(np.floor((poses[p, 0] + forward * cosines[p] + right * sines[p]) / cell_cm))
+            iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
+        low_x, low_y = ix.min(), iy.min()
+        wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
+        boxed, used = wide * high <= _BOX, 0
+        if boxed:
+            asked[: wide * high] = 0
+            for p in range(particles):
+                asked[(iy[p] - low_y) * wide + ix[p] - low_x] += 1
+        for p in range(particles):
+            row = _SINGLY
+            if boxed:
+                box = (iy[p] - low_y) * wide + ix[p] - low_x
+                if asked[box] > _FEW:
+                    filled = _expand(
+                        tree, cells, pages, ix[p], iy[p], frame, memory, fades, values[used]
+                    )
+                    rows[box] = used if filled else _NOTHING
+                    used += filled
+                    asked[box] = 0
+                elif asked[box] > 0:
+                    rows[box] = _SINGLY
+                    asked[box] = 0
+                row = rows[box]
+            if row == _NOTHING:
+                continue
+            if row == _SINGLY:
+                x, y = _look(tree, cells, pages, ix[p], iy[p], frame, memory, fades, p)
+            else:
+                x, y = values[row, p, 0], values[row, p, 1]
+            if occupied > 0.0:
+                scores[p] += points[i, 4] * (x >= occupied)
+            else:
+                nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
+                ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
+                # Saturate: an edge that was seen often counts once.
+                scores[p] += points[i, 4] * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))
