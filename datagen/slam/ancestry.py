@@ -212,6 +212,7 @@ class AncestryMap:
             self.wheelbase_cm,
             self.cell_cm,
             self.memory_frames,
+            self.likelihood == "count",
         )
         self._oldest += 1
 

@@ -205,33 +205,31 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     )
     particles, nodes = tree.first.shape[1], tree.count[row]
     mask = state.shape[0] - 1
-    wx, wy = np.zeros(3), np.zeros(3)
-    wx[1], wy[1] = 1.0, 1.0
+    wx, wy = np.ones(2), np.ones(2)
+    reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
     for i in range(start, tree.size[row]):
-        if free[1] < 9 * nodes:
+        if free[1] < reach * reach * nodes:
             return i
         right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
         weight = points[row, i, 4]
         for node in range(nodes):
             c, s = cosines[node], sines[node]
-            gx = (pose[row, node, 0] + forward * c + right * s) / cell_cm
-            gy = (pose[row, node, 1] + forward * s - right * c) / cell_cm
+            gx = (pose[row, node, 0] + forward * c + right * s) / cell_cm - half
+            gy = (pose[row, node, 1] + forward * s - right * c) / cell_cm - half
             cx, cy = int(np.floor(gx)), int(np.floor(gy))
             nx, ny = 1.0, 0.0
             if not plain:
                 nx = points[row, i, 3] * c + points[row, i, 2] * s
                 ny = points[row, i, 3] * s - points[row, i, 2] * c
-                # Quadratic B-spline over three cells each way; the shares sum to one.
+                # Shared among the four nearest cells by distance.
                 tx, ty = gx - cx, gy - cy
-                wx[0], wx[1], wx[2] = 0.5 * (1.0 - tx) ** 2, 0.75 - (tx - 0.5) ** 2, 0.5 * tx**2
-                wy[0], wy[1], wy[2] = 0.5 * (1.0 - ty) ** 2, 0.75 - (ty - 0.5) ** 2, 0.5 * ty**2
-            for jy in range(3):
-                for jx in range(3):
+                wx[0], wx[1] = 1.0 - tx, tx
+                wy[0], wy[1] = 1.0 - ty, ty
+            for jy in range(reach):
+                for jx in range(reach):
                     share = weight * wx[jx] * wy[jy]
-                    if share == 0.0:
-                        continue
-                    ix, iy = cx + jx - 1, cy + jy - 1
+                    ix, iy = cx + jx, cy + jy
                     a, b = iy & mask, ix & mask
                     if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
                         # Another patch of road takes the cell over; what it held is forgotten.
@@ -257,7 +255,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory):
+def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory, plain):
     """Free a row of the tree: its entries move into the roots or are dropped.
 
     Where particles still disagree on the frame, the ancestor of most of them is taken for all.
@@ -271,12 +269,14 @@ def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory):
         wheelbase: Distance between the axles, [cm].
         cell_cm: Side of a cell.
         memory: Frames after which what was mapped has faded to 1/e.
+        plain: As in :func:`write`.
 
     Returns:
         Whether they disagreed.
     """
     first, last, pose, points, state = tree.first, tree.last, tree.pose, tree.points, cells.state
     particles, nodes, mask = first.shape[1], tree.count[row], state.shape[0] - 1
+    reach, half = (1, 0.0) if plain else (2, 0.5)
     sizes = last[row, :nodes] - first[row, :nodes]
     best = np.argmax(sizes)
     forced = sizes[best] < particles
@@ -288,10 +288,10 @@ def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory):
         right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
         for node in range(nodes):
             c, s = cosines[node], sines[node]
-            cx = int(np.floor((pose[row, node, 0] + forward * c + right * s) / cell_cm))
-            cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm))
-            for iy in range(cy - 1, cy + 2):
-                for ix in range(cx - 1, cx + 2):
+            cx = int(np.floor((pose[row, node, 0] + forward * c + right * s) / cell_cm - half))
+            cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm - half))
+            for iy in range(cy, cy + reach):
+                for ix in range(cx, cx + reach):
                     a, b = iy & mask, ix & mask
                     # Forcing changes intervals, so that what was pruned is pruned once more.
                     if state[a, b, _PAGE] >= 0 and (forced or state[a, b, _PRUNED] != newest):
