@@ -84,6 +84,7 @@ class AncestryMap:
             np.zeros((window, particles, 3)),
             np.zeros((window, points, 5)),
             np.zeros(window, np.int32),
+            np.zeros(1, np.int32),
         )
         state = np.zeros((size, size, 8), np.int32)
         state[:, :, 2:] = -1
@@ -122,7 +123,7 @@ class AncestryMap:
         normals_car: Float[np.ndarray, "n 2"],
         weights: Float[np.ndarray, "n"],
         frame: int,
-    ) -> Float[np.ndarray, "p"]:
+    ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
         """Score how well a frame's edges fit what each particle's lineage has seen.
 
         Args:
@@ -133,9 +134,9 @@ class AncestryMap:
             frame: Number of the frame, later than all that was mapped.
 
         Returns:
-            About the weighted number of matched points, one number per particle.
+            Scores, which compare particles, and the weighted number of points that each matches.
         """
-        scores = np.zeros(len(poses))
+        scores, matches = np.zeros(len(poses)), np.zeros(len(poses))
         points = np.concatenate([points_car_cm, normals_car, weights[:, None]], axis=1)
         occupied = _OCCUPIED if self.likelihood == "count" else 0.0
         score(
@@ -151,8 +152,9 @@ class AncestryMap:
             self._fades,
             occupied,
             scores,
+            matches,
         )
-        return scores
+        return scores, matches
 
     def descend(self, states: Float[np.ndarray, "p s"], chosen: Int[np.ndarray, "p"], frame: int) -> int:
         """Follow a resampling and give the survivors nodes of this frame.
@@ -167,12 +169,12 @@ class AncestryMap:
         """
         window = len(self.tree.count)
         if frame - self._oldest >= window:
-            self._forget_oldest(frame - 1)
+            self._forget_oldest()
         grow(self.tree, frame % window, frame, states, chosen, self.node_of)
         # Lineages that have met free a frame each, some frames at once; to share the work, two at most.
         for _ in range(2):
             if self._oldest < frame and self._agreed(self._oldest % window):
-                self._forget_oldest(frame)
+                self._forget_oldest()
         return int(self.tree.count[frame % window])
 
     def enter(
@@ -192,7 +194,7 @@ class AncestryMap:
             done = write(self.tree, self.cells, self.pages, row, done, self.wheelbase_cm, self.cell_cm, plain)
             if done == len(weights) or self._oldest == frame:
                 break
-            self._forget_oldest(frame)
+            self._forget_oldest()
 
     def _agreed(self, row: int) -> bool:
         """Whether all particles descend from one node of a row."""
@@ -201,14 +203,13 @@ class AncestryMap:
             np.any(self.tree.last[row, nodes] - self.tree.first[row, nodes] == self.tree.first.shape[1])
         )
 
-    def _forget_oldest(self, newest: int) -> None:
+    def _forget_oldest(self) -> None:
         row = self._oldest % len(self.tree.count)
         self.forced += forget(
             self.tree,
             self.cells,
             self.pages,
             row,
-            newest,
             self.wheelbase_cm,
             self.cell_cm,
             self.memory_frames,

@@ -39,6 +39,7 @@ class Tree(NamedTuple):
         pose: Rear-axle pose of each node, frame map.
         points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
         size: How many points each frame wrote.
+        version: How often intervals have changed.
     """
 
     first: Int32[np.ndarray, "w p"]
@@ -48,6 +49,7 @@ class Tree(NamedTuple):
     pose: Float[np.ndarray, "w p 3"]
     points: Float[np.ndarray, "w m 5"]
     size: Int32[np.ndarray, "w"]
+    version: Int32[np.ndarray, "1"]
 
 
 class Cells(NamedTuple):
@@ -55,7 +57,7 @@ class Cells(NamedTuple):
 
     Attributes:
         state: Per cell: which cell of the unbounded plane it holds (ix, iy), its first page (-1: none), the
-            frame of the newest content of its root (-1: none), and the frame when it was last pruned.
+            frame of the newest content of its root (-1: none), and the version of the tree for which it was pruned.
         root: Sum of what all particles agree on, faded to the frame of its newest content.
     """
 
@@ -115,16 +117,17 @@ def grow(tree, row, frame, states, chosen, node_of):
             count += 1
     tree.count[row] = count
     tree.frame[row] = frame
+    tree.version[0] += 1
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _prune(tree, cells, pages, a, b, newest, memory):
+def _prune(tree, cells, pages, a, b, memory):
     """Take the dead entries out of a cell, and move those that all particles share into its root."""
     first, last, state, root = tree.first, tree.last, cells.state, cells.root
     following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
     particles = first.shape[1]
-    state[a, b, _PRUNED] = newest
+    state[a, b, _PRUNED] = tree.version[0]
     # Entries that stay move up to the front; ``into`` is the page that is being filled.
     into, filled = state[a, b, _PAGE], 0
     page = into
@@ -255,7 +258,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory, plain):
+def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     """Free a row of the tree: its entries move into the roots or are dropped.
 
     Where particles still disagree on the frame, the ancestor of most of them is taken for all.
@@ -265,7 +268,6 @@ def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory, plain):
         cells: The grid.
         pages: The pages.
         row: Row to free.
-        newest: Newest frame of the ancestry.
         wheelbase: Distance between the axles, [cm].
         cell_cm: Side of a cell.
         memory: Frames after which what was mapped has faded to 1/e.
@@ -283,6 +285,8 @@ def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory, plain):
     first[row, :nodes] = 0
     last[row, :nodes] = 0
     last[row, best] = particles
+    tree.version[0] += forced
+    version = tree.version[0]
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
     for i in range(tree.size[row]):
         right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
@@ -293,9 +297,8 @@ def forget(tree, cells, pages, row, newest, wheelbase, cell_cm, memory, plain):
             for iy in range(cy, cy + reach):
                 for ix in range(cx, cx + reach):
                     a, b = iy & mask, ix & mask
-                    # Forcing changes intervals, so that what was pruned is pruned once more.
-                    if state[a, b, _PAGE] >= 0 and (forced or state[a, b, _PRUNED] != newest):
-                        _prune(tree, cells, pages, a, b, newest, memory)
+                    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != version:
+                        _prune(tree, cells, pages, a, b, memory)
     tree.count[row] = 0
     tree.size[row] = 0
     return forced
@@ -314,8 +317,8 @@ def _expand(tree, cells, pages, ix, iy, frame, memory, fades, values):
     a, b = iy & mask, ix & mask
     if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
         return False
-    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != frame - 1:
-        _prune(tree, cells, pages, a, b, frame - 1, memory)
+    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != tree.version[0]:
+        _prune(tree, cells, pages, a, b, memory)
     page, stamp = state[a, b, _PAGE], state[a, b, _STAMP]
     if page < 0 and stamp < 0:
         return False
@@ -375,7 +378,7 @@ def _look(tree, cells, pages, ix, iy, frame, memory, fades, particle):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores):
+def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores, matches):
     """Score each particle's view of a frame against the map of its own lineage.
 
     Args:
@@ -391,13 +394,16 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
         fades: Fade by age in frames.
         occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
         scores: Filled.
+        matches: Filled with the weight of the points that each particle matches.
     """
     particles = len(poses)
     cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
+    along = np.zeros(particles)
     scores[:] = 0.0
+    matches[:] = 0.0
     for i in range(len(points)):
         right, forward = points[i, 0], points[i, 1] + wheelbase
         for p in range(particles):
@@ -405,7 +411,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
         low_x, low_y = ix.min(), iy.min()
         wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
-        boxed, used = wide * high <= _BOX, 0
+        boxed, used, strength = wide * high <= _BOX, 0, 0.0
         if boxed:
             asked[: wide * high] = 0
             for p in range(particles):
@@ -425,16 +431,24 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     rows[box] = _SINGLY
                     asked[box] = 0
                 row = rows[box]
-            if row == _NOTHING:
-                continue
+            x, y = 0.0, 0.0
             if row == _SINGLY:
                 x, y = _look(tree, cells, pages, ix[p], iy[p], frame, memory, fades, p)
-            else:
+            elif row >= 0:
                 x, y = values[row, p, 0], values[row, p, 1]
             if occupied > 0.0:
                 scores[p] += points[i, 4] * (x >= occupied)
+                matches[p] = scores[p]
             else:
                 nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
                 ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
-                # Saturate: an edge that was seen often counts once.
-                scores[p] += points[i, 4] * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))
+                length = np.sqrt(x * x + y * y)
+                strength += length
+                along[p] = nx * x + ny * y
+                matches[p] += points[i, 4] * along[p] / (1.0 + length)
+        if occupied == 0.0:
+            # Saturate: an edge that was seen often counts once. All particles share the denominator: with one
+            # of its own each, those would win that smear their map and match everywhere a little.
+            share = points[i, 4] / (1.0 + strength / particles)
+            for p in range(particles):
+                scores[p] += share * along[p]

@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from pydantic import Field
 
 from datagen.slam.ancestry import AncestryMap, Likelihood
-from datagen.slam.motion import FACTOR, MotionModel
+from datagen.slam.condense import condense
+from datagen.slam.motion import FACTOR, MotionModel, widen_steps
 from datagen.slam.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.scans import Progress, Scans
 from lanenet.config import Settings
@@ -27,11 +28,13 @@ class FilterSettings(Settings):
         cell_heights: Side of a cell of the map.
         field_size: Cells along each side of the map, which wraps around; a power of two.
         memory_frames: Frames after which what was mapped has faded to 1/e.
-        max_points: Edge points per frame that are scored.
-        map_points: Of these, how many are entered into the map.
+        patch_heights: Side of the patches whose edge points are taken together.
+        max_points: Patches per frame that are scored and mapped, the heaviest first.
         window: Frames for which the map tells lineages apart.
         effective_share: Least effective share of the particles; scores are tempered until it is reached.
         resample_below: Effective share below which the particles are drawn anew.
+        stray_every: One of so many particles strays from the predicted step further than the others; 0: none.
+        stray_factor: How many times as far (see :func:`widen_steps`).
     """
 
     particles: int = Field(default=300, ge=10)
@@ -39,11 +42,13 @@ class FilterSettings(Settings):
     cell_heights: float = Field(default=0.05, gt=0.0)
     field_size: int = Field(default=512, ge=64)
     memory_frames: float = Field(default=40.0, gt=0.0)
-    max_points: int = Field(default=150, ge=20)
-    map_points: int = Field(default=80, ge=10)
+    patch_heights: float = Field(default=0.08, gt=0.0)
+    max_points: int = Field(default=120, ge=20)
     window: int = Field(default=64, ge=2)
     effective_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     resample_below: float = Field(default=0.5, gt=0.0, le=1.0)
+    stray_every: int = Field(default=5, ge=0)
+    stray_factor: float = Field(default=4.0, ge=1.0)
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,7 @@ class ParticleFilter:
     ) -> None:
         count = settings.particles
         self.settings, self.rng = settings, rng
+        self.patch_cm = settings.patch_heights * camera_height_cm
         self.states = motion.start(count, rng)
         self.weights = np.full(count, 1.0 / count)
         self.map = AncestryMap.empty(
@@ -123,7 +129,7 @@ class ParticleFilter:
             settings.field_size,
             settings.memory_frames,
             wheelbase_cm,
-            settings.map_points,
+            settings.max_points,
             settings.window,
             settings.likelihood,
         )
@@ -150,16 +156,20 @@ class ParticleFilter:
         Source:
             Kozlowski et al. 2024, sections 3.1-3.3, after Eliazar and Parr, DP-SLAM, 2003.
         """
+        points_cm, normals, trust = condense(
+            points_cm, normals, trust, self.patch_cm, self.settings.max_points
+        )
         match = np.nan
         if self.frame > 0:
+            before = self.states.copy()
             motion.predict(self.states, k, self.rng)
-            scores = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
+            widen_steps(before, self.states, self.settings.stray_every, self.settings.stray_factor)
+            scores, matches = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
-            match = scores.max() / trust.sum() if trust.size else np.nan
+            match = matches.max() / trust.sum() if trust.size else np.nan
         estimate = self._estimate(match)
         self._resample()
-        entered = spread_rows(len(trust), self.settings.map_points, self.frame)
-        self.map.enter(points_cm[entered], normals[entered], trust[entered], self.frame)
+        self.map.enter(points_cm, normals, trust, self.frame)
         self.frame += 1
         return estimate
 
@@ -201,7 +211,9 @@ def run_filter(
     history: list[Survivors] = []
     match, spread = np.full(n, np.nan), np.zeros(n)
     for k in range(n):
-        estimate = particles.step(*thin_scan(scans, k, settings.max_points, rng), motion, k)
+        frame = scans.frame(k)
+        points_cm, normals, trust = scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
+        estimate = particles.step(points_cm, normals, trust, motion, k)
         match[k], spread[k] = estimate.match, estimate.spread_cm
         history.append(particles.survivors)
         if progress is not None:
@@ -209,25 +221,6 @@ def run_filter(
     final = np.bincount(particles.map.node_of, particles.weights) if n else np.zeros(0)
     smoothed = smooth_lineages(history, final)
     return Trajectory(smoothed[:, :3], smoothed[:, FACTOR], match, spread)
-
-
-def thin_scan(
-    scans: Scans, k: int, max_points: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
-    frame = scans.frame(k)
-    size = frame.stop - frame.start
-    if size <= max_points:
-        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
-    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
-    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]
-
-
-def spread_rows(size: int, wanted: int, turn: int) -> Int[np.ndarray, "m"]:
-    """Choose at most ``wanted`` of the rows 0..size-1, evenly spread and shifted by ``turn``."""
-    if size <= wanted:
-        return np.arange(size)
-    return (turn + np.arange(wanted) * size // wanted) % size
 
 
 def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> Float[np.ndarray, "n 5"]:

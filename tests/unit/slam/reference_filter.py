@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from datagen.slam.filter import FilterSettings, spread_rows, thin_scan
-from datagen.slam.motion import MotionModel
+from datagen.slam.motion import MotionModel, calm_motion
 from datagen.slam.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.scans import Scans
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -89,6 +89,7 @@ def reference_filter(
     for k in range(len(scans)):
         points, normals, trust = thin_scan(scans, k, settings.max_points, rng)
         if k > 0:
+            before = states.copy()
             motion.predict(states, k, rng)
             scores = np.array(
                 [
@@ -105,6 +106,7 @@ def reference_filter(
                 ]
             )
             weights = reweigh(weights, scores, settings.effective_share)
+            calm_motion(before, states, weights, settings.noise_kept)
             if effective_number(weights) < settings.resample_below * count:
                 chosen = systematic_resample(weights, rng)
                 states, weights = states[chosen], np.full(count, 1.0 / count)
