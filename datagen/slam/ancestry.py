@@ -77,8 +77,7 @@ class AncestryMap:
             pages: Room for what single lineages saw, in pages of 16 entries.
         """
         tree = Tree(
-            np.zeros((window, particles), np.int32),
-            np.zeros((window, particles), np.int32),
+            np.zeros((window, particles, 2), np.int32),
             np.zeros(window, np.int32),
             np.zeros(window, np.int32),
             np.zeros((window, particles, 3)),
@@ -198,10 +197,8 @@ class AncestryMap:
 
     def _agreed(self, row: int) -> bool:
         """Whether all particles descend from one node of a row."""
-        nodes = slice(0, int(self.tree.count[row]))
-        return bool(
-            np.any(self.tree.last[row, nodes] - self.tree.first[row, nodes] == self.tree.first.shape[1])
-        )
+        span = self.tree.span[row, : int(self.tree.count[row])]
+        return bool(np.any(span[:, 1] - span[:, 0] == self.tree.span.shape[1]))
 
     def _forget_oldest(self) -> None:
         row = self._oldest % len(self.tree.count)

@@ -25,15 +25,14 @@ PAGE_SIZE = 16
 _OWNER_X, _OWNER_Y, _PAGE, _STAMP, _PRUNED = range(5)
 _BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
 _FEW = 4  # particles that ask for the same cell and are yet looked up singly
-_NOTHING, _SINGLY = -1, -2
 
 
 class Tree(NamedTuple):
     """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
 
     Attributes:
-        first: First living particle that descends from the node.
-        last: One behind the last; equal to ``first`` for a dead node.
+        span: First living particle that descends from the node, and one behind the last; the same for a
+            dead node.
         count: Nodes per row.
         frame: Frame that the row belongs to.
         pose: Rear-axle pose of each node, frame map.
@@ -42,8 +41,7 @@ class Tree(NamedTuple):
         version: How often intervals have changed.
     """
 
-    first: Int32[np.ndarray, "w p"]
-    last: Int32[np.ndarray, "w p"]
+    span: Int32[np.ndarray, "w p 2"]
     count: Int32[np.ndarray, "w"]
     frame: Int32[np.ndarray, "w"]
     pose: Float[np.ndarray, "w p 3"]
@@ -96,22 +94,22 @@ def grow(tree, row, frame, states, chosen, node_of):
         chosen: Ascending index of each new particle's parent among them.
         node_of: Filled with the number of each new particle's node.
     """
-    first, last, particles = tree.first, tree.last, len(chosen)
+    span, particles = tree.span, len(chosen)
     # How many new particles stand before the copies of each old one.
     before = np.zeros(particles + 1, np.int32)
     for p in range(particles):
         before[chosen[p] + 1] += 1
     for p in range(particles):
         before[p + 1] += before[p]
-    for r in range(first.shape[0]):
+    for r in range(span.shape[0]):
         for i in range(tree.count[r]):
-            first[r, i] = before[first[r, i]]
-            last[r, i] = before[last[r, i]]
+            span[r, i, 0] = before[span[r, i, 0]]
+            span[r, i, 1] = before[span[r, i, 1]]
     count = 0
     for p in range(particles):
         if before[p + 1] > before[p]:
-            first[row, count] = before[p]
-            last[row, count] = before[p + 1]
+            span[row, count, 0] = before[p]
+            span[row, count, 1] = before[p + 1]
             tree.pose[row, count] = states[p, :3]
             node_of[before[p] : before[p + 1]] = count
             count += 1
@@ -124,9 +122,10 @@ def grow(tree, row, frame, states, chosen, node_of):
 @no_type_check
 def _prune(tree, cells, pages, a, b, memory):
     """Take the dead entries out of a cell, and move those that all particles share into its root."""
-    first, last, state, root = tree.first, tree.last, cells.state, cells.root
+    state, root = cells.state, cells.root
     following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
-    particles = first.shape[1]
+    particles = tree.span.shape[1]
+    span = tree.span.reshape((-1, 2))
     state[a, b, _PRUNED] = tree.version[0]
     # Entries that stay move up to the front; ``into`` is the page that is being filled.
     into, filled = state[a, b, _PAGE], 0
@@ -134,10 +133,9 @@ def _prune(tree, cells, pages, a, b, memory):
     while page >= 0:
         for e in range(used[page]):
             node = nodes[page, e]
-            row = node // particles
-            start, stop = first[row, node - row * particles], last[row, node - row * particles]
+            start, stop = span[node, 0], span[node, 1]
             if stop - start == particles:
-                frame, stamp = tree.frame[row], state[a, b, _STAMP]
+                frame, stamp = tree.frame[node // particles], state[a, b, _STAMP]
                 fade = 1.0
                 if stamp < frame:
                     old = np.exp((stamp - frame) / memory) if stamp >= 0 else 0.0
@@ -206,7 +204,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
         pages.vector,
         pages.free,
     )
-    particles, nodes = tree.first.shape[1], tree.count[row]
+    particles, nodes = tree.span.shape[1], tree.count[row]
     mask = state.shape[0] - 1
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
@@ -276,15 +274,14 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     Returns:
         Whether they disagreed.
     """
-    first, last, pose, points, state = tree.first, tree.last, tree.pose, tree.points, cells.state
-    particles, nodes, mask = first.shape[1], tree.count[row], state.shape[0] - 1
+    span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
+    particles, nodes, mask = span.shape[1], tree.count[row], state.shape[0] - 1
     reach, half = (1, 0.0) if plain else (2, 0.5)
-    sizes = last[row, :nodes] - first[row, :nodes]
+    sizes = span[row, :nodes, 1] - span[row, :nodes, 0]
     best = np.argmax(sizes)
     forced = sizes[best] < particles
-    first[row, :nodes] = 0
-    last[row, :nodes] = 0
-    last[row, best] = particles
+    span[row, :nodes] = 0
+    span[row, best, 1] = particles
     tree.version[0] += forced
     version = tree.version[0]
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
@@ -302,78 +299,6 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     tree.count[row] = 0
     tree.size[row] = 0
     return forced
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _expand(tree, cells, pages, ix, iy, frame, memory, fades, values):
-    """What a cell holds for each particle: the root and the entries of its lineage, faded to this frame.
-
-    Returns:
-        Whether it holds anything; ``values`` is filled only then.
-    """
-    first, last, state, root = tree.first, tree.last, cells.state, cells.root
-    mask, particles = state.shape[0] - 1, first.shape[1]
-    a, b = iy & mask, ix & mask
-    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
-        return False
-    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != tree.version[0]:
-        _prune(tree, cells, pages, a, b, memory)
-    page, stamp = state[a, b, _PAGE], state[a, b, _STAMP]
-    if page < 0 and stamp < 0:
-        return False
-    x, y = 0.0, 0.0
-    if stamp >= 0:
-        fade = np.exp((stamp - frame) / memory)
-        x, y = fade * root[a, b, 0], fade * root[a, b, 1]
-    if page < 0:
-        values[:, 0] = x
-        values[:, 1] = y
-        return True
-    values[:, :] = 0.0
-    while page >= 0:
-        for e in range(pages.used[page]):
-            node = pages.node[page, e]
-            row = node // particles
-            start, stop = first[row, node - row * particles], last[row, node - row * particles]
-            fade = fades[frame - tree.frame[row]]
-            vx, vy = fade * pages.vector[page, e, 0], fade * pages.vector[page, e, 1]
-            # Steps at both ends of the interval; the running sum below makes them plateaus.
-            values[start, 0] += vx
-            values[start, 1] += vy
-            values[stop, 0] -= vx
-            values[stop, 1] -= vy
-        page = pages.following[page]
-    for p in range(particles):
-        x += values[p, 0]
-        y += values[p, 1]
-        values[p, 0], values[p, 1] = x, y
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _look(tree, cells, pages, ix, iy, frame, memory, fades, particle):
-    """What a cell holds for one particle; slower than :func:`_expand` where many particles ask."""
-    state, particles = cells.state, tree.first.shape[1]
-    a, b = iy & (state.shape[0] - 1), ix & (state.shape[0] - 1)
-    x, y = 0.0, 0.0
-    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
-        return x, y
-    if state[a, b, _STAMP] >= 0:
-        fade = np.exp((state[a, b, _STAMP] - frame) / memory)
-        x, y = fade * cells.root[a, b, 0], fade * cells.root[a, b, 1]
-    page = state[a, b, _PAGE]
-    while page >= 0:
-        for e in range(pages.used[page]):
-            node = pages.node[page, e]
-            row = node // particles
-            if tree.first[row, node - row * particles] <= particle < tree.last[row, node - row * particles]:
-                fade = fades[frame - tree.frame[row]]
-                x += fade * pages.vector[page, e, 0]
-                y += fade * pages.vector[page, e, 1]
-        page = pages.following[page]
-    return x, y
 
 
 @njit(cache=True, error_model="numpy")
@@ -397,58 +322,89 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
         matches: Filled with the weight of the points that each particle matches.
     """
     particles = len(poses)
+    state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
+    following, used, entered, vector = pages.following, pages.used, pages.node, pages.vector
+    span = tree.span.reshape((-1, 2))
+    fade_of = np.empty(len(span))
+    for row in range(len(tree.frame)):
+        fade_of[row * particles : row * particles + tree.count[row]] = fades[max(frame - tree.frame[row], 0)]
     cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
-    along = np.zeros(particles)
+    along, lengths = np.zeros(particles), np.zeros(particles)
     scores[:] = 0.0
     matches[:] = 0.0
     for i in range(len(points)):
-        right, forward = points[i, 0], points[i, 1] + wheelbase
+        right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
         for p in range(particles):
             ix[p] = int(np.floor((poses[p, 0] + forward * cosines[p] + right * sines[p]) / cell_cm))
             iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
         low_x, low_y = ix.min(), iy.min()
         wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
-        boxed, used, strength = wide * high <= _BOX, 0, 0.0
+        boxed, filled, strength = wide * high <= _BOX, 0, 0.0
         if boxed:
             asked[: wide * high] = 0
             for p in range(particles):
                 asked[(iy[p] - low_y) * wide + ix[p] - low_x] += 1
         for p in range(particles):
-            row = _SINGLY
-            if boxed:
-                box = (iy[p] - low_y) * wide + ix[p] - low_x
-                if asked[box] > _FEW:
-                    filled = _expand(
-                        tree, cells, pages, ix[p], iy[p], frame, memory, fades, values[used]
-                    )
-                    rows[box] = used if filled else _NOTHING
-                    used += filled
-                    asked[box] = 0
-                elif asked[box] > 0:
-                    rows[box] = _SINGLY
-                    asked[box] = 0
-                row = rows[box]
             x, y = 0.0, 0.0
-            if row == _SINGLY:
-                x, y = _look(tree, cells, pages, ix[p], iy[p], frame, memory, fades, p)
-            elif row >= 0:
-                x, y = values[row, p, 0], values[row, p, 1]
+            box = (iy[p] - low_y) * wide + ix[p] - low_x if boxed else 0
+            if boxed and asked[box] == 0:
+                # Looked up before, for all particles.
+                x, y = values[rows[box], p, 0], values[rows[box], p, 1]
+            else:
+                a, b = iy[p] & mask, ix[p] & mask
+                mine = state[a, b, _OWNER_X] == ix[p] and state[a, b, _OWNER_Y] == iy[p]
+                page = -1
+                if mine:
+                    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != tree.version[0]:
+                        _prune(tree, cells, pages, a, b, memory)
+                    if state[a, b, _STAMP] >= 0:
+                        fade = np.exp((state[a, b, _STAMP] - frame) / memory)
+                        x, y = fade * root[a, b, 0], fade * root[a, b, 1]
+                    page = state[a, b, _PAGE]
+                if boxed and asked[box] > _FEW:
+                    held = values[filled]
+                    held[:, :] = 0.0
+                    while page >= 0:
+                        for e in range(used[page]):
+                            node = entered[page, e]
+                            vx, vy = fade_of[node] * vector[page, e, 0], fade_of[node] * vector[page, e, 1]
+                            # Steps at both ends of the interval; the running sum makes them plateaus.
+                            held[span[node, 0], 0] += vx
+                            held[span[node, 0], 1] += vy
+                            held[span[node, 1], 0] -= vx
+                            held[span[node, 1], 1] -= vy
+                        page = following[page]
+                    for q in range(particles):
+                        x += held[q, 0]
+                        y += held[q, 1]
+                        held[q, 0], held[q, 1] = x, y
+                    rows[box], asked[box] = filled, 0
+                    filled += 1
+                    x, y = held[p, 0], held[p, 1]
+                else:
+                    while page >= 0:
+                        for e in range(used[page]):
+                            node = entered[page, e]
+                            if span[node, 0] <= p < span[node, 1]:
+                                x += fade_of[node] * vector[page, e, 0]
+                                y += fade_of[node] * vector[page, e, 1]
+                        page = following[page]
             if occupied > 0.0:
-                scores[p] += points[i, 4] * (x >= occupied)
-                matches[p] = scores[p]
+                scores[p] += weight * (x >= occupied)
             else:
                 nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
                 ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
-                length = np.sqrt(x * x + y * y)
-                strength += length
                 along[p] = nx * x + ny * y
-                matches[p] += points[i, 4] * along[p] / (1.0 + length)
+                lengths[p] = np.sqrt(x * x + y * y)
+                strength += lengths[p]
         if occupied == 0.0:
             # Saturate: an edge that was seen often counts once. All particles share the denominator: with one
             # of its own each, those would win that smear their map and match everywhere a little.
-            share = points[i, 4] / (1.0 + strength / particles)
             for p in range(particles):
-                scores[p] += share * along[p]
+                scores[p] += weight * along[p] / (1.0 + strength / particles)
+                matches[p] += weight * along[p] / (1.0 + lengths[p])
+    if occupied > 0.0:
+        matches[:] = scores

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from datagen.slam.filter import FilterSettings, spread_rows, thin_scan
-from datagen.slam.motion import MotionModel, calm_motion
+from datagen.slam.condense import condense
+from datagen.slam.filter import FilterSettings
+from datagen.slam.motion import MotionModel, widen_steps
 from datagen.slam.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.scans import Scans
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -51,25 +52,15 @@ def enter(
             plain.setdefault(cell, []).append((frame, vector))
 
 
-def score(
-    plain: PlainMap,
-    points_map_cm: np.ndarray,
-    normals_map: np.ndarray,
-    weights: np.ndarray,
-    frame: int,
-    settings: FilterSettings,
-    cell_cm: float,
-) -> float:
-    total = 0.0
-    for point, normal, weight in zip(points_map_cm / cell_cm, normals_map, weights, strict=True):
-        vector = np.zeros(2)
+def look_up(
+    plain: PlainMap, points_map_cm: np.ndarray, frame: int, settings: FilterSettings, cell_cm: float
+) -> np.ndarray:
+    """What the map holds where the points lie."""
+    found = np.zeros((len(points_map_cm), 2))
+    for i, point in enumerate(points_map_cm / cell_cm):
         for seen, what in plain.get((int(np.floor(point[0])), int(np.floor(point[1]))), []):
-            vector += np.exp((seen - frame) / settings.memory_frames) * what
-        if settings.likelihood == "count":
-            total += weight * (vector[0] >= 0.05)
-        else:
-            total += weight * float(normal @ vector) / (1.0 + float(np.linalg.norm(vector)))
-    return total
+            found[i] += np.exp((seen - frame) / settings.memory_frames) * what
+    return found
 
 
 def reference_filter(
@@ -87,37 +78,43 @@ def reference_filter(
     maps: list[PlainMap] = [{} for _ in range(count)]
     all_states, all_weights = [], []
     for k in range(len(scans)):
-        points, normals, trust = thin_scan(scans, k, settings.max_points, rng)
+        rows = scans.frame(k)
+        points, normals, trust = condense(
+            scans.points_cm[rows],
+            scans.normals[rows],
+            scans.weights[rows],
+            settings.patch_heights * camera_height_cm,
+            settings.max_points,
+        )
         if k > 0:
             before = states.copy()
             motion.predict(states, k, rng)
-            scores = np.array(
+            widen_steps(before, states, settings.stray_every, settings.stray_factor)
+            held = np.stack(
                 [
-                    score(
-                        maps[p],
-                        map_from_car(points, states[p, :3], wheelbase_cm),
-                        map_from_car_directions(normals, states[p, 2]),
-                        trust,
-                        k,
-                        settings,
-                        cell_cm,
+                    look_up(
+                        maps[p], map_from_car(points, states[p, :3], wheelbase_cm), k, settings, cell_cm
                     )
                     for p in range(count)
                 ]
             )
+            if settings.likelihood == "count":
+                scores = (held[:, :, 0] >= 0.05) @ trust
+            else:
+                turned = np.stack([map_from_car_directions(normals, states[p, 2]) for p in range(count)])
+                strength = np.linalg.norm(held, axis=2).mean(axis=0)
+                scores = np.sum(turned * held, axis=2) @ (trust / (1.0 + strength))
             weights = reweigh(weights, scores, settings.effective_share)
-            calm_motion(before, states, weights, settings.noise_kept)
             if effective_number(weights) < settings.resample_below * count:
                 chosen = systematic_resample(weights, rng)
                 states, weights = states[chosen], np.full(count, 1.0 / count)
                 maps = [copy_of(maps[p]) for p in chosen]
-        rows = spread_rows(len(trust), settings.map_points, k)
         for p in range(count):
             enter(
                 maps[p],
-                map_from_car(points[rows], states[p, :3], wheelbase_cm),
-                map_from_car_directions(normals[rows], states[p, 2]),
-                trust[rows],
+                map_from_car(points, states[p, :3], wheelbase_cm),
+                map_from_car_directions(normals, states[p, 2]),
+                trust,
                 k,
                 cell_cm,
                 settings.likelihood == "count",
