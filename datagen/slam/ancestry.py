@@ -122,7 +122,7 @@ class AncestryMap:
         normals_car: Float[np.ndarray, "n 2"],
         weights: Float[np.ndarray, "n"],
         frame: int,
-    ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    ) -> Float[np.ndarray, "p"]:
         """Score how well a frame's edges fit what each particle's lineage has seen.
 
         Args:
@@ -133,9 +133,9 @@ class AncestryMap:
             frame: Number of the frame, later than all that was mapped.
 
         Returns:
-            Scores, which compare particles, and the weighted number of points that each matches.
+            About the weighted number of matched points, one number per particle.
         """
-        scores, matches = np.zeros(len(poses)), np.zeros(len(poses))
+        scores = np.zeros(len(poses))
         points = np.concatenate([points_car_cm, normals_car, weights[:, None]], axis=1)
         occupied = _OCCUPIED if self.likelihood == "count" else 0.0
         score(
@@ -151,9 +151,8 @@ class AncestryMap:
             self._fades,
             occupied,
             scores,
-            matches,
         )
-        return scores, matches
+        return scores
 
     def descend(self, states: Float[np.ndarray, "p s"], chosen: Int[np.ndarray, "p"], frame: int) -> int:
         """Follow a resampling and give the survivors nodes of this frame.
@@ -201,16 +200,26 @@ class AncestryMap:
         return bool(np.any(span[:, 1] - span[:, 0] == self.tree.span.shape[1]))
 
     def _forget_oldest(self) -> None:
+        """Free the row of the oldest frame."""
         row = self._oldest % len(self.tree.count)
-        self.forced += forget(
-            self.tree,
-            self.cells,
-            self.pages,
-            row,
-            self.wheelbase_cm,
-            self.cell_cm,
-            self.memory_frames,
-            self.likelihood == "count",
-        )
+        plain = self.likelihood == "count"
+        if self._forget(row):
+            self.forced += 1
+            write(self.tree, self.cells, self.pages, row, 0, self.wheelbase_cm, self.cell_cm, plain)
+            self._forget(row)
         self._oldest += 1
 
+    def _forget(self, row: int) -> bool:
+        plain = self.likelihood == "count"
+        return bool(
+            forget(
+                self.tree,
+                self.cells,
+                self.pages,
+                row,
+                self.wheelbase_cm,
+                self.cell_cm,
+                self.memory_frames,
+                plain,
+            )
+        )

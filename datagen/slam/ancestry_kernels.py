@@ -259,7 +259,8 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     """Free a row of the tree: its entries move into the roots or are dropped.
 
-    Where particles still disagree on the frame, the ancestor of most of them is taken for all.
+    Where particles still disagree on the frame, a node at their ancestors' mean pose is left in the row, to be
+    entered and forgotten in its turn.
 
     Args:
         tree: The tree.
@@ -277,12 +278,14 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
     particles, nodes, mask = span.shape[1], tree.count[row], state.shape[0] - 1
     reach, half = (1, 0.0) if plain else (2, 0.5)
-    sizes = span[row, :nodes, 1] - span[row, :nodes, 0]
-    best = np.argmax(sizes)
-    forced = sizes[best] < particles
-    span[row, :nodes] = 0
-    span[row, best, 1] = particles
-    tree.version[0] += forced
+    forced, mean = True, np.zeros(3)
+    for node in range(nodes):
+        size = span[row, node, 1] - span[row, node, 0]
+        forced &= size < particles
+        mean += size / particles * pose[row, node]
+    if forced:
+        span[row, :nodes] = 0
+        tree.version[0] += 1
     version = tree.version[0]
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
     for i in range(tree.size[row]):
@@ -296,14 +299,21 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
                     a, b = iy & mask, ix & mask
                     if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != version:
                         _prune(tree, cells, pages, a, b, memory)
-    tree.count[row] = 0
-    tree.size[row] = 0
+    if forced:
+        # All lineages are gone from the cells; one node that everybody descends from takes their place.
+        pose[row, 0] = mean
+        span[row, 0, 1] = particles
+        tree.count[row] = 1
+        tree.version[0] += 1
+    else:
+        tree.count[row] = 0
+        tree.size[row] = 0
     return forced
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores, matches):
+def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores):
     """Score each particle's view of a frame against the map of its own lineage.
 
     Args:
@@ -319,7 +329,6 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
         fades: Fade by age in frames.
         occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
         scores: Filled.
-        matches: Filled with the weight of the points that each particle matches.
     """
     particles = len(poses)
     state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
@@ -332,9 +341,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
-    along, lengths = np.zeros(particles), np.zeros(particles)
     scores[:] = 0.0
-    matches[:] = 0.0
     for i in range(len(points)):
         right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
         for p in range(particles):
@@ -342,7 +349,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
         low_x, low_y = ix.min(), iy.min()
         wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
-        boxed, filled, strength = wide * high <= _BOX, 0, 0.0
+        boxed, filled = wide * high <= _BOX, 0
         if boxed:
             asked[: wide * high] = 0
             for p in range(particles):
@@ -397,14 +404,5 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             else:
                 nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
                 ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
-                along[p] = nx * x + ny * y
-                lengths[p] = np.sqrt(x * x + y * y)
-                strength += lengths[p]
-        if occupied == 0.0:
-            # Saturate: an edge that was seen often counts once. All particles share the denominator: with one
-            # of its own each, those would win that smear their map and match everywhere a little.
-            for p in range(particles):
-                scores[p] += weight * along[p] / (1.0 + strength / particles)
-                matches[p] += weight * along[p] / (1.0 + lengths[p])
-    if occupied > 0.0:
-        matches[:] = scores
+                # Saturate: an edge that was seen often counts once.
+                scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))

@@ -37,7 +37,7 @@ def condense(
     _, patch = np.unique(key, return_inverse=True)
 
     def total(values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n"]:
-        return np.bincount(patch, values)
+        return np.bincount(patch, values).astype(np.float64)
 
     weight = total(weights)
     normal = np.column_stack([total(weights * normals[:, 0]), total(weights * normals[:, 1])])

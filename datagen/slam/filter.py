@@ -164,9 +164,9 @@ class ParticleFilter:
             before = self.states.copy()
             motion.predict(self.states, k, self.rng)
             widen_steps(before, self.states, self.settings.stray_every, self.settings.stray_factor)
-            scores, matches = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
+            scores = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
-            match = matches.max() / trust.sum() if trust.size else np.nan
+            match = scores.max() / trust.sum() if trust.size else np.nan
         estimate = self._estimate(match)
         self._resample()
         self.map.enter(points_cm, normals, trust, self.frame)

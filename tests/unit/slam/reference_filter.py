@@ -102,8 +102,8 @@ def reference_filter(
                 scores = (held[:, :, 0] >= 0.05) @ trust
             else:
                 turned = np.stack([map_from_car_directions(normals, states[p, 2]) for p in range(count)])
-                strength = np.linalg.norm(held, axis=2).mean(axis=0)
-                scores = np.sum(turned * held, axis=2) @ (trust / (1.0 + strength))
+                strength = np.linalg.norm(held, axis=2)
+                scores = (np.sum(turned * held, axis=2) / (1.0 + strength)) @ trust
             weights = reweigh(weights, scores, settings.effective_share)
             if effective_number(weights) < settings.resample_below * count:
                 chosen = systematic_resample(weights, rng)

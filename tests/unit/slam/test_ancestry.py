@@ -87,13 +87,13 @@ def test_any_family_tree_scores_as_separate_maps_do(seed, frames, particles):
         shown.append(scan)
         lineages = [[*lineages[parent], (states[parent], frame)] for parent in chosen]
     poses, view = _states(rng, particles), _scan(rng)
-    _, matches = shared.score(poses, *view, frames)
+    matches = shared.score(poses, *view, frames)
     for p, lineage in enumerate(lineages):
         alone = _map(1)
         for pose, frame in lineage:
             alone.descend(pose[None], np.zeros(1, np.int64), frame)
             alone.enter(*shown[frame], frame)
-        expected = alone.score(poses[p : p + 1], *view, frames)[1][0]
+        expected = alone.score(poses[p : p + 1], *view, frames)[0]
         assert matches[p] == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
@@ -112,27 +112,29 @@ def test_entries_live_exactly_as_long_as_their_lineages_differ():
     assert (shared.cells.root != 0.0).any()
 
 
-def test_a_full_window_takes_the_ancestor_of_most_and_counts_it():
+def test_a_full_window_takes_the_mean_of_the_ancestors_and_counts_it():
     rng = np.random.default_rng(1)
-    view, poses = _scan(rng), np.zeros((5, 3))
-    shared, most = _map(5, window=4), _map(1)
-    ancestors = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    shared, mean = _map(5, window=4), _map(1)
+    ancestors = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.1], [0.0, 2.0, 0.3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     scan = _scan(rng)
     # One lineage of the first particle, three of the second, one of the third.
     chosen = np.array([0, 1, 1, 1, 2])
     shared.descend(ancestors, chosen, 0)
     shared.enter(*scan, 0)
-    most.descend(ancestors[1:2], np.zeros(1, np.int64), 0)
-    most.enter(*scan, 0)
+    poses = np.tile(ancestors[chosen].mean(axis=0), (5, 1))
+    mean.descend(poses[:1], np.zeros(1, np.int64), 0)
+    mean.enter(*scan, 0)
     nothing = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     for frame in range(1, 5):
         shared.descend(poses, np.arange(5), frame)
         shared.enter(*nothing, frame)
-        most.descend(poses[:1], np.zeros(1, np.int64), frame)
+        mean.descend(poses[:1], np.zeros(1, np.int64), frame)
     assert shared.forced == 1
-    expected = most.score(poses[:1], *view, 5)[1][0]
-    assert abs(expected) > 1e-3
-    np.testing.assert_allclose(shared.score(poses, *view, 5)[1], expected, rtol=1e-6)
+    # Nothing of it is left to single lineages.
+    assert shared.pages.free[1] == len(shared.pages.used)
+    expected = mean.score(poses[:1], *scan, 5)[0]
+    assert expected > 1.0
+    np.testing.assert_allclose(shared.score(poses, *scan, 5), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("pages", [700, 5000])
@@ -148,7 +150,7 @@ def test_memory_is_bounded_however_long_lineages_stay_apart(pages):
     assert shared.bytes == size
     # With room enough only the window binds; with little the pool does, earlier.
     assert shared.forced >= 60 - 16
-    assert np.isfinite(shared.score(_states(rng, 6), *_scan(rng), 60)[0]).all()
+    assert np.isfinite(shared.score(_states(rng, 6), *_scan(rng), 60)).all()
 
 
 def test_no_page_is_lost_over_many_generations():
@@ -176,7 +178,7 @@ def test_counting_takes_no_notice_of_directions():
         shared.descend(np.zeros((1, 3)), np.zeros(1, np.int64), 0)
         shared.enter(points, normals, weights, 0)
         results[likelihood] = [
-            shared.score(np.zeros((1, 3)), points, sign * normals, weights, 1)[0][0] for sign in (1.0, -1.0)
+            shared.score(np.zeros((1, 3)), points, sign * normals, weights, 1)[0] for sign in (1.0, -1.0)
         ]
     assert results["count"] == [2.0, 2.0]
     assert results["direction"][0] == pytest.approx(-results["direction"][1])
