@@ -83,7 +83,8 @@ class AncestryMap:
             np.zeros((window, particles, 3)),
             np.zeros((window, points, 5)),
             np.zeros(window, np.int32),
-            np.zeros(1, np.int32),
+            np.zeros(2, np.int64),
+            np.zeros((particles, 2), np.int64),
         )
         state = np.zeros((size, size, 8), np.int32)
         state[:, :, 2:] = -1
@@ -94,7 +95,7 @@ class AncestryMap:
             following,
             np.zeros(pages, np.int32),
             np.zeros((pages, PAGE_SIZE), np.int32),
-            np.zeros((pages, PAGE_SIZE, 2), np.float32),
+            np.zeros((pages, PAGE_SIZE, 2)),
             np.array([0, pages], np.int32),
         )
         fades = np.exp(-np.arange(window + 1) / memory_frames)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Int32, Int64
 from numba import njit
 
 #: Entries per page.
@@ -38,7 +38,9 @@ class Tree(NamedTuple):
         pose: Rear-axle pose of each node, frame map.
         points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
         size: How many points each frame wrote.
-        version: How often intervals have changed.
+        version: How often intervals have changed, and how many cells were pruned.
+        mark: Of :func:`_prune`: the last pruned cell in which an entry's interval began with this particle,
+            and where that entry is.
     """
 
     span: Int32[np.ndarray, "w p 2"]
@@ -47,7 +49,8 @@ class Tree(NamedTuple):
     pose: Float[np.ndarray, "w p 3"]
     points: Float[np.ndarray, "w m 5"]
     size: Int32[np.ndarray, "w"]
-    version: Int32[np.ndarray, "1"]
+    version: Int64[np.ndarray, "2"]
+    mark: Int64[np.ndarray, "p 2"]
 
 
 class Cells(NamedTuple):
@@ -77,7 +80,7 @@ class Pages(NamedTuple):
     following: Int32[np.ndarray, "n"]
     used: Int32[np.ndarray, "n"]
     node: Int32[np.ndarray, "n e"]
-    vector: Float32[np.ndarray, "n e 2"]
+    vector: Float[np.ndarray, "n e 2"]
     free: Int32[np.ndarray, "2"]
 
 
@@ -121,12 +124,18 @@ def grow(tree, row, frame, states, chosen, node_of):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _prune(tree, cells, pages, a, b, memory):
-    """Take the dead entries out of a cell, and move those that all particles share into its root."""
+    """Take the dead entries out of a cell, and move those that all particles share into its root.
+
+    Entries with the same descendants will have the same for ever: they become one.
+    """
     state, root = cells.state, cells.root
     following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
     particles = tree.span.shape[1]
     span = tree.span.reshape((-1, 2))
     state[a, b, _PRUNED] = tree.version[0]
+    mark = tree.mark
+    tree.version[1] += 1
+    serial = tree.version[1]
     # Entries that stay move up to the front; ``into`` is the page that is being filled.
     into, filled = state[a, b, _PAGE], 0
     page = into
@@ -147,12 +156,21 @@ def _prune(tree, cells, pages, a, b, memory):
                 root[a, b, 0] += fade * vector[page, e, 0]
                 root[a, b, 1] += fade * vector[page, e, 1]
             elif stop > start:
+                if mark[start, 0] == serial:
+                    other, place = mark[start, 1] // PAGE_SIZE, mark[start, 1] % PAGE_SIZE
+                    like = nodes[other, place]
+                    if span[like, 1] == stop:
+                        fade = np.exp((tree.frame[node // particles] - tree.frame[like // particles]) / memory)
+                        vector[other, place, 0] += fade * vector[page, e, 0]
+                        vector[other, place, 1] += fade * vector[page, e, 1]
+                        continue
                 if filled == PAGE_SIZE:
                     used[into] = PAGE_SIZE
                     into, filled = following[into], 0
                 nodes[into, filled] = node
                 vector[into, filled, 0] = vector[page, e, 0]
                 vector[into, filled, 1] = vector[page, e, 1]
+                mark[start, 0], mark[start, 1] = serial, into * PAGE_SIZE + filled
                 filled += 1
         page = following[page]
     rest = state[a, b, _PAGE]

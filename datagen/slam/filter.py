@@ -39,11 +39,11 @@ class FilterSettings(Settings):
 
     particles: int = Field(default=300, ge=10)
     likelihood: Likelihood = "direction"
-    cell_heights: float = Field(default=0.05, gt=0.0)
+    cell_heights: float = Field(default=0.08, gt=0.0)
     field_size: int = Field(default=512, ge=64)
     memory_frames: float = Field(default=40.0, gt=0.0)
     patch_heights: float = Field(default=0.08, gt=0.0)
-    max_points: int = Field(default=120, ge=20)
+    max_points: int = Field(default=80, ge=20)
     window: int = Field(default=64, ge=2)
     effective_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     resample_below: float = Field(default=0.5, gt=0.0, le=1.0)

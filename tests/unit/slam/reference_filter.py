@@ -47,9 +47,7 @@ def enter(
                 (x + 1, y + 1): tx * ty,
             }
         for cell, share in shares.items():
-            # The filter proper stores single precision.
-            vector = (weight * share * normal).astype(np.float32).astype(np.float64)
-            plain.setdefault(cell, []).append((frame, vector))
+            plain.setdefault(cell, []).append((frame, weight * share * normal))
 
 
 def look_up(
