@@ -1,9 +1,9 @@
 """One map that all particles share, each cell of which knows what each lineage saw there.
 
-After Eliazar and Parr (DP-SLAM, 2003): particles differ in where they were during the last frames only; before
-that they descend from the same ancestor. What a frame showed is entered once for each particle that survived
-its resampling (a node of the ancestry), and a particle sees of it what its own ancestor entered. Once all
-particles descend from one node, its entries belong to all; once none does, they are dropped.
+After Eliazar and Parr (DP-SLAM, 2003): particles differ in where they were during the last frames only;
+before that they descend from the same ancestor. What a frame showed is entered once for each particle that
+survived its resampling (a node of the ancestry), and a particle sees of it what its own ancestor entered.
+Once all particles descend from one node, its entries belong to all; once none does, they are dropped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int, Int32
 
-from datagen.slam.ancestry_kernels import PAGE_SIZE, Cells, Pages, Tree, forget, grow, score, write
+from datagen.slam.ancestry_arrays import PAGE_SIZE, Cells, Pages, Tree
+from datagen.slam.ancestry_kernels import forget, grow, write
+from datagen.slam.ancestry_score import score
 
 Likelihood = Literal["direction", "count"]
 
@@ -35,8 +37,8 @@ class AncestryMap:
         cells: The grid.
         pages: What single lineages saw.
         node_of: Number of the newest node of each particle.
-        forced: Frames that were taken from the ancestor of most particles, because they still disagreed when
-            the window or the pool was full.
+        forced: Frames that were entered for all at the mean pose of their ancestors, because lineages still
+            differed when the window or the pages were full.
     """
 
     cell_cm: float
@@ -166,7 +168,7 @@ class AncestryMap:
         Returns:
             Number of survivors.
         """
-        window = len(self.tree.count)
+        window = len(self.tree.nodes)
         if frame - self._oldest >= window:
             self._forget_oldest()
         grow(self.tree, frame % window, frame, states, chosen, self.node_of)
@@ -174,7 +176,7 @@ class AncestryMap:
         for _ in range(2):
             if self._oldest < frame and self._agreed(self._oldest % window):
                 self._forget_oldest()
-        return int(self.tree.count[frame % window])
+        return int(self.tree.nodes[frame % window])
 
     def enter(
         self,
@@ -184,7 +186,7 @@ class AncestryMap:
         frame: int,
     ) -> None:
         """Enter a frame's edges as seen from each of its nodes, [cm], frame car."""
-        row = frame % len(self.tree.count)
+        row = frame % len(self.tree.nodes)
         stored = self.tree.points[row, : len(weights)]
         stored[:, :2], stored[:, 2:4], stored[:, 4] = points_car_cm, normals_car, weights
         self.tree.size[row] = len(weights)
@@ -197,12 +199,12 @@ class AncestryMap:
 
     def _agreed(self, row: int) -> bool:
         """Whether all particles descend from one node of a row."""
-        span = self.tree.span[row, : int(self.tree.count[row])]
+        span = self.tree.span[row, : int(self.tree.nodes[row])]
         return bool(np.any(span[:, 1] - span[:, 0] == self.tree.span.shape[1]))
 
     def _forget_oldest(self) -> None:
         """Free the row of the oldest frame."""
-        row = self._oldest % len(self.tree.count)
+        row = self._oldest % len(self.tree.nodes)
         plain = self.likelihood == "count"
         if self._forget(row):
             self.forced += 1

@@ -1,8 +1,8 @@
-"""The loops of the shared map: writing, looking up along lineages, pruning.
+"""The loops of the shared map: following the ancestry, writing, pruning.
 
-Resampling keeps the order of the particles (systematic resampling draws ascending indices), so that the living
-descendants of a node are always neighbours: one interval of particles. Whether a particle descends from a node
-is two comparisons, and what a cell holds for each particle is a sum over intervals.
+Resampling keeps the order of the particles (systematic resampling draws ascending indices), so that the
+living descendants of a node are always neighbours: one interval of particles. Whether a particle descends
+from a node is two comparisons, and what a cell holds for each particle is a sum over intervals.
 
 An entry whose interval is empty is dead; one whose interval holds everybody is the same for all particles and
 moves into the root. Both happen where a cell is visited, and at the latest when its frame leaves the tree.
@@ -13,75 +13,12 @@ outermost: chasing entries one by one through memory would take longer than all 
 
 from __future__ import annotations
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int32, Int64
 from numba import njit
 
-#: Entries per page.
-PAGE_SIZE = 16
-# Columns of a cell's state.
-_OWNER_X, _OWNER_Y, _PAGE, _STAMP, _PRUNED = range(5)
-_BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
-_FEW = 4  # particles that ask for the same cell and are yet looked up singly
-
-
-class Tree(NamedTuple):
-    """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
-
-    Attributes:
-        span: First living particle that descends from the node, and one behind the last; the same for a
-            dead node.
-        count: Nodes per row.
-        frame: Frame that the row belongs to.
-        pose: Rear-axle pose of each node, frame map.
-        points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
-        size: How many points each frame wrote.
-        version: How often intervals have changed, and how many cells were pruned.
-        mark: Of :func:`_prune`: the last pruned cell in which an entry's interval began with this particle,
-            and where that entry is.
-    """
-
-    span: Int32[np.ndarray, "w p 2"]
-    count: Int32[np.ndarray, "w"]
-    frame: Int32[np.ndarray, "w"]
-    pose: Float[np.ndarray, "w p 3"]
-    points: Float[np.ndarray, "w m 5"]
-    size: Int32[np.ndarray, "w"]
-    version: Int64[np.ndarray, "2"]
-    mark: Int64[np.ndarray, "p 2"]
-
-
-class Cells(NamedTuple):
-    """A wrapping grid; each cell has a root, which all particles share, and entries of single lineages.
-
-    Attributes:
-        state: Per cell: which cell of the unbounded plane it holds (ix, iy), its first page (-1: none), the
-            frame of the newest content of its root (-1: none), and the version of the tree for which it was pruned.
-        root: Sum of what all particles agree on, faded to the frame of its newest content.
-    """
-
-    state: Int32[np.ndarray, "s s 8"]
-    root: Float[np.ndarray, "s s 2"]
-
-
-class Pages(NamedTuple):
-    """Entries of the cells, by the page: what one node saw in one cell.
-
-    Attributes:
-        following: Next page of the cell, or of the free ones; -1 at the end.
-        used: Entries in each page.
-        node: Who saw it: row * particles + number in the row.
-        vector: What was seen.
-        free: First free page, and how many are free.
-    """
-
-    following: Int32[np.ndarray, "n"]
-    used: Int32[np.ndarray, "n"]
-    node: Int32[np.ndarray, "n e"]
-    vector: Float[np.ndarray, "n e 2"]
-    free: Int32[np.ndarray, "2"]
+from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PRUNED, STAMP
 
 
 @njit(cache=True, error_model="numpy")
@@ -105,7 +42,7 @@ def grow(tree, row, frame, states, chosen, node_of):
     for p in range(particles):
         before[p + 1] += before[p]
     for r in range(span.shape[0]):
-        for i in range(tree.count[r]):
+        for i in range(tree.nodes[r]):
             span[r, i, 0] = before[span[r, i, 0]]
             span[r, i, 1] = before[span[r, i, 1]]
     count = 0
@@ -116,14 +53,14 @@ def grow(tree, row, frame, states, chosen, node_of):
             tree.pose[row, count] = states[p, :3]
             node_of[before[p] : before[p + 1]] = count
             count += 1
-    tree.count[row] = count
+    tree.nodes[row] = count
     tree.frame[row] = frame
     tree.version[0] += 1
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _prune(tree, cells, pages, a, b, memory):
+def prune(tree, cells, pages, a, b, memory):
     """Take the dead entries out of a cell, and move those that all particles share into its root.
 
     Entries with the same descendants will have the same for ever: they become one.
@@ -132,25 +69,25 @@ def _prune(tree, cells, pages, a, b, memory):
     following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
     particles = tree.span.shape[1]
     span = tree.span.reshape((-1, 2))
-    state[a, b, _PRUNED] = tree.version[0]
+    state[a, b, PRUNED] = tree.version[0]
     mark = tree.mark
     tree.version[1] += 1
     serial = tree.version[1]
     # Entries that stay move up to the front; ``into`` is the page that is being filled.
-    into, filled = state[a, b, _PAGE], 0
+    into, filled = state[a, b, PAGE], 0
     page = into
     while page >= 0:
         for e in range(used[page]):
             node = nodes[page, e]
             start, stop = span[node, 0], span[node, 1]
             if stop - start == particles:
-                frame, stamp = tree.frame[node // particles], state[a, b, _STAMP]
+                frame, stamp = tree.frame[node // particles], state[a, b, STAMP]
                 fade = 1.0
                 if stamp < frame:
                     old = np.exp((stamp - frame) / memory) if stamp >= 0 else 0.0
                     root[a, b, 0] *= old
                     root[a, b, 1] *= old
-                    state[a, b, _STAMP] = frame
+                    state[a, b, STAMP] = frame
                 else:
                     fade = np.exp((frame - stamp) / memory)
                 root[a, b, 0] += fade * vector[page, e, 0]
@@ -160,7 +97,9 @@ def _prune(tree, cells, pages, a, b, memory):
                     other, place = mark[start, 1] // PAGE_SIZE, mark[start, 1] % PAGE_SIZE
                     like = nodes[other, place]
                     if span[like, 1] == stop:
-                        fade = np.exp((tree.frame[node // particles] - tree.frame[like // particles]) / memory)
+                        fade = np.exp(
+                            (tree.frame[node // particles] - tree.frame[like // particles]) / memory
+                        )
                         vector[other, place, 0] += fade * vector[page, e, 0]
                         vector[other, place, 1] += fade * vector[page, e, 1]
                         continue
@@ -173,13 +112,13 @@ def _prune(tree, cells, pages, a, b, memory):
                 mark[start, 0], mark[start, 1] = serial, into * PAGE_SIZE + filled
                 filled += 1
         page = following[page]
-    rest = state[a, b, _PAGE]
+    rest = state[a, b, PAGE]
     if filled:
         used[into] = filled
         rest = following[into]
         following[into] = -1
     else:
-        state[a, b, _PAGE] = -1
+        state[a, b, PAGE] = -1
     _free(pages, rest)
 
 
@@ -222,7 +161,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
         pages.vector,
         pages.free,
     )
-    particles, nodes = tree.span.shape[1], tree.count[row]
+    particles, nodes = tree.span.shape[1], tree.nodes[row]
     mask = state.shape[0] - 1
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
@@ -250,20 +189,20 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                     share = weight * wx[jx] * wy[jy]
                     ix, iy = cx + jx, cy + jy
                     a, b = iy & mask, ix & mask
-                    if state[a, b, _OWNER_X] != ix or state[a, b, _OWNER_Y] != iy:
+                    if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
                         # Another patch of road takes the cell over; what it held is forgotten.
-                        _free(pages, state[a, b, _PAGE])
-                        state[a, b, _PAGE], state[a, b, _STAMP] = -1, -1
+                        _free(pages, state[a, b, PAGE])
+                        state[a, b, PAGE], state[a, b, STAMP] = -1, -1
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
-                        state[a, b, _OWNER_X], state[a, b, _OWNER_Y] = ix, iy
-                    page = state[a, b, _PAGE]
+                        state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
+                    page = state[a, b, PAGE]
                     if page < 0 or used[page] == PAGE_SIZE:
                         fresh = free[0]
                         free[0] = following[fresh]
                         free[1] -= 1
                         following[fresh] = page
                         used[fresh] = 0
-                        state[a, b, _PAGE] = page = fresh
+                        state[a, b, PAGE] = page = fresh
                     e = used[page]
                     entered[page, e] = row * particles + node
                     vector[page, e, 0] = share * nx
@@ -277,8 +216,8 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     """Free a row of the tree: its entries move into the roots or are dropped.
 
-    Where particles still disagree on the frame, a node at their ancestors' mean pose is left in the row, to be
-    entered and forgotten in its turn.
+    Where particles still disagree on the frame, a node at their ancestors' mean pose is left in the row, to
+    be entered and forgotten in its turn.
 
     Args:
         tree: The tree.
@@ -294,7 +233,7 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
         Whether they disagreed.
     """
     span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
-    particles, nodes, mask = span.shape[1], tree.count[row], state.shape[0] - 1
+    particles, nodes, mask = span.shape[1], tree.nodes[row], state.shape[0] - 1
     reach, half = (1, 0.0) if plain else (2, 0.5)
     forced, mean = True, np.zeros(3)
     for node in range(nodes):
@@ -315,112 +254,15 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
             for iy in range(cy, cy + reach):
                 for ix in range(cx, cx + reach):
                     a, b = iy & mask, ix & mask
-                    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != version:
-                        _prune(tree, cells, pages, a, b, memory)
+                    if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
+                        prune(tree, cells, pages, a, b, memory)
     if forced:
         # All lineages are gone from the cells; one node that everybody descends from takes their place.
         pose[row, 0] = mean
         span[row, 0, 1] = particles
-        tree.count[row] = 1
+        tree.nodes[row] = 1
         tree.version[0] += 1
     else:
-        tree.count[row] = 0
+        tree.nodes[row] = 0
         tree.size[row] = 0
     return forced
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores):
-    """Score each particle's view of a frame against the map of its own lineage.
-
-    Args:
-        tree: The tree.
-        cells: The grid.
-        pages: The pages.
-        poses: Predicted poses, frame map.
-        points: Edge points as in :class:`Tree`.
-        frame: Number of the frame, one more than the newest in the tree.
-        wheelbase: Distance between the axles, [cm].
-        cell_cm: Side of a cell.
-        memory: Frames after which what was mapped has faded to 1/e.
-        fades: Fade by age in frames.
-        occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
-        scores: Filled.
-    """
-    particles = len(poses)
-    state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
-    following, used, entered, vector = pages.following, pages.used, pages.node, pages.vector
-    span = tree.span.reshape((-1, 2))
-    fade_of = np.empty(len(span))
-    for row in range(len(tree.frame)):
-        fade_of[row * particles : row * particles + tree.count[row]] = fades[max(frame - tree.frame[row], 0)]
-    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    values = np.empty((particles // _FEW + 1, particles + 1, 2))
-    asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
-    ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
-    scores[:] = 0.0
-    for i in range(len(points)):
-        right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
-        for p in range(particles):
-            ix[p] = int(np.floor((poses[p, 0] + forward * cosines[p] + right * sines[p]) / cell_cm))
-            iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
-        low_x, low_y = ix.min(), iy.min()
-        wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
-        boxed, filled = wide * high <= _BOX, 0
-        if boxed:
-            asked[: wide * high] = 0
-            for p in range(particles):
-                asked[(iy[p] - low_y) * wide + ix[p] - low_x] += 1
-        for p in range(particles):
-            x, y = 0.0, 0.0
-            box = (iy[p] - low_y) * wide + ix[p] - low_x if boxed else 0
-            if boxed and asked[box] == 0:
-                # Looked up before, for all particles.
-                x, y = values[rows[box], p, 0], values[rows[box], p, 1]
-            else:
-                a, b = iy[p] & mask, ix[p] & mask
-                mine = state[a, b, _OWNER_X] == ix[p] and state[a, b, _OWNER_Y] == iy[p]
-                page = -1
-                if mine:
-                    if state[a, b, _PAGE] >= 0 and state[a, b, _PRUNED] != tree.version[0]:
-                        _prune(tree, cells, pages, a, b, memory)
-                    if state[a, b, _STAMP] >= 0:
-                        fade = np.exp((state[a, b, _STAMP] - frame) / memory)
-                        x, y = fade * root[a, b, 0], fade * root[a, b, 1]
-                    page = state[a, b, _PAGE]
-                if boxed and asked[box] > _FEW:
-                    held = values[filled]
-                    held[:, :] = 0.0
-                    while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            vx, vy = fade_of[node] * vector[page, e, 0], fade_of[node] * vector[page, e, 1]
-                            # Steps at both ends of the interval; the running sum makes them plateaus.
-                            held[span[node, 0], 0] += vx
-                            held[span[node, 0], 1] += vy
-                            held[span[node, 1], 0] -= vx
-                            held[span[node, 1], 1] -= vy
-                        page = following[page]
-                    for q in range(particles):
-                        x += held[q, 0]
-                        y += held[q, 1]
-                        held[q, 0], held[q, 1] = x, y
-                    rows[box], asked[box] = filled, 0
-                    filled += 1
-                    x, y = held[p, 0], held[p, 1]
-                else:
-                    while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            if span[node, 0] <= p < span[node, 1]:
-                                x += fade_of[node] * vector[page, e, 0]
-                                y += fade_of[node] * vector[page, e, 1]
-                        page = following[page]
-            if occupied > 0.0:
-                scores[p] += weight * (x >= occupied)
-            else:
-                nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
-                ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
-                # Saturate: an edge that was seen often counts once.
-                scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))

@@ -28,8 +28,8 @@ def condense(
         most: How many patches to keep.
 
     Returns:
-        Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so that
-        normals that disagree weigh less.
+        Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
+        that normals that disagree weigh less.
     """
     column, row = np.floor(points_cm / patch_cm).astype(np.int64).T
     sector = np.rint(np.arctan2(normals[:, 1], normals[:, 0]) * (_SECTORS / (2.0 * np.pi))).astype(np.int64)

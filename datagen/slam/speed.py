@@ -21,7 +21,7 @@ from datagen.slam.scans import Progress, Scans
 STEPS_HEIGHTS = tuple(0.05 * 1.25**k for k in range(13))
 _FRAMES = 300
 _PARTICLES = 150
-_POINTS = 150
+_POINTS = 80
 
 
 @dataclass(frozen=True)

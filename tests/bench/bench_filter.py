@@ -1,8 +1,8 @@
 """Time of a frame of the particle filter: ``python tests/bench/bench_filter.py [--frames N]``.
 
-A made-up ring of dashed tapes is driven over and over. Both likelihoods take turns a block of frames at a time,
-beside the plainest map there is, one field that all particles share and that is written at their mean pose (no
-ancestry). Prints JSON: time of a frame early and late in the drive, and what the map takes.
+A made-up ring of dashed tapes is driven over and over. Both likelihoods take turns a block of frames at a
+time, beside the plainest map there is, one field that all particles share and that is written at their mean
+pose (no ancestry). Prints JSON: time of a frame early and late in the drive, and what the map takes.
 """
 
 from __future__ import annotations

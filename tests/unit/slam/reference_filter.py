@@ -1,7 +1,7 @@
 """The particle filter in its plainest form: every particle owns a whole map and copies it with itself.
 
-Slow, and obviously right: no ancestry, no pruning, no grid that wraps around. It draws the same random numbers
-as the filter proper, whose shared map must answer the same.
+Slow, and obviously right: no ancestry, no pruning, no grid that wraps around. It draws the same random
+numbers as the filter proper, whose shared map must answer the same.
 """
 
 from __future__ import annotations
@@ -90,9 +90,7 @@ def reference_filter(
             widen_steps(before, states, settings.stray_every, settings.stray_factor)
             held = np.stack(
                 [
-                    look_up(
-                        maps[p], map_from_car(points, states[p, :3], wheelbase_cm), k, settings, cell_cm
-                    )
+                    look_up(maps[p], map_from_car(points, states[p, :3], wheelbase_cm), k, settings, cell_cm)
                     for p in range(count)
                 ]
             )

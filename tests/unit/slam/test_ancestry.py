@@ -115,7 +115,9 @@ def test_entries_live_exactly_as_long_as_their_lineages_differ():
 def test_a_full_window_takes_the_mean_of_the_ancestors_and_counts_it():
     rng = np.random.default_rng(1)
     shared, mean = _map(5, window=4), _map(1)
-    ancestors = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.1], [0.0, 2.0, 0.3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    ancestors = np.array(
+        [[0.0, 0.0, 0.0], [3.0, 0.0, 0.1], [0.0, 2.0, 0.3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    )
     scan = _scan(rng)
     # One lineage of the first particle, three of the second, one of the third.
     chosen = np.array([0, 1, 1, 1, 2])
