@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int, Int32
+from jaxtyping import Float, Int
 
 from datagen.slam.ancestry_arrays import PAGE_SIZE, Cells, Pages, Tree
 from datagen.slam.ancestry_kernels import forget, grow, write
@@ -36,7 +36,6 @@ class AncestryMap:
         tree: The living ancestry.
         cells: The grid.
         pages: What single lineages saw.
-        node_of: Number of the newest node of each particle.
         forced: Frames that were entered for all at the mean pose of their ancestors, because lineages still
             differed when the window or the pages were full.
     """
@@ -48,7 +47,6 @@ class AncestryMap:
     tree: Tree
     cells: Cells
     pages: Pages
-    node_of: Int32[np.ndarray, "p"]
     forced: int = 0
     _oldest: int = 0
     _fades: Float[np.ndarray, "w1"] = field(default_factory=lambda: np.ones(1))
@@ -109,7 +107,6 @@ class AncestryMap:
             tree,
             cells,
             pool,
-            np.zeros(particles, np.int32),
             _fades=fades,
         )
 
@@ -171,7 +168,7 @@ class AncestryMap:
         window = len(self.tree.nodes)
         if frame - self._oldest >= window:
             self._forget_oldest()
-        grow(self.tree, frame % window, frame, states, chosen, self.node_of)
+        grow(self.tree, frame % window, frame, states, chosen)
         # Lineages that have met free a frame each, some frames at once; to share the work, two at most.
         for _ in range(2):
             if self._oldest < frame and self._agreed(self._oldest % window):

@@ -23,7 +23,7 @@ from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PRUN
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def grow(tree, row, frame, states, chosen, node_of):
+def grow(tree, row, frame, states, chosen):
     """Follow a resampling: give every node its new interval, and the survivors nodes of their own.
 
     Args:
@@ -32,7 +32,6 @@ def grow(tree, row, frame, states, chosen, node_of):
         frame: Their frame.
         states: Particles before resampling; the first three columns are poses.
         chosen: Ascending index of each new particle's parent among them.
-        node_of: Filled with the number of each new particle's node.
     """
     span, particles = tree.span, len(chosen)
     # How many new particles stand before the copies of each old one.
@@ -51,7 +50,6 @@ def grow(tree, row, frame, states, chosen, node_of):
             span[row, count, 0] = before[p]
             span[row, count, 1] = before[p + 1]
             tree.pose[row, count] = states[p, :3]
-            node_of[before[p] : before[p + 1]] = count
             count += 1
     tree.nodes[row] = count
     tree.frame[row] = frame

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +26,9 @@ class FilterSettings(Settings):
         particles: How many trajectories are followed.
         likelihood: ``direction`` scores edges that brighten the same way; ``count`` is the paper's number of
             matched points.
+        maps: ``lineage`` is DP-SLAM: a particle's map is what its own ancestors saw from where they were;
+            ``mean`` enters every frame once, at the particles' mean pose, for all. That is cheaper, and
+            steadier where the model does not quite fit, but its particles cannot disagree on the map.
         cell_heights: Side of a cell of the map.
         field_size: Cells along each side of the map, which wraps around; a power of two.
         memory_frames: Frames after which what was mapped has faded to 1/e.
@@ -39,6 +43,7 @@ class FilterSettings(Settings):
 
     particles: int = Field(default=300, ge=10)
     likelihood: Likelihood = "direction"
+    maps: Literal["lineage", "mean"] = "lineage"
     cell_heights: float = Field(default=0.08, gt=0.0)
     field_size: int = Field(default=512, ge=64)
     memory_frames: float = Field(default=40.0, gt=0.0)
@@ -107,6 +112,7 @@ class ParticleFilter:
         weights: Their weights.
         map: The map that they share.
         survivors: Of the last step's resampling.
+        survivor_of: Which of them each particle descends from.
         frame: Number of the next frame.
     """
 
@@ -133,7 +139,8 @@ class ParticleFilter:
             settings.window,
             settings.likelihood,
         )
-        self.survivors = Survivors(self.states[:0], np.zeros(0, np.int32))
+        self.survivors = Survivors(self.states[:0], np.zeros(0, np.int64))
+        self.survivor_of = np.zeros(count, np.int64)
         self.frame = 0
 
     def step(
@@ -168,7 +175,7 @@ class ParticleFilter:
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
             match = scores.max() / trust.sum() if trust.size else np.nan
         estimate = self._estimate(match)
-        self._resample()
+        self._resample(estimate.pose)
         self.map.enter(points_cm, normals, trust, self.frame)
         self.frame += 1
         return estimate
@@ -179,7 +186,7 @@ class ParticleFilter:
         spread = np.sqrt(self.weights @ np.sum((self.states[:, :2] - mean[:2]) ** 2, axis=1))
         return Estimate(mean[:3], float(mean[FACTOR]), float(match), float(spread))
 
-    def _resample(self) -> None:
+    def _resample(self, mean_pose: Float[np.ndarray, "3"]) -> None:
         """Draw the particles anew where too few of them count, and let the ancestry follow."""
         count = len(self.weights)
         chosen = np.arange(count)
@@ -187,8 +194,12 @@ class ParticleFilter:
             chosen = systematic_resample(self.weights, self.rng)
             self.weights = np.full(count, 1.0 / count)
         survived = np.bincount(chosen, minlength=count) > 0
-        self.survivors = Survivors(self.states[survived], self.map.node_of[survived])
-        self.map.descend(self.states, chosen, self.frame)
+        self.survivors = Survivors(self.states[survived], self.survivor_of[survived])
+        self.survivor_of = (np.cumsum(survived) - 1)[chosen]
+        if self.settings.maps == "lineage":
+            self.map.descend(self.states, chosen, self.frame)
+        else:
+            self.map.descend(np.tile(mean_pose, (count, 1)), np.zeros(count, np.int64), self.frame)
         self.states = self.states[chosen]
 
 
@@ -218,7 +229,7 @@ def run_filter(
         history.append(particles.survivors)
         if progress is not None:
             progress(k + 1, n)
-    final = np.bincount(particles.map.node_of, particles.weights) if n else np.zeros(0)
+    final = np.bincount(particles.survivor_of, particles.weights) if n else np.zeros(0)
     smoothed = smooth_lineages(history, final)
     return Trajectory(smoothed[:, :3], smoothed[:, FACTOR], match, spread)
 

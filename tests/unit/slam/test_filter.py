@@ -157,6 +157,16 @@ def test_headings_keep_counting_through_turns_and_half_turns():
     assert result.poses[-1, 2] == pytest.approx(road.poses[-1, 2], abs=np.deg2rad(15.0))
 
 
+def test_one_map_at_the_mean_pose_follows_the_path_too():
+    road = tape_road(60)
+    mean = SETTINGS.model_copy(update={"maps": "mean"})
+    result = run_filter(
+        road.scans(), _motion(60, True), mean, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(0)
+    )
+    assert np.linalg.norm(result.poses[-1, :2] - road.poses[-1, :2]) < 10.0
+    assert not np.array_equal(result.poses, _run(road, 0).poses)
+
+
 def test_counting_points_drives_the_filter_too():
     road = tape_road(60)
     counted = run_filter(
