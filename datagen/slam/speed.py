@@ -83,7 +83,7 @@ def profile_speed(
     """
     stretch = middle_stretch(scans, _FRAMES)
     part, relative = scans.cut(stretch), relative_cm[stretch]
-    settings = FilterSettings(particles=_PARTICLES, max_points=_POINTS, maps="mean")
+    settings = FilterSettings(particles=_PARTICLES, max_points=_POINTS, maps="mean", stray_every=0)
     match = np.zeros(len(steps_cm))
     for i, step_cm in enumerate(steps_cm):
         motion = held_motion(float(step_cm), relative, height_cm)
