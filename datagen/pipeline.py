@@ -35,6 +35,7 @@ from datagen.report.verdict import judge
 from datagen.slam.calibrate import coarse_camera, with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.stillness import following_frames
 from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
@@ -90,12 +91,13 @@ def _map_drive(
     progress: Progress | None,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
-    drive = open_drive(drive_path)
+    recorded = open_drive(drive_path)
+    notes: list[str] = list(recorded.problems)
+    drive = following_frames(recorded, notes)
     segments = split_segments(drive)
     check_moving(drive)
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
-    notes: list[str] = list(drive.problems)
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:

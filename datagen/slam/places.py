@@ -10,8 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from datagen.slam.field import DirectionField
-from datagen.slam.filter import thin_scan
-from datagen.slam.scans import Progress, Scans
+from datagen.slam.scans import Progress, Scans, thin_scan
 from datagen.slam.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
