@@ -11,6 +11,7 @@ import numpy as np
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import lines_at
 from datagen.lanes.fit import fit_lines
+from datagen.lanes.lap import lap_path
 from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
@@ -166,10 +167,15 @@ def _find_lane(
 ) -> MappedSegment:
     """Find a solved segment's lane lines, in the scale of its camera."""
     height = solved.camera.mounting.height_cm
-    path = path_of_poses(solved.poses, 0.12 * height, 5.0 * height)
+    step, ahead = 0.12 * height, 5.0 * height
+    revisits = [(revisit.earlier, revisit.later) for revisit in solved.revisits]
+    path = lap_path(solved.poses, revisits, step, height)
+    if path is None:
+        path = path_of_poses(solved.poses, step, ahead)
     edges = edges_along_path(path, solved.scans, solved.poses, solved.camera.wheelbase_cm, 3.5 * height)
     lane = trace_lane(path, edges, height, lane_width_cm, settings.trace)
-    return MappedSegment(rows, solved, path.s_frames_cm, lane, fit_lines(path, lane, height, settings.fit))
+    lines = fit_lines(path, edges, lane, height, settings.fit)
+    return MappedSegment(rows, solved, path.s_frames_cm, lane, lines)
 
 
 def _assemble(

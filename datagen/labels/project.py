@@ -43,7 +43,9 @@ def lines_of_frame(
         wheelbase_cm: Distance between the axles.
     """
     s = np.arange(s_cm - _BEHIND_CM, s_cm + wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
-    polylines = {line.side: car_from_map(line.points(s), pose, wheelbase_cm) for line in lines}
+    polylines = {
+        line.side: car_from_map(line.points(s), pose, wheelbase_cm) for line in lines if line.rank == 0
+    }
     left, right = polylines["left"], polylines["right"]
     points = np.concatenate([rows_of_polyline(left), rows_of_polyline(right)])
     assert points.shape == (N_POINTS,)
