@@ -172,7 +172,9 @@ def _find_lane(
     path = lap_path(solved.poses, revisits, step, height)
     if path is None:
         path = path_of_poses(solved.poses, step, ahead)
-    edges = edges_along_path(path, solved.scans, solved.poses, solved.camera.wheelbase_cm, 3.5 * height)
+    # In a wide lane the further line only comes into view a lane's width ahead.
+    reach = max(3.5 * height, 1.2 * (lane_width_cm or 0.0))
+    edges = edges_along_path(path, solved.scans, solved.poses, solved.camera.wheelbase_cm, reach)
     lane = trace_lane(path, edges, height, lane_width_cm, settings.trace)
     lines = fit_lines(path, edges, lane, height, settings.fit)
     return MappedSegment(rows, solved, path.s_frames_cm, lane, lines)
@@ -194,7 +196,7 @@ def _assemble(
         drive=str(drive_path),
         lane_width_cm=lane_width_cm,
         mapped_lane_cm=factor * float(np.median([part.lane.lane_cm for part in parts])),
-        tape_cm=factor * float(np.median([part.lane.tape_cm for part in parts])),
+        tape_cm=factor * float(np.median([line.marking_cm for part in parts for line in part.lines[:2]])),
         scale_from="lane width" if scale_from_lane else "camera",
         laps=int(laps.max()) if any(part.solved.revisits for part in parts) else 0,
     )

@@ -28,24 +28,28 @@ class FitSettings(Settings):
     Attributes:
         knot_heights: Length of a cubic on straight road.
         corner_heights: Length of a cubic in tight bends.
-        bridge_heights: Longest gap in the paint that still counts as line, with paint on both sides.
+        bridge_heights: Longest gap in the paint that still counts as line, with paint on both sides; where
+            the line beside it is seen, a gap counts for less than half.
         extend_heights: What is believed beyond the end of the paint.
         reach_heights: How far from the traced line its edges are looked for, beyond half the marking.
         bend_heights: Typical bend of a line against the path: its inverse radius times the height.
         guide_lanes: How well a line keeps its distance from the one beside it, in lane widths.
         loose_lanes: How well the lane is known where neither of its lines is seen, in lane widths.
+        precise_heights: Distance at which an edge point counts half. One pixel spans road in proportion to
+            the squared distance, and what a frame's tilt is off by moves its points likewise.
         min_aligned: Cosine between a border and the line as traced: a line that turns off at the mouth of a
             junction is followed no further.
     """
 
     knot_heights: float = Field(default=0.6, gt=0.0)
     corner_heights: float = Field(default=0.3, gt=0.0)
-    bridge_heights: float = Field(default=5.0, gt=0.0)
+    bridge_heights: float = Field(default=7.0, gt=0.0)
     extend_heights: float = Field(default=0.5, ge=0.0)
     reach_heights: float = Field(default=0.06, gt=0.0)
     bend_heights: float = Field(default=0.08, gt=0.0)
     guide_lanes: float = Field(default=0.03, gt=0.0)
     loose_lanes: float = Field(default=0.3, gt=0.0)
+    precise_heights: float = Field(default=1.5, gt=0.0)
     min_aligned: float = Field(default=0.94, gt=0.0, lt=1.0)
 
 
@@ -105,8 +109,13 @@ def fit_lines(
         beside = fitted[side, rank - 1]
         apart = _apart(path, np.abs(known[side, rank] - beside.d_cm), lane.lane_cm)
         fitted[side, rank] = fit(known[side, rank], beside.d_cm + _SIGN[side] * apart, beside.seen)
-    names = sorted(fitted, key=lambda name: (name[1], name[0]))
-    return [_line(path, basis, *name, fitted[name], camera_height_cm, settings) for name in names]
+    lines = []
+    for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
+        inner: tuple[Side, int] = (side, rank - 1) if rank else (second if side == first else first, 0)
+        parallel = fitted[inner].seen
+        offset = fitted[side, rank]
+        lines.append(_line(path, basis, side, rank, offset, parallel, camera_height_cm, settings))
+    return lines
 
 
 def _curvature(path: Path) -> Float[np.ndarray, "m"]:
@@ -154,7 +163,10 @@ def _borders(
     slope = _slope(path, smooth_cm)[np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)]
     aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
     near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
-    return Borders(edges.s_cm[near], edges.d_cm[near], border[near], edges.weight[near], edges.frame[near])
+    precision = 1.0 / (1.0 + (edges.distance_cm[near] / (settings.precise_heights * camera_height_cm)) ** 6)
+    return Borders(
+        edges.s_cm[near], edges.d_cm[near], border[near], edges.weight[near], precision, edges.frame[near]
+    )
 
 
 def _line(
@@ -163,6 +175,7 @@ def _line(
     side: Side,
     rank: int,
     offset: FittedOffset,
+    parallel: Bool[np.ndarray, "m"],
     camera_height_cm: float,
     settings: FitSettings,
 ) -> LaneLine:
@@ -175,7 +188,7 @@ def _line(
         side,
         basis.knots_cm,
         basis.unfolded(control),
-        stretches(path, offset.seen, bridge, extend),
+        stretches(path, offset.seen, bridge, extend, parallel),
         offset.residual_cm,
         rank,
         path.period_cm,

@@ -34,7 +34,8 @@ class Borders:
         s_cm: Position along the path.
         d_cm: Offset from the path.
         border: 1 for the marking's left border, -1 for its right one.
-        weight: Trust in the point.
+        weight: Trust that the point is there.
+        precision: Inverse variance of its place, 1 near the car.
         frame: Frame that saw it.
     """
 
@@ -42,6 +43,7 @@ class Borders:
     d_cm: Float[np.ndarray, "n"]
     border: Float[np.ndarray, "n"]
     weight: Float[np.ndarray, "n"]
+    precision: Float[np.ndarray, "n"]
     frame: Int[np.ndarray, "n"]
 
 
@@ -107,23 +109,24 @@ def fit_offset(
     stiffness = csc_array(stiff.T @ stiff) * (path.step_cm / prior.knot_cm / prior.bend_per_cm**2)
     marking, scale = tape_cm, 0.02 * prior.height_cm
     seen = np.zeros(len(path.xy_cm), dtype=bool)
-    trust = points.weight
+    trust = points.precision
     solution = _solve(at_samples, stiffness, at_points, 0.0 * trust, points.d_cm, prior, seen, path)[0]
     residual = points.d_cm
     for _ in range(_ROUNDS):
         off = points.d_cm - at_points @ solution
         marking = _width(off, points, trust, marking, tape_cm)
         residual = off - 0.5 * points.border * marking
-        robust = points.weight / (1.0 + points.weight * (residual / (2.0 * scale)) ** 2)
+        robust = 1.0 / (1.0 + points.precision * (residual / (2.0 * scale)) ** 2)
+        found = points.weight * robust
         seen = seen_samples(
-            path, points.s_cm, points.border, robust, 0.1 * prior.height_cm, 2.0 * prior.height_cm
+            path, points.s_cm, points.border, found, 0.1 * prior.height_cm, 2.0 * prior.height_cm
         )
         # Where paint ends for long, it may turn off into a side road before it does.
         ends = stretches(path, seen, _LONG_GAP * prior.height_cm, -_TURNS_OFF * prior.height_cm)
-        trust = np.where(_at(path, seen & within(path, ends), points.s_cm), robust, 0.0)
+        trust = np.where(_at(path, seen & within(path, ends), points.s_cm), points.precision * robust, 0.0)
         if not trust.any():
             break
-        spread = (np.sqrt(points.weight) * np.abs(residual))[trust > 0.0]
+        spread = (np.sqrt(points.precision) * np.abs(residual))[trust > 0.0]
         low, high = 1e-3 * prior.height_cm, 0.05 * prior.height_cm
         scale = float(np.clip(1.4826 * np.median(spread), low, high))
         middle = points.d_cm - 0.5 * points.border * marking
@@ -137,7 +140,7 @@ def fit_offset(
     solution, factor, _ = _solve(
         at_samples, stiffness, at_points, weight / excess, middle, prior, seen, path
     )
-    near = trust > 0.5 * points.weight
+    near = trust > 0.5 * points.precision
     robust_sd = 1.4826 * float(np.median(np.abs(residual[near]))) if near.any() else float("nan")
     sigma = np.sqrt(_variance(factor, at_samples))
     return FittedOffset(np.asarray(at_samples @ solution), sigma, seen, marking, robust_sd)

@@ -15,9 +15,6 @@ from datagen.slam.scans import Scans
 from lanenet.errors import TrackingLostError
 
 _SHORTEST_CM = 20.0
-#: Share of the reach at which an edge point counts half: one pixel spans road in proportion to the squared
-#: distance, and what the tilt of a frame is off by does so as well.
-_HALF_REACH = 0.43
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,8 @@ class PathEdges:
         d_cm: Offset to the left.
         side: Component of the edge's normal (towards the brighter side) to the left, -1..1.
         along: Component of it along the path.
-        weight: Trust in the point, 1 near the car.
+        weight: Trust in the point.
+        distance_cm: How far from the front axle it was seen.
         frame: Frame that saw it.
     """
 
@@ -117,6 +115,7 @@ class PathEdges:
     side: Float[np.ndarray, "m"]
     along: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
+    distance_cm: Float[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
 
 
@@ -153,8 +152,15 @@ def edges_along_path(
         reach_cm + 2.0 * wheelbase_cm,
     )
     good = np.isfinite(s)
-    weight = 1.0 / (1.0 + (distance[keep] / (_HALF_REACH * reach_cm)) ** 6)
-    return PathEdges(s[good], d[good], side[good], along[good], weight[good], frame[good])
+    return PathEdges(
+        s[good],
+        d[good],
+        side[good],
+        along[good],
+        scans.weights[keep][good],
+        distance[keep][good],
+        frame[good],
+    )
 
 
 @njit(cache=True)

@@ -10,6 +10,8 @@ from datagen.lanes.path import Path
 
 #: Weight of the edge points of one border per path sample from which it counts as seen.
 _SEEN = 0.5
+#: What a gap counts where a parallel line is seen.
+_HELD = 0.4
 
 
 def seen_samples(
@@ -54,7 +56,11 @@ def seen_samples(
 
 
 def stretches(
-    path: Path, seen: Bool[np.ndarray, "m"], bridge_cm: float, extend_cm: float
+    path: Path,
+    seen: Bool[np.ndarray, "m"],
+    bridge_cm: float,
+    extend_cm: float,
+    held: Bool[np.ndarray, "m"] | None = None,
 ) -> Float[np.ndarray, "g 2"]:
     """Stretches between seen samples whose gaps are no longer than the bridge.
 
@@ -64,6 +70,7 @@ def stretches(
         bridge_cm: Longest gap, with the marking seen on both sides.
         extend_cm: What is believed beyond either end; a stretch shorter than this between two gaps is as
             likely clutter as line.
+        held: Where a parallel line is seen; a gap counts less there.
 
     Returns:
         (from, to); on a closed path a stretch over the seam ends beyond the period.
@@ -71,12 +78,14 @@ def stretches(
     period, at = path.period_cm, path.s_cm[seen]
     if at.size < 2:
         return np.empty((0, 2))
+    cost = np.full(len(seen), path.step_cm) if held is None else np.where(held, _HELD, 1.0) * path.step_cm
+    bare = np.cumsum(cost)[seen]
     if period is None:
-        cuts = np.flatnonzero(np.diff(at) > bridge_cm)
+        cuts = np.flatnonzero(np.diff(bare) > bridge_cm)
         first, last = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(at) - 1]])
         found = np.stack([at[first], at[last]], axis=1)
     else:
-        cuts = np.flatnonzero(np.diff(at, append=at[0] + period) > bridge_cm)
+        cuts = np.flatnonzero(np.diff(bare, append=bare[0] + cost.sum()) > bridge_cm)
         if not cuts.size:
             return np.array([[0.0, period]])
         first, last = (cuts + 1) % len(at), np.roll(cuts, -1)
