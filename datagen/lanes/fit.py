@@ -75,11 +75,14 @@ def fit_lines(
     basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
 
     def fit(
-        known_cm: Float[np.ndarray, "m"], guess_cm: Float[np.ndarray, "m"], held: Bool[np.ndarray, "m"]
+        known_cm: Float[np.ndarray, "m"],
+        guess_cm: Float[np.ndarray, "m"],
+        held: Bool[np.ndarray, "m"],
+        tape_cm: float,
     ) -> FittedOffset:
         start = np.where(np.isfinite(known_cm), known_cm, guess_cm)
         guess = _smoothed(path, start, 0.25 * lane.lane_cm)
-        points = _borders(path, edges, start, guess, lane.tape_cm, camera_height_cm, settings)
+        points = _borders(path, edges, start, guess, tape_cm, camera_height_cm, settings)
         prior = Prior(
             guess_cm=guess_cm,
             sigma_cm=np.where(held, settings.guide_lanes, settings.loose_lanes) * lane.lane_cm,
@@ -88,7 +91,7 @@ def fit_lines(
             knot_cm=widest,
             height_cm=camera_height_cm,
         )
-        return fit_offset(path, basis, points, lane.tape_cm, prior)
+        return fit_offset(path, basis, points, tape_cm, prior)
 
     known: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
         ("left", 0): lane.left_cm,
@@ -102,13 +105,15 @@ def fit_lines(
     by_centre = lane.centre_cm + 0.5 * _SIGN[first] * width
     by_other = known[second, 0] + _SIGN[first] * width
     held = np.isfinite(by_other)
-    fitted = {(first, 0): fit(known[first, 0], np.where(held, by_other, by_centre), held)}
+    fitted = {(first, 0): fit(known[first, 0], np.where(held, by_other, by_centre), held, lane.tape_cm)}
     beside = fitted[first, 0]
-    fitted[second, 0] = fit(known[second, 0], beside.d_cm + _SIGN[second] * width, beside.seen)
+    # A line that is only seen from afar does not show how wide it is; most are as wide as the best seen one.
+    tape = beside.marking_cm
+    fitted[second, 0] = fit(known[second, 0], beside.d_cm + _SIGN[second] * width, beside.seen, tape)
     for side, rank in sorted(lane.beside_cm, key=lambda name: name[1]):
         beside = fitted[side, rank - 1]
         apart = _apart(path, np.abs(known[side, rank] - beside.d_cm), lane.lane_cm)
-        fitted[side, rank] = fit(known[side, rank], beside.d_cm + _SIGN[side] * apart, beside.seen)
+        fitted[side, rank] = fit(known[side, rank], beside.d_cm + _SIGN[side] * apart, beside.seen, tape)
     lines = []
     for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
         inner: tuple[Side, int] = (side, rank - 1) if rank else (second if side == first else first, 0)

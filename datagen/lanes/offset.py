@@ -22,6 +22,8 @@ _ROUNDS = 5
 #: Frames whose errors count as one: their poses hang together.
 _FRAMES_TOGETHER = 10
 _CHUNK = 256
+#: Precision of the edge points that tell a marking's width.
+_NEAR = 0.2
 #: Gaps at whose ends paint is not trusted, and how much of it, in camera heights.
 _LONG_GAP, _TURNS_OFF = 2.0, 0.4
 
@@ -180,8 +182,8 @@ def _width(
     before_cm: float,
     usual_cm: float,
 ) -> float:
-    """Distance between the medians of the two borders, from the points that are trusted most."""
-    good = trust > 0.5 * float(trust.max(initial=0.0))
+    """Distance between the medians of the two borders; far points lie too loosely to tell."""
+    good = (points.precision > _NEAR) & (trust > 0.5 * points.precision)
     left, right = off_cm[good & (points.border > 0.0)], off_cm[good & (points.border < 0.0)]
     if min(len(left), len(right)) < 10:
         return before_cm

@@ -8,8 +8,9 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from datagen.lanes.path import Path
 
-#: Weight of the edge points of one border per path sample from which it counts as seen.
-_SEEN = 0.5
+#: Weight of the edge points of one border per path sample from which it counts as seen: at least, and as a
+#: share of what the line usually shows. Clutter is sparse.
+_SEEN, _SEEN_SHARE = 0.5, 0.15
 #: What a gap counts where a parallel line is seen.
 _HELD = 0.4
 
@@ -47,12 +48,15 @@ def seen_samples(
         )
         for sign in (1.0, -1.0)
     )
-    both = np.minimum(left, right) > _SEEN
+    weaker = np.minimum(left, right)
+    both = weaker > _SEEN
     if not both.any():
         return both
+    enough = max(_SEEN, _SEEN_SHARE * float(np.median(weaker[both])))
+    both = weaker > enough
     lead = m if path.closed else 0
     apart = distance_transform_edt(~np.pad(both, lead, mode="wrap"))[lead : lead + m]
-    return both | ((np.maximum(left, right) > _SEEN) & (apart * path.step_cm <= alone_cm))
+    return both | ((np.maximum(left, right) > enough) & (apart * path.step_cm <= alone_cm))
 
 
 def stretches(

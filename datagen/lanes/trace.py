@@ -53,7 +53,7 @@ class TraceSettings(Settings):
     sideways: float = Field(default=0.3, ge=0.0)
     second_line: float = Field(default=0.2, gt=0.0, le=1.0)
     inside: float = Field(default=0.25, ge=0.0)
-    min_support: float = Field(default=0.2, gt=0.0)
+    min_support: float = Field(default=0.4, gt=0.0)
     width_share: float = Field(default=0.15, gt=0.0, lt=0.5)
     neighbours: int = Field(default=1, ge=0)
     neighbour_lanes: float = Field(default=4.0, gt=0.0)
