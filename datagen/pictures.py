@@ -27,7 +27,7 @@ def draw_map(
     parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
     size_px: int = 1600,
 ) -> None:
-    """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right, cyan beside) and scale.
+    """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right), a metre of scale.
 
     Args:
         path: PNG to write.

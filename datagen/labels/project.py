@@ -14,7 +14,7 @@ from lanenet.geometry.lane import N_POINTS, ROWS_CM, rows_of_polyline
 _SAMPLE_CM = 2.0
 _BEHIND_CM = 20.0
 _AHEAD_CM = 90.0
-#: A line that turns away from the car's heading by more than this has no place in a row: tangent of 60 degrees.
+#: Tangent of 60 degrees: a line that turns further away from the car's heading has no place in a row.
 _STEEPEST = float(np.tan(np.pi / 3.0))
 
 
@@ -74,9 +74,8 @@ def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
     for i, row in enumerate(ROWS_CM):
         crossed = np.flatnonzero((y[:-1] <= row) != (y[1:] <= row))
         crossed = crossed[np.isfinite(y[crossed]) & np.isfinite(y[crossed + 1])]
-        if len(crossed) != 1:
-            found[i] = np.nan
-        elif abs(x[crossed[0] + 1] - x[crossed[0]]) > _STEEPEST * abs(y[crossed[0] + 1] - y[crossed[0]]):
+        sideways, ahead = (abs(part[crossed + 1] - part[crossed]) for part in (x, y))
+        if len(crossed) != 1 or sideways[0] > _STEEPEST * ahead[0]:
             found[i] = np.nan
     return found
 

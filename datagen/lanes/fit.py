@@ -13,7 +13,7 @@ from datagen.lanes.line import LaneLine, Side
 from datagen.lanes.offset import Borders, FittedOffset, Prior, fit_offset
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.spline import CubicBasis, adapted_breaks
-from datagen.lanes.support import stretches, within
+from datagen.lanes.support import stretches
 from datagen.lanes.trace import TracedLane
 from lanenet.config import Settings
 
@@ -165,7 +165,9 @@ def _borders(
     border = np.where(edges.side < 0.0, 1.0, -1.0)
     off = edges.d_cm - np.interp(edges.s_cm, path.s_cm, start_cm, period=path.period_cm)
     reach = 0.3 * tape_cm + settings.reach_heights * camera_height_cm
-    slope = _slope(path, smooth_cm)[np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)]
+    slope = _slope(path, smooth_cm)[
+        np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
+    ]
     aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
     near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
     precision = 1.0 / (1.0 + (edges.distance_cm[near] / (settings.precise_heights * camera_height_cm)) ** 6)

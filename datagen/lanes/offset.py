@@ -22,6 +22,8 @@ _ROUNDS = 5
 #: Frames whose errors count as one: their poses hang together.
 _FRAMES_TOGETHER = 10
 _CHUNK = 256
+#: What is left however often a line is seen, in camera heights: paint and lens are not perfect.
+_FLOOR = 0.003
 #: Precision of the edge points that tell a marking's width.
 _NEAR = 0.2
 #: Gaps at whose ends paint is not trusted, and how much of it, in camera heights.
@@ -89,9 +91,7 @@ class FittedOffset:
     residual_cm: float
 
 
-def fit_offset(
-    path: Path, basis: CubicBasis, points: Borders, tape_cm: float, prior: Prior
-) -> FittedOffset:
+def fit_offset(path: Path, basis: CubicBasis, points: Borders, tape_cm: float, prior: Prior) -> FittedOffset:
     """Fit a cubic spline to the borders of one marking, robustly.
 
     Args:
@@ -132,19 +132,15 @@ def fit_offset(
         low, high = 1e-3 * prior.height_cm, 0.05 * prior.height_cm
         scale = float(np.clip(1.4826 * np.median(spread), low, high))
         middle = points.d_cm - 0.5 * points.border * marking
-        solution, _, _ = _solve(
-            at_samples, stiffness, at_points, trust / scale**2, middle, prior, seen, path
-        )
+        solution, _, _ = _solve(at_samples, stiffness, at_points, trust / scale**2, middle, prior, seen, path)
     middle = points.d_cm - 0.5 * points.border * marking
     weight = trust / scale**2
     solution, factor, data = _solve(at_samples, stiffness, at_points, weight, middle, prior, seen, path)
     excess = _in_common(factor, data, at_points, weight * (middle - at_points @ solution), points.frame)
-    solution, factor, _ = _solve(
-        at_samples, stiffness, at_points, weight / excess, middle, prior, seen, path
-    )
+    solution, factor, _ = _solve(at_samples, stiffness, at_points, weight / excess, middle, prior, seen, path)
     near = trust > 0.5 * points.precision
     robust_sd = 1.4826 * float(np.median(np.abs(residual[near]))) if near.any() else float("nan")
-    sigma = np.sqrt(_variance(factor, at_samples))
+    sigma = np.sqrt(_variance(factor, at_samples) + (_FLOOR * prior.height_cm) ** 2)
     return FittedOffset(np.asarray(at_samples @ solution), sigma, seen, marking, robust_sd)
 
 

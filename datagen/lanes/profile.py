@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -66,9 +67,11 @@ def edge_profile(
         along = inside & (sign * edges.side >= min_side)
         counts = np.bincount(
             row[along] * shape[1] + column[along], edges.weight[along], minlength=shape[0] * shape[1]
-        ).reshape(shape)
-        density = gaussian_filter1d(counts, _ACROSS_CELLS, axis=1, mode="constant")
-        mode = "wrap" if path.closed else "nearest"
+        )
+        density = gaussian_filter1d(
+            counts.astype(np.float64).reshape(shape), _ACROSS_CELLS, axis=1, mode="constant"
+        )
+        mode: Literal["wrap", "nearest"] = "wrap" if path.closed else "nearest"
         density = gaussian_filter1d(density, along_cm / path.step_cm, axis=0, mode=mode)
         profiles.append(density / (density + _HALF_FULL))
     return EdgeProfile(cell_cm, half_cells, profiles[0], profiles[1])

@@ -43,6 +43,8 @@ class CubicBasis:
 
     def design(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> csr_array:
         """Matrix that turns coefficients into values, or a derivative of them, at given places."""
+        if not len(s_cm):
+            return csr_array((0, self.size))
         b, knots = self.breaks_cm, self.knots_cm
         s = np.mod(s_cm - b[0], b[-1] - b[0]) + b[0] if self.periodic else np.clip(s_cm, b[0], b[-1])
         inner = knots[derivative : len(knots) - derivative]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
@@ -39,7 +41,7 @@ def seen_samples(
     m = len(path.xy_cm)
     row = np.clip(np.rint(s_cm / path.step_cm).astype(np.intp), 0, m)
     row = row % m if path.closed else np.minimum(row, m - 1)
-    mode = "wrap" if path.closed else "constant"
+    mode: Literal["wrap", "constant"] = "wrap" if path.closed else "constant"
     left, right = (
         gaussian_filter1d(
             np.bincount(row[border == sign], weight[border == sign], minlength=m).astype(np.float64),

@@ -17,6 +17,7 @@ from numba import njit
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
 
+from datagen.lanes.line import Side
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.profile import EdgeProfile, edge_profile, shifted
 from lanenet.config import Settings
@@ -78,7 +79,7 @@ class TracedLane:
     centre_cm: Float[np.ndarray, "m"]
     lane_cm: float
     tape_cm: float
-    beside_cm: dict[tuple[str, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
+    beside_cm: dict[tuple[Side, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
 
 
 def trace_lane(
@@ -120,8 +121,9 @@ def trace_lane(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
             "and the camera's height, and look at the map's picture"
         )
-    beside = {}
-    for side, sign, line in (("left", 1.0, left), ("right", -1.0, right)):
+    beside: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
+    sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [("left", 1.0, left), ("right", -1.0, right)]
+    for side, sign, line in sides:
         guess = np.where(np.isfinite(line), line, centre + 0.5 * sign * lane)
         for rank in range(1, settings.neighbours + 1):
             found = _follow(path, tapes, profile, guess + sign * lane, 2.0 * band, settings)
@@ -201,9 +203,9 @@ def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.n
     for row, offset in zip(rows[forward], d[forward], strict=True):
         total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0)
         visits[row] += 1.0
-    mode = "wrap" if path.closed else "nearest"
     near = max(1.0, 0.25 * lane_cm / path.step_cm)
-    total, visits = (gaussian_filter1d(part, near, axis=0, mode=mode) for part in (total, visits))
+    total = gaussian_filter1d(total, near, axis=0, mode="wrap" if path.closed else "nearest")
+    visits = gaussian_filter1d(visits, near, mode="wrap" if path.closed else "nearest")
     return total / np.maximum(visits, 1e-3)[:, None]
 
 
@@ -286,7 +288,7 @@ def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settin
     """Tell a painted line from clutter: enough of it, in runs rather than in specks."""
     seen = _in_runs(np.isfinite(line_cm), max(2, int(0.1 * lane_cm / path.step_cm)))
     length = float(seen.sum()) * path.step_cm
-    return length >= settings.neighbour_lanes * lane_cm and seen.mean() >= settings.neighbour_share
+    return length >= settings.neighbour_lanes * lane_cm and float(seen.mean()) >= settings.neighbour_share
 
 
 def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int) -> Bool[np.ndarray, "m"]:
