@@ -36,8 +36,9 @@ class TraceSettings(Settings):
         smoothness: Cost of a step of one cell across per sample along the path, growing with its square.
         sideways: Cost of a step of one cell where no paint is.
         second_line: What the weaker one of the two lines counts beside the stronger one.
-        inside: What it costs per sample when the car is outside the lane. It exceeds what a second line
-            brings, so that a neighbouring lane with two solid lines does not take over.
+        inside: What it costs per sample when the car is a lane further, less when it is only just outside. It
+            exceeds what a second line brings, so that a neighbouring lane with two solid lines does not take
+            over, and lets a driver cut a corner over a line.
         min_support: Density of edges from which a marking counts as seen, 0..1.
         width_share: How much the lane's width may vary along the road.
         neighbours: Lines to look for on each side beyond those of the driven lane.
@@ -52,13 +53,13 @@ class TraceSettings(Settings):
     lane_heights: tuple[float, float] = (1.2, 6.5)
     smoothness: float = Field(default=0.04, gt=0.0)
     sideways: float = Field(default=0.3, ge=0.0)
-    second_line: float = Field(default=0.2, gt=0.0, le=1.0)
-    inside: float = Field(default=0.25, ge=0.0)
+    second_line: float = Field(default=0.08, gt=0.0, le=1.0)
+    inside: float = Field(default=0.17, ge=0.0)
     min_support: float = Field(default=0.4, gt=0.0)
     width_share: float = Field(default=0.15, gt=0.0, lt=0.5)
     neighbours: int = Field(default=1, ge=0)
     neighbour_lanes: float = Field(default=4.0, gt=0.0)
-    neighbour_share: float = Field(default=0.08, ge=0.0, le=1.0)
+    neighbour_share: float = Field(default=0.35, ge=0.0, le=1.0)
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ def _best_lane(
 
 
 def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.ndarray, "m c"]:
-    """Share of the visits of each place with the car outside a lane centred at each offset, 0..1."""
+    """How far outside a lane centred at each offset the car is, 1 from a lane away, mean of all visits."""
     m, columns = profile.left.shape
     at = (np.arange(columns) - profile.half_cells) * profile.cell_cm
     d = np.zeros(len(path.s_frames_cm)) if path.d_frames_cm is None else path.d_frames_cm
@@ -201,7 +202,7 @@ def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.n
     rows = np.rint(path.s_frames_cm / path.step_cm).astype(np.intp) % m
     total, visits = np.zeros((m, columns)), np.zeros(m)
     for row, offset in zip(rows[forward], d[forward], strict=True):
-        total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0)
+        total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0) ** 2
         visits[row] += 1.0
     near = max(1.0, 0.25 * lane_cm / path.step_cm)
     total = gaussian_filter1d(total, near, axis=0, mode="wrap" if path.closed else "nearest")
