@@ -36,9 +36,8 @@ class TraceSettings(Settings):
         smoothness: Cost of a step of one cell across per sample along the path, growing with its square.
         sideways: Cost of a step of one cell where no paint is.
         second_line: What the weaker one of the two lines counts beside the stronger one.
-        inside: What it costs per sample when the car is a lane further, less when it is only just outside. It
-            exceeds what a second line brings, so that a neighbouring lane with two solid lines does not take
-            over, and lets a driver cut a corner over a line.
+        inside: What it costs per sample when the car is a lane further, less when it is only just outside:
+            more than a second line brings, so that a lane beside it with two solid lines does not take over.
         min_support: Density of edges from which a marking counts as seen, 0..1.
         width_share: How much the lane's width may vary along the road.
         neighbours: Lines to look for on each side beyond those of the driven lane.
