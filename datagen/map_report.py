@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datagen.lanes.fit import LaneLine
+from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_folder import DriveMap
 from datagen.report.verdict import MapEvidence
@@ -34,7 +34,7 @@ class MappedSegment:
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
-        lines: Its two lines.
+        lines: Its two lines, then those of the lanes beside it.
         free_lane_cm: Width of the lane as found without the user's number; None where that fails, or where
             the user's number was not used in the first place.
     """
@@ -96,7 +96,11 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
                 "steering": None if solved.steering is None else vars(solved.steering),
                 "lane_cm": factor * lane.lane_cm,
                 "tape_cm": factor * lane.tape_cm,
-                "line_residual_cm": {line.side: factor * line.residual_cm for line in part.lines},
+                "line_residual_cm": {
+                    line.side: factor * line.residual_cm for line in part.lines if line.rank == 0
+                },
+                "lines": sorted(line.index for line in part.lines),
+                "closed": part.lines[0].period_cm is not None,
             }
         )
     m = camera.mounting

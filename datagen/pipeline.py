@@ -13,6 +13,7 @@ from jaxtyping import Bool
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lanes.fit import fit_lines
+from datagen.lanes.lap import lap_path
 from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
@@ -222,15 +223,21 @@ def _find_lane(
 ) -> MappedSegment:
     """Find a solved segment's lane lines, in the scale of its camera, without the frames held out."""
     height = solved.camera.mounting.height_cm
-    path = path_of_poses(solved.poses, 0.12 * height, 5.0 * height)
+    step, ahead = 0.12 * height, 5.0 * height
+    revisits = [(revisit.earlier, revisit.later) for revisit in solved.revisits]
+    path = lap_path(solved.poses, revisits, step, height)
+    if path is None:
+        path = path_of_poses(solved.poses, step, ahead)
+    # In a wide lane the further line only comes into view a lane's width ahead.
+    reach = max(3.5 * height, 1.2 * (lane_width_cm or 0.0))
     scans = without_frames(solved.scans, held_out)
-    edges = edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, 3.5 * height)
+    edges = edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, settings.trace)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, settings.trace)
-    lines = fit_lines(path, lane, height, settings.fit)
+    lines = fit_lines(path, edges, lane, height, settings.fit)
     return MappedSegment(rows, solved, path.s_frames_cm, lane, lines, free_cm)
 
 
@@ -250,7 +257,7 @@ def _assemble(
         drive=str(drive_path),
         lane_width_cm=lane_width_cm,
         mapped_lane_cm=factor * float(np.median([part.lane.lane_cm for part in parts])),
-        tape_cm=factor * float(np.median([part.lane.tape_cm for part in parts])),
+        tape_cm=factor * float(np.median([line.marking_cm for part in parts for line in part.lines[:2]])),
         scale_from="lane width" if scale_from_lane else "camera",
         laps=int(laps.max()) if any(part.solved.revisits for part in parts) else 0,
     )

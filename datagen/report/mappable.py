@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
@@ -87,13 +87,12 @@ def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
     Raises:
         TrackingLostError: Says how much of the way each line was seen.
     """
-    way = sum(float(part.s_frames_cm[-1] - part.s_frames_cm[0]) for part in parts)
-    seen = dict.fromkeys(SIDES, 0.0)
+    seen: dict[str, list[Bool[np.ndarray, "_"]]] = {side: [] for side in SIDES}
     for part in parts:
         for line in part.lines:
-            stretches = np.clip(line.supported_cm, part.s_frames_cm[0], part.s_frames_cm[-1])
-            seen[line.side] += float(np.sum(stretches[:, 1] - stretches[:, 0]))
-    share = {side: seen[side] / max(way, 1e-9) for side in SIDES}
+            if line.rank == 0:
+                seen[line.side].append(line.supported(part.s_frames_cm))
+    share = {side: float(np.mean(np.concatenate(found))) if found else 0.0 for side, found in seen.items()}
     if min(share.values()) >= _LEAST_SEEN:
         return
     found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the way" for side in SIDES)
