@@ -93,10 +93,10 @@ def _map_drive(
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
     recorded = open_drive(drive_path)
+    check_moving(recorded)
     notes: list[str] = list(recorded.problems)
     drive = following_frames(recorded, notes)
     segments = split_segments(drive)
-    check_moving(drive)
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
     settings = hide_bumper(drive, settings, notes)

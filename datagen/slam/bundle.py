@@ -136,7 +136,7 @@ def adjust(
     """
     problem = _Problem(edges, camera, settings, rng, free, loops, breaks, expected)
     height = camera.mounting.height_cm
-    state = problem.start(poses / [height, height, 1.0], tilt, camera if prior is None else prior)
+    state = problem.start(poses / [height, height, 1.0], tilt, prior)
     for gate_px in settings.gates_px:
         links = problem.associate(state, gate_px)
         damping = _DAMPING
@@ -235,8 +235,8 @@ class _Problem:
             [s.focal, s.centre_px * scale, s.centre_px * scale, s.k1, s.pitch, s.roll, s.yaw, s.lever]
         )
 
-    def start(self, poses: np.ndarray, tilt: np.ndarray | None, prior: Camera) -> _State:
-        self.prior = _numbers(prior)
+    def start(self, poses: np.ndarray, tilt: np.ndarray | None, prior: Camera | None = None) -> _State:
+        self.prior = _numbers(self.camera if prior is None else prior)
         return _State(poses, np.zeros((self.n, 2)) if tilt is None else tilt, *_numbers(self.camera))
 
     def camera_of(self, state: _State) -> Camera:
