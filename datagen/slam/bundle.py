@@ -111,6 +111,7 @@ def adjust(
     tilt: Float[np.ndarray, "n 2"] | None = None,
     breaks: Bool[np.ndarray, "n"] | None = None,
     expected: Float[np.ndarray, "n"] | None = None,
+    believed: Camera | None = None,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
@@ -125,11 +126,14 @@ def adjust(
         tilt: Start of the frames' tilts; None for level.
         breaks: Frames that do not follow the one before them.
         expected: Commanded way from the frame before, 1 where it is usual; None for the same all along.
+        believed: Camera about which the priors lie; None for the start. Rounds that each begin where the one
+            before ended would walk away from it otherwise.
 
     Returns:
         The adjusted drive.
     """
     problem = _Problem(edges, camera, settings, rng, free, loops, breaks, expected)
+    problem.prior = _numbers_of(camera if believed is None else believed)
     height = camera.mounting.height_cm
     state = problem.start(poses / [height, height, 1.0], tilt)
     for gate_px in settings.gates_px:
@@ -180,7 +184,19 @@ class _Links:
     pair_starts: Int[np.ndarray, "p1"]
 
 
+def _numbers_of(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]:
+    """A camera as the kernels take it: lens, and mounting with lengths in camera heights."""
+    m = camera.mounting
+    D = np.concatenate([camera.D, np.zeros(5)])[:5]
+    lens = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *D])
+    lever = (m.ahead_of_front_axle_cm + camera.wheelbase_cm) / m.height_cm
+    mount = np.array([m.pitch_down_rad, m.roll_rad, m.yaw_rad, lever, -m.right_of_centre_cm / m.height_cm])
+    return lens, mount
+
+
 class _Problem:
+    prior: tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]
+
     def __init__(
         self,
         edges: Sequence[EdgePixels],
@@ -231,14 +247,7 @@ class _Problem:
         )
 
     def start(self, poses: np.ndarray, tilt: np.ndarray | None) -> _State:
-        c, m = self.camera, self.camera.mounting
-        D = np.concatenate([c.D, np.zeros(5)])[:5]
-        lens = np.array([c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2], *D])
-        lever = (m.ahead_of_front_axle_cm + c.wheelbase_cm) / m.height_cm
-        mount = np.array(
-            [m.pitch_down_rad, m.roll_rad, m.yaw_rad, lever, -m.right_of_centre_cm / m.height_cm]
-        )
-        self.prior = (lens, mount)
+        lens, mount = _numbers_of(self.camera)
         return _State(poses, np.zeros((self.n, 2)) if tilt is None else tilt, lens, mount)
 
     def camera_of(self, state: _State) -> Camera:
