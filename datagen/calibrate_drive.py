@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from datagen.lane_scale import LaneScale, measure_lane
 from datagen.map_settings import MapSettings
+from datagen.pictures import straight_frames
 from datagen.pipeline import hide_bumper, split_segments
 from datagen.self_calibration import (
     DRIVE_INSTEAD,
@@ -31,7 +31,8 @@ from lanenet.geometry.camera import Camera
 StageProgress = Callable[[str, int, int], None]
 #: A lane that differs by this much from the given one, where the scale is known otherwise, is worth a word.
 _OTHER_LANE = 0.05
-_SHOWN = 3
+#: Frames in the pictures, and how far ahead they show the road, in camera heights.
+_SHOWN, _SEEN_HEIGHTS = 3, 6.0
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,7 @@ def calibrate_drive(
         found, settings, drive_path, needed=lane_width_cm is not None and camera_height_cm is None
     )
     factor, height_sigma, scale_from = _scale(found.camera, lane, lane_width_cm, camera_height_cm)
+    height = found.camera.mounting.height_cm
     camera = with_known_scale(found.camera, factor, settings.guess)
     lane_cm = None if lane is None else factor * lane.width_cm
     if lane_width_cm and lane_cm and abs(lane_cm / lane_width_cm - 1.0) > _OTHER_LANE:
@@ -188,7 +190,7 @@ def calibrate_drive(
         revisits=len(found.solved.revisits),
         robust_sd_px=found.solved.bundle.robust_sd_px,
         lane_cm=lane_cm,
-        shown=straight_frames(found.solved.poses, _SHOWN),
+        shown=straight_frames(found.solved.poses, _SEEN_HEIGHTS * height, _SHOWN),
         drive=drive,
     )
 
@@ -280,21 +282,3 @@ def _sigma_with_units(
         "ahead_of_front_axle_cm": float(ahead),
     }
     return with_units if height_sigma is None else {**with_units, "height_cm": height_sigma * m.height_cm}
-
-
-def straight_frames(poses: Float[np.ndarray, "n 3"], count: int) -> tuple[int, ...]:
-    """Pick the frame of each part of a drive around which the car turns least: its lines are straight.
-
-    Args:
-        poses: Poses, heading unwrapped.
-        count: Number of equal parts.
-    """
-    n = len(poses)
-    # Half a second ahead and as much behind, at 20 Hz.
-    ahead = min(10, max(1, n // 4))
-    at = np.arange(n)
-    turn = np.abs(poses[np.minimum(at + ahead, n - 1), 2] - poses[np.maximum(at - ahead, 0), 2])
-    # The ends see less than a whole window.
-    turn[:ahead] = turn[n - ahead :] = np.inf
-    parts = np.array_split(at, count)
-    return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))

@@ -36,6 +36,8 @@ MAX_FOCAL_SIGMA = 0.05
 _LENS = ("focal", "cx", "cy", "k1")
 #: Numbers whose priors every usual camera meets: far from them, the pictures do not show a flat road alone.
 _USUAL = ("cx", "cy", "roll")
+#: Strain that is worth a word.
+_STRAINED = 1.5
 #: Focal lengths to start from anew, relative to the first, where that closes no loop.
 _ANEW = (1.0, 1.2)
 #: What the adjustment's own standard deviations are multiplied by, as measured on simulated drives with known
@@ -237,12 +239,18 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
         return [
             f"{problem}: the focal length is the start's, give or take {100.0 * found.sigma['focal']:.0f} %"
         ]
+    strained = (
+        f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras usually differ: "
+        "something in them is not on a flat road, such as lamps mirrored in the floor"
+    )
     if found.sigma["focal"] > MAX_FOCAL_SIGMA:
+        why = f"; {strained}" if found.strain > _STRAINED else ""
         raise CalibrationError(
             f"{where}: the focal length is known to {100.0 * found.sigma['focal']:.1f} % only ({driven}, "
-            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %: {DRIVE_INSTEAD}"
+            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %{why}. "
+            f"{DRIVE_INSTEAD.capitalize()}"
         )
-    return []
+    return [strained] if found.strain > _STRAINED else []
 
 
 def nudged(camera: Camera, name: str, by: float) -> Camera:
