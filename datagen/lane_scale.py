@@ -8,7 +8,7 @@ import numpy as np
 
 from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
-from datagen.self_calibration import nudged
+from datagen.slam.calibrate import nudged
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
 

@@ -7,7 +7,7 @@ heading down, and with it the focal length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import CAMERA_NAMES, BundleSettings
-from datagen.slam.calibrate import Candidate, coarse_camera
+from datagen.slam.calibrate import Candidate, coarse_camera, nudged
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
 from lanenet.data.drive import Drive
@@ -36,13 +36,18 @@ MAX_FOCAL_SIGMA = 0.05
 _LENS = ("focal", "cx", "cy", "k1")
 #: Numbers whose priors every usual camera meets: far from them, the pictures do not show a flat road alone.
 _USUAL = ("cx", "cy", "roll")
+#: How far principal points usually are from the middle, for images of 160 px, and cameras from level, [rad]:
+#: real ones differ by more than the adjustment's priors, which are close to keep what is nearly degenerate.
+_CENTRE_PX, _LEVEL_RAD = 2.0, 0.04
 #: Strain that is worth a word.
 _STRAINED = 1.5
+#: A start whose focal length is this close to what was found from it is good enough.
+_CLOSE_START = 0.03
 #: Focal lengths to start from anew, relative to the first, where that closes no loop.
 _ANEW = (1.0, 1.2)
 #: What the adjustment's own standard deviations are multiplied by, as measured on simulated drives with known
 #: cameras (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
-SIGMA_FACTOR = 2.0
+SIGMA_FACTOR = 3.0
 
 
 def refining(settings: BundleSettings) -> BundleSettings:
@@ -69,7 +74,7 @@ class FoundCamera:
         sigma: Standard deviation of each number of the camera, in the units of
             :attr:`datagen.slam.bundle.BundleResult.sigma`, after :data:`SIGMA_FACTOR`.
         refined: Whether a known camera was the start.
-        strain: How far principal point and roll had to go from their priors, in the priors' standard
+        strain: How far principal point and roll had to go from their priors, in usual standard
             deviations; by so much, if it is more than one, the standard deviations are larger.
     """
 
@@ -147,26 +152,51 @@ def find_camera(
         settings = settings.model_copy(update={"bundle": refining(settings.bundle)})
     solved = solve_segment(drive, camera, settings, rng, progress, find_camera=True)
     if start is None:
-        first, searched = solved, camera
-        for factor in _ANEW:
-            if solved.revisits or len(drive) < MIN_FRAMES or turning_rad(solved.poses) < MIN_TURNING_RAD:
-                break
-            # The open loop has found pitch and yaw better than the search, which the filter needs.
-            m = first.camera.mounting
-            turned = searched.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
-            camera = nudged(turned, "focal", float(np.log(factor)))
-            solved = solve_segment(drive, camera, settings, rng, progress, find_camera=True)
-        solved = solved if solved.revisits else first
+        solved = _started_anew(drive, camera, solved, settings, rng, progress)
     closed = bool(solved.revisits)
     strain = prior_strain(solved.camera, camera, settings.bundle)
     sigma = honest_sigma(solved.bundle.sigma, closed, strain, settings.bundle, camera.width)
     return FoundCamera(solved, candidates, sigma, start is not None, strain)
 
 
+def _started_anew(
+    drive: Drive,
+    searched: Camera,
+    first: SolvedSegment,
+    settings: MapSettings,
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> SolvedSegment:
+    """Solve a drive again with what was learned of its camera, where the search was off.
+
+    The filter follows the drive, and loops are found, with the camera of the start: poses that a wrong one has
+    bent hold the adjustment back.
+    """
+    start, found = searched, first
+    for factor in _ANEW:
+        if found.revisits:
+            if abs(found.camera.K[0, 0] / start.K[0, 0] - 1.0) < _CLOSE_START:
+                return found
+            focal_px = float(found.camera.K[0, 0])
+        elif len(drive) < MIN_FRAMES or turning_rad(first.poses) < MIN_TURNING_RAD:
+            return first
+        else:
+            focal_px = float(searched.K[0, 0]) * factor
+        # Principal point, roll and k1 begin where they are believed to be.
+        m = found.camera.mounting if found.revisits else first.camera.mounting
+        turned = searched.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
+        start = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
+        again = solve_segment(drive, start, settings, rng, progress, find_camera=True)
+        if found.revisits and not again.revisits:
+            return found
+        found = again
+    return found if found.revisits else first
+
+
 def prior_strain(camera: Camera, believed: Camera, priors: BundleSettings) -> float:
-    """How far a camera's principal point and roll are from where they were believed, in prior sigmas."""
-    centre = priors.centre_px * camera.width / 160.0
-    spread = {"cx": centre, "cy": centre, "roll": priors.roll}
+    """How far a camera's principal point and roll are from where they were believed, in usual deviations."""
+    centre = max(priors.centre_px, _CENTRE_PX) * camera.width / 160.0
+    spread = {"cx": centre, "cy": centre, "roll": max(priors.roll, _LEVEL_RAD)}
     off = {
         "cx": camera.K[0, 2] - believed.K[0, 2],
         "cy": camera.K[1, 2] - believed.K[1, 2],
@@ -240,7 +270,7 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
             f"{problem}: the focal length is the start's, give or take {100.0 * found.sigma['focal']:.0f} %"
         ]
     strained = (
-        f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras usually differ: "
+        f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras differ: "
         "something in them is not on a flat road, such as lamps mirrored in the floor"
     )
     if found.sigma["focal"] > MAX_FOCAL_SIGMA:
@@ -251,24 +281,3 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
             f"{DRIVE_INSTEAD.capitalize()}"
         )
     return [strained] if found.strain > _STRAINED else []
-
-
-def nudged(camera: Camera, name: str, by: float) -> Camera:
-    """Return the camera with one of its adjustable numbers changed, in the adjustment's units."""
-    m = camera.mounting
-    if name == "pitch":
-        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad + by)
-    if name == "roll":
-        return camera.with_mounting(roll_rad=m.roll_rad + by)
-    if name == "yaw":
-        return camera.with_mounting(yaw_rad=m.yaw_rad + by)
-    if name == "lever":
-        return camera.with_mounting(ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + by * m.height_cm)
-    K, D = np.array(camera.K, dtype=np.float64), np.array(camera.D, dtype=np.float64)
-    if name == "focal":
-        K[:2, :2] *= np.exp(by)
-    elif name == "k1":
-        D[0] += by
-    else:
-        K[("cx", "cy").index(name), 2] += by
-    return replace(camera, K=K, D=D)

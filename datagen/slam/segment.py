@@ -34,7 +34,7 @@ _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
 #: The camera is adjusted until its focal length moves by less than this share, or so often.
-_SETTLED, _MAX_CAMERA_ROUNDS = 0.01, 4
+_SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
 
 
 @dataclass(frozen=True)
