@@ -169,8 +169,8 @@ def _started_anew(
 ) -> SolvedSegment:
     """Solve a drive again with what was learned of its camera, where the search was off.
 
-    The filter follows the drive, and loops are found, with the camera of the start: poses that a wrong one has
-    bent hold the adjustment back.
+    The filter follows the drive, and loops are found, with the camera of the start: poses that a wrong camera
+    has bent hold the adjustment back.
     """
     start, found = searched, first
     for factor in _ANEW:
