@@ -20,6 +20,7 @@ from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.slam.calibrate import coarse_camera, with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.stillness import following_frames
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
@@ -58,10 +59,11 @@ def map_drive(
         CalibrationError: If the camera does not fit the images.
     """
     rng = np.random.default_rng(settings.seed)
-    drive = open_drive(drive_path)
+    recorded = open_drive(drive_path)
+    notes: list[str] = list(recorded.problems)
+    drive = following_frames(recorded, notes)
     segments = split_segments(drive)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
-    notes: list[str] = list(drive.problems)
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:

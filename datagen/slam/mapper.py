@@ -1,4 +1,4 @@
-"""From scans and commands to a trajectory: two passes of the filter, then loop closure."""
+"""From scans and commands to an open-loop trajectory: the usual step, then two passes of the filter."""
 
 from __future__ import annotations
 
