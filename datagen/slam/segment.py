@@ -124,7 +124,7 @@ def solve_segment(
             before, loops = bundle.camera.K[0, 0], _loops(closure.revisits, len(drive))
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=expected,
+                loops=loops, tilt=bundle.tilt, expected=expected, prior=camera,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
