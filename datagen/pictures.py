@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from datagen.labels.project import FrameLines
 from datagen.map_folder import DriveMap
+from datagen.slam.places import path_lengths
 from datagen.slam.scans import Scans
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
@@ -137,3 +138,21 @@ def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
     if not done:
         raise LanenetError(f"{path}: the picture could not be encoded")
     path.write_bytes(data.tobytes())
+
+
+def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int) -> tuple[int, ...]:
+    """Pick the frame of each part of a drive from which the car drives straightest: its lines are straight.
+
+    Args:
+        poses: Poses, heading unwrapped.
+        ahead_cm: Way that has to be straight, from the frame on.
+        count: Number of equal parts.
+    """
+    n = len(poses)
+    path = path_lengths(poses)
+    last = np.minimum(np.searchsorted(path, path + ahead_cm), n - 1)
+    turn = np.array([np.ptp(poses[k : last[k] + 1, 2]) for k in range(n)])
+    # Near the end, less than the whole way is known.
+    turn[path + ahead_cm > path[-1]] += 2.0 * np.pi
+    parts = np.array_split(np.arange(n), count)
+    return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))

@@ -33,7 +33,8 @@ from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
 from datagen.report.residuals import ResidualSettings
 from datagen.report.verdict import judge
-from datagen.slam.calibrate import coarse_camera, with_known_scale
+from datagen.self_calibration import find_camera
+from datagen.slam.calibrate import with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
 from datagen.slam.stillness import following_frames
@@ -59,6 +60,7 @@ def map_drive(
     settings: MapSettings,
     out: Path,
     progress: Progress | None = None,
+    refine_camera: bool = False,
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
 
@@ -70,6 +72,7 @@ def map_drive(
         settings: Settings of all stages.
         out: Map folder to write.
         progress: Called with (done, total).
+        refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -77,7 +80,7 @@ def map_drive(
             camera and lane width say.
     """
     try:
-        return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress)
+        return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera)
     except TrackingLostError as error:
         where = "" if str(drive_path) in str(error) else f"{drive_path}: "
         raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}") from error
@@ -90,37 +93,33 @@ def _map_drive(
     settings: MapSettings,
     out: Path,
     progress: Progress | None,
+    refine_camera: bool,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
     recorded = open_drive(drive_path)
+    check_moving(recorded)
     notes: list[str] = list(recorded.problems)
     drive = following_frames(recorded, notes)
     segments = split_segments(drive)
-    check_moving(drive)
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:
         _check_size(known, drive, camera_path)
-        camera, how = known, "given"
-    else:
+    camera, how, longest_rows = known, "given", None
+    if camera is None or refine_camera:
         longest_rows = max(segments, key=lambda s: s.stop - s.start)
         longest = drive.subset(longest_rows)
         check_edges(longest, settings.perception.edges)
-        camera, candidates = coarse_camera(longest, settings.perception, settings.guess, rng, progress)
-        how = "from the drive: coarse by match score, then bundle adjustment, scale by lane width"
-        solved = solve_segment(longest, camera, settings, rng, progress, find_camera=True)
-        camera = solved.camera
-        figures["calibration"] = {
-            "candidates": [vars(c) for c in candidates],
-            "sigma": solved.bundle.sigma,
-            "closed": bool(solved.revisits),
-        }
+        found = find_camera(longest, known, settings, rng, progress, search_progress=progress)
+        solved, camera, how = found.solved, found.camera, found.how
+        figures["calibration"] = found.figures
+        notes.append(found.note)
     width = lane_width_cm if known is not None else None
     parts = []
     for rows in segments:
-        if known is not None or rows != longest_rows:
+        if rows != longest_rows:
             solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
         parts.append(_find_lane(rows, solved, width, settings, held_out[rows]))
     check_lane(parts, drive)

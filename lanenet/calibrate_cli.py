@@ -1,4 +1,4 @@
-"""The verbs below ``lanenet calibrate``: thin shells over :mod:`lanenet.calibration`."""
+"""The verbs below ``lanenet calibrate``: thin shells over :mod:`lanenet.calibration` and ``datagen``."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
+    from datagen.map_settings import MapSettings
     from lanenet.geometry.camera import Camera
 
 app = typer.Typer(no_args_is_help=True, help="Find the camera: its lens, and where it sits on the car.")
@@ -163,6 +164,73 @@ def ground(
     console.show_problems([] if image else ["no pictures without a photo; give --image"])
     console.wrote(out, *pictures)
     console.next_command("doctor", "--camera", out)
+
+
+@app.command(
+    "drive",
+    epilog="Example: lanenet calibrate drive data/tub --lane-width 40 --wheelbase 26 --out camera.yaml",
+)
+def drive_(
+    drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)],
+    out: _Out,
+    lane_width: Annotated[
+        float | None,
+        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm: sets the scale."),
+    ] = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Height of the lens above the road, cm: sets the scale instead."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", help="Camera YAML to begin with (--refine).", show_default=False),
+    ] = None,
+    refine: Annotated[
+        bool, typer.Option("--refine", help="Refine --camera, or the drive's own, instead of a search.")
+    ] = False,
+    accept_open_loop: Annotated[
+        bool, typer.Option("--accept-open-loop", help="Take a guessed focal length where no place recurs.")
+    ] = False,
+    wheelbase: Annotated[float | None, typer.Option(min=0.1, help="Distance of the car's axles, cm.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML with the mapping's settings.")] = None,
+) -> None:
+    """Find lens and mounting from two laps alone: no board, no measured points."""
+    from datagen.calibrate_drive import calibrate_drive, starting_camera
+    from datagen.map_settings import MapSettings
+    from lanenet.calibrate_show import drive_pictures, show_drive
+    from lanenet.config import load_settings
+    from lanenet.data.camera_file import write_camera
+
+    _check_yaml(out)
+    settings = MapSettings() if config is None else load_settings(MapSettings, config)
+    start, notes = starting_camera(drive, camera, refine)
+    settings, start, note = _with_wheelbase(settings, start, wheelbase)
+    with console.progress_bar("calibrate") as progress:
+        result = calibrate_drive(
+            drive, lane_width, camera_height, start, settings, progress, accept_open_loop=accept_open_loop
+        )
+    today = datetime.date.today().isoformat()
+    write_camera(out, result.camera, result.method, result.residuals, today)
+    pictures = drive_pictures(out, result)
+    show_drive(result)
+    console.show_problems([*notes, *result.notes, *note])
+    console.wrote(out, *pictures)
+    width = "LANE_WIDTH" if lane_width is None else f"{lane_width:g}"
+    console.next_command("map", drive, "--lane-width", width, "--camera", out, "--out", "MAP")
+
+
+def _with_wheelbase(
+    settings: MapSettings, start: Camera | None, wheelbase_cm: float | None
+) -> tuple[MapSettings, Camera | None, list[str]]:
+    """Put the wheelbase where the calibration looks for it: poses are those of the rear axle."""
+    from dataclasses import replace
+
+    if wheelbase_cm is None:
+        nominal = f"the wheelbase is a nominal {settings.guess.wheelbase_cm:g} cm; give --wheelbase"
+        return settings, start, [] if start is not None else [nominal]
+    guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
+    settings = settings.model_copy(update={"guess": guess})
+    return settings, None if start is None else replace(start, wheelbase_cm=wheelbase_cm), []
 
 
 def _check_yaml(*paths: Path | None) -> None:

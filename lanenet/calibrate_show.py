@@ -10,11 +10,14 @@ import numpy as np
 from lanenet import console
 
 if TYPE_CHECKING:
+    from datagen.calibrate_drive import CalibratedDrive
     from lanenet.calibration.chessboard_camera import ChessboardCalibration
     from lanenet.calibration.ground import GroundCalibration
 
 #: The bird's-eye picture's left, near, right and far edge, [cm].
 _AREA_CM = (-60.0, 0.0, 60.0, 120.0)
+#: Scale of several such pictures beside each other; a line of the grid every 10 cm.
+_SMALL_PX_PER_CM = 4.0
 
 
 def lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
@@ -49,6 +52,21 @@ def ground_pictures(
     return [
         _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
         _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
+    ]
+
+
+def drive_pictures(out: Path, result: CalibratedDrive) -> list[Path]:
+    """Write frames of a straight stretch without distortion, and from above; returns their paths."""
+    from lanenet.calibration.pictures import plane_picture, undistorted_picture
+    from lanenet.calibration.pose import pose_from_mounting
+
+    pose = pose_from_mounting(result.camera.mounting)
+    frames = [result.drive.image(k) for k in result.shown]
+    flat = [undistorted_picture(frame, result.camera) for frame in frames]
+    above = [plane_picture(frame, result.camera, pose, _AREA_CM, _SMALL_PX_PER_CM) for frame in frames]
+    return [
+        _write_picture(out, "undistorted", np.concatenate(flat, axis=1)),
+        _write_picture(out, "birdseye", np.concatenate(above, axis=1)),
     ]
 
 
@@ -103,5 +121,34 @@ def show_mounting(result: GroundCalibration, points_cm: np.ndarray, pixels_px: n
                 else f"{np.linalg.norm(result.residuals_px[k]):.1f} px off"
             )
             for k in np.flatnonzero(~result.used)
+        ]
+    )
+
+
+def show_drive(result: CalibratedDrive) -> None:
+    """Print a camera found from a drive with its spreads, in the units that people use."""
+    camera, m, sigma = result.camera, result.camera.mounting, result.sigma
+    K, turn = camera.K, float(np.rad2deg(1.0))
+    numbers = (
+        ("focal length", K[0, 0], sigma["focal_px"], "px", 1),
+        ("principal point, u", K[0, 2], sigma["cx_px"], "px", 1),
+        ("principal point, v", K[1, 2], sigma["cy_px"], "px", 1),
+        ("distortion k1", camera.D[0], sigma["k1"], "", 4),
+        ("pitch, down", turn * m.pitch_down_rad, turn * sigma["pitch_down_rad"], "degrees", 2),
+        ("roll", turn * m.roll_rad, turn * sigma["roll_rad"], "degrees", 2),
+        ("yaw, to the left", turn * m.yaw_rad, turn * sigma["yaw_rad"], "degrees", 2),
+        ("height", m.height_cm, sigma.get("height_cm"), "cm", 1),
+        ("ahead of front axle", m.ahead_of_front_axle_cm, sigma["ahead_of_front_axle_cm"], "cm", 1),
+    )
+    rows = [
+        [name, f"{value:.{digits}f}", "given" if spread is None else f"{spread:.{digits}f}", unit]
+        for name, value, spread, unit, digits in numbers
+    ]
+    console.show_table(f"{camera.model} camera from {result.drive.name}", ("number", "found", "+-", ""), rows)
+    lane = "no lane found" if result.lane_cm is None else f"lane {result.lane_cm:.1f} cm"
+    console.show_lines(
+        [
+            f"{result.frames} frames, {result.revisits} places seen twice, edges agree to "
+            f"{result.robust_sd_px:.2f} px (robust sd), {lane}"
         ]
     )

@@ -215,13 +215,16 @@ def map_(
     out: Annotated[Path, typer.Option(help="Folder for the map.", show_default=False)],
     camera: _CameraOption = None,
     config: Annotated[Path | None, typer.Option(help="YAML with the mapping's settings.")] = None,
+    refine_camera: Annotated[
+        bool, typer.Option("--refine-camera", help="Adjust a known camera to this drive.")
+    ] = False,
 ) -> None:
     """Find the poses of a drive and one map of its lane lines; without a camera it is calibrated too."""
     from datagen.pipeline import MapSettings, map_drive
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     with console.progress_bar("map") as progress:
-        report = map_drive(drive, lane_width, camera, settings, out, progress)
+        report = map_drive(drive, lane_width, camera, settings, out, progress, refine_camera)
     console.show_lines(report.lines)
     console.wrote(out, out / "report.html")
     if report.figures["verdict"]["grade"] == "reject":

@@ -114,7 +114,7 @@ def adjust(
     tilt: Float[np.ndarray, "n 2"] | None = None,
     breaks: Bool[np.ndarray, "n"] | None = None,
     expected: Float[np.ndarray, "n"] | None = None,
-    prior: Camera | None = None,
+    believed: Camera | None = None,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
@@ -129,14 +129,16 @@ def adjust(
         tilt: Start of the frames' tilts; None for level.
         breaks: Frames that do not follow the one before them.
         expected: Commanded way from the frame before, 1 where it is usual; None for the same all along.
-        prior: Camera that the priors are about; None for the start.
+        believed: Camera about which the priors lie; None for the start. Rounds that each begin where the one
+            before ended would walk away from it otherwise.
 
     Returns:
         The adjusted drive.
     """
     problem = _Problem(edges, camera, settings, rng, free, loops, breaks, expected)
+    problem.prior = _numbers_of(camera if believed is None else believed)
     height = camera.mounting.height_cm
-    state = problem.start(poses / [height, height, 1.0], tilt, camera if prior is None else prior)
+    state = problem.start(poses / [height, height, 1.0], tilt)
     for gate_px in settings.gates_px:
         links = problem.associate(state, gate_px)
         damping = _DAMPING
@@ -185,7 +187,19 @@ class _Links:
     pair_starts: Int[np.ndarray, "p1"]
 
 
+def _numbers_of(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]:
+    """A camera as the kernels take it: lens, and mounting with lengths in camera heights."""
+    m = camera.mounting
+    D = np.concatenate([camera.D, np.zeros(5)])[:5]
+    lens = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *D])
+    lever = (m.ahead_of_front_axle_cm + camera.wheelbase_cm) / m.height_cm
+    mount = np.array([m.pitch_down_rad, m.roll_rad, m.yaw_rad, lever, -m.right_of_centre_cm / m.height_cm])
+    return lens, mount
+
+
 class _Problem:
+    prior: tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]
+
     def __init__(
         self,
         edges: Sequence[EdgePixels],
@@ -235,9 +249,9 @@ class _Problem:
             [s.focal, s.centre_px * scale, s.centre_px * scale, s.k1, s.pitch, s.roll, s.yaw, s.lever]
         )
 
-    def start(self, poses: np.ndarray, tilt: np.ndarray | None, prior: Camera) -> _State:
-        self.prior = _numbers(prior)
-        return _State(poses, np.zeros((self.n, 2)) if tilt is None else tilt, *_numbers(self.camera))
+    def start(self, poses: np.ndarray, tilt: np.ndarray | None) -> _State:
+        lens, mount = _numbers_of(self.camera)
+        return _State(poses, np.zeros((self.n, 2)) if tilt is None else tilt, lens, mount)
 
     def camera_of(self, state: _State) -> Camera:
         c, lens, mount = self.camera, state.lens, state.mount
@@ -446,16 +460,6 @@ class _Problem:
         lens[2:5] += camera[1:4]
         mount[:4] += camera[4:8]
         return _State(state.poses + frames[:, :3], state.tilt + frames[:, 3:], lens, mount)
-
-
-def _numbers(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]:
-    """The camera as the kernels take it: lens and mounting, lengths in camera heights."""
-    K, m = camera.K, camera.mounting
-    D = np.concatenate([camera.D, np.zeros(5)])[:5]
-    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *D])
-    lever = (m.ahead_of_front_axle_cm + camera.wheelbase_cm) / m.height_cm
-    left = -m.right_of_centre_cm / m.height_cm
-    return lens, np.array([m.pitch_down_rad, m.roll_rad, m.yaw_rad, lever, left])
 
 
 def point_trust(in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:

@@ -151,3 +151,24 @@ def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Cam
     lever = scaled.wheelbase_cm + scaled.mounting.ahead_of_front_axle_cm
     kept = replace(scaled, wheelbase_cm=guess.wheelbase_cm)
     return kept.with_mounting(ahead_of_front_axle_cm=lever - guess.wheelbase_cm)
+
+
+def nudged(camera: Camera, name: str, by: float) -> Camera:
+    """Return the camera with one of its adjustable numbers changed, in the adjustment's units."""
+    m = camera.mounting
+    if name == "pitch":
+        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad + by)
+    if name == "roll":
+        return camera.with_mounting(roll_rad=m.roll_rad + by)
+    if name == "yaw":
+        return camera.with_mounting(yaw_rad=m.yaw_rad + by)
+    if name == "lever":
+        return camera.with_mounting(ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + by * m.height_cm)
+    K, D = np.array(camera.K, dtype=np.float64), np.array(camera.D, dtype=np.float64)
+    if name == "focal":
+        K[:2, :2] *= np.exp(by)
+    elif name == "k1":
+        D[0] += by
+    else:
+        K[("cx", "cy").index(name), 2] += by
+    return replace(camera, K=K, D=D)

@@ -34,7 +34,7 @@ _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
 #: The camera is adjusted until its focal length moves by less than this share, or so often.
-_SETTLED, _MAX_CAMERA_ROUNDS = 0.01, 4
+_SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    closure = _close(edges, opened, matched, settings, rng, free, expected)
+    closure = _close(edges, opened, matched, settings, rng, free, expected, camera)
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
@@ -124,7 +124,7 @@ def solve_segment(
             before, loops = bundle.camera.K[0, 0], _loops(closure.revisits, len(drive))
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=expected, prior=camera,
+                loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
@@ -162,6 +162,7 @@ def _close(
     rng: np.random.Generator,
     free: Sequence[str],
     expected: Float[np.ndarray, "n"],
+    believed: Camera,
 ) -> _Closure | None:
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
     best: _Closure | None = None
@@ -170,8 +171,9 @@ def _close(
         poses, missed = close_loops(opened.poses, revisits, height)
         loops = _loops(revisits, len(poses))
         closed = adjust(
-            edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt, expected=expected
-        )
+            edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
+            expected=expected, believed=believed,
+        )  # fmt: skip
         if best is None or closed.misfit < best.bundle.misfit:
             best = _Closure(revisits, missed, drift, closed)
     return best

@@ -97,7 +97,7 @@ def test_one_line_only(tmp_path):
 
 def test_no_line_at_all(tmp_path):
     drive = simulated(tmp_path / "drive", 80, left="none", right="none")
-    assert re.search("no lane|no line", refusal(drive, tmp_path / "map"))
+    assert re.search("no lane|no line|no pair of lines", refusal(drive, tmp_path / "map"))
 
 
 @pytest.mark.parametrize("given_cm", [20.0, 80.0])

@@ -25,7 +25,7 @@ def _problem(camera: Camera, frames: int = 2, free: tuple[str, ...] = CAMERA_NAM
 
 
 def _vectors(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    state = _problem(camera).start(np.zeros((2, 3)), None, camera)
+    state = _problem(camera).start(np.zeros((2, 3)), None)
     return state.lens, state.mount
 
 

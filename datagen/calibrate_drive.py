@@ -1,0 +1,284 @@
+"""A camera file's worth of knowledge from one drive: ``lanenet calibrate drive``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from datagen.lane_scale import LaneScale, measure_lane
+from datagen.map_settings import MapSettings
+from datagen.pictures import straight_frames
+from datagen.pipeline import hide_bumper, split_segments
+from datagen.self_calibration import (
+    DRIVE_INSTEAD,
+    MIN_FRAMES,
+    FoundCamera,
+    check_observable,
+    find_camera,
+)
+from datagen.slam.calibrate import Candidate, with_known_scale
+from datagen.slam.scans import Progress
+from datagen.slam.stillness import following_frames
+from lanenet.data.camera_file import read_camera
+from lanenet.data.drive import Drive, open_drive
+from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.geometry.camera import Camera
+
+#: Called with (stage, done, total).
+StageProgress = Callable[[str, int, int], None]
+#: A lane that differs by this much from the given one, where the scale is known otherwise, is worth a word.
+_OTHER_LANE = 0.05
+#: Frames in the pictures, and how far ahead they show the road, in camera heights.
+_SHOWN, _SEEN_HEIGHTS = 3, 6.0
+
+
+@dataclass(frozen=True)
+class CalibratedDrive:
+    """A camera found from a drive.
+
+    Attributes:
+        camera: The camera, [cm].
+        sigma: Standard deviations; each name ends in its unit. A height that was given has none.
+        candidates: Cameras of the coarse search; none where one was given.
+        closed: Whether a place was seen twice.
+        notes: What the user should know, a sentence each.
+        method: How the camera was found.
+        frames: Number of frames that were used.
+        revisits: Places that were seen twice.
+        robust_sd_px: Robust standard deviation of what edges miss between frames.
+        lane_cm: Width of the driven lane with this camera; None where none was found.
+        shown: Frames for pictures, in which the car drives straight ahead.
+        drive: The drive, without frames in which the car stands.
+    """
+
+    camera: Camera
+    sigma: dict[str, float]
+    candidates: list[Candidate]
+    closed: bool
+    notes: tuple[str, ...]
+    method: str
+    frames: int
+    revisits: int
+    robust_sd_px: float
+    lane_cm: float | None
+    shown: tuple[int, ...]
+    drive: Drive
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Figures for the camera file; each name ends in its unit."""
+        figures = {}
+        for name, value in self.sigma.items():
+            what, _, unit = name.rpartition("_")
+            figures[f"{what}_sigma_{unit}" if what else f"{name}_sigma"] = value
+        counts = {"frames_count": float(self.frames), "revisits_count": float(self.revisits)}
+        return {"reprojection_robust_sd_px": self.robust_sd_px, **counts, **figures}
+
+
+def starting_camera(
+    drive_path: Path, camera_path: Path | None, refine: bool
+) -> tuple[Camera | None, list[str]]:
+    """Decide with which camera a calibration begins.
+
+    Args:
+        drive_path: The drive, which may know its camera.
+        camera_path: A camera file; None takes the drive's own.
+        refine: Whether the camera is to be refined. A known camera is otherwise used as it is.
+
+    Returns:
+        The camera to refine, or None to look for one; and notes.
+
+    Raises:
+        CalibrationError: If a camera is given and nothing is to be done to it, or one is missing.
+    """
+    if camera_path is not None:
+        if not refine:
+            raise CalibrationError(
+                f"{camera_path}: a known camera is used as it is; add --refine to adjust it to the drive, or "
+                "leave --camera out to find one"
+            )
+        return read_camera(camera_path), []
+    own = open_drive(drive_path).camera
+    if refine and own is None:
+        raise CalibrationError(f"{drive_path}: the drive names no camera to refine; give one with --camera")
+    if refine or own is None:
+        return own, []
+    return None, [
+        f"the drive names a camera of its own, which is left alone (focal length {own.K[0, 0]:.1f} px)"
+    ]
+
+
+def calibrate_drive(
+    drive_path: Path,
+    lane_width_cm: float | None,
+    camera_height_cm: float | None,
+    start: Camera | None,
+    settings: MapSettings,
+    progress: StageProgress | None = None,
+    *,
+    accept_open_loop: bool = False,
+) -> CalibratedDrive:
+    """Find or refine the camera of a drive.
+
+    The pictures tell all but the scale. It comes from the camera's height where that is given, else from the
+    lane's width, else from the height of the camera to refine.
+
+    Args:
+        drive_path: Drive folder, Donkeycar tub or video.
+        lane_width_cm: Between the middles of the two lines of the driven lane.
+        camera_height_cm: Height of the lens above the road.
+        start: Camera to refine; None looks for one.
+        settings: Settings of all mapping stages; ``guess`` is where the search begins.
+        progress: Called with (stage, done, total).
+        accept_open_loop: Take a focal length that is guessed where no place was seen twice.
+
+    Returns:
+        The camera with its uncertainties.
+
+    Raises:
+        CalibrationError: If the drive does not determine the camera, or nothing gives the scale; says what to
+            drive or to give instead.
+        DriveFormatError: If the drive cannot be read.
+    """
+    if lane_width_cm is None and camera_height_cm is None and start is None:
+        raise CalibrationError(
+            "pictures do not tell lengths: expected the lane's width or the camera's height, found neither"
+        )
+    drive, notes = _moving_part(open_drive(drive_path), start)
+    settings = hide_bumper(drive, settings, notes)
+    if start is not None:
+        guess = settings.guess.model_copy(update={"wheelbase_cm": start.wheelbase_cm})
+        settings = settings.model_copy(update={"guess": guess})
+    rng = np.random.default_rng(settings.seed)
+    try:
+        found = find_camera(
+            drive,
+            start,
+            settings,
+            rng,
+            _follow_progress(progress),
+            None if progress is None else lambda done, total: progress("try cameras", done, total),
+        )
+    except TrackingLostError as error:
+        raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
+    if progress is not None:
+        progress(_ADJUST, 1, 1)
+    notes += check_observable(found, str(drive_path), accept_open_loop)
+    lane = _lane_of(
+        found, settings, drive_path, needed=lane_width_cm is not None and camera_height_cm is None
+    )
+    factor, height_sigma, scale_from = _scale(found.camera, lane, lane_width_cm, camera_height_cm)
+    height = found.camera.mounting.height_cm
+    camera = with_known_scale(found.camera, factor, settings.guess)
+    lane_cm = None if lane is None else factor * lane.width_cm
+    if lane_width_cm and lane_cm and abs(lane_cm / lane_width_cm - 1.0) > _OTHER_LANE:
+        notes.append(
+            f"the lane measures {lane_cm:.1f} cm with the scale from {scale_from}; given were "
+            f"{lane_width_cm:.1f} cm"
+        )
+    return CalibratedDrive(
+        camera=camera,
+        sigma=_sigma_with_units(found.sigma, camera, height_sigma),
+        candidates=found.candidates,
+        closed=found.closed,
+        notes=tuple(notes),
+        method=f"{found.how}; {len(drive)} frames of {drive.name}; scale from {scale_from}",
+        frames=len(drive),
+        revisits=len(found.solved.revisits),
+        robust_sd_px=found.solved.bundle.robust_sd_px,
+        lane_cm=lane_cm,
+        shown=straight_frames(found.solved.poses, _SEEN_HEIGHTS * height, _SHOWN),
+        drive=drive,
+    )
+
+
+_ADJUST = "adjust poses and camera"
+
+
+def _follow_progress(progress: StageProgress | None) -> Progress | None:
+    """Report the filter's progress, and after it the stage of the adjustment, which has no steps."""
+    if progress is None:
+        return None
+
+    def report(done: int, total: int) -> None:
+        progress("follow the drive", done, total)
+        if done == total:
+            progress(_ADJUST, 0, 1)
+
+    return report
+
+
+def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str]]:
+    """Longest uninterrupted stretch of the frames in which the car moves, and what was left out."""
+    notes = list(recorded.problems)
+    if start is not None and (start.width, start.height) != (recorded.width, recorded.height):
+        raise CalibrationError(
+            f"{recorded.path}: images of {recorded.width}x{recorded.height} px, but the camera to refine is "
+            f"for {start.width}x{start.height} px"
+        )
+    _check_count(recorded, len(recorded), "frames")
+    moving = following_frames(recorded, notes)
+    _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
+    try:
+        segments = split_segments(moving)
+    except TrackingLostError as error:
+        raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
+    longest = max(segments, key=lambda s: s.stop - s.start)
+    drive = moving.subset(longest)
+    if len(drive) < len(moving):
+        _check_count(recorded, len(drive), "frames without a break")
+        notes.append(f"the longest stretch without a break is used, {len(drive)} of {len(moving)} frames")
+    return drive, notes
+
+
+def _check_count(drive: Drive, count: int, what: str) -> None:
+    if count < MIN_FRAMES:
+        raise CalibrationError(f"{drive.path}: {count} {what}, expected {MIN_FRAMES}: {DRIVE_INSTEAD}")
+
+
+def _lane_of(found: FoundCamera, settings: MapSettings, where: Path, needed: bool) -> LaneScale | None:
+    try:
+        return measure_lane(found.solved, settings.trace, found.sigma)
+    except TrackingLostError as error:
+        if needed:
+            raise CalibrationError(
+                f"{where}: {error}. Drive between two lines, or give the camera's height (--camera-height)"
+            ) from error
+        return None
+
+
+def _scale(
+    camera: Camera, lane: LaneScale | None, lane_width_cm: float | None, camera_height_cm: float | None
+) -> tuple[float, float | None, str]:
+    """Factor to centimetres, the relative sigma of the height (None where it was given), and its source."""
+    if camera_height_cm is not None:
+        return (
+            camera_height_cm / camera.mounting.height_cm,
+            None,
+            f"the camera's height, {camera_height_cm:g} cm",
+        )
+    if lane_width_cm is not None and lane is not None:
+        return lane_width_cm / lane.width_cm, lane.sigma, f"the lane's width, {lane_width_cm:g} cm"
+    return 1.0, None, f"the given camera's height, {camera.mounting.height_cm:g} cm"
+
+
+def _sigma_with_units(
+    sigma: dict[str, float], camera: Camera, height_sigma: float | None
+) -> dict[str, float]:
+    m = camera.mounting
+    lever_heights = (m.ahead_of_front_axle_cm + camera.wheelbase_cm) / m.height_cm
+    ahead = np.hypot(sigma["lever"], lever_heights * (height_sigma or 0.0)) * m.height_cm
+    with_units = {
+        "focal_px": float(camera.K[0, 0]) * sigma["focal"],
+        "cx_px": sigma["cx"],
+        "cy_px": sigma["cy"],
+        "k1": sigma["k1"],
+        "pitch_down_rad": sigma["pitch"],
+        "roll_rad": sigma["roll"],
+        "yaw_rad": sigma["yaw"],
+        "ahead_of_front_axle_cm": float(ahead),
+    }
+    return with_units if height_sigma is None else {**with_units, "height_cm": height_sigma * m.height_cm}

@@ -1,0 +1,265 @@
+"""The camera from a drive: what is refused and why, and what the uncertainties are worth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import datagen.self_calibration
+from datagen.calibrate_drive import calibrate_drive, starting_camera
+from datagen.lane_scale import traced_width_cm, width_sigma
+from datagen.lanes.trace import TracedLane
+from datagen.map_settings import MapSettings
+from datagen.pictures import straight_frames
+from datagen.self_calibration import (
+    SIGMA_FACTOR,
+    FoundCamera,
+    check_observable,
+    find_camera,
+    honest_sigma,
+    prior_strain,
+    refining,
+)
+from datagen.slam.bundle import CAMERA_NAMES, BundleResult, BundleSettings
+from datagen.slam.calibrate import GuessSettings, guessed_camera, nudged
+from datagen.slam.filter import Trajectory
+from datagen.slam.places import Revisit
+from datagen.slam.scans import pack_scans
+from datagen.slam.segment import SolvedSegment
+from lanenet.data.camera_file import write_camera
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.recording import Commands, Drive, ImageFiles
+from lanenet.errors import CalibrationError
+from lanenet.perception.birdseye import RoadEdges
+
+CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
+SIGMA = dict(zip(CAMERA_NAMES, (0.01, 0.4, 0.4, 0.004, 0.004, 0.003, 0.006, 0.04), strict=True))
+REVISIT = Revisit(10, 200, np.zeros(3), 0.8, 1)
+
+
+def found(heading: np.ndarray, revisits: int = 4, focal_sigma: float = 0.02) -> FoundCamera:
+    """A drive of 3 cm per frame with this heading."""
+    n = len(heading)
+    steps = 3.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    poses = np.column_stack([np.cumsum(steps, axis=0), heading])
+    nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
+    bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, SIGMA, np.zeros(5), 1.0, 10)
+    trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
+    places = [REVISIT] * revisits
+    solved = SolvedSegment(
+        CAMERA, nothing, trajectory, poses, poses, None, places, np.zeros((revisits, 3)), None, bundle
+    )
+    return FoundCamera(solved, [], {**SIGMA, "focal": focal_sigma}, False, 0.5)
+
+
+def write_drive(folder: Path, places_px: np.ndarray, noise: float = 1.0) -> Path:
+    """A wall of blobs that passes by, seen from these places."""
+    rng = np.random.default_rng(0)
+    wall = np.kron(rng.uniform(40.0, 200.0, (4, 60)), np.ones((12, 12)))
+    with DriveWriter(folder) as writer:
+        for k, place in enumerate(places_px):
+            gray = wall[:48, int(place) : int(place) + 64] + noise * rng.standard_normal((48, 64))
+            writer.add(
+                np.repeat(gray.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2), 0.05 * k, truth=None
+            )
+    return folder
+
+
+def test_a_drive_that_is_too_short_is_refused_with_what_to_drive(tmp_path):
+    drive = write_drive(tmp_path / "d", np.arange(60) * 3.0)
+    with pytest.raises(CalibrationError, match=r"60 frames, expected 200: drive two laps of a closed track"):
+        calibrate_drive(drive, 40.0, None, None, MapSettings())
+
+
+def test_a_car_that_stands_is_refused(tmp_path):
+    places = np.concatenate([np.arange(100) * 3.0, np.full(150, 297.0)])
+    drive = write_drive(tmp_path / "d", places)
+    with pytest.raises(CalibrationError, match=r"1\d\d of 250 frames show a car that moves, expected 200"):
+        calibrate_drive(drive, 40.0, None, None, MapSettings())
+
+
+def test_lengths_and_sizes_have_to_be_known(tmp_path):
+    drive = write_drive(tmp_path / "d", np.arange(60) * 3.0)
+    with pytest.raises(CalibrationError, match="the lane's width or the camera's height, found neither"):
+        calibrate_drive(drive, None, None, None, MapSettings())
+    with pytest.raises(CalibrationError, match=r"64x48 px, but the camera to refine is for 160x120"):
+        calibrate_drive(drive, None, None, CAMERA, MapSettings())
+
+
+def test_a_known_camera_is_refined_on_request_only(tmp_path):
+    drive = write_drive(tmp_path / "d", np.arange(5) * 3.0)
+    path = tmp_path / "camera.yaml"
+    write_camera(path, CAMERA, "made up")
+    assert starting_camera(drive, None, False) == (None, [])
+    start, notes = starting_camera(drive, path, True)
+    assert start is not None and start.hash == CAMERA.hash and not notes
+    with pytest.raises(CalibrationError, match="used as it is; add --refine"):
+        starting_camera(drive, path, False)
+    with pytest.raises(CalibrationError, match="names no camera to refine"):
+        starting_camera(drive, None, True)
+
+
+def test_two_laps_determine_the_camera():
+    assert check_observable(found(np.linspace(0.0, 4.0 * np.pi, 400)), "d", False) == []
+    # A figure of eight turns as much one way as the other.
+    eight = np.abs((np.linspace(0.0, 2.0, 400) % 2.0) - 1.0) * 1.5 * np.pi
+    assert check_observable(found(eight), "d", False) == []
+
+
+@pytest.mark.parametrize(
+    ("heading", "revisits", "message"),
+    [
+        (
+            np.zeros(400),
+            0,
+            "too straight: 400 frames, 80 camera heights long.* within 0 degrees, expected 180",
+        ),
+        # Swinging along a straight road is no bend, and places seen twice there cannot be.
+        (0.4 * np.sin(np.arange(400) / 8.0), 4, "too straight.* within 46 degrees"),
+        (np.linspace(0.0, 6.0, 400), 0, "no place was seen twice.* bends of 344 degrees"),
+    ],
+)
+def test_a_drive_that_leaves_the_focal_length_open_is_refused(heading, revisits, message):
+    camera = found(heading, revisits, focal_sigma=0.3)
+    with pytest.raises(CalibrationError, match=message) as caught:
+        check_observable(camera, "tub", False)
+    assert "two laps of a closed track, or of a figure of eight" in str(caught.value)
+    assert str(caught.value).startswith("tub: ") and "--accept-open-loop" in str(caught.value)
+    (note,) = check_observable(camera, "tub", True)
+    assert "the focal length is the start's, give or take 30 %" in note
+
+
+def test_a_wide_focal_length_is_refused():
+    lap = np.linspace(0.0, 4.0 * np.pi, 400)
+    assert check_observable(found(lap, focal_sigma=0.049), "d", False) == []
+    with pytest.raises(CalibrationError, match=r"known to 6\.0 % only .*4 revisits.*expected 5 %"):
+        check_observable(found(lap, focal_sigma=0.06), "d", True)
+
+
+def test_uncertainties_are_widened_and_an_open_loop_knows_no_more_of_the_lens_than_the_prior():
+    priors = BundleSettings()
+    closed = honest_sigma(SIGMA, True, 0.4, priors, 320)
+    assert closed == {name: pytest.approx(SIGMA_FACTOR * value) for name, value in SIGMA.items()}
+    strained = honest_sigma(SIGMA, True, 3.0, priors, 320)
+    assert strained["focal"] == pytest.approx(3.0 * closed["focal"])
+    held = dict.fromkeys(CAMERA_NAMES, 1e-9) | {"pitch": 0.002}
+    opened = honest_sigma(held, False, 0.0, priors, 320)
+    assert opened["focal"] == priors.focal and opened["k1"] == priors.k1
+    assert opened["cx"] == opened["cy"] == 2.0 * priors.centre_px
+    assert opened["pitch"] == pytest.approx(0.002 * SIGMA_FACTOR)
+
+
+@pytest.mark.parametrize("name", CAMERA_NAMES)
+def test_a_nudge_changes_one_number_and_comes_back(name):
+    there = nudged(CAMERA, name, 0.02)
+    assert there.hash != CAMERA.hash and nudged(there, name, -0.02).hash == CAMERA.hash
+    strain = prior_strain(there, CAMERA, BundleSettings())
+    expected = {"cx": 0.01, "cy": 0.01, "roll": 0.5}.get(name, 0.0)
+    assert strain == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("answers", "starts"),
+    [
+        # What each start gives: focal length, and whether a loop closed; and the starts that follow.
+        ([(81.0, True)], [80.0]),
+        ([(90.0, True), (91.0, True)], [80.0, 90.0]),
+        ([(90.0, True), (95.0, True), (99.0, True)], [80.0, 90.0, 95.0]),
+        ([(80.0, False), (79.0, True)], [80.0, 80.0]),
+        ([(80.0, False), (80.0, False), (95.0, True)], [80.0, 80.0, 96.0]),
+        ([(90.0, True), (90.0, False)], [80.0, 90.0]),
+    ],
+)
+def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
+    asked: list[float] = []
+    lap = np.linspace(0.0, 4.0 * np.pi, 400)
+
+    def solve(drive, camera, settings, rng, progress, find_camera):
+        asked.append(float(camera.K[0, 0]))
+        # Roll and principal point are believed to be as usual, whatever came out before.
+        assert camera.mounting.roll_rad == 0.0 and camera.K[0, 2] == 79.5 and find_camera
+        focal_px, closed = answers[len(asked) - 1]
+        adjusted = nudged(nudged(nudged(CAMERA, "roll", 0.04), "cx", 2.0), "focal", np.log(focal_px / 80.0))
+        solved = found(lap, 4 if closed else 0).solved
+        bundle = replace(solved.bundle, camera=adjusted)
+        return replace(solved, camera=adjusted, bundle=bundle)
+
+    monkeypatch.setattr(datagen.self_calibration, "solve_segment", solve)
+    monkeypatch.setattr(datagen.self_calibration, "coarse_camera", lambda *_: (CAMERA, []))
+    result = find_camera(made_up_drive(400), None, MapSettings(), np.random.default_rng(0))
+    assert asked == pytest.approx(starts)
+    closed = [focal_px for focal_px, was_closed in answers if was_closed]
+    assert result.closed and result.camera.K[0, 0] == pytest.approx(closed[-1])
+    assert result.strain == pytest.approx(1.0)
+    assert not result.refined and "from the drive" in result.note
+
+
+def made_up_drive(frames: int) -> Drive:
+    none = np.zeros(frames, bool)
+    at = np.arange(frames)
+    return Drive(
+        "d",
+        Path("d"),
+        at,
+        0.05 * at,
+        True,
+        Commands(),
+        none,
+        none,
+        None,
+        None,
+        (),
+        160,
+        120,
+        ImageFiles([]),
+        at,
+    )
+
+
+def test_priors_about_a_known_camera_are_never_wider():
+    wide, close = BundleSettings(), refining(BundleSettings())
+    assert close.focal < wide.focal and close.pitch < wide.pitch and close.roll == wide.roll
+    own = BundleSettings(focal=0.01)
+    assert refining(own).focal == 0.01
+    assert close.model_dump(exclude={"focal", "k1", "pitch", "yaw", "lever"}) == wide.model_dump(
+        exclude={"focal", "k1", "pitch", "yaw", "lever"}
+    )
+
+
+def test_the_lane_is_measured_where_both_lines_are_seen():
+    nan = np.nan
+    lane = TracedLane(
+        np.array([20.0, 21.0, nan, 22.0]), np.array([-20.0, nan, -18.0, -19.0]), np.zeros(4), 39.0, 2.0
+    )
+    assert traced_width_cm(lane) == pytest.approx(40.5)
+    one_sided = replace(lane, right_cm=np.full(4, nan))
+    assert traced_width_cm(one_sided) == 39.0
+
+
+def test_the_width_of_the_lane_depends_on_the_camera_as_the_geometry_says():
+    nothing = dict.fromkeys(CAMERA_NAMES, 0.0)
+    assert width_sigma(CAMERA, nothing, 40.0) == pytest.approx(0.0, abs=1e-9)
+    # Looking further up moves the road away: every width grows in proportion to its distance.
+    pitch = width_sigma(CAMERA, {**nothing, "pitch": 0.01}, 40.0)
+    assert width_sigma(CAMERA, {**nothing, "pitch": 0.02}, 40.0) == pytest.approx(2.0 * pitch, rel=0.1)
+    # A camera at height h sees the road at a distance d under h/d: 0.01 rad are about 0.01 (d/h + h/d).
+    assert 0.01 < pitch < 0.05
+    # Neither the place on the car nor the direction changes a width.
+    assert width_sigma(CAMERA, {**nothing, "lever": 0.5, "yaw": 0.1}, 40.0) == pytest.approx(0.0, abs=1e-9)
+    both = width_sigma(CAMERA, {**nothing, "pitch": 0.01, "focal": 0.02}, 40.0)
+    focal = width_sigma(CAMERA, {**nothing, "focal": 0.02}, 40.0)
+    assert both == pytest.approx(math.hypot(pitch, focal))
+
+
+def test_pictures_show_where_the_car_drives_straight():
+    heading = np.concatenate([np.linspace(0.0, 2.0, 60), np.full(40, 2.0), np.linspace(2.0, 4.0, 50)])
+    camera = found(heading)
+    first, second = straight_frames(camera.solved.poses, 60.0, 2)
+    # 60 cm are 20 frames, all of which lie in the straight.
+    assert 59 <= first <= 79 and 75 <= second <= 80
+    (only,) = straight_frames(found(np.zeros(4)).solved.poses, 60.0, 1)
+    assert 0 <= only < 4
