@@ -136,7 +136,8 @@ def adjust(
         The adjusted drive.
     """
     problem = _Problem(edges, camera, settings, rng, free, loops, breaks, expected)
-    problem.prior = _numbers_of(camera if believed is None else believed)
+    if believed is not None:
+        problem.prior = _numbers_of(believed)
     height = camera.mounting.height_cm
     state = problem.start(poses / [height, height, 1.0], tilt)
     for gate_px in settings.gates_px:
@@ -198,8 +199,6 @@ def _numbers_of(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarra
 
 
 class _Problem:
-    prior: tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]
-
     def __init__(
         self,
         edges: Sequence[EdgePixels],
@@ -212,6 +211,7 @@ class _Problem:
         expected: Float[np.ndarray, "n"] | None = None,
     ) -> None:
         self.settings, self.camera, self.n = settings, camera, len(edges)
+        self.prior = _numbers_of(camera)
         self.fisheye = camera.model == "fisheye"
         self.free = np.array([name in free for name in CAMERA_NAMES])
         # The frames' own tilts need the derivatives by pitch and roll in any case.

@@ -87,7 +87,7 @@ def _changed(camera: Camera, name: str, amount: float) -> Camera:
 def test_derivatives_of_lifting_by_the_camera(model):
     camera = CAMERAS[model]
     problem = _problem(camera)
-    lifted, by, half = problem._lift(problem.start(np.zeros((2, 3)), None, camera))
+    lifted, by, half = problem._lift(problem.start(np.zeros((2, 3)), None))
     np.testing.assert_allclose(lifted, _ground(camera, problem.uv), atol=1e-6)
     np.testing.assert_allclose(half, _ground(camera, problem.uv + 0.5 * problem.normals), atol=1e-5)
     near = lifted[:, 0] < 6.0
@@ -103,7 +103,7 @@ def test_a_frame_that_nods_is_a_camera_that_is_mounted_so():
     camera = fisheye()
     problem = _problem(camera)
     tilt = np.array([[0.0, 0.0], [0.02, -0.015]])
-    lifted, _, _ = problem._lift(problem.start(np.zeros((2, 3)), tilt, camera))
+    lifted, _, _ = problem._lift(problem.start(np.zeros((2, 3)), tilt))
     m = camera.mounting
     nodded = camera.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.02, roll_rad=m.roll_rad - 0.015)
     for frame, seen in enumerate((camera, nodded)):
@@ -120,7 +120,7 @@ def test_the_normal_equations_hold_the_slope_of_the_cost(model, seed):
     road = tape_road(frames)
     problem = _problem(camera, frames)
     poses = road.poses / [HEIGHT_CM, HEIGHT_CM, 1.0] + rng.normal(size=(frames, 3)) * [0.01, 0.01, 0.004]
-    state = problem.start(poses, 0.003 * rng.normal(size=(frames, 2)), camera)
+    state = problem.start(poses, 0.003 * rng.normal(size=(frames, 2)))
     away = np.concatenate([np.zeros(5 * frames), [0.02, 0.3, -0.4, 0.004, 0.003, 0.002, -0.004, 0.05]])
     state = problem.moved(state, away)
     links = problem.associate(state, 4.0)
@@ -147,7 +147,7 @@ def test_uncertainty_of_a_link_grows_with_the_stretch(model):
     camera, frames = CAMERAS[model], 6
     road = tape_road(frames)
     problem = _problem(camera, frames)
-    state = problem.start(road.poses / [HEIGHT_CM, HEIGHT_CM, 1.0], None, camera)
+    state = problem.start(road.poses / [HEIGHT_CM, HEIGHT_CM, 1.0], None)
     links = problem.associate(state, 2.0)
     pair = np.searchsorted(links.pair_starts, np.arange(len(links.point)), side="right") - 1
     i, j = problem.pairs[pair].T
@@ -176,5 +176,5 @@ def test_an_edge_that_brightens_the_other_way_is_not_met():
     met = []
     for second in (edges[1], turned):
         problem = _Problem([edges[0], second], camera, SMALL, np.random.default_rng(0), (), (), None)
-        met.append(len(problem.associate(problem.start(poses, None, camera), 0.3).point))
+        met.append(len(problem.associate(problem.start(poses, None), 0.3).point))
     assert met[0] > 20 and met[1] == 0

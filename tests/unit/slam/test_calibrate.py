@@ -63,12 +63,12 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     true = fisheye(pitch_down_rad=np.deg2rad(24.0), roll_rad=0.0, yaw_rad=0.0)
     true.K[:2, :2] = np.diag([60.0, 60.0])
     drive, _ = loop_drive(true, 60, 100, 400.0, seed)
-    guess = GuessSettings(focal_px=(45.0, 60.0, 80.0), pitch_deg=(16.0, 24.0, 32.0), frames=50)
+    guess = GuessSettings(focal_px=(60.0, 80.0), pitch_deg=(16.0, 24.0), frames=50)
     seen: list[tuple[int, int]] = []
     camera, tried = coarse_camera(
         drive, PerceptionSettings(), guess, np.random.default_rng(seed), lambda *done: seen.append(done)
     )
-    assert abs(camera.K[0, 0] - 60.0) <= 7.5
+    assert abs(camera.K[0, 0] - 60.0) <= 10.0
     assert abs(np.rad2deg(camera.mounting.pitch_down_rad) - 24.0) <= 4.0 + 1e-9
     assert camera.mounting.height_cm == NOMINAL_HEIGHT_CM and camera.wheelbase_cm == guess.wheelbase_cm
     # The camera is that of the best candidate, and no camera was tried twice.
@@ -76,7 +76,7 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     assert (best.focal_px, best.pitch_deg) == pytest.approx(
         (camera.K[0, 0], np.rad2deg(camera.mounting.pitch_down_rad))
     )
-    assert len({(c.focal_px, c.pitch_deg) for c in tried}) == len(tried) >= 12
+    assert len({(c.focal_px, c.pitch_deg) for c in tried}) == len(tried) >= 8
     assert {(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {
         (c.focal_px, c.pitch_deg) for c in tried
     }
