@@ -212,6 +212,7 @@ class _Problem:
     ) -> None:
         self.prior = _numbers_of(camera)
         self.settings, self.camera, self.n = settings, camera, len(edges)
+        self.prior = _numbers_of(camera)
         self.fisheye = camera.model == "fisheye"
         self.free = np.array([name in free for name in CAMERA_NAMES])
         # The frames' own tilts need the derivatives by pitch and roll in any case.

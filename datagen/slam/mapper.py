@@ -1,4 +1,4 @@
-"""From scans and commands to a trajectory: two passes of the filter, then loop closure."""
+"""From scans and commands to an open-loop trajectory: the usual step, then two passes of the filter."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def commands_of(drive: Drive, wheelbase_cm: float) -> CommandedMotion:
     )
     step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
     usual = max(float(np.median(step_s[1:])) if len(step_s) > 1 else 1.0, 1e-6)
-    # A longer step is a stop, whose frames were left out: the car has not driven on all the while.
-    step_s = np.minimum(step_s, _LONGEST_STEP * usual)
+    # A longer step is a stop, whose frames were left out: the car has driven for about one of them.
+    step_s = np.where(step_s > _LONGEST_STEP * usual, usual, step_s)
     if speed_cm_s is not None:
         distance, known = speed_cm_s * step_s, True
     else:

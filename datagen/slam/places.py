@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from datagen.slam.field import DirectionField
-from datagen.slam.scans import Progress, Scans, thin_scan
+from datagen.slam.scans import Scans, thin_scan
 from datagen.slam.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
@@ -65,14 +65,14 @@ class Revisit:
     turns: int = 0
 
 
-def thumbnails(drive: Drive, progress: Progress | None = None) -> Float[np.ndarray, "n d"]:
+def thumbnails(drive: Drive) -> Float[np.ndarray, "n d"]:
     """Return a small, contrast-normalised picture of each frame as a unit vector.
 
     The whole frame counts, also what stands above the road: walls and people tell places apart that have the
     same markings.
     """
     rows = np.empty((len(drive), SMALL_HEIGHT * SMALL_WIDTH), np.float32)
-    for k, small in enumerate(small_pictures(drive, progress)):
+    for k, small in enumerate(small_pictures(drive)):
         flat = small - cv2.GaussianBlur(small, (0, 0), 6.0)
         # Less than a tenth of a gray level is rounding: blank pictures would be alike by it.
         rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 2.0)

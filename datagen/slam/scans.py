@@ -51,16 +51,9 @@ class Scans:
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
 
-def edges_of_drive(
-    drive: Drive, settings: EdgeSettings, table: RoadTable, progress: Progress | None = None
-) -> list[EdgePixels]:
+def edges_of_drive(drive: Drive, settings: EdgeSettings, table: RoadTable) -> list[EdgePixels]:
     """Find the edge pixels of every frame that see the road."""
-    frames: list[EdgePixels] = []
-    for k in range(len(drive)):
-        frames.append(find_edges(drive.image(k), settings, table.keep, table.scale))
-        if progress is not None:
-            progress(k + 1, len(drive))
-    return frames
+    return [find_edges(drive.image(k), settings, table.keep, table.scale) for k in range(len(drive))]
 
 
 def scans_of(

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from datagen.slam.scans import Progress
 from lanenet.data.drive import Drive
 from lanenet.perception.edges import to_gray
 
@@ -44,14 +43,12 @@ def following_frames(drive: Drive, notes: list[str]) -> Drive:
     return drive
 
 
-def small_pictures(drive: Drive, progress: Progress | None = None) -> Float32[np.ndarray, "n h w"]:
+def small_pictures(drive: Drive) -> Float32[np.ndarray, "n h w"]:
     """Return every frame in gray, averaged over large patches, gray levels."""
     small = np.empty((len(drive), SMALL_HEIGHT, SMALL_WIDTH), np.float32)
     for k in range(len(drive)):
         gray = to_gray(drive.image(k))
         small[k] = cv2.resize(gray, (SMALL_WIDTH, SMALL_HEIGHT), interpolation=cv2.INTER_AREA)
-        if progress is not None:
-            progress(k + 1, len(drive))
     return small
 
 

@@ -59,11 +59,15 @@ def camera_numbers(camera: Camera) -> np.ndarray:
     return np.array([camera.K[0, 0], camera.K[0, 2], camera.K[1, 2], camera.D[0], *mount])
 
 
+def bean(lap_cm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Length along a road that closes on itself, and its curvature: twofold symmetry closes the curve."""
+    s = np.linspace(0.0, lap_cm, 4 * int(lap_cm) + 1)
+    return s, 2.0 * np.pi / lap_cm * (1.0 + 0.7 * np.cos(4.0 * np.pi * s / lap_cm))
+
+
 def tape_loop(frames: int, lap_frames: int = 60, lap_cm: float = 330.0) -> TapeRoad:
     """A bean of a road that closes on itself, driven again and again; dashes do not repeat within a lap."""
-    s = np.linspace(0.0, lap_cm, 2 * 660 + 1)
-    # Bends of two and three to the lap: twofold symmetry closes the curve, and both ends are alike.
-    curvature = 2.0 * np.pi / lap_cm * (1.0 + 0.7 * np.cos(4.0 * np.pi * s / lap_cm))
+    s, curvature = bean(lap_cm)
     road = tapes_along(s, curvature, np.arange(lap_frames) * (len(s) - 1) // lap_frames)
     laps, place = np.divmod(np.arange(frames), lap_frames)
     poses = road.poses[place] + np.outer(laps, [0.0, 0.0, 2.0 * np.pi])

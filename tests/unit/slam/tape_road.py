@@ -14,6 +14,8 @@ HEIGHT_CM = 15.0
 WHEELBASE_CM = 17.0
 STEP_CM = 3.0
 TAPE_CM = 2.0
+#: Offset to the left of the middle, painted length, period and phase of each line.
+LINES = ((18.0, 14.0, 26.0, 5.0), (-18.0, 30.0, 40.0, 11.0))
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,10 @@ def tape_road(frames: int, curvature_per_cm: float = 0.004, swing_per_cm: float 
 
 def tapes_along(s: np.ndarray, curvature: np.ndarray, driven: np.ndarray) -> TapeRoad:
     """Tape both sides of a lane; ``driven`` are the rows of ``s`` at which the car is, frame by frame."""
-    ds = float(s[1] - s[0])
-    heading = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]) * ds)])
-    middle = 0.5 * (heading[1:] + heading[:-1])
-    steps = ds * np.column_stack([np.cos(middle), np.sin(middle)])
-    xy = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    xy, heading = _centre_line(s, curvature)
     left = np.column_stack([-np.sin(heading), np.cos(heading)])
     points, normals = [], []
-    for offset, dash, period, phase in ((18.0, 14.0, 26.0, 5.0), (-18.0, 30.0, 40.0, 11.0)):
+    for offset, dash, period, phase in LINES:
         painted = np.mod(s + phase, period) < dash
         rows = np.flatnonzero(painted)[::4]
         for side in (0.5, -0.5):
@@ -86,3 +84,24 @@ def tapes_along(s: np.ndarray, curvature: np.ndarray, driven: np.ndarray) -> Tap
     return TapeRoad(
         np.concatenate(points), np.concatenate(normals), np.column_stack([xy[driven], heading[driven]])
     )
+
+
+def dashes_along(s: np.ndarray, curvature: np.ndarray) -> list[np.ndarray]:
+    """The middle of every dash of the same tapes, as points of the map."""
+    xy, heading = _centre_line(s, curvature)
+    left = np.column_stack([-np.sin(heading), np.cos(heading)])
+    dashes = []
+    for offset, dash, period, phase in LINES:
+        painted = np.flatnonzero(np.mod(s + phase, period) < dash)
+        runs = np.split(painted, np.flatnonzero(np.diff(painted) > 1) + 1)
+        dashes += [xy[run] + offset * left[run] for run in runs if len(run) > 1]
+    return dashes
+
+
+def _centre_line(s: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and headings of the middle of the lane, from the origin along +x."""
+    ds = float(s[1] - s[0])
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]) * ds)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = ds * np.column_stack([np.cos(middle), np.sin(middle)])
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), heading

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from picture_road import loop_drive
+from pixel_road import fisheye
 
 from datagen.slam.calibrate import (
     NOMINAL_HEIGHT_CM,
     GuessSettings,
+    coarse_camera,
     guessed_camera,
     mapping_range,
     with_known_scale,
 )
-from lanenet.perception.birdseye import RangeSettings
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 
 GUESS = GuessSettings()
 
@@ -52,3 +55,41 @@ def test_the_mapping_range_grows_with_the_camera():
     assert (small.far_cm, small.side_cm, small.max_cm_per_px) == pytest.approx((60.0, 60.0, 3.0))
     assert large.far_cm == pytest.approx(2.0 * small.far_cm)
     assert (large.top_row, large.bottom_rows) == (40, 7)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
+    """The truth lies on the grid; a second round looks half as far around the best."""
+    true = fisheye(pitch_down_rad=np.deg2rad(24.0), roll_rad=0.0, yaw_rad=0.0)
+    true.K[:2, :2] = np.diag([60.0, 60.0])
+    drive, _ = loop_drive(true, 60, 100, 400.0, seed)
+    guess = GuessSettings(focal_px=(60.0, 80.0), pitch_deg=(16.0, 24.0), frames=50)
+    seen: list[tuple[int, int]] = []
+    camera, tried = coarse_camera(
+        drive, PerceptionSettings(), guess, np.random.default_rng(seed), lambda *done: seen.append(done)
+    )
+    assert abs(camera.K[0, 0] - 60.0) <= 10.0
+    assert abs(np.rad2deg(camera.mounting.pitch_down_rad) - 24.0) <= 4.0 + 1e-9
+    assert camera.mounting.height_cm == NOMINAL_HEIGHT_CM and camera.wheelbase_cm == guess.wheelbase_cm
+    # The camera is that of the best candidate, and no camera was tried twice.
+    best = max(tried, key=lambda candidate: candidate.match)
+    assert (best.focal_px, best.pitch_deg) == pytest.approx(
+        (camera.K[0, 0], np.rad2deg(camera.mounting.pitch_down_rad))
+    )
+    assert len({(c.focal_px, c.pitch_deg) for c in tried}) == len(tried) >= 8
+    assert {(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {
+        (c.focal_px, c.pitch_deg) for c in tried
+    }
+    assert all(0.0 < c.match < 1.0 and c.step_heights > 0.0 for c in tried)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_the_focal_lengths_to_try_grow_with_the_image():
+    camera = guessed_camera(320, 240, 160.0, 15.0, GUESS)
+    np.testing.assert_allclose(camera.K[:2, 2], [159.5, 119.5])
+    small = guessed_camera(160, 120, 80.0, 15.0, GUESS)
+    # The same ray in a picture of twice the size; pixel centres are at integers.
+    np.testing.assert_allclose(
+        camera.intersect_ground(np.array([[240.5, 200.5]])),
+        small.intersect_ground(np.array([[120.0, 100.0]])),
+    )

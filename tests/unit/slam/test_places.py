@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from picture_road import made_up_drive
 from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
 from datagen.slam.places import (
@@ -20,7 +19,6 @@ from datagen.slam.places import (
     thumbnails,
 )
 from datagen.slam.scans import Scans, pack_scans
-from lanenet.data.recording import Commands, Drive
 from lanenet.perception.birdseye import RoadEdges
 
 LAP = 100
@@ -114,14 +112,6 @@ def test_fewer_pairs_are_asked_for_than_found():
     assert 3 <= len(pairs) <= 8
 
 
-class _Images:
-    def __init__(self, images: list[np.ndarray]) -> None:
-        self.images = images
-
-    def read(self, row: int) -> np.ndarray:
-        return self.images[row]
-
-
 def test_thumbnails_ignore_brightness_and_contrast():
     rng = np.random.default_rng(0)
     picture = cv2.GaussianBlur(rng.uniform(0.0, 120.0, (120, 160, 3)), (0, 0), 6.0)
@@ -129,24 +119,7 @@ def test_thumbnails_ignore_brightness_and_contrast():
     other = rng.uniform(0.0, 255.0, (120, 160, 3))
     flat = np.full((120, 160, 3), 90.0)
     images = [np.clip(v, 0, 255).astype(np.uint8) for v in (picture, 0.7 * picture + 60.0, other, flat)]
-    drive = Drive(
-        name="made-up",
-        path=Path("made-up"),
-        frames=np.arange(4),
-        t_s=0.1 * np.arange(4),
-        times_trusted=True,
-        commands=Commands(),
-        deleted=np.zeros(4, dtype=bool),
-        breaks=np.zeros(4, dtype=bool),
-        camera=None,
-        lane_width_cm=None,
-        problems=(),
-        width=160,
-        height=120,
-        images=_Images(images),
-        rows=np.arange(4),
-    )
-    thumbs = thumbnails(drive)
+    thumbs = thumbnails(made_up_drive(images))
     np.testing.assert_allclose(np.linalg.norm(thumbs[:3], axis=1), 1.0, atol=1e-5)
     assert thumbs[0] @ thumbs[1] > 0.98
     assert abs(thumbs[0] @ thumbs[2]) < 0.4

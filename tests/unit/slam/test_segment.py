@@ -1,0 +1,164 @@
+"""A segment from pictures to closed poses: tracked, closed, adjusted, its laps counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from picture_road import loop_drive, made_up_drive
+from pixel_road import camera_numbers, fisheye
+
+from datagen.map_settings import MapSettings
+from datagen.slam.bundle import BundleSettings
+from datagen.slam.filter import FilterSettings
+from datagen.slam.mapper import CommandedMotion
+from datagen.slam.places import Revisit, RevisitSettings, path_lengths
+from datagen.slam.segment import SolvedSegment, _loops, _relative_ways, solve_segment
+from datagen.world.simulate import SimulationSettings, simulate_drive
+from lanenet.data.drive import open_drive, read_truth
+from lanenet.data.recording import Commands, Drive
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.camera import Camera
+
+SMALL = MapSettings(
+    filter=FilterSettings(particles=80, max_points=80),
+    bundle=BundleSettings(points=40),
+    revisits=RevisitSettings(max_pairs=30),
+)
+LAP_FRAMES, LAP_CM = 90, 360.0
+
+
+def _camera() -> Camera:
+    """A wide lens that looks well down, so that many of the few dashes are in view."""
+    camera = fisheye(pitch_down_rad=0.42)
+    return replace(camera, K=camera.K * np.array([[0.75, 0.0, 1.0], [0.0, 0.75, 1.0], [0.0, 0.0, 1.0]]))
+
+
+def _drive(frames: int, seed: int = 0) -> tuple[Drive, np.ndarray]:
+    drive, poses = loop_drive(_camera(), frames, LAP_FRAMES, LAP_CM, seed)
+    speed = Commands(speed_cm_s=np.full(frames, LAP_CM / LAP_FRAMES / 0.05))
+    return replace(drive, commands=speed), poses
+
+
+def _errors_cm(poses: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distance of each frame from the truth, with the whole path laid over it."""
+    here, there = (p[:, :2] - p[:, :2].mean(axis=0) for p in (poses, true))
+    u, _, v = np.linalg.svd(here.T @ there)
+    assert np.linalg.det(u @ v) > 0.0
+    return np.linalg.norm(there - here @ u @ v, axis=1)
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[SolvedSegment, np.ndarray]:
+    drive, poses = _drive(125)
+    return solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None), poses
+
+
+def test_two_laps_of_pictures_give_the_true_path(solved):
+    segment, true = solved
+    error = _errors_cm(segment.poses, true)
+    # A thousandth of the path: 5 mm.
+    assert np.sqrt(np.mean(error**2)) < 1e-3 * path_lengths(true)[-1]
+    assert error.max() < 1.5
+    assert segment.path_cm[-1] == pytest.approx(path_lengths(true)[-1], rel=0.01)
+    assert segment.poses[-1, 2] - segment.poses[0, 2] == pytest.approx(true[-1, 2], abs=np.deg2rad(2.0))
+    # The closure is what makes it so.
+    assert np.sqrt(np.mean(_errors_cm(segment.open_poses, true) ** 2)) > 3.0 * np.sqrt(np.mean(error**2))
+
+
+def test_revisits_are_a_lap_apart_and_meet(solved):
+    segment, _ = solved
+    assert len(segment.revisits) >= 5
+    for revisit in segment.revisits:
+        assert abs(revisit.later - revisit.earlier - LAP_FRAMES) <= 2
+        assert revisit.turns == 1
+    assert segment.residuals.shape == (len(segment.revisits), 3)
+    missed = np.median(np.abs(segment.residuals), axis=0)
+    assert missed[:2].max() < 1.0 and missed[2] < np.deg2rad(1.0)
+    assert segment.drift_rad_per_cm is not None
+    missed_rad = [
+        segment.open_poses[r.later, 2] - segment.open_poses[r.earlier, 2] - r.relative[2] - 2.0 * np.pi
+        for r in segment.revisits
+    ]
+    drift = float(np.median(missed_rad)) / LAP_CM
+    assert segment.drift_rad_per_cm == pytest.approx(drift, abs=np.deg2rad(10.0) / LAP_CM)
+    np.testing.assert_array_equal(segment.laps, segment.path_cm // LAP_CM > 0.99)
+
+
+def test_a_known_camera_stays_and_the_frames_agree(solved):
+    segment, _ = solved
+    np.testing.assert_allclose(camera_numbers(segment.camera), camera_numbers(_camera()), rtol=1e-9)
+    assert segment.bundle.robust_sd_px < 0.2
+    assert len(segment.scans) == 125 and segment.steering is None
+    assert np.abs(segment.bundle.tilt).max() < np.deg2rad(1.0)
+
+
+def test_one_lap_stays_open():
+    drive, true = _drive(60)
+    segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
+    assert segment.revisits == [] and segment.drift_rad_per_cm is None
+    assert segment.residuals.shape == (0, 3) and not segment.laps.any()
+    np.testing.assert_array_equal(segment.poses, segment.open_poses)
+    assert segment.path_cm[-1] == pytest.approx(path_lengths(true)[-1], rel=0.1)
+
+
+def test_pictures_without_edges_cannot_be_mapped():
+    gray = [np.full((120, 160, 3), 90, np.uint8)] * 60
+    with pytest.raises(TrackingLostError, match=r"0 edge points per frame.*needs 20"):
+        solve_segment(made_up_drive(gray), _camera(), SMALL, np.random.default_rng(0), None)
+
+
+def test_pairs_around_a_revisit_stay_within_the_drive():
+    revisits = [Revisit(4, 60, np.zeros(3), 0.8), Revisit(30, 95, np.zeros(3), 0.8)]
+    pairs = _loops(revisits, 100)
+    assert pairs == [(4 + d, 60 + d) for d in range(-4, 13, 4)] + [(30 + d, 95 + d) for d in range(-12, 5, 4)]
+
+
+def test_ways_are_relative_to_the_usual_one():
+    ways = _relative_ways(CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None))
+    np.testing.assert_allclose(ways, [0.0, 1.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(_relative_ways(CommandedMotion(np.zeros(3), True, None)), np.zeros(3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_that_is_off_is_found_once_the_loop_is_closed(seed):
+    """From either side: the road closes, and then two starts end at one camera."""
+    true = _camera()
+    drive, poses = _drive(150, seed)
+    found = []
+    for factor, pitch_rad in ((1.06, 0.44), (0.94, 0.40)):
+        start = replace(true, K=true.K * np.array([[factor, 0.0, 1.0], [0.0, factor, 1.0], [0.0, 0.0, 1.0]]))
+        start = start.with_mounting(pitch_down_rad=pitch_rad, yaw_rad=0.0)
+        segment = solve_segment(drive, start, SMALL, np.random.default_rng(seed), None, find_camera=True)
+        assert segment.camera.K[0, 0] == pytest.approx(true.K[0, 0], rel=0.04)
+        pitch_error_rad = segment.camera.mounting.pitch_down_rad - true.mounting.pitch_down_rad
+        assert abs(pitch_error_rad) < np.deg2rad(1.2)
+        assert _errors_cm(segment.poses, poses).max() < 3.0
+        # The uncertainty it tells is that of a number that was seen, not of the prior.
+        assert segment.bundle.sigma["focal"] < 0.05
+        found.append(segment.camera)
+    assert found[0].K[0, 0] == pytest.approx(found[1].K[0, 0], rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_simulated_drive_is_mapped_to_millimetres(tmp_path: Path, seed):
+    settings = SimulationSettings.model_validate(
+        {
+            "seed": seed,
+            "frames": 250,
+            "camera": {"width": 160, "height": 120},
+            "track": {"closed": True, "length_cm": 500.0, "lanes": 1, "min_radius_cm": 60.0},
+        }
+    )
+    drive = open_drive(simulate_drive(settings, tmp_path / "drive"))
+    assert drive.camera is not None
+    segment = solve_segment(drive, drive.camera, MapSettings(), np.random.default_rng(seed), None)
+    truth = read_truth(tmp_path / "drive")
+    error = _errors_cm(segment.poses, np.stack([truth["x_cm"], truth["y_cm"]], axis=1))
+    assert segment.revisits
+    assert np.sqrt(np.mean(error**2)) < 1e-3 * segment.path_cm[-1]
+    assert error.max() < 2.0
