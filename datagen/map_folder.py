@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from datagen.lanes.fit import LaneLine
+from datagen.lanes.assign import FrameLanes, assign_lanes
+from datagen.lanes.line import LaneLine
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.files import write_json, write_text
@@ -22,6 +24,8 @@ from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 
 FORMAT = "lanenet-map/1"
+#: The first version has a left and a right line per segment, without period and uncertainty.
+LANES_FORMATS = ("lanenet-lanes/1", "lanenet-lanes/2")
 REPORT_FORMAT = "lanenet-map-report/1"
 EDGES_FORMAT = "lanenet-edges/1"
 
@@ -38,6 +42,7 @@ class MapMeta(Settings):
         tape_cm: Width of the markings on this map.
         scale_from: What sets the scale: the camera's height or the lane width.
         laps: Whole laps between revisits, 0 where no place was seen twice.
+        verdict: How far the map can be trusted, see :mod:`datagen.report.verdict`; older maps have none.
     """
 
     format: str
@@ -47,6 +52,7 @@ class MapMeta(Settings):
     tape_cm: float
     scale_from: str
     laps: int
+    verdict: Literal["good", "usable", "reject"] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,9 +67,11 @@ class DriveMap:
         poses: Rear-axle x, y, heading (unwrapped) per frame, frame map.
         lap: Lap of each frame, from 0.
         segment: Uninterrupted stretch of the drive that each frame belongs to.
-        s_cm: Position along the segment's path.
+        s_cm: Position along the segment's path; on a closed lap below its length.
         match: Matched share of each frame's edges, 0..1.
-        lines: Left and right line of each segment.
+        lines: Left and right line of the driven lane of each segment, then those of the lanes beside it.
+        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for level.
+        held_out: Frames whose edge points had no say in the lines; None where there were none.
     """
 
     meta: MapMeta
@@ -76,6 +84,27 @@ class DriveMap:
     s_cm: Float[np.ndarray, "n"]
     match: Float[np.ndarray, "n"]
     lines: dict[int, list[LaneLine]]
+    tilt_rad: Float[np.ndarray, "n 2"] | None = None
+    held_out: Bool[np.ndarray, "n"] | None = None
+
+    def camera_at(self, k: int) -> Camera:
+        """Return the camera as it nodded in the k-th frame."""
+        if self.tilt_rad is None:
+            return self.camera
+        m = self.camera.mounting
+        pitch, roll = (float(angle) for angle in self.tilt_rad[k])
+        return self.camera.with_mounting(pitch_down_rad=m.pitch_down_rad + pitch, roll_rad=m.roll_rad + roll)
+
+    @cached_property
+    def lanes(self) -> FrameLanes:
+        """The lane of each frame, and its direction of travel along the segment's path."""
+        lane = np.zeros(len(self.frames), dtype=np.int64)
+        forward = np.ones(len(self.frames), dtype=bool)
+        for segment, lines in self.lines.items():
+            rows = np.flatnonzero(self.segment == segment)
+            found = assign_lanes(lines, self.poses[rows], self.s_cm[rows], self.camera.wheelbase_cm)
+            lane[rows], forward[rows] = found.lane, found.forward
+        return FrameLanes(lane, forward)
 
 
 def write_map(
@@ -98,6 +127,10 @@ def write_map(
         "s_cm": m.s_cm,
         "match": m.match,
     }
+    if m.tilt_rad is not None:
+        columns |= {"pitch_rad": m.tilt_rad[:, 0], "roll_rad": m.tilt_rad[:, 1]}
+    if m.held_out is not None:
+        columns["held_out"] = m.held_out
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -105,16 +138,21 @@ def write_map(
         {
             "segment": segment,
             "side": line.side,
+            "rank": line.rank,
             "degree": 3,
+            "period_cm": line.period_cm,
             "knots_cm": line.knots_cm,
             "coefficients_cm": line.coefficients_cm,
             "supported_cm": line.supported_cm,
             "residual_cm": line.residual_cm,
+            "marking_cm": line.marking_cm,
+            "sigma_s_cm": line.sigma_s_cm,
+            "sigma_at_cm": line.sigma_at_cm,
         }
         for segment, pair in m.lines.items()
         for line in pair
     ]
-    write_json(folder / "lanes.json", {"format": "lanenet-lanes/1", "lines": lines})
+    write_json(folder / "lanes.json", {"format": LANES_FORMATS[-1], "lines": lines})
     write_columns(folder / "edges.parquet", edges, {"format": EDGES_FORMAT})
     write_json(folder / "report.json", {"format": REPORT_FORMAT, **report})
     # In full, so that the map leads to its drive from any folder.
@@ -151,9 +189,15 @@ def read_map(folder: Path) -> DriveMap:
             "segment": ColumnSpec("int"),
             "s_cm": ColumnSpec(),
             "match": ColumnSpec(allow_empty=True),
+            # Older maps lack these.
+            "pitch_rad": ColumnSpec(required=False),
+            "roll_rad": ColumnSpec(required=False),
+            "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
         },
         error=MapFormatError,
     )
+    n = len(table["frame"])
+    tilt = [table.get(name, np.zeros(n)) for name in ("pitch_rad", "roll_rad")]
     return DriveMap(
         meta=meta,
         camera=read_camera(folder / "camera.yaml"),
@@ -165,24 +209,28 @@ def read_map(folder: Path) -> DriveMap:
         s_cm=table["s_cm"],
         match=table["match"],
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
+        tilt_rad=np.stack(tilt, axis=1),
+        held_out=table.get("held_out", np.zeros(n)) > 0,
     )
 
 
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))
-        if plain["format"] != "lanenet-lanes/1":
-            raise MapFormatError(f"{path}: format is {plain['format']!r}, expected 'lanenet-lanes/1'")
+        if plain["format"] not in LANES_FORMATS:
+            raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {LANES_FORMATS[-1]!r}")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
             lines.setdefault(int(item["segment"]), []).append(_line(item))
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise MapFormatError(f"{path}: lane lines cannot be read ({error!r})") from None
     for segment in sorted(segments):
-        sides = sorted(line.side for line in lines.get(segment, []))
-        if sides != ["left", "right"]:
+        found = sorted(line.index for line in lines.get(segment, []))
+        # Without gaps from left to right: a lane lies between neighbouring numbers.
+        if not {0, 1} <= set(found) or found != list(range(found[0], found[-1] + 1)):
             raise MapFormatError(
-                f"{path}: segment {segment} has lines {sides}, expected one left and one right line"
+                f"{path}: segment {segment} has lines {found} from left to right, expected one each, among "
+                "them 0 and 1, the left and right line of the driven lane"
             )
     return lines
 
@@ -197,11 +245,30 @@ def _line(item: dict[str, Any]) -> LaneLine:
         raise ValueError(f"{len(knots)} knots with coefficients of shape {coefficients.shape}")
     if not (np.isfinite(knots).all() and np.isfinite(coefficients).all() and (np.diff(knots) >= 0.0).all()):
         raise ValueError("knots must not decrease, and all numbers must be finite")
-    residual = item["residual_cm"]
+    rank, period = int(item.get("rank", 0)), _optional(item.get("period_cm"))
+    if rank < 0:
+        raise ValueError(f"rank is {rank}")
+    if period is not None and not np.isclose(knots[-4] - knots[3], period):
+        raise ValueError(f"period_cm is {period}, the knots span {knots[-4] - knots[3]}")
+    sigma_s, sigma_at = (
+        np.array(item.get(name, []), dtype=np.float64) for name in ("sigma_s_cm", "sigma_at_cm")
+    )
+    if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape or not np.isfinite([*sigma_s, *sigma_at]).all():
+        raise ValueError(f"uncertainty of shape {sigma_at.shape} at places of shape {sigma_s.shape}")
+    residual, marking = _optional(item["residual_cm"]), _optional(item.get("marking_cm"))
     return LaneLine(
         item["side"],
         knots,
         coefficients,
         supported.reshape(-1, 2),
-        float("nan") if residual is None else float(residual),
+        float("nan") if residual is None else residual,
+        rank,
+        period,
+        sigma_s,
+        sigma_at,
+        float("nan") if marking is None else marking,
     )
+
+
+def _optional(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datagen.lanes.fit import LaneLine
+from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_folder import DriveMap
+from datagen.report.verdict import MapEvidence
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -33,7 +34,9 @@ class MappedSegment:
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
-        lines: Its two lines.
+        lines: Its two lines, then those of the lanes beside it.
+        free_lane_cm: Width of the lane as found without the user's number; None where that fails, or where
+            the user's number was not used in the first place.
     """
 
     rows: slice
@@ -41,6 +44,7 @@ class MappedSegment:
     s_frames_cm: Float[np.ndarray, "n"]
     lane: TracedLane
     lines: list[LaneLine]
+    free_lane_cm: float | None = None
 
 
 def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict[str, np.ndarray]:
@@ -92,7 +96,11 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
                 "steering": None if solved.steering is None else vars(solved.steering),
                 "lane_cm": factor * lane.lane_cm,
                 "tape_cm": factor * lane.tape_cm,
-                "line_residual_cm": {line.side: factor * line.residual_cm for line in part.lines},
+                "line_residual_cm": {
+                    line.side: factor * line.residual_cm for line in part.lines if line.rank == 0
+                },
+                "lines": sorted(line.index for line in part.lines),
+                "closed": part.lines[0].period_cm is not None,
             }
         )
     m = camera.mounting
@@ -106,6 +114,36 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
         "laps": drive_map.meta.laps,
         "segments_mapped": segments,
     }
+
+
+def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[str, Any]) -> MapEvidence:
+    """Collect what the verdict rests on; ``figures`` are those of the map and of its quality."""
+    meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
+    both = figures["held_out"]["both_lines"]
+    across = [
+        (segment["closure_residual_median"]["across_cm"], segment["revisits"])
+        for segment in figures["segments_mapped"]
+        if segment["revisits"]
+    ]
+    revisits = sum(count for _, count in across)
+    known = "calibration" not in figures
+    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    return MapEvidence(
+        robust_sd_px=both["robust_sd_px_at_160"],
+        p95_px=both["p95_px_at_160"],
+        coverage=both["coverage"],
+        labelled_share=figures["labelled"]["share"],
+        not_labelled=figures["labelled"]["why_not"],
+        revisits=revisits,
+        closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm
+        if revisits
+        else None,
+        camera_known=known,
+        sigma={} if known else figures["calibration"]["sigma"],
+        given_lane_cm=meta.lane_width_cm,
+        # Where the free search finds nothing better, the lane that was traced at the given width is it.
+        found_lane_cm=None if not known else float(np.median(free)) if free else meta.mapped_lane_cm,
+    )
 
 
 def map_notes(drive_map: DriveMap, figures: dict[str, Any], camera_known: bool) -> list[str]:

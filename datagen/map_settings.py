@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from datagen.lanes.fit import FitSettings
 from datagen.lanes.trace import TraceSettings
+from datagen.report.verdict import VerdictSettings
 from datagen.slam.bundle import BundleSettings
 from datagen.slam.calibrate import GuessSettings
 from datagen.slam.filter import FilterSettings
@@ -33,6 +34,9 @@ class MapSettings(Settings):
         revisits: What counts as the same place.
         trace: How lane lines are looked for.
         fit: Cubics through them.
+        held_out_every: Of every so many frames one has no say in the lines, so that the map can be checked
+            against it; 0 for none.
+        verdict: What counts as a good map.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -45,3 +49,12 @@ class MapSettings(Settings):
     revisits: RevisitSettings = RevisitSettings()
     trace: TraceSettings = TraceSettings()
     fit: FitSettings = FitSettings()
+    held_out_every: int = Field(default=10, ge=0)
+    verdict: VerdictSettings = VerdictSettings()
+
+    @field_validator("held_out_every")
+    @classmethod
+    def _leaves_frames_for_the_map(cls, every: int) -> int:
+        if every == 1:
+            raise ValueError("expected 0 or at least 2: every frame held out leaves none for the lines")
+        return every

@@ -18,6 +18,7 @@ from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
 
 _LEFT, _RIGHT, _POINT = (80, 220, 80), (220, 80, 220), (60, 60, 255)
+_BESIDE = (200, 200, 80)
 _TILE_WIDTH = 400
 
 
@@ -27,7 +28,7 @@ def draw_map(
     parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
     size_px: int = 1600,
 ) -> None:
-    """Draw edges (hue = time), driven path (white), lane lines and a metre of scale.
+    """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right), a metre of scale.
 
     Args:
         path: PNG to write.
@@ -64,9 +65,10 @@ def draw_map(
         image[at[:, 1], at[:, 0]] = colour
     for segment, lines in drive_map.lines.items():
         s = drive_map.s_cm[drive_map.segment == segment]
-        samples = np.arange(s.min(), s.max() + 60.0, 2.0)
         for line in lines:
-            _polyline(image, pixels, line.points(samples), _LEFT if line.side == "left" else _RIGHT)
+            end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
+            colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
+            _polyline(image, pixels, line.points(np.arange(s.min(), end, 2.0)), colour)
         _polyline(image, pixels, drive_map.poses[drive_map.segment == segment, :2], (255, 255, 255))
     metre = int(100.0 * scale)
     cv2.line(image, (20, height - 20), (20 + metre, height - 20), (255, 255, 255), 2)

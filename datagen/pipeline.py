@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import lines_at
+from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lanes.fit import fit_lines
+from datagen.lanes.lap import lap_path
 from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
-from datagen.map_report import MappedSegment, Report, map_edges, map_figures, map_notes
+from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
+from datagen.report.held_out import held_out_frames, without_frames
+from datagen.report.mappable import (
+    DRIVE_INSTEAD,
+    check_edges,
+    check_lane,
+    check_lines_seen,
+    check_moving,
+    trace_known_lane,
+)
+from datagen.report.page import PAGE_NAME, report_page
+from datagen.report.quality import measure_map, quality_figures
+from datagen.report.residuals import ResidualSettings
+from datagen.report.verdict import judge
 from datagen.self_calibration import find_camera
 from datagen.slam.calibrate import with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.stillness import following_frames
+from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
@@ -58,13 +76,33 @@ def map_drive(
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
-        CalibrationError: If the camera does not fit the images.
+        CalibrationError: If the camera does not fit the images, or the lane on the road is another one than
+            camera and lane width say.
     """
+    try:
+        return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera)
+    except TrackingLostError as error:
+        where = "" if str(drive_path) in str(error) else f"{drive_path}: "
+        raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}") from error
+
+
+def _map_drive(
+    drive_path: Path,
+    lane_width_cm: float,
+    camera_path: Path | None,
+    settings: MapSettings,
+    out: Path,
+    progress: Progress | None,
+    refine_camera: bool,
+) -> Report:
     rng = np.random.default_rng(settings.seed)
-    drive = open_drive(drive_path)
+    recorded = open_drive(drive_path)
+    check_moving(recorded)
+    notes: list[str] = list(recorded.problems)
+    drive = following_frames(recorded, notes)
     segments = split_segments(drive)
+    held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed)
     known = read_camera(camera_path) if camera_path is not None else drive.camera
-    notes: list[str] = list(drive.problems)
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:
@@ -73,6 +111,7 @@ def map_drive(
     if camera is None or refine_camera:
         longest_rows = max(segments, key=lambda s: s.stop - s.start)
         longest = drive.subset(longest_rows)
+        check_edges(longest, settings.perception.edges)
         found = find_camera(longest, known, settings, rng, progress, search_progress=progress)
         solved, camera, how = found.solved, found.camera, found.how
         figures["calibration"] = found.figures
@@ -82,17 +121,28 @@ def map_drive(
     for rows in segments:
         if rows != longest_rows:
             solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
-        parts.append(_find_lane(rows, solved, width, settings))
+        parts.append(_find_lane(rows, solved, width, settings, held_out[rows]))
+    check_lane(parts, drive)
     factor = 1.0
     if known is None:
         factor = lane_width_cm / float(np.median([part.lane.lane_cm for part in parts]))
         camera = with_known_scale(camera, factor, settings.guess)
     drive_map = _assemble(drive, drive_path, lane_width_cm, camera, parts, factor, known is None)
+    drive_map = replace(drive_map, held_out=np.concatenate([held_out[part.rows] for part in parts]))
     figures |= map_figures(drive_map, parts, factor)
     notes += map_notes(drive_map, figures, known is not None)
+    rows_of_map = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in parts])
+    mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
+    quality = measure_map(mapped, ResidualSettings())
+    check_lines_seen(quality, drive)
+    figures |= quality_figures(quality, drive.width, ResidualSettings())
+    verdict = judge(map_evidence(drive_map, parts, figures), settings.verdict)
+    drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))
+    figures["verdict"] = asdict(verdict)
     figures["notes"] = notes
     index = {int(frame): i for i, frame in enumerate(drive.frames)}
     shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
+    clear_unfinished(out)
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
@@ -106,7 +156,11 @@ def map_drive(
             for k, number in zip(shown, numbers, strict=True)
         ]
         draw_contact_sheet(folder / "frames.png", tiles, camera)
-    return Report(tuple(notes), figures)
+        png = (folder / "map.png").read_bytes()
+        page = report_page(mapped, quality, verdict, figures, opened, png, settings.verdict)
+        write_text(folder / PAGE_NAME, page)
+    said = [f"verdict: {verdict.grade}", *verdict.reasons, *notes, *verdict.remarks]
+    return Report(tuple(said), figures)
 
 
 def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSettings:
@@ -160,14 +214,30 @@ def _check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
 
 
 def _find_lane(
-    rows: slice, solved: SolvedSegment, lane_width_cm: float | None, settings: MapSettings
+    rows: slice,
+    solved: SolvedSegment,
+    lane_width_cm: float | None,
+    settings: MapSettings,
+    held_out: Bool[np.ndarray, "n"],
 ) -> MappedSegment:
-    """Find a solved segment's lane lines, in the scale of its camera."""
+    """Find a solved segment's lane lines, in the scale of its camera, without the frames held out."""
     height = solved.camera.mounting.height_cm
-    path = path_of_poses(solved.poses, 0.12 * height, 5.0 * height)
-    edges = edges_along_path(path, solved.scans, solved.poses, solved.camera.wheelbase_cm, 3.5 * height)
-    lane = trace_lane(path, edges, height, lane_width_cm, settings.trace)
-    return MappedSegment(rows, solved, path.s_frames_cm, lane, fit_lines(path, lane, height, settings.fit))
+    step, ahead = 0.12 * height, 5.0 * height
+    revisits = [(revisit.earlier, revisit.later) for revisit in solved.revisits]
+    path = lap_path(solved.poses, revisits, step, height)
+    if path is None:
+        path = path_of_poses(solved.poses, step, ahead)
+    # In a wide lane the further line only comes into view a lane's width ahead.
+    reach = max(3.5 * height, 1.2 * (lane_width_cm or 0.0))
+    scans = without_frames(solved.scans, held_out)
+    edges = edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach)
+    free_cm = None
+    if lane_width_cm is None:
+        lane = trace_lane(path, edges, height, None, settings.trace)
+    else:
+        lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, settings.trace)
+    lines = fit_lines(path, edges, lane, height, settings.fit)
+    return MappedSegment(rows, solved, path.s_frames_cm, lane, lines, free_cm)
 
 
 def _assemble(
@@ -186,7 +256,7 @@ def _assemble(
         drive=str(drive_path),
         lane_width_cm=lane_width_cm,
         mapped_lane_cm=factor * float(np.median([part.lane.lane_cm for part in parts])),
-        tape_cm=factor * float(np.median([part.lane.tape_cm for part in parts])),
+        tape_cm=factor * float(np.median([line.marking_cm for part in parts for line in part.lines[:2]])),
         scale_from="lane width" if scale_from_lane else "camera",
         laps=int(laps.max()) if any(part.solved.revisits for part in parts) else 0,
     )
@@ -201,4 +271,5 @@ def _assemble(
         s_cm=np.concatenate([part.s_frames_cm for part in parts]) * factor,
         match=np.concatenate([part.solved.trajectory.match for part in parts]),
         lines={i: [line.scaled(factor) for line in part.lines] for i, part in enumerate(parts)},
+        tilt_rad=np.concatenate([part.solved.bundle.tilt for part in parts]),
     )

@@ -226,7 +226,9 @@ def map_(
     with console.progress_bar("map") as progress:
         report = map_drive(drive, lane_width, camera, settings, out, progress, refine_camera)
     console.show_lines(report.lines)
-    console.wrote(out)
+    console.wrote(out, out / "report.html")
+    if report.figures["verdict"]["grade"] == "reject":
+        raise LanenetError(f"{out}: the map was rejected; it is kept to be looked at, and gives no labels")
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 
 
@@ -234,13 +236,14 @@ def map_(
 def label(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Label set to write (.parquet).", show_default=False)],
+    force: Annotated[bool, typer.Option("--force", help="Label a rejected map, too.")] = False,
 ) -> None:
     """Project a map's lane lines into each frame: six labels per frame, and a report of their quality."""
     from datagen.pipeline import label_map
 
     check_ending(out, ".parquet")
     with console.progress_bar("label") as progress:
-        report = label_map(map_folder, out, progress)
+        report = label_map(map_folder, out, progress, force=force)
     console.show_lines(report.lines)
     console.wrote(out)
     console.next_command("val", "MODEL", out)

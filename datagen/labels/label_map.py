@@ -17,6 +17,7 @@ from datagen.labels.mapped_drive import (
 from datagen.labels.quality import frame_residual_cm, label_report
 from datagen.map_report import Report
 from datagen.pictures import draw_contact_sheet
+from datagen.report.refusal import refuse_rejected
 from datagen.slam.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
@@ -33,6 +34,7 @@ def label_map(
     drive_path: Path | None = None,
     perception: PerceptionSettings | None = None,
     window: BirdseyeWindow | None = None,
+    force: bool = False,
 ) -> Report:
     """Project a map's lines into each frame and write the label set, its report and a contact sheet.
 
@@ -45,9 +47,12 @@ def label_map(
         drive_path: Where the drive is now, if it has moved since it was mapped.
         perception: How the network's edge points are found; None takes what the map was made with.
         window: The network's window.
+        force: Label a map that was rejected, too.
     """
     mapped = open_mapped_drive(map_folder, drive_path)
     drive_map, drive = mapped.drive_map, mapped.drive
+    if not force:
+        refuse_rejected(map_folder, drive_map)
     perception = mapped.perception if perception is None else perception
     window = BirdseyeWindow() if window is None else window
     extractor = RoadEdgeExtractor(drive_map.camera, perception)

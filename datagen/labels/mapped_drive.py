@@ -20,6 +20,8 @@ from lanenet.geometry.lane import N_POINTS
 from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
+#: Uncertainty of a line's position from which it gives no label, in lane widths.
+_MAX_SIGMA_LANES = 0.05
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 
@@ -72,9 +74,17 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
 
 
 def lines_at(drive_map: DriveMap, k: int) -> FrameLines:
-    """Return the lane of the map's k-th frame."""
-    lines = drive_map.lines[int(drive_map.segment[k])]
-    return lines_of_frame(lines, drive_map.poses[k], float(drive_map.s_cm[k]), drive_map.camera.wheelbase_cm)
+    """Return the lane of the map's k-th frame: the one that it is in, in its direction of travel."""
+    segment = int(drive_map.segment[k])
+    return lines_of_frame(
+        drive_map.lines[segment],
+        drive_map.poses[k],
+        float(drive_map.s_cm[k]),
+        drive_map.camera.wheelbase_cm,
+        int(drive_map.lanes.lane[k]),
+        bool(drive_map.lanes.forward[k]),
+        _MAX_SIGMA_LANES * drive_map.meta.mapped_lane_cm,
+    )
 
 
 def label_frame(

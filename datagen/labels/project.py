@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.lanes.fit import LaneLine
+from datagen.lanes.line import LaneLine
 from lanenet.geometry.frames import car_from_map
-from lanenet.geometry.lane import N_POINTS, rows_of_polyline
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, rows_of_polyline
 
 _SAMPLE_CM = 2.0
 _BEHIND_CM = 20.0
 _AHEAD_CM = 90.0
+#: Tangent of 60 degrees: a line that turns further away from the car's heading has no place in a row.
+_STEEPEST = float(np.tan(np.pi / 3.0))
 
 
 @dataclass(frozen=True)
@@ -32,19 +34,61 @@ class FrameLines:
 
 
 def lines_of_frame(
-    lines: list[LaneLine], pose: Float[np.ndarray, "3"], s_cm: float, wheelbase_cm: float
+    lines: list[LaneLine],
+    pose: Float[np.ndarray, "3"],
+    s_cm: float,
+    wheelbase_cm: float,
+    lane: int = 0,
+    forward: bool = True,
+    max_sigma_cm: float = np.inf,
 ) -> FrameLines:
     """Project the stretch of lane around a frame into its car frame.
 
     Args:
-        lines: Left and right line of the driven lane.
+        lines: Lines of the segment.
         pose: Rear-axle pose of the frame, frame map.
-        s_cm: Position of the rear axle along the driven path.
+        s_cm: Position of the rear axle along the path.
         wheelbase_cm: Distance between the axles.
+        lane: Index of the line on the left of the lane, seen in the path's direction; 0 is the driven lane.
+        forward: Whether the frame drives in the path's direction; the other way left and right swap.
+        max_sigma_cm: Where a line is less certain than this, it is masked.
     """
-    s = np.arange(s_cm - _BEHIND_CM, s_cm + wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
-    polylines = {line.side: car_from_map(line.points(s), pose, wheelbase_cm) for line in lines}
-    left, right = polylines["left"], polylines["right"]
-    points = np.concatenate([rows_of_polyline(left), rows_of_polyline(right)])
+    along = np.arange(-_BEHIND_CM, wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
+    s = s_cm + (along if forward else -along)
+    by_index = {line.index: line for line in lines}
+    pair = (lane, lane + 1) if forward else (lane + 1, lane)
+    left, right = (_polyline(by_index[i], s, pose, wheelbase_cm, max_sigma_cm) for i in pair)
+    points = np.concatenate([label_rows(left), label_rows(right)])
     assert points.shape == (N_POINTS,)
     return FrameLines(left, right, points)
+
+
+def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
+    """Find x where a line crosses the label rows; NaN where it turns away or comes back across the row.
+
+    Args:
+        line_car_cm: Polyline in the direction of travel, frame car; NaN rows break it.
+    """
+    found = rows_of_polyline(line_car_cm)
+    x, y = line_car_cm[:, 0], line_car_cm[:, 1]
+    for i, row in enumerate(ROWS_CM):
+        crossed = np.flatnonzero((y[:-1] <= row) != (y[1:] <= row))
+        crossed = crossed[np.isfinite(y[crossed]) & np.isfinite(y[crossed + 1])]
+        sideways, ahead = (abs(part[crossed + 1] - part[crossed]) for part in (x, y))
+        if len(crossed) != 1 or sideways[0] > _STEEPEST * ahead[0]:
+            found[i] = np.nan
+    return found
+
+
+def _polyline(
+    line: LaneLine,
+    s_cm: Float[np.ndarray, "m"],
+    pose: Float[np.ndarray, "3"],
+    wheelbase_cm: float,
+    max_sigma_cm: float,
+) -> Float[np.ndarray, "m 2"]:
+    """Express a stretch of line in the car frame; NaN where it cannot be relied on."""
+    polyline = car_from_map(line.points(s_cm), pose, wheelbase_cm)
+    # Maps of the first version know no uncertainty.
+    polyline[np.nan_to_num(line.sigma_cm(s_cm), nan=0.0) > max_sigma_cm] = np.nan
+    return polyline

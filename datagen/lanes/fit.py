@@ -1,136 +1,205 @@
-"""Piecewise cubic lane lines through the traced markings."""
+"""Piecewise cubic lane lines through the edges of the traced markings."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
-from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
-from datagen.lanes.path import Path
+from datagen.lanes.line import LaneLine, Side
+from datagen.lanes.offset import Borders, FittedOffset, Prior, fit_offset
+from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.spline import CubicBasis, adapted_breaks
+from datagen.lanes.support import stretches
 from datagen.lanes.trace import TracedLane
 from lanenet.config import Settings
 
-Side = Literal["left", "right"]
+__all__ = ["FitSettings", "LaneLine", "Side", "fit_lines"]
+
+_SIGN: dict[Side, float] = {"left": 1.0, "right": -1.0}
 
 
 class FitSettings(Settings):
-    """Spacing of the cubics and length of the gaps that they bridge, in camera heights."""
-
-    knot_heights: float = Field(default=1.0, gt=0.0)
-    bridge_heights: float = Field(default=4.0, gt=0.0)
-    outlier_heights: float = Field(default=0.06, gt=0.0)
-
-
-@dataclass(frozen=True)
-class LaneLine:
-    """One lane line: cubic B-splines x(s), y(s) over the position s along the driven path.
+    """Spacing of the cubics, and the gaps that they bridge; lengths in camera heights where the name says so.
 
     Attributes:
-        side: Left or right line of the driven lane.
-        knots_cm: Knots in s, with the ends repeated.
-        coefficients_cm: Control points, frame map.
-        supported_cm: Stretches of s, (from, to), where the map has seen the line or bridges a gap.
-        residual_cm: Robust standard deviation of the marking's middle about the fit.
+        knot_heights: Length of a cubic on straight road.
+        corner_heights: Length of a cubic in tight bends.
+        bridge_heights: Longest gap in the paint that still counts as line, with paint on both sides; where
+            the line beside it is seen, a gap counts for less than half.
+        extend_heights: What is believed beyond the end of the paint.
+        reach_heights: How far from the traced line its edges are looked for, beyond half the marking.
+        bend_heights: Typical bend of a line against the path: its inverse radius times the height.
+        guide_lanes: How well a line keeps its distance from the one beside it, in lane widths.
+        loose_lanes: How well the lane is known where neither of its lines is seen, in lane widths.
+        precise_heights: Distance at which an edge point counts half. One pixel spans road in proportion to
+            the squared distance, and what a frame's tilt is off by moves its points likewise.
+        min_aligned: Cosine between a border and the line as traced: a line that turns off at the mouth of a
+            junction is followed no further.
     """
 
-    side: Side
-    knots_cm: Float[np.ndarray, "k"]
-    coefficients_cm: Float[np.ndarray, "c 2"]
-    supported_cm: Float[np.ndarray, "g 2"]
-    residual_cm: float
+    knot_heights: float = Field(default=0.6, gt=0.0)
+    corner_heights: float = Field(default=0.3, gt=0.0)
+    bridge_heights: float = Field(default=7.0, gt=0.0)
+    extend_heights: float = Field(default=0.5, ge=0.0)
+    reach_heights: float = Field(default=0.06, gt=0.0)
+    bend_heights: float = Field(default=0.08, gt=0.0)
+    guide_lanes: float = Field(default=0.03, gt=0.0)
+    loose_lanes: float = Field(default=0.3, gt=0.0)
+    precise_heights: float = Field(default=1.5, gt=0.0)
+    min_aligned: float = Field(default=0.94, gt=0.0, lt=1.0)
 
-    def points(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
-        """Evaluate the line, [cm], frame map; NaN where it is not supported."""
-        low, high = self.knots_cm[0], self.knots_cm[-1]
-        spline = BSpline(self.knots_cm, self.coefficients_cm, 3)
-        points = np.asarray(spline(np.clip(s_cm, low, high)))
-        points[~self.supported(s_cm)] = np.nan
-        return points
 
-    def supported(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
-        """Tell where the line can be relied on."""
-        inside = np.zeros(len(s_cm), dtype=bool)
-        for start, end in self.supported_cm:
-            inside |= (s_cm >= start) & (s_cm <= end)
-        return inside
+def fit_lines(
+    path: Path, edges: PathEdges, lane: TracedLane, camera_height_cm: float, settings: FitSettings
+) -> list[LaneLine]:
+    """Fit the lines of the driven lane, then those beside it.
 
-    def scaled(self, factor: float) -> LaneLine:
-        """Return the line with every length multiplied."""
-        return LaneLine(
-            self.side,
-            self.knots_cm * factor,
-            self.coefficients_cm * factor,
-            self.supported_cm * factor,
-            self.residual_cm * factor,
+    Where a line has a gap, the one beside it, a lane's width away, guides the cubic through it.
+
+    Args:
+        path: The path.
+        edges: Edge points in its coordinates.
+        lane: The traced lines.
+        camera_height_cm: Sets the scale of knots and bounds.
+        settings: Spacing and bounds.
+
+    Returns:
+        Left and right line of the driven lane, then the ones found beside it.
+    """
+    widest = settings.knot_heights * camera_height_cm
+    narrowest = settings.corner_heights * camera_height_cm
+    basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
+
+    def fit(
+        known_cm: Float[np.ndarray, "m"],
+        guess_cm: Float[np.ndarray, "m"],
+        held: Bool[np.ndarray, "m"],
+        tape_cm: float,
+    ) -> FittedOffset:
+        start = np.where(np.isfinite(known_cm), known_cm, guess_cm)
+        guess = _smoothed(path, start, 0.25 * lane.lane_cm)
+        points = _borders(path, edges, start, guess, tape_cm, camera_height_cm, settings)
+        prior = Prior(
+            guess_cm=guess_cm,
+            sigma_cm=np.where(held, settings.guide_lanes, settings.loose_lanes) * lane.lane_cm,
+            lane_cm=lane.lane_cm,
+            bend_per_cm=settings.bend_heights / camera_height_cm,
+            knot_cm=widest,
+            height_cm=camera_height_cm,
         )
+        return fit_offset(path, basis, points, tape_cm, prior)
+
+    known: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
+        ("left", 0): lane.left_cm,
+        ("right", 0): lane.right_cm,
+        **lane.beside_cm,
+    }
+    # The line of which more is seen first: it guides the other one.
+    first: Side = "left" if np.isfinite(lane.left_cm).sum() >= np.isfinite(lane.right_cm).sum() else "right"
+    second: Side = "right" if first == "left" else "left"
+    width = _apart(path, lane.left_cm - lane.right_cm, lane.lane_cm)
+    by_centre = lane.centre_cm + 0.5 * _SIGN[first] * width
+    by_other = known[second, 0] + _SIGN[first] * width
+    held = np.isfinite(by_other)
+    fitted = {(first, 0): fit(known[first, 0], np.where(held, by_other, by_centre), held, lane.tape_cm)}
+    beside = fitted[first, 0]
+    # A line that is only seen from afar does not show how wide it is; most are as wide as the best seen one.
+    tape = beside.marking_cm
+    fitted[second, 0] = fit(known[second, 0], beside.d_cm + _SIGN[second] * width, beside.seen, tape)
+    for side, rank in sorted(lane.beside_cm, key=lambda name: name[1]):
+        beside = fitted[side, rank - 1]
+        apart = _apart(path, np.abs(known[side, rank] - beside.d_cm), lane.lane_cm)
+        fitted[side, rank] = fit(known[side, rank], beside.d_cm + _SIGN[side] * apart, beside.seen, tape)
+    lines = []
+    for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
+        inner: tuple[Side, int] = (side, rank - 1) if rank else (second if side == first else first, 0)
+        parallel = fitted[inner].seen
+        offset = fitted[side, rank]
+        lines.append(_line(path, basis, side, rank, offset, parallel, camera_height_cm, settings))
+    return lines
 
 
-def fit_lines(path: Path, lane: TracedLane, camera_height_cm: float, settings: FitSettings) -> list[LaneLine]:
-    """Fit both lines of the driven lane.
-
-    Where one line has a gap, the other one, a lane's width away, guides the cubic through it with a small
-    weight; the gap only counts as supported when it is short.
-    """
-    width = _smooth_width(lane)
-    left_guide = np.where(np.isfinite(lane.right_cm), lane.right_cm + width, lane.centre_cm + 0.5 * width)
-    right_guide = np.where(np.isfinite(lane.left_cm), lane.left_cm - width, lane.centre_cm - 0.5 * width)
-    return [
-        _fit_line("left", path, lane.left_cm, left_guide, camera_height_cm, settings),
-        _fit_line("right", path, lane.right_cm, right_guide, camera_height_cm, settings),
-    ]
+def _curvature(path: Path) -> Float[np.ndarray, "m"]:
+    heading = np.arctan2(-path.left[:, 0], path.left[:, 1])
+    if path.closed:
+        turn = np.unwrap(np.concatenate([heading[-1:], heading, heading[:1]]))
+        return gaussian_filter1d(0.5 * (turn[2:] - turn[:-2]) / path.step_cm, 2.0, mode="wrap")
+    return gaussian_filter1d(np.gradient(np.unwrap(heading)) / path.step_cm, 2.0, mode="nearest")
 
 
-def _smooth_width(lane: TracedLane) -> Float[np.ndarray, "m"]:
-    """Lane width along the path: interpolated where one line is missing."""
-    both = lane.left_cm - lane.right_cm
-    known = np.isfinite(both) & (np.abs(both - lane.lane_cm) < 0.25 * lane.lane_cm)
+def _apart(path: Path, apart_cm: Float[np.ndarray, "m"], lane_cm: float) -> Float[np.ndarray, "m"]:
+    """Distance between two neighbouring lines, smoothed over a lane's width and interpolated in gaps."""
+    known = np.isfinite(apart_cm) & (np.abs(apart_cm - lane_cm) < 0.35 * lane_cm)
     if not known.any():
-        return np.full(len(both), lane.lane_cm)
-    index = np.arange(len(both))
-    return np.interp(index, index[known], both[known])
+        return np.full(len(apart_cm), lane_cm)
+    filled = np.interp(path.s_cm, path.s_cm[known], apart_cm[known], period=path.period_cm)
+    return _smoothed(path, filled, 0.5 * lane_cm)
 
 
-def _fit_line(
-    side: Side,
+def _smoothed(path: Path, values: Float[np.ndarray, "m"], over_cm: float) -> Float[np.ndarray, "m"]:
+    return gaussian_filter1d(values, over_cm / path.step_cm, mode="wrap" if path.closed else "nearest")
+
+
+def _slope(path: Path, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Change of an offset per length."""
+    if path.closed:
+        return 0.5 * (np.roll(d_cm, -1) - np.roll(d_cm, 1)) / path.step_cm
+    return np.gradient(d_cm) / path.step_cm
+
+
+def _borders(
     path: Path,
-    offset_cm: Float[np.ndarray, "m"],
-    guide_cm: Float[np.ndarray, "m"],
+    edges: PathEdges,
+    start_cm: Float[np.ndarray, "m"],
+    smooth_cm: Float[np.ndarray, "m"],
+    tape_cm: float,
+    camera_height_cm: float,
+    settings: FitSettings,
+) -> Borders:
+    """Edge points that may be the borders of a marking whose middle is about at the given offset."""
+    # The left border of a bright marking brightens to the right.
+    border = np.where(edges.side < 0.0, 1.0, -1.0)
+    off = edges.d_cm - np.interp(edges.s_cm, path.s_cm, start_cm, period=path.period_cm)
+    reach = 0.3 * tape_cm + settings.reach_heights * camera_height_cm
+    slope = _slope(path, smooth_cm)[
+        np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
+    ]
+    aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
+    near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
+    precision = 1.0 / (1.0 + (edges.distance_cm[near] / (settings.precise_heights * camera_height_cm)) ** 6)
+    return Borders(
+        edges.s_cm[near], edges.d_cm[near], border[near], edges.weight[near], precision, edges.frame[near]
+    )
+
+
+def _line(
+    path: Path,
+    basis: CubicBasis,
+    side: Side,
+    rank: int,
+    offset: FittedOffset,
+    parallel: Bool[np.ndarray, "m"],
     camera_height_cm: float,
     settings: FitSettings,
 ) -> LaneLine:
-    seen = np.isfinite(offset_cm)
-    points = path.points(np.where(seen, offset_cm, guide_cm))
-    s = path.s_cm
-    spacing = settings.knot_heights * camera_height_cm
-    inner = np.linspace(s[0], s[-1], max(2, int((s[-1] - s[0]) / spacing)) + 1)[1:-1]
-    knots = np.concatenate([np.full(4, s[0]), inner, np.full(4, s[-1])])
-    weight = np.where(seen, 1.0, 0.1)
-    scale = settings.outlier_heights * camera_height_cm
-    for _ in range(4):
-        spline = make_lsq_spline(s, points, knots, 3, w=weight)
-        # Only the distance across the path matters: along it, a line's points slide freely.
-        across = np.sum((points - np.asarray(spline(s))) * path.left, axis=1)
-        weight = np.where(seen, 1.0, 0.1) / (1.0 + (across / scale) ** 2)
-    trusted = seen & (np.abs(across) < 4.0 * scale)
-    residual = float(1.4826 * np.median(np.abs(across[trusted]))) if trusted.any() else float("nan")
-    supported = _supported_stretches(s, trusted, settings.bridge_heights * camera_height_cm)
-    return LaneLine(side, knots, np.asarray(spline.c), supported, residual)
-
-
-def _supported_stretches(
-    s_cm: Float[np.ndarray, "m"], seen: Bool[np.ndarray, "m"], bridge_cm: float
-) -> Float[np.ndarray, "g 2"]:
-    """Stretches between seen samples whose gaps are no longer than the bridge."""
-    at = s_cm[seen]
-    if at.size < 2:
-        return np.empty((0, 2))
-    cuts = np.flatnonzero(np.diff(at) > bridge_cm)
-    starts = np.concatenate([[0], cuts + 1])
-    ends = np.concatenate([cuts, [len(at) - 1]])
-    stretches = np.stack([at[starts], at[ends]], axis=1)
-    # A stretch shorter than a bridge between two gaps is as likely clutter as line.
-    return stretches[stretches[:, 1] - stretches[:, 0] > 0.5 * bridge_cm]
+    """Turn an offset from the path into a cubic on the map."""
+    design = basis.design(path.s_cm)
+    factor = splu(csc_array(design.T @ design))
+    control = factor.solve(np.asarray(design.T @ path.points(offset.d_cm)))
+    bridge, extend = settings.bridge_heights * camera_height_cm, settings.extend_heights * camera_height_cm
+    return LaneLine(
+        side,
+        basis.knots_cm,
+        basis.unfolded(control),
+        stretches(path, offset.seen, bridge, extend, parallel),
+        offset.residual_cm,
+        rank,
+        path.period_cm,
+        path.s_cm,
+        offset.sigma_cm,
+        offset.marking_cm,
+    )

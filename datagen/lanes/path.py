@@ -1,4 +1,4 @@
-"""Curvilinear coordinates along the driven path: s along it, d to its left."""
+"""Curvilinear coordinates along a path: s along it, d to its left; the path is open or one closed lap."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
@@ -26,12 +26,23 @@ class Path:
         xy_cm: Samples, frame map.
         left: Unit vector to the left at each sample.
         s_frames_cm: Position of each frame's rear axle along the path.
+        d_frames_cm: Offset of each frame's rear axle; None for a car on its path.
+        forward: Which frames drive in the path's direction; None for all.
+        closed: Whether the path is one lap, whose last sample comes a step before the first.
     """
 
     step_cm: float
     xy_cm: Float[np.ndarray, "m 2"]
     left: Float[np.ndarray, "m 2"]
     s_frames_cm: Float[np.ndarray, "n"]
+    d_frames_cm: Float[np.ndarray, "n"] | None = None
+    forward: Bool[np.ndarray, "n"] | None = None
+    closed: bool = False
+
+    @property
+    def period_cm(self) -> float | None:
+        """Length of a lap; None where the path is open."""
+        return len(self.xy_cm) * self.step_cm if self.closed else None
 
     @property
     def s_cm(self) -> Float[np.ndarray, "m"]:
@@ -76,9 +87,13 @@ def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: flo
     added = xy[-1] + np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1) * step_cm, axis=0)
     xy = np.concatenate([xy, added])
     xy = gaussian_filter1d(xy, max(1.0, 4.0 / step_cm), axis=0, mode="nearest")
-    tangent = np.gradient(xy, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
-    return Path(step_cm, xy, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1), s)
+    return Path(step_cm, xy, left_of(np.gradient(xy, axis=0)), s)
+
+
+def left_of(direction: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+    """Unit vectors to the left of directions of any length."""
+    unit = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    return np.stack([-unit[:, 1], unit[:, 0]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -89,13 +104,19 @@ class PathEdges:
         s_cm: Position along the path.
         d_cm: Offset to the left.
         side: Component of the edge's normal (towards the brighter side) to the left, -1..1.
+        along: Component of it along the path.
         weight: Trust in the point.
+        distance_cm: How far from the front axle it was seen.
+        frame: Frame that saw it.
     """
 
     s_cm: Float[np.ndarray, "m"]
     d_cm: Float[np.ndarray, "m"]
     side: Float[np.ndarray, "m"]
+    along: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
+    distance_cm: Float[np.ndarray, "m"]
+    frame: Int[np.ndarray, "m"]
 
 
 def edges_along_path(
@@ -103,8 +124,8 @@ def edges_along_path(
 ) -> PathEdges:
     """Express every frame's edge points in path coordinates.
 
-    A point is looked for only on the stretch of path that its frame could see, so that other laps and
-    neighbouring stretches never take it.
+    A point is looked for only on the stretch of path that its frame could see, so that neighbouring stretches
+    never take it. On a closed path the edges of all laps and of both directions come to lie on one another.
 
     Args:
         path: The path of these poses.
@@ -113,13 +134,17 @@ def edges_along_path(
         wheelbase_cm: Distance between the axles.
         reach_cm: Edge points further than this from the front axle are left out.
     """
-    keep = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1]) <= reach_cm
+    distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
+    keep = distance <= reach_cm
     frame = scans.frame_of_point[keep]
-    s, d, side = _project(
+    forward = np.ones(len(poses), dtype=bool) if path.forward is None else path.forward
+    s, d, side, along = _project(
         path.xy_cm,
         path.left,
         path.step_cm,
+        path.closed,
         path.s_frames_cm[frame],
+        forward[frame],
         poses[frame],
         scans.points_cm[keep],
         scans.normals[keep],
@@ -127,34 +152,52 @@ def edges_along_path(
         reach_cm + 2.0 * wheelbase_cm,
     )
     good = np.isfinite(s)
-    return PathEdges(s[good], d[good], side[good], scans.weights[keep][good])
+    return PathEdges(
+        s[good],
+        d[good],
+        side[good],
+        along[good],
+        scans.weights[keep][good],
+        distance[keep][good],
+        frame[good],
+    )
 
 
 @njit(cache=True)
 @no_type_check
-def _project(xy, left, step, s_frame, pose, points, normals, wheelbase, span):
-    n = points.shape[0]
-    s_out, d_out, side_out = np.full(n, np.nan), np.zeros(n), np.zeros(n)
+def _project(xy, left, step, closed, s_frame, forward, pose, points, normals, wheelbase, span):
+    n, m = points.shape[0], xy.shape[0]
+    s_out, d_out = np.full(n, np.nan), np.zeros(n)
+    side_out, along_out = np.zeros(n), np.zeros(n)
     for i in range(n):
         c, sn = np.cos(pose[i, 2]), np.sin(pose[i, 2])
-        forward, right = points[i, 1] + wheelbase, points[i, 0]
-        x = pose[i, 0] + forward * c + right * sn
-        y = pose[i, 1] + forward * sn - right * c
-        first = max(0, int(s_frame[i] / step) - 5)
-        last = min(xy.shape[0] - 1, int((s_frame[i] + span) / step))
-        best, nearest = 1e18, -1
+        ahead, right = points[i, 1] + wheelbase, points[i, 0]
+        x = pose[i, 0] + ahead * c + right * sn
+        y = pose[i, 1] + ahead * sn - right * c
+        here = int(s_frame[i] / step)
+        reach = int(span / step)
+        first, last = (here - 5, here + reach) if forward[i] else (here - reach, here + 5)
+        if closed:
+            last = min(last, first + m - 1)
+        else:
+            first, last = max(0, first), min(m - 1, last)
+        best, nearest = 1e18, first
         for j in range(first, last + 1):
-            distance = (xy[j, 0] - x) ** 2 + (xy[j, 1] - y) ** 2
+            distance = (xy[j % m, 0] - x) ** 2 + (xy[j % m, 1] - y) ** 2
             if distance < best:
                 best, nearest = distance, j
         if nearest <= first or nearest >= last:
             continue
+        nearest = nearest % m
         dx, dy = x - xy[nearest, 0], y - xy[nearest, 1]
         # The tangent is the left normal turned clockwise.
         along = dx * left[nearest, 1] - dy * left[nearest, 0]
         s_out[i] = nearest * step + along
+        if closed:
+            s_out[i] = s_out[i] % (m * step)
         d_out[i] = dx * left[nearest, 0] + dy * left[nearest, 1]
         nx = normals[i, 1] * c + normals[i, 0] * sn
         ny = normals[i, 1] * sn - normals[i, 0] * c
         side_out[i] = nx * left[nearest, 0] + ny * left[nearest, 1]
-    return s_out, d_out, side_out
+        along_out[i] = nx * left[nearest, 1] - ny * left[nearest, 0]
+    return s_out, d_out, side_out, along_out

@@ -1,28 +1,49 @@
-"""From edges along the path to the two lines of the driven lane.
+"""From edges along the path to the offsets of the lane lines.
 
-A marking shows as two edges of opposite direction, a tape's width apart. The lane is the pair of markings a
-lane's width apart that runs along the whole path; both are found together by dynamic programming, so that a
-dashed line and an interrupted one are carried by the other.
+A marking shows as two edges of opposite direction, a tape's width apart. The driven lane is the pair of
+markings a lane's width apart that runs along the whole path, with the car inside it most of the way; both are
+found together by dynamic programming, so that a dashed line and an interrupted one are carried by the other.
+The lines of the neighbouring lanes are looked for from there outwards, one after the other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 from pydantic import Field
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d
 
+from datagen.lanes.line import Side
 from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.profile import EdgeProfile, edge_profile, shifted
 from lanenet.config import Settings
 from lanenet.errors import TrackingLostError
 
 
 class TraceSettings(Settings):
-    """How lane lines are looked for; lengths in camera heights where the name says so."""
+    """How lane lines are looked for; lengths in camera heights where the name says so.
+
+    Attributes:
+        cell_heights: Cells across the path.
+        side_heights: How far beside the path edges count.
+        min_side: Component across the path of the normal of an edge that runs along it.
+        tape_heights: Narrowest and widest marking.
+        lane_heights: Narrowest and widest lane, where its width is not known.
+        smoothness: Cost of a step of one cell across per sample along the path, growing with its square.
+        sideways: Cost of a step of one cell where no paint is.
+        second_line: What the weaker one of the two lines counts beside the stronger one.
+        inside: What it costs per sample when the car is a lane further, less when it is only just outside:
+            more than a second line brings, so that a lane beside it with two solid lines does not take over.
+        min_support: Density of edges from which a marking counts as seen, 0..1.
+        width_share: How much the lane's width may vary along the road.
+        neighbours: Lines to look for on each side beyond those of the driven lane.
+        neighbour_lanes: Length of paint that makes a neighbouring line, in lane widths.
+        neighbour_share: Share of the path along which a neighbouring line must be seen.
+    """
 
     cell_heights: float = Field(default=0.03, gt=0.0)
     side_heights: float = Field(default=8.0, gt=0.0)
@@ -30,37 +51,19 @@ class TraceSettings(Settings):
     tape_heights: tuple[float, float] = (0.05, 0.6)
     lane_heights: tuple[float, float] = (1.2, 6.5)
     smoothness: float = Field(default=0.04, gt=0.0)
-    second_line: float = Field(default=0.3, gt=0.0, le=1.0)
-    min_support: float = Field(default=0.2, gt=0.0)
-
-
-@dataclass(frozen=True)
-class EdgeProfile:
-    """Density of edges over path position and offset.
-
-    Attributes:
-        cell_cm: Width of a column.
-        half_cells: Columns on each side of the path; offset d is column half_cells + d / cell_cm.
-        left: Edges that brighten to the right (left side of a bright marking), m x columns, 0..1.
-        right: Edges that brighten to the left (right side of a bright marking), m x columns, 0..1.
-    """
-
-    cell_cm: float
-    half_cells: int
-    left: Float[np.ndarray, "m c"]
-    right: Float[np.ndarray, "m c"]
-
-    def tapes(self, width_cm: float) -> Float[np.ndarray, "m c"]:
-        """Return how well a marking of this width, with its middle at each offset, is supported."""
-        return np.sqrt(
-            _shifted(self.left, 0.5 * width_cm / self.cell_cm)
-            * _shifted(self.right, -0.5 * width_cm / self.cell_cm)
-        )
+    sideways: float = Field(default=0.3, ge=0.0)
+    second_line: float = Field(default=0.08, gt=0.0, le=1.0)
+    inside: float = Field(default=0.17, ge=0.0)
+    min_support: float = Field(default=0.4, gt=0.0)
+    width_share: float = Field(default=0.15, gt=0.0, lt=0.5)
+    neighbours: int = Field(default=1, ge=0)
+    neighbour_lanes: float = Field(default=4.0, gt=0.0)
+    neighbour_share: float = Field(default=0.35, ge=0.0, le=1.0)
 
 
 @dataclass(frozen=True)
 class TracedLane:
-    """The two lines of the driven lane, in path coordinates.
+    """The lines of the driven lane and beside it, in path coordinates.
 
     Attributes:
         left_cm: Offset of the left line's middle at each path sample; NaN where nothing supports it.
@@ -68,6 +71,7 @@ class TracedLane:
         centre_cm: Offset of the lane's centre as found from both, everywhere.
         lane_cm: Lane width.
         tape_cm: Width of the markings.
+        beside_cm: Further lines likewise, by side and rank from 1, counted outwards.
     """
 
     left_cm: Float[np.ndarray, "m"]
@@ -75,31 +79,7 @@ class TracedLane:
     centre_cm: Float[np.ndarray, "m"]
     lane_cm: float
     tape_cm: float
-
-
-def edge_profile(
-    path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings
-) -> EdgeProfile:
-    """Count edges that run along the path, per direction, in cells of path position and offset.
-
-    Counts saturate, so that a stretch where the car stood does not outweigh the rest, and are smoothed over
-    a quarter of a camera height along the path and one cell across.
-    """
-    cell = settings.cell_heights * camera_height_cm
-    half = int(settings.side_heights / settings.cell_heights)
-    shape = (len(path.xy_cm), 2 * half + 1)
-    profiles = []
-    for sign in (-1.0, 1.0):
-        column = np.rint(edges.d_cm / cell).astype(np.intp) + half
-        row = np.rint(edges.s_cm / path.step_cm).astype(np.intp)
-        inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-        along = inside & (sign * edges.side >= settings.min_side)
-        counts = np.bincount(
-            row[along] * shape[1] + column[along], edges.weight[along], minlength=shape[0] * shape[1]
-        )
-        density = gaussian_filter(counts.reshape(shape), (0.25 * camera_height_cm / path.step_cm, 1.2))
-        profiles.append(density / (density + 0.15))
-    return EdgeProfile(cell, half, profiles[0], profiles[1])
+    beside_cm: dict[tuple[Side, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
 
 
 def trace_lane(
@@ -109,7 +89,7 @@ def trace_lane(
     lane_width_cm: float | None,
     settings: TraceSettings,
 ) -> TracedLane:
-    """Find the lines that bound the driven lane.
+    """Find the lines that bound the driven lane, and those of the lanes beside it.
 
     Args:
         path: The driven path.
@@ -121,30 +101,38 @@ def trace_lane(
     Raises:
         TrackingLostError: If no pair of lines runs along the path.
     """
-    profile = edge_profile(path, edges, camera_height_cm, settings)
-    driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
+    cell = settings.cell_heights * camera_height_cm
+    half = int(settings.side_heights / settings.cell_heights)
+    profile = edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
+    driven = len(path.xy_cm)
+    if not path.closed:
+        driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
     tape = _tape_width(profile, driven, camera_height_cm, settings)
     tapes = profile.tapes(tape)
     if lane_width_cm is None:
         lane_width_cm = _lane_width(tapes[:driven], profile, camera_height_cm, settings)
-    lane, centre = _best_lane(tapes, profile, lane_width_cm, settings)
-    left = _refine(profile, centre + 0.5 * lane, tape, camera_height_cm, settings)
-    right = _refine(profile, centre - 0.5 * lane, tape, camera_height_cm, settings)
+    lane, centre = _best_lane(path, tapes, profile, lane_width_cm, settings)
+    band = settings.width_share * lane
+    left = _follow(path, tapes, profile, centre + 0.5 * lane, band, settings)
+    right = _follow(path, tapes, profile, centre - 0.5 * lane, band, settings)
+    left, right = (_known_middle(profile, line, tape, settings) for line in (left, right))
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
         raise TrackingLostError(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
             "and the camera's height, and look at the map's picture"
         )
-    return TracedLane(left, right, centre, lane, tape)
-
-
-def _shifted(image: Float[np.ndarray, "m c"], cells: float) -> Float[np.ndarray, "m c"]:
-    """Return image[:, c + cells] with linear interpolation, zero outside."""
-    whole = int(np.floor(cells))
-    part = cells - whole
-    padded = np.pad(image, ((0, 0), (abs(whole) + 1, abs(whole) + 1)))
-    start, width = abs(whole) + 1 + whole, image.shape[1]
-    return (1.0 - part) * padded[:, start : start + width] + part * padded[:, start + 1 : start + 1 + width]
+    beside: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
+    sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [("left", 1.0, left), ("right", -1.0, right)]
+    for side, sign, line in sides:
+        guess = np.where(np.isfinite(line), line, centre + 0.5 * sign * lane)
+        for rank in range(1, settings.neighbours + 1):
+            found = _follow(path, tapes, profile, guess + sign * lane, 2.0 * band, settings)
+            known = _known_middle(profile, found, tape, settings)
+            if not _is_line(path, known, lane, settings):
+                break
+            beside[side, rank] = known
+            guess = np.where(np.isfinite(known), known, found)
+    return TracedLane(left, right, centre, lane, tape, beside)
 
 
 def _tape_width(profile: EdgeProfile, driven: int, camera_height_cm: float, settings: TraceSettings) -> float:
@@ -179,46 +167,81 @@ def _lane_width(
 
 def _pair_score(tapes: Float[np.ndarray, "m c"], width_cells: float) -> Float[np.ndarray, "m c"]:
     """Product of left and right support for a lane centred at each offset."""
-    return _shifted(tapes, 0.5 * width_cells) * _shifted(tapes, -0.5 * width_cells)
+    return shifted(tapes, 0.5 * width_cells) * shifted(tapes, -0.5 * width_cells)
 
 
 def _best_lane(
-    tapes: Float[np.ndarray, "m c"], profile: EdgeProfile, lane_width_cm: float, settings: TraceSettings
+    path: Path,
+    tapes: Float[np.ndarray, "m c"],
+    profile: EdgeProfile,
+    lane_width_cm: float,
+    settings: TraceSettings,
 ) -> tuple[float, Float[np.ndarray, "m"]]:
     """Track the lane's centre; the width may differ by a tenth from what the user gave."""
     best: tuple[float, float, Float[np.ndarray, "m"]] | None = None
+    outside = settings.inside * _car_outside(path, profile, lane_width_cm)
     for width in lane_width_cm * np.linspace(0.9, 1.1, 9):
         cells = width / profile.cell_cm
-        left, right = _shifted(tapes, 0.5 * cells), _shifted(tapes, -0.5 * cells)
+        left, right = shifted(tapes, 0.5 * cells), shifted(tapes, -0.5 * cells)
         # One line is nearly as good as two: a lane with a worn line must not be left for its neighbour.
         support = np.maximum(left, right) + settings.second_line * np.minimum(left, right)
-        centre, score = _viterbi(support, settings.smoothness, profile.half_cells, cells)
+        centre, score = _best_track(path, support, outside, settings)
         if best is None or score > best[0]:
             best = (score, float(width), (centre - profile.half_cells) * profile.cell_cm)
     assert best is not None
     return best[1], best[2]
 
 
+def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.ndarray, "m c"]:
+    """How far outside a lane centred at each offset the car is, 1 from a lane away, mean of all visits."""
+    m, columns = profile.left.shape
+    at = (np.arange(columns) - profile.half_cells) * profile.cell_cm
+    d = np.zeros(len(path.s_frames_cm)) if path.d_frames_cm is None else path.d_frames_cm
+    forward = np.ones(len(d), dtype=bool) if path.forward is None else path.forward
+    rows = np.rint(path.s_frames_cm / path.step_cm).astype(np.intp) % m
+    total, visits = np.zeros((m, columns)), np.zeros(m)
+    for row, offset in zip(rows[forward], d[forward], strict=True):
+        total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0) ** 2
+        visits[row] += 1.0
+    near = max(1.0, 0.25 * lane_cm / path.step_cm)
+    total = gaussian_filter1d(total, near, axis=0, mode="wrap" if path.closed else "nearest")
+    visits = gaussian_filter1d(visits, near, mode="wrap" if path.closed else "nearest")
+    return total / np.maximum(visits, 1e-3)[:, None]
+
+
+def _best_track(
+    path: Path, support: Float[np.ndarray, "m c"], against: Float[np.ndarray, "m c"], settings: TraceSettings
+) -> tuple[Float[np.ndarray, "m"], float]:
+    """Columns with the most support along the path; a closed path is followed once more on either side."""
+    m = len(support)
+    lead = m // 2 if path.closed else 0
+    if lead:
+        support, against = (np.concatenate([part[-lead:], part, part[:lead]]) for part in (support, against))
+    track, score = _viterbi(
+        support.astype(np.float32), against.astype(np.float32), settings.smoothness, settings.sideways
+    )
+    return track[lead : lead + m].astype(np.float64), float(score)
+
+
 @njit(cache=True)
 @no_type_check
-def _viterbi(support, smoothness, middle, width_cells):
-    """Path of columns with the most support; steps of up to four columns, dearer the larger they are."""
+def _viterbi(support, against, smoothness, sideways):
+    """Path of columns with the most support; steps of up to four columns, dearer where no paint is."""
     m, columns = support.shape
     cost = np.empty((m, columns), np.float32)
     back = np.zeros((m, columns), np.int8)
     for c in range(columns):
-        # The car starts inside its lane.
-        outside = max(0.0, abs(c - middle) / (0.5 * width_cells) - 1.0)
-        cost[0, c] = support[0, c] - 5.0 * outside
+        cost[0, c] = support[0, c] - against[0, c]
     for i in range(1, m):
         for c in range(columns):
             best, step = -1e18, 0
+            bare = sideways * max(0.0, 1.0 - support[i, c])
             for j in range(-4, 5):
                 if 0 <= c + j < columns:
-                    value = cost[i - 1, c + j] - smoothness * j * j
+                    value = cost[i - 1, c + j] - smoothness * j * j - bare * abs(j)
                     if value > best:
                         best, step = value, j
-            cost[i, c] = best + support[i, c]
+            cost[i, c] = best + support[i, c] - against[i, c]
             back[i, c] = step
     track = np.empty(m, np.int64)
     track[m - 1] = np.argmax(cost[m - 1])
@@ -228,46 +251,49 @@ def _viterbi(support, smoothness, middle, width_cells):
     return track, score
 
 
-def _refine(
+def _follow(
+    path: Path,
+    tapes: Float[np.ndarray, "m c"],
     profile: EdgeProfile,
     guess_cm: Float[np.ndarray, "m"],
-    tape_cm: float,
-    camera_height_cm: float,
+    band_cm: float,
     settings: TraceSettings,
 ) -> Float[np.ndarray, "m"]:
-    """Middle of the marking near a guess: centroids of its two edges, each on its own, then their mean.
-
-    A stretch where only one of the edges is seen has no middle and stays NaN.
-    """
-    guess = guess_cm
-    reach = min(0.3 * camera_height_cm, max(0.8 * tape_cm, 3.0 * profile.cell_cm))
-    result = np.full(len(guess), np.nan)
-    for _ in range(2):
-        edges = []
-        for density, offset in ((profile.left, 0.5 * tape_cm), (profile.right, -0.5 * tape_cm)):
-            edges.append(
-                _centroid(
-                    profile, density, guess + offset, min(reach, 0.7 * tape_cm + profile.cell_cm), settings
-                )
-            )
-        result = 0.5 * (edges[0] + edges[1])
-        guess = np.where(np.isfinite(result), result, guess)
-    return result
+    """Follow one marking within a band about a guess."""
+    reach = max(2, int(band_cm / profile.cell_cm))
+    offsets = np.arange(-reach, reach + 1)
+    column = np.clip(guess_cm / profile.cell_cm + profile.half_cells, 0.0, tapes.shape[1] - 1.0)
+    nearest = np.rint(column).astype(np.intp)
+    window = np.clip(nearest[:, None] + offsets, 0, tapes.shape[1] - 1)
+    support = np.take_along_axis(tapes, window, axis=1)
+    # Of two tapes side by side the one nearer to the guess.
+    against = np.broadcast_to(0.1 * np.abs(offsets) / reach, support.shape)
+    track, _ = _best_track(path, support, np.ascontiguousarray(against), settings)
+    return (nearest + track - reach - profile.half_cells) * profile.cell_cm
 
 
-def _centroid(
-    profile: EdgeProfile,
-    density: Float[np.ndarray, "m c"],
-    guess_cm: Float[np.ndarray, "m"],
-    reach_cm: float,
-    settings: TraceSettings,
+def _known_middle(
+    profile: EdgeProfile, line_cm: Float[np.ndarray, "m"], tape_cm: float, settings: TraceSettings
 ) -> Float[np.ndarray, "m"]:
-    """Weighted mean offset within reach of the guess; NaN where the densest cell is below the support."""
-    reach = max(1, int(np.ceil(reach_cm / profile.cell_cm)))
-    column = np.rint(guess_cm / profile.cell_cm).astype(np.intp) + profile.half_cells
-    window = np.clip(column[:, None] + np.arange(-reach, reach + 1), 0, density.shape[1] - 1)
-    weight = density[np.arange(len(density))[:, None], window] ** 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        centre = np.sum(weight * window, axis=1) / weight.sum(axis=1)
-    centre[weight.max(axis=1) < settings.min_support**2] = np.nan
-    return (centre - profile.half_cells) * profile.cell_cm
+    """Keep a followed line where both edges of its marking are seen; NaN elsewhere."""
+    edges = []
+    for density, offset in ((profile.left, 0.5 * tape_cm), (profile.right, -0.5 * tape_cm)):
+        column = np.rint((line_cm + offset) / profile.cell_cm).astype(np.intp) + profile.half_cells
+        window = np.clip(column[:, None] + np.arange(-1, 2), 0, density.shape[1] - 1)
+        edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
+    return np.where(np.minimum(*edges) >= settings.min_support, line_cm, np.nan)
+
+
+def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settings: TraceSettings) -> bool:
+    """Tell a painted line from clutter: enough of it, in runs rather than in specks."""
+    seen = _in_runs(np.isfinite(line_cm), max(2, int(0.1 * lane_cm / path.step_cm)))
+    length = float(seen.sum()) * path.step_cm
+    return length >= settings.neighbour_lanes * lane_cm and float(seen.mean()) >= settings.neighbour_share
+
+
+def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int) -> Bool[np.ndarray, "m"]:
+    """Drop runs of fewer samples."""
+    kept = np.zeros(len(seen), dtype=bool)
+    for run in np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen.astype(np.int8))) + 1):
+        kept[run] = seen[run[0]] and len(run) >= shortest
+    return kept

@@ -45,7 +45,7 @@ class GuessSettings(Settings):
 #: Steps tried with each camera, relative to the one that suits the camera in the middle of the grid.
 _AROUND = np.array([0.75, 1.0, 1.33])
 #: A coarse answer is enough: the adjustment starts from it.
-_SEARCH = FilterSettings(particles=80, max_points=100)
+_SEARCH = FilterSettings(particles=80, max_points=60, maps="mean", stray_every=0)
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 

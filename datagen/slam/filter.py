@@ -3,31 +3,88 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
-from datagen.slam.field import DirectionField
-from datagen.slam.motion import HEADING, MotionModel
+from datagen.slam.ancestry import AncestryMap, Likelihood
+from datagen.slam.condense import condense
+from datagen.slam.motion import FACTOR, MotionModel, widen_steps
+from datagen.slam.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.scans import Progress, Scans
 from lanenet.config import Settings
-from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 
 class FilterSettings(Settings):
     """Size of the filter and sharpness of its likelihood.
 
     Lengths are in camera heights, because the road in one pixel, and with it every tolerance, scales with it.
+
+    Attributes:
+        particles: How many trajectories are followed.
+        likelihood: ``direction`` scores edges that brighten the same way; ``count`` is the paper's number of
+            matched points.
+        maps: ``lineage`` is DP-SLAM: a particle's map is what its own ancestors saw from where they were;
+            ``mean`` enters every frame once, at the particles' mean pose, for all. That is cheaper, and
+            steadier where the model does not quite fit, but its particles cannot disagree on the map.
+        cell_heights: Side of a cell of the map.
+        field_size: Cells along each side of the map, which wraps around; a power of two.
+        memory_frames: Frames after which what was mapped has faded to 1/e.
+        patch_heights: Side of the patches whose edge points are taken together.
+        max_points: Patches per frame that are scored and mapped, the heaviest first.
+        window: Frames for which the map tells lineages apart.
+        effective_share: Least effective share of the particles; scores are tempered until it is reached.
+        resample_below: Effective share below which the particles are drawn anew.
+        stray_every: One of so many particles strays from the predicted step further than the others; 0: none.
+        stray_factor: How many times as far (see :func:`widen_steps`).
     """
 
     particles: int = Field(default=300, ge=10)
-    cell_heights: float = Field(default=0.04, gt=0.0)
-    field_size: int = Field(default=1024, ge=64)
+    likelihood: Likelihood = "direction"
+    maps: Literal["lineage", "mean"] = "lineage"
+    cell_heights: float = Field(default=0.08, gt=0.0)
+    field_size: int = Field(default=512, ge=64)
     memory_frames: float = Field(default=40.0, gt=0.0)
-    max_points: int = Field(default=250, ge=20)
+    patch_heights: float = Field(default=0.08, gt=0.0)
+    max_points: int = Field(default=80, ge=20)
+    window: int = Field(default=64, ge=2)
     effective_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     resample_below: float = Field(default=0.5, gt=0.0, le=1.0)
+    stray_every: int = Field(default=5, ge=0)
+    stray_factor: float = Field(default=4.0, ge=1.0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known when a frame has been filtered.
+
+    Attributes:
+        pose: Weighted mean of the particles: rear-axle x, y and heading (unwrapped), [cm], [cm], [rad],
+            frame map.
+        factor: Mean distance factor (see :class:`MotionModel`).
+        match: Matched share of the frame's edge points, 0..1; NaN where it has none and in the first frame.
+        spread_cm: Standard deviation of the particles' position.
+    """
+
+    pose: Float[np.ndarray, "3"]
+    factor: float
+    match: float
+    spread_cm: float
+
+
+@dataclass(frozen=True)
+class Survivors:
+    """Particles of a frame that have descendants after its resampling, in their order.
+
+    Attributes:
+        states: Their states.
+        parents: Which survivor of the frame before each descends from.
+    """
+
+    states: Float[np.ndarray, "u 5"]
+    parents: Int[np.ndarray, "u"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +104,105 @@ class Trajectory:
     spread_cm: Float[np.ndarray, "n"]
 
 
+class ParticleFilter:
+    """The filter, a frame at a time; its memory is bounded, so that it runs for as long as a car drives.
+
+    Attributes:
+        states: Particles after the last step (columns as in :mod:`datagen.slam.motion`).
+        weights: Their weights.
+        map: The map that they share.
+        survivors: Of the last step's resampling.
+        survivor_of: Which of them each particle descends from.
+        frame: Number of the next frame.
+    """
+
+    def __init__(
+        self,
+        motion: MotionModel,
+        settings: FilterSettings,
+        camera_height_cm: float,
+        wheelbase_cm: float,
+        rng: np.random.Generator,
+    ) -> None:
+        count = settings.particles
+        self.settings, self.rng = settings, rng
+        self.patch_cm = settings.patch_heights * camera_height_cm
+        self.states = motion.start(count, rng)
+        self.weights = np.full(count, 1.0 / count)
+        self.map = AncestryMap.empty(
+            count,
+            settings.cell_heights * camera_height_cm,
+            settings.field_size,
+            settings.memory_frames,
+            wheelbase_cm,
+            settings.max_points,
+            settings.window,
+            settings.likelihood,
+        )
+        self.survivors = Survivors(self.states[:0], np.zeros(0, np.int64))
+        self.survivor_of = np.zeros(count, np.int64)
+        self.frame = 0
+
+    def step(
+        self,
+        points_cm: Float[np.ndarray, "m 2"],
+        normals: Float[np.ndarray, "m 2"],
+        trust: Float[np.ndarray, "m"],
+        motion: MotionModel,
+        k: int,
+    ) -> Estimate:
+        """Take in the next frame.
+
+        Args:
+            points_cm: Edge points, frame car.
+            normals: Their unit normals.
+            trust: Weight of each.
+            motion: How the car may have moved since the last frame; a live car may pass a model of one row.
+            k: Row of the motion model.
+
+        Source:
+            Kozlowski et al. 2024, sections 3.1-3.3, after Eliazar and Parr, DP-SLAM, 2003.
+        """
+        points_cm, normals, trust = condense(
+            points_cm, normals, trust, self.patch_cm, self.settings.max_points
+        )
+        match = np.nan
+        if self.frame > 0:
+            before = self.states.copy()
+            motion.predict(self.states, k, self.rng)
+            widen_steps(before, self.states, self.settings.stray_every, self.settings.stray_factor)
+            scores = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
+            self.weights = reweigh(self.weights, scores, self.settings.effective_share)
+            match = scores.max() / trust.sum() if trust.size else np.nan
+        estimate = self._estimate(match)
+        self._resample(estimate.pose)
+        self.map.enter(points_cm, normals, trust, self.frame)
+        self.frame += 1
+        return estimate
+
+    def _estimate(self, match: float) -> Estimate:
+        # Headings are unwrapped and close together, so that a plain mean serves.
+        mean = self.weights @ self.states
+        spread = np.sqrt(self.weights @ np.sum((self.states[:, :2] - mean[:2]) ** 2, axis=1))
+        return Estimate(mean[:3], float(mean[FACTOR]), float(match), float(spread))
+
+    def _resample(self, mean_pose: Float[np.ndarray, "3"]) -> None:
+        """Draw the particles anew where too few of them count, and let the ancestry follow."""
+        count = len(self.weights)
+        chosen = np.arange(count)
+        if self.frame > 0 and effective_number(self.weights) < self.settings.resample_below * count:
+            chosen = systematic_resample(self.weights, self.rng)
+            self.weights = np.full(count, 1.0 / count)
+        survived = np.bincount(chosen, minlength=count) > 0
+        self.survivors = Survivors(self.states[survived], self.survivor_of[survived])
+        self.survivor_of = (np.cumsum(survived) - 1)[chosen]
+        if self.settings.maps == "lineage":
+            self.map.descend(self.states, chosen, self.frame)
+        else:
+            self.map.descend(np.tile(mean_pose, (count, 1)), np.zeros(count, np.int64), self.frame)
+        self.states = self.states[chosen]
+
+
 def run_filter(
     scans: Scans,
     motion: MotionModel,
@@ -60,116 +216,35 @@ def run_filter(
 
     Returns:
         The smoothed trajectory: the mean over the lineages of the particles that survived to the end.
-
-    Source:
-        Kozlowski et al. 2024, sections 3.1-3.3; likelihood by direction instead of counted points.
     """
-    n, count = len(scans), settings.particles
-    field = DirectionField.empty(
-        settings.cell_heights * camera_height_cm, settings.field_size, settings.memory_frames
-    )
-    states = motion.start(count, rng)
-    weights = np.full(count, 1.0 / count)
-    history = np.empty((n, count, 5), np.float32)
-    parents = np.empty((n, count), np.int32)
-    parents[0] = np.arange(count)
-    match = np.full(n, np.nan)
-    spread = np.zeros(n)
+    n = len(scans)
+    particles = ParticleFilter(motion, settings, camera_height_cm, wheelbase_cm, rng)
+    history: list[Survivors] = []
+    match, spread = np.full(n, np.nan), np.zeros(n)
     for k in range(n):
-        points, normals, trust = thin_scan(scans, k, settings.max_points, rng)
-        if k > 0:
-            motion.predict(states, k, rng)
-            scores = field.score(states[:, :3], wheelbase_cm, points, normals, trust, k)
-            weights = reweigh(weights, scores, settings.effective_share)
-            match[k] = scores.max() / trust.sum() if trust.size else np.nan
-        pose = mean_pose(states, weights)
-        spread[k] = np.sqrt(np.sum(weights[:, None] * (states[:, :2] - pose[:2]) ** 2))
-        history[k] = states
-        if k > 0 and 1.0 / np.sum(weights**2) < settings.resample_below * count:
-            chosen = systematic_resample(weights, rng)
-            states, weights = states[chosen], np.full(count, 1.0 / count)
-        else:
-            chosen = np.arange(count)
-        if k + 1 < n:
-            parents[k + 1] = chosen
         frame = scans.frame(k)
-        field.insert(
-            map_from_car(scans.points_cm[frame], pose, wheelbase_cm),
-            map_from_car_directions(scans.normals[frame], pose[HEADING]),
-            scans.weights[frame],
-            k,
-        )
+        points_cm, normals, trust = scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
+        estimate = particles.step(points_cm, normals, trust, motion, k)
+        match[k], spread[k] = estimate.match, estimate.spread_cm
+        history.append(particles.survivors)
         if progress is not None:
             progress(k + 1, n)
-    # The last step may have resampled: its weights then belong to the chosen particles.
-    final = np.bincount(chosen, weights, minlength=count)
-    smoothed = smooth_lineages(history, parents, final)
-    return Trajectory(smoothed[:, :3], smoothed[:, 3], match, spread)
+    final = np.bincount(particles.survivor_of, particles.weights) if n else np.zeros(0)
+    smoothed = smooth_lineages(history, final)
+    return Trajectory(smoothed[:, :3], smoothed[:, FACTOR], match, spread)
 
 
-def thin_scan(
-    scans: Scans, k: int, max_points: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
-    frame = scans.frame(k)
-    size = frame.stop - frame.start
-    if size <= max_points:
-        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
-    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
-    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]
-
-
-def reweigh(
-    weights: Float[np.ndarray, "p"], scores: Float[np.ndarray, "p"], effective_share: float
-) -> Float[np.ndarray, "p"]:
-    """Turn match scores into weights, as sharply as the particles can bear.
-
-    Edge points of one line are not independent, so that the plain likelihood would leave one particle. The
-    scores are tempered until the effective number of particles is at least ``effective_share`` of them.
-    """
-    relative = scores - scores.max()
-    temperature = 1.0
-    for _ in range(20):
-        new = weights * np.exp(relative / temperature)
-        new /= new.sum()
-        if 1.0 / np.sum(new**2) >= effective_share * len(new):
-            break
-        temperature *= 1.4
-    return new
-
-
-def systematic_resample(weights: Float[np.ndarray, "p"], rng: np.random.Generator) -> Int[np.ndarray, "p"]:
-    """Draw as many particles as there are, each N times its weight on average, with one random number.
-
-    Source:
-        Kitagawa 1996; copies of each particle differ from N * weight by less than one.
-    """
-    n = len(weights)
-    positions = (np.arange(n) + rng.random()) / n
-    cumulative = np.cumsum(weights)
-    cumulative[-1] = 1.0
-    return np.searchsorted(cumulative, positions, side="right").clip(0, n - 1)
-
-
-def mean_pose(states: Float[np.ndarray, "p 5"], weights: Float[np.ndarray, "p"]) -> Float[np.ndarray, "3"]:
-    """Weighted mean pose; headings are unwrapped and close together, so that a plain mean serves."""
-    return weights @ states[:, :3]
-
-
-def smooth_lineages(
-    history: Float[np.ndarray, "n p 5"], parents: Int[np.ndarray, "n p"], final: Float[np.ndarray, "p"]
-) -> Float[np.ndarray, "n 5"]:
+def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> Float[np.ndarray, "n 5"]:
     """Mean state per frame over the lineages of the final particles.
 
     Args:
-        history: Every particle at every frame, before resampling.
-        parents: Index of each particle's ancestor in the frame before.
-        final: Weights of the particles at the last frame.
+        history: Survivors of every frame.
+        final: Weights of the last frame's survivors.
     """
-    n = len(history)
-    smoothed = np.empty((n, 5))
+    smoothed = np.empty((len(history), 5))
     weights = final
-    for k in range(n - 1, -1, -1):
-        smoothed[k] = weights @ history[k]
-        weights = np.bincount(parents[k], weights, minlength=history.shape[1])
+    for k in range(len(history) - 1, -1, -1):
+        smoothed[k] = weights @ history[k].states
+        if k > 0:
+            weights = np.bincount(history[k].parents, weights, minlength=len(history[k - 1].states))
     return smoothed

@@ -65,3 +65,34 @@ class MotionModel:
         states[:, X] += distance * np.cos(middle)
         states[:, Y] += distance * np.sin(middle)
         states[:, HEADING] += turn
+
+
+def widen_steps(
+    before: Float[np.ndarray, "p 5"], states: Float[np.ndarray, "p 5"], every: int, factor: float
+) -> None:
+    """Let some particles stray further from the mean step than the motion model does, in place.
+
+    Recorded drives jerk: a frame is missing, a wheel slips, the camera nods. Normal noise that is wide enough
+    for such a frame is far too wide for all others; a few particles that stray far keep track through it.
+
+    Args:
+        before: Particles before the prediction.
+        states: Particles after it.
+        every: One of so many particles strays; 0 for none.
+        factor: How many times as far.
+
+    Source:
+        Mixture of two normal distributions; own derivation.
+    """
+    if every == 0:
+        return
+    turn = states[:, HEADING] - before[:, HEADING]
+    middle = before[:, HEADING] + 0.5 * turn
+    # A step is a chord in the direction of the middle heading (see MotionModel.predict).
+    distance = (states[:, X] - before[:, X]) * np.cos(middle) + (states[:, Y] - before[:, Y]) * np.sin(middle)
+    turn = turn.mean() + factor * (turn[::every] - turn.mean())
+    distance = distance.mean() + factor * (distance[::every] - distance.mean())
+    middle = before[::every, HEADING] + 0.5 * turn
+    states[::every, X] = before[::every, X] + distance * np.cos(middle)
+    states[::every, Y] = before[::every, Y] + distance * np.sin(middle)
+    states[::every, HEADING] = before[::every, HEADING] + turn

@@ -10,15 +10,11 @@ from jaxtyping import Float
 from pydantic import Field
 
 from datagen.slam.field import DirectionField
-from datagen.slam.filter import thin_scan
-from datagen.slam.scans import Progress, Scans
+from datagen.slam.scans import Progress, Scans, thin_scan
 from datagen.slam.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
-
-#: Explanations of the drift that are worth a map of their own.
-_MAX_DRIFTS, _MIN_VOTE_SHARE = 3, 0.5
 
 
 class RevisitSettings(Settings):
@@ -30,7 +26,7 @@ class RevisitSettings(Settings):
         max_drift_rad: Heading that the open loop may miss in one lap. Revisits
             that no common drift per length explains are not believed: rooms repeat, and one false revisit
             bends a whole map.
-        drift_tolerance_rad: What a revisit may miss of the common drift.
+        drift_tolerance_rad: What a revisit may miss of the common drift, one lap later.
         min_revisits: Fewer revisits than this are not believed.
         min_match: Matched share of the edges once aligned.
         max_pairs: Pairs to verify at most, spread over the drive.
@@ -140,9 +136,9 @@ def consistent_revisits(
     """Group the revisits by the drift of the heading that explains them, and count their whole turns.
 
     The open loop misses heading in proportion to its length, nearly: most of it is a camera that looks a
-    little to the side, or a speed that is a little off. All drifts are tried, up to whole turns; where two
-    explain the revisits about as well, a lap that turns once and one that turns twice or not at all are both
-    possible, and only the map that each gives can tell.
+    little to the side, or a speed that is a little off. The drift is known up to whole turns per lap: a lap
+    that turns once, and one that does not turn at all or turns the other way, explain the same revisits with
+    another drift, and only the map that each gives can tell.
 
     Args:
         poses: Open-loop trajectory, heading unwrapped.
@@ -150,7 +146,7 @@ def consistent_revisits(
         settings: Bounds.
 
     Returns:
-        The possible sets of revisits, with their turns and their drift, [rad/cm]; likeliest first.
+        The revisits with their turns, and the drift, [rad/cm], once for each count of turns per lap.
     """
     if len(revisits) < settings.min_revisits:
         return []
@@ -159,24 +155,33 @@ def consistent_revisits(
     between = path[later] - path[earlier]
     missed = poses[later, 2] - poses[earlier, 2] - np.array([r.relative[2] for r in revisits])
     # Later visits may skip laps: the shortest gaps are those of one lap.
-    lap = float(np.percentile(between, 10))
+    lap = float(np.median(between[between < 1.5 * np.percentile(between, 10)]))
     limit = settings.max_drift_rad / lap
-    # A fifth of the tolerance apart at the longest gap.
+    # What the drift varies by adds up over the laps.
+    tolerance = settings.drift_tolerance_rad * np.sqrt(np.maximum(between / lap, 1.0))
     count = int(10.0 * limit * between.max() / settings.drift_tolerance_rad)
     rates = np.linspace(-limit, limit, 2 * count + 1)
     rest = wrap_angle(missed - rates[:, None] * between)
-    votes = np.sum(np.exp(-0.5 * (rest / (0.5 * settings.drift_tolerance_rad)) ** 2), axis=1)
+    best = int(np.argmax(np.sum(np.exp(-0.5 * (rest / (0.5 * tolerance)) ** 2), axis=1)))
+    expected, rest = rates[best] * between, rest[best]
+    for _ in range(2):
+        # The drift may grow or shrink on the way.
+        good = np.abs(rest) <= tolerance
+        terms = np.stack([between, path[later] ** 2 - path[earlier] ** 2], axis=1)
+        scale = np.abs(terms).max(axis=0)
+        fitted = np.linalg.lstsq(terms[good] / scale, (expected + rest)[good], rcond=None)[0]
+        expected = terms / scale @ fitted
+        rest = wrap_angle(missed - expected)
+    turns = np.rint((missed - expected) / (2.0 * np.pi)).astype(int)
+    good = np.abs(rest) <= tolerance
+    laps = np.maximum(np.rint(between / lap), 1.0).astype(int)
     found: list[tuple[list[Revisit], float]] = []
-    left = votes.copy()
-    while len(found) < _MAX_DRIFTS and left.max() >= _MIN_VOTE_SHARE * votes.max():
-        best = int(np.argmax(left))
-        turns = np.rint((missed - rates[best] * between) / (2.0 * np.pi)).astype(int)
-        good = np.abs(rest[best]) <= settings.drift_tolerance_rad
-        kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, turns, good, strict=True) if ok]
-        if len(kept) >= settings.min_revisits:
-            found.append((kept, float(rates[best])))
-        # Another count of turns is half a turn per lap away, at least.
-        left[np.abs(rates - rates[best]) * lap < 0.5 * np.pi] = 0.0
+    for more in (0, -1, 1):
+        rate = float(np.median(expected / between)) - 2.0 * np.pi * more / lap
+        whole = turns + more * laps
+        kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, whole, good, strict=True) if ok]
+        if abs(rate) <= limit and len(kept) >= settings.min_revisits:
+            found.append((kept, rate))
     return found
 
 

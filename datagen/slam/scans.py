@@ -118,3 +118,15 @@ def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
     normals = np.concatenate([np.empty((0, 2)), *(frame.normals for frame in frames)])
     distance = np.hypot(points[:, 0], points[:, 1]) / (4.0 * camera_height_cm)
     return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
+
+
+def thin_scan(
+    scans: Scans, k: int, max_points: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
+    frame = scans.frame(k)
+    size = frame.stop - frame.start
+    if size <= max_points:
+        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
+    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
+    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]

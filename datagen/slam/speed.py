@@ -20,7 +20,8 @@ from datagen.slam.scans import Progress, Scans
 #: Steps to try, in camera heights per frame: 1 cm of the paper's crawl up to a fast car at 10 Hz.
 STEPS_HEIGHTS = tuple(0.05 * 1.25**k for k in range(13))
 _FRAMES = 300
-_SETTINGS = FilterSettings(particles=150, max_points=150)
+# Held speeds are compared, not driven: one map serves all particles, and none strays.
+_SETTINGS = FilterSettings(particles=150, max_points=80, maps="mean", stray_every=0)
 
 
 @dataclass(frozen=True)

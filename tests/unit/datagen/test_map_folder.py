@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from datagen.lanes.fit import LaneLine, Side
+from datagen.lanes.line import LaneLine, Side
+from datagen.lanes.spline import CubicBasis
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, read_map, write_map
 from lanenet.data.files import require
 from lanenet.errors import LanenetError, MapFormatError
@@ -69,6 +71,8 @@ def _drive_map() -> DriveMap:
             0: [_line("left", 18.0), _line("right", -18.0)],
             1: [_line("left", 18.0), never_seen],
         },
+        tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
+        held_out=np.arange(N) % 10 == 3,
     )
 
 
@@ -88,7 +92,8 @@ def test_round_trip(folder):
     for name in ("frames", "lap", "segment"):
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
     # Nine digits on paper.
-    for name in ("t_s", "poses", "s_cm", "match"):
+    np.testing.assert_array_equal(found.held_out, written.held_out)
+    for name in ("t_s", "poses", "s_cm", "match", "tilt_rad"):
         np.testing.assert_allclose(getattr(found, name), getattr(written, name), rtol=1e-7)
     assert found.lines.keys() == written.lines.keys()
     s = np.linspace(-10.0, 210.0, 45)
@@ -97,6 +102,88 @@ def test_round_trip(folder):
         for line, again in zip(pair, found.lines[segment], strict=True):
             np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
             np.testing.assert_allclose(again.residual_cm, line.residual_cm)
+
+
+def test_the_camera_nods_with_the_frame(folder):
+    found = read_map(folder)
+    for name, change in zip(("pitch_down_rad", "roll_rad"), found.tilt_rad[7], strict=True):
+        mounted, nodded = (getattr(c.mounting, name) for c in (found.camera, found.camera_at(7)))
+        assert nodded - mounted == pytest.approx(change) and change != 0.0
+
+
+def test_an_older_map_has_no_tilt_no_held_out_frames_and_no_verdict(tmp_path):
+    older = replace(_drive_map(), tilt_rad=None, held_out=None)
+    write_map(tmp_path, older, {"frame_index": np.arange(2)}, {}, "given")
+    assert "pitch_rad" not in (tmp_path / "poses.csv").read_text()
+    path = tmp_path / "map.yaml"
+    path.write_text(re.sub(r"^verdict:.*\n", "", path.read_text(), flags=re.MULTILINE))
+    found = read_map(tmp_path)
+    assert not found.tilt_rad.any() and not found.held_out.any() and found.meta.verdict is None
+    assert found.camera_at(3).hash == found.camera.hash
+
+
+def _closed_map() -> DriveMap:
+    """A lap with a lane beside the driven one."""
+    basis = CubicBasis(np.linspace(0.0, 300.0, 21), periodic=True)
+    angle = 2.0 * np.pi * np.arange(20) / 20
+
+    def ring(side: Side, radius_cm: float, rank: int = 0) -> LaneLine:
+        control = basis.unfolded(radius_cm * np.column_stack([np.cos(angle), np.sin(angle)]))
+        return LaneLine(
+            side,
+            basis.knots_cm,
+            control,
+            np.array([[280.0, 350.0]]),
+            0.1,
+            rank,
+            300.0,
+            np.linspace(0.0, 295.0, 60),
+            np.linspace(0.05, 0.4, 60),
+            2.0,
+        )
+
+    plain = _drive_map()
+    lines = [ring("left", 30.0), ring("right", 66.0), ring("right", 102.0, 1)]
+    return replace(plain, segment=np.zeros(N, dtype=np.int64), lines={0: lines})
+
+
+def test_closed_lines_and_lines_beside_the_lane_are_read_back(tmp_path):
+    written = _closed_map()
+    write_map(tmp_path, written, {"frame_index": np.arange(2)}, {}, "given")
+    found = read_map(tmp_path)
+    s = np.linspace(-100.0, 700.0, 97)
+    for line, again in zip(written.lines[0], found.lines[0], strict=True):
+        assert (again.side, again.rank, again.index, again.period_cm) == (
+            line.side,
+            line.rank,
+            line.index,
+            300.0,
+        )
+        assert again.marking_cm == 2.0
+        np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
+        np.testing.assert_allclose(again.sigma_cm(s), line.sigma_cm(s), atol=1e-9)
+    assert [line.index for line in found.lines[0]] == [0, 1, 2]
+    np.testing.assert_array_equal(
+        found.lines[0][0].supported(np.array([290.0, 20.0, 320.0, 60.0])), [1, 1, 1, 0]
+    )
+
+
+def test_lines_of_the_first_version_are_read(folder):
+    path = folder / "lanes.json"
+    plain = json.loads(path.read_text())
+    for line in plain["lines"]:
+        for name in ("rank", "period_cm", "marking_cm", "sigma_s_cm", "sigma_at_cm"):
+            del line[name]
+    plain["format"] = "lanenet-lanes/1"
+    path.write_text(json.dumps(plain))
+    found, written = read_map(folder), _drive_map()
+    s = np.linspace(-10.0, 210.0, 45)
+    for segment, pair in written.lines.items():
+        for line, again in zip(pair, found.lines[segment], strict=True):
+            assert (again.side, again.rank, again.period_cm) == (line.side, 0, None)
+            np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
+            assert np.isnan(again.sigma_cm(s)).all()
+    assert not found.lanes.lane.any()
 
 
 def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
@@ -202,6 +289,14 @@ def _damage(plain: dict, what: str) -> object:
         line["knots_cm"][5] = -40.0
     elif what == "two left lines":
         plain["lines"][1]["side"] = "left"
+    elif what == "a gap between lines":
+        plain["lines"].append({**line, "rank": 2})
+    elif what == "negative rank":
+        line["rank"] = -1
+    elif what == "another period":
+        line["period_cm"] = 80.0
+    elif what == "half an uncertainty":
+        line["sigma_s_cm"] = [1.0, 2.0]
     elif what == "one line":
         del plain["lines"][0]
     return plain
@@ -221,6 +316,10 @@ def _damage(plain: dict, what: str) -> object:
         "too few coefficients",
         "knots out of order",
         "two left lines",
+        "a gap between lines",
+        "negative rank",
+        "another period",
+        "half an uncertainty",
         "one line",
     ],
 )

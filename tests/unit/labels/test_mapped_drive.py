@@ -11,7 +11,7 @@ import pytest
 
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import DELETED, UNCERTAIN, label_frame, open_mapped_drive, read_map_frames
-from datagen.lanes.fit import LaneLine, Side
+from datagen.lanes.line import LaneLine, Side
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from lanenet.config import dump_settings

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.labels.project import lines_of_frame
-from datagen.lanes.fit import LaneLine, Side
+from datagen.labels.project import label_rows, lines_of_frame
+from datagen.lanes.line import LaneLine, Side
 from lanenet.geometry.lane import ROWS_CM, mirror_points
 
 WHEELBASE_CM = 17.0
@@ -148,3 +150,54 @@ def test_only_the_stretch_around_the_frame_counts():
         [line("left", 20.0), line("right", -20.0)], np.array([100.0, 0.0, 0.0]), 100.0, 17.0
     )
     np.testing.assert_allclose(found.points_cm, [-20.0] * 3 + [20.0] * 3, atol=1e-6)
+
+
+def test_the_other_way_swaps_the_lines():
+    pose = np.array([150.0, 4.0, np.pi])
+    found = lines_of_frame(_straight(), pose, 150.0, WHEELBASE_CM, forward=False)
+    # The path's right line, at y = -20, is to the left of a car that drives towards -x.
+    np.testing.assert_allclose(found.points_cm, [-24.0] * 3 + [16.0] * 3, atol=1e-6)
+    for line in (found.left_cm, found.right_cm):
+        assert (np.diff(line[:, 1]) > 0.0).all()
+
+
+def test_a_lane_beside_the_driven_one():
+    lines = _straight()
+    further = replace(lines[0], rank=1, coefficients_cm=lines[0].coefficients_cm + [0.0, 2.0 * HALF_CM])
+    there = lines_of_frame([*lines, further], np.array([150.0, 45.0, 0.0]), 150.0, WHEELBASE_CM, lane=-1)
+    np.testing.assert_allclose(there.points_cm, [-15.0] * 3 + [25.0] * 3, atol=1e-6)
+    back = np.array([150.0, 45.0, np.pi])
+    oncoming = lines_of_frame([*lines, further], back, 150.0, WHEELBASE_CM, lane=-1, forward=False)
+    np.testing.assert_allclose(oncoming.points_cm, [-25.0] * 3 + [15.0] * 3, atol=1e-6)
+
+
+def test_uncertain_stretches_are_masked():
+    lines = [
+        replace(line, sigma_s_cm=np.array([0.0, 175.0, 176.0]), sigma_at_cm=np.array([0.1, 0.1, 3.0]))
+        for line in _straight()
+    ]
+    pose = np.array([150.0, 0.0, 0.0])
+    # Row 0 is at s = 167, row 15 at 182.
+    found = lines_of_frame(lines, pose, 150.0, WHEELBASE_CM, max_sigma_cm=1.0)
+    np.testing.assert_array_equal(np.isfinite(found.points_cm), [True, False, False] * 2)
+    assert np.isfinite(lines_of_frame(lines, pose, 150.0, WHEELBASE_CM).points_cm).all()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "known"), [(0.0, True), (50.0, True), (58.0, True), (65.0, False), (80.0, False)]
+)
+def test_a_line_that_turns_away_is_masked(degrees, known):
+    along = np.arange(-60.0, 260.0, 2.0)
+    angle = np.deg2rad(degrees)
+    line = np.column_stack([along * np.sin(angle) - 20.0, along * np.cos(angle)])
+    assert np.isfinite(label_rows(line)).all() == known
+    assert np.isnan(label_rows(line)).all() != known
+
+
+def test_a_row_that_is_crossed_twice_is_masked():
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 60)
+    # Up to y = 25 and back down: rows 0 and 15 twice, row 30 never.
+    hairpin = np.column_stack([20.0 * np.sin(turn), 45.0 * np.cos(turn) - 20.0])
+    assert np.isnan(label_rows(hairpin)).all()
+    upwards = hairpin[:30]
+    np.testing.assert_array_equal(np.isfinite(label_rows(upwards)), [True, True, False])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from datagen.lanes.path import Path, PathEdges
-from datagen.lanes.trace import TracedLane, TraceSettings, edge_profile, trace_lane
+from datagen.lanes.profile import EdgeProfile, edge_profile
+from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
 from lanenet.errors import TrackingLostError
 
 HEIGHT_CM = 15.0
@@ -49,8 +50,18 @@ def _clutter(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _edges(*parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> PathEdges:
-    s, d, side = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return PathEdges(s, d, side, np.ones(len(s)))
+    return _path_edges(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _path_edges(s: np.ndarray, d: np.ndarray, side: np.ndarray) -> PathEdges:
+    along = np.sqrt(np.maximum(0.0, 1.0 - side**2))
+    frame = np.maximum(0, (s / 3.0).astype(np.int64) - 6)
+    return PathEdges(s, d, side, along, np.ones(len(s)), np.full(len(s), 20.0), frame)
+
+
+def _profile(path: Path, edges: PathEdges) -> EdgeProfile:
+    half = int(SETTINGS.side_heights / SETTINGS.cell_heights)
+    return edge_profile(path, edges, CELL_CM, half, 0.25 * HEIGHT_CM, SETTINGS.min_side)
 
 
 def _dashed(path: Path, dash_cm: float = 15.0, period_cm: float = 30.0) -> np.ndarray:
@@ -111,7 +122,7 @@ def test_left_and_right_are_mirror_images():
         _tape(rng, centre - 0.5 * LANE_CM, np.ones(len(path.s_cm), dtype=bool)),
         _clutter(rng, 1500),
     )
-    mirrored = PathEdges(edges.s_cm, -edges.d_cm, -edges.side, edges.weight)
+    mirrored = _path_edges(edges.s_cm, -edges.d_cm, -edges.side)
     here = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
     there = trace_lane(path, mirrored, HEIGHT_CM, LANE_CM, SETTINGS)
     np.testing.assert_array_equal(np.isfinite(here.left_cm), np.isfinite(there.right_cm))
@@ -180,7 +191,7 @@ def test_without_lines_the_drive_cannot_be_mapped():
     path = _path()
     with pytest.raises(TrackingLostError, match=r"36 cm apart.*lane width"):
         trace_lane(path, _edges(_clutter(rng, 150)), HEIGHT_CM, LANE_CM, SETTINGS)
-    nothing = PathEdges(*(np.empty(0) for _ in range(4)))
+    nothing = _path_edges(*(np.empty(0) for _ in range(3)))
     with pytest.raises(TrackingLostError):
         trace_lane(path, nothing, HEIGHT_CM, LANE_CM, SETTINGS)
     with pytest.raises(TrackingLostError):
@@ -191,33 +202,30 @@ def test_the_profile_keeps_directions_apart_and_saturates():
     path = _path()
     n = 400
     at = np.full(n, 90.0)
-    edges = PathEdges(at, np.full(n, 10.0), np.full(n, -1.0), np.ones(n))
-    profile = edge_profile(path, edges, HEIGHT_CM, SETTINGS)
+    edges = _path_edges(at, np.full(n, 10.0), np.full(n, -1.0))
+    profile = _profile(path, edges)
     row, column = round(90.0 / STEP_CM), profile.half_cells + round(10.0 / profile.cell_cm)
     assert profile.left[row, column] > 0.95
     assert profile.left.max() < 1.0
     assert profile.left[row].argmax() == column
     assert not profile.right.any()
     # An edge across the path belongs to neither.
-    across = PathEdges(at, np.full(n, 10.0), np.full(n, 0.3), np.ones(n))
-    assert not edge_profile(path, across, HEIGHT_CM, SETTINGS).left.any()
+    across = _path_edges(at, np.full(n, 10.0), np.full(n, 0.3))
+    assert not _profile(path, across).left.any()
 
 
 def test_a_tape_is_supported_at_its_middle():
     path = _path()
     s = np.repeat(path.s_cm, 4)
     one = np.ones(len(s))
-    edges = PathEdges(
-        np.concatenate([s, s]),
-        np.concatenate([11.2 * one, 8.8 * one]),
-        np.concatenate([-one, one]),
-        np.concatenate([one, one]),
+    edges = _path_edges(
+        np.concatenate([s, s]), np.concatenate([11.2 * one, 8.8 * one]), np.concatenate([-one, one])
     )
-    profile = edge_profile(path, edges, HEIGHT_CM, SETTINGS)
+    profile = _profile(path, edges)
     tapes = profile.tapes(2.4)
     middle = (tapes[50].argmax() - profile.half_cells) * profile.cell_cm
     assert middle == pytest.approx(10.0, abs=profile.cell_cm)
     # Of the wrong width, or with its edges swapped (a dark gap between tapes), it is none.
     assert profile.tapes(6.0)[50].max() < 0.1
-    dark = PathEdges(edges.s_cm, edges.d_cm, -edges.side, edges.weight)
-    assert edge_profile(path, dark, HEIGHT_CM, SETTINGS).tapes(2.4)[50].max() < 0.5 * tapes[50].max()
+    dark = _path_edges(edges.s_cm, edges.d_cm, -edges.side)
+    assert _profile(path, dark).tapes(2.4)[50].max() < 0.5 * tapes[50].max()

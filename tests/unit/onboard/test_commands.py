@@ -129,6 +129,11 @@ def test_missing_extra_names_the_pip_command(tmp_path: Path) -> None:
 @dataclass(frozen=True)
 class Report:
     lines: tuple[str, ...]
+    grade: str = "good"
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        return {"verdict": {"grade": self.grade}}
 
 
 class Asked:
@@ -136,6 +141,7 @@ class Asked:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls: dict[str, tuple[Any, ...]] = {}
+        self.options: dict[str, dict[str, Any]] = {}
         self.order: list[str] = []
         self._patch = monkeypatch
 
@@ -146,8 +152,9 @@ class Asked:
         self._patch.setitem(sys.modules, name, module)
 
     def function(self, name: str, answer: Any = None) -> Any:
-        def call(*args: Any) -> Any:
+        def call(*args: Any, **options: Any) -> Any:
             self.calls[name] = args
+            self.options[name] = options
             self.order.append(name)
             if isinstance(answer, Exception):
                 raise answer
@@ -185,6 +192,15 @@ def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
         assert text in result.stdout
 
 
+def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
+    map_drive = asked.function("map", Report(("verdict: reject",), "reject"))
+    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=map_drive)
+    result = run("map", "tub", "--lane-width", "40", "--out", "m")
+    assert "the map was rejected" in error_of(result)
+    assert "verdict: reject" in result.stdout and "wrote m/report.html" in result.stdout
+    assert "next:" not in result.stdout
+
+
 def test_map_that_is_lost_says_so(asked: Asked) -> None:
     lost = asked.function("map", TrackingLostError("tub: lost at frame 12"))
     asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=lost)
@@ -196,6 +212,9 @@ def test_label_hands_on_its_arguments(asked: Asked) -> None:
     result = run("label", "m/one", "--out", "one.parquet")
     assert result.exit_code == 0, result.output
     assert asked.calls["label"][:2] == (Path("m/one"), Path("one.parquet"))
+    assert asked.options["label"] == {"force": False}
+    assert run("label", "m/one", "--force", "--out", "one.parquet").exit_code == 0
+    assert asked.options["label"] == {"force": True}
     assert ".parquet" in error_of(run("label", "m/one", "--out", "one.txt"))
 
 

@@ -57,6 +57,12 @@ def tape_road(frames: int, curvature_per_cm: float = 0.004, swing_per_cm: float 
     ds = 0.25
     s = np.arange(0.0, frames * STEP_CM + 130.0, ds)
     curvature = curvature_per_cm + swing_per_cm * np.sin(2.0 * np.pi * s / 250.0)
+    return tapes_along(s, curvature, (np.arange(frames) * STEP_CM / ds).astype(int))
+
+
+def tapes_along(s: np.ndarray, curvature: np.ndarray, driven: np.ndarray) -> TapeRoad:
+    """Tape both sides of a lane; ``driven`` are the rows of ``s`` at which the car is, frame by frame."""
+    ds = float(s[1] - s[0])
     heading = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]) * ds)])
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = ds * np.column_stack([np.cos(middle), np.sin(middle)])
@@ -77,7 +83,6 @@ def tape_road(frames: int, curvature_per_cm: float = 0.004, swing_per_cm: float 
             for across in (-0.7, 0.0, 0.7):
                 points.append(xy[ends] + (offset + across) * left[ends])
                 normals.append(sign * ahead[ends])
-    driven = (np.arange(frames) * STEP_CM / ds).astype(int)
     return TapeRoad(
         np.concatenate(points), np.concatenate(normals), np.column_stack([xy[driven], heading[driven]])
     )

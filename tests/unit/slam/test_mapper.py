@@ -83,9 +83,9 @@ def test_donkeycar_full_left_turns_left():
     np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0])
 
 
-def test_a_long_pause_counts_as_five_steps_at_most():
+def test_a_long_pause_counts_as_three_steps_at_most():
     commands = commands_of(_drive([0.0, 0.05, 0.1, 0.15, 3.0, 3.05], angle=[0.0] * 6), 17.0)
-    np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0, 1.0, 5.0, 1.0], rtol=1e-9)
+    np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0, 1.0, 3.0, 1.0], rtol=1e-9)
 
 
 def test_yaw_rate_over_speed_is_curvature():

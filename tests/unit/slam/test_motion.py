@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.motion import FACTOR, HEADING, OFFSET, MotionModel, X, Y
+from datagen.slam.motion import FACTOR, HEADING, OFFSET, MotionModel, X, Y, widen_steps
 
 N = 20_000
 
@@ -114,3 +114,30 @@ def test_the_start_has_the_stated_mean_and_spread():
     factors = _model(2, factor_start=(3.0, 0.5)).start(N, np.random.default_rng(0))[:, FACTOR]
     assert np.mean(factors) == pytest.approx(3.0, abs=0.02)
     assert np.std(factors) == pytest.approx(0.5, rel=0.03)
+
+
+def test_one_in_some_strays_so_many_times_as_far():
+    model = _model(2, 0.01, distance_noise=0.05, curvature_noise_per_cm=0.004)
+    rng = np.random.default_rng(0)
+    before = model.start(N, rng)
+    before[:, [X, Y, HEADING]] = rng.normal(size=(N, 3))
+    states = before.copy()
+    model.predict(states, 1, rng)
+    predicted = states.copy()
+    widen_steps(before, states, 5, 4.0)
+    strays = np.arange(N) % 5 == 0
+    np.testing.assert_array_equal(states[~strays], predicted[~strays])
+
+    def steps(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        moved = states[rows] - before[rows]
+        return np.hypot(moved[:, X], moved[:, Y]), moved[:, HEADING]
+
+    for few, most in zip(steps(strays), steps(~strays), strict=True):
+        assert np.std(few) == pytest.approx(4.0 * np.std(most), rel=0.05)
+        assert np.mean(few) == pytest.approx(np.mean(most), abs=0.1 * np.std(few))
+    np.testing.assert_array_equal(states[:, [FACTOR, OFFSET]], predicted[:, [FACTOR, OFFSET]])
+    # Nobody strays at factor one, or where none shall.
+    for every, factor in ((5, 1.0), (0, 4.0)):
+        same = predicted.copy()
+        widen_steps(before, same, every, factor)
+        np.testing.assert_allclose(same, predicted, atol=1e-9)

@@ -31,7 +31,7 @@ def _revisits(true: np.ndarray, frames: range, noise: np.random.Generator | None
         relative = relative_pose(true[k], true[k + LAP])
         if noise is not None:
             relative = relative + noise.normal(size=3) * [0.5, 0.3, 0.01]
-        found.append(Revisit(k, k + LAP, relative, 0.8))
+        found.append(Revisit(k, k + LAP, relative, 0.8, turns=1))
     return found
 
 
@@ -71,7 +71,7 @@ def test_one_wrong_revisit_among_ten_is_left_unsatisfied(wrong):
     good = revisits[wrong]
     # The next dash but one, seen from a metre beside: 40 cm along, 25 cm across, 10 degrees.
     relative = good.relative + [40.0, 25.0, np.deg2rad(10.0)]
-    revisits[wrong] = Revisit(good.earlier, good.later, relative, 0.8)
+    revisits[wrong] = Revisit(good.earlier, good.later, relative, 0.8, turns=1)
     closed, residuals = close_loops(drifted, revisits, HEIGHT_CM)
     size = np.linalg.norm(residuals[:, :2], axis=1)
     assert size[wrong] > 40.0

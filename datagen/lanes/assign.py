@@ -1,0 +1,93 @@
+"""Which lane each frame is in: between which two lines, and in which direction it drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from datagen.lanes.line import LaneLine
+
+#: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
+_BEYOND = 0.1
+#: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
+_WIDTHS = (0.6, 1.5)
+
+
+@dataclass(frozen=True)
+class FrameLanes:
+    """The lane of each frame.
+
+    Attributes:
+        lane: Index of the line on the left of the lane, seen in the path's direction: 0 for the driven lane,
+            -1 for the one to its left, 1 for the one to its right.
+        forward: Whether the frame drives in the path's direction.
+    """
+
+    lane: Int[np.ndarray, "n"]
+    forward: Bool[np.ndarray, "n"]
+
+
+def assign_lanes(
+    lines: list[LaneLine], poses: Float[np.ndarray, "n 3"], s_cm: Float[np.ndarray, "n"], wheelbase_cm: float
+) -> FrameLanes:
+    """Find the lane of each frame of a segment, in the order in which they were driven.
+
+    The lane is the one in which the middle of the front axle is; it changes when that is clearly beyond a
+    line that has a lane behind it. Beside the road the car keeps the lane that it left.
+
+    Args:
+        lines: Lines of the segment.
+        poses: Rear-axle poses, frame map.
+        s_cm: Position of the rear axles along the path.
+        wheelbase_cm: Distance between the axles.
+    """
+    by_index = {line.index: line for line in lines}
+    n = len(s_cm)
+    direction = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    tangent = sum(by_index[i].everywhere(s_cm, 1) for i in (0, 1))
+    forward = np.sum(direction * tangent, axis=1) >= 0.0
+    inner = range(min(by_index), max(by_index))
+    if len(inner) == 1:
+        return FrameLanes(np.zeros(n, dtype=np.int64), forward)
+    front = poses[:, :2] + wheelbase_cm * direction
+    s_front = s_cm + np.where(forward, wheelbase_cm, -wheelbase_cm)
+    # How far the front axle's middle is to the left of each line.
+    left_of = {i: _left_of(line, s_front, front) for i, line in by_index.items()}
+    usual = float(np.nanmedian(left_of[1] - left_of[0]))
+    exists = {}
+    for i in inner:
+        width = left_of[i + 1] - left_of[i]
+        known = by_index[i].supported(s_front) & by_index[i + 1].supported(s_front)
+        exists[i] = known & (width > _WIDTHS[0] * usual) & (width < _WIDTHS[1] * usual)
+    lane = np.zeros(n, dtype=np.int64)
+    margin = _BEYOND * usual
+    # On a road of two lanes the first frame may be in either.
+    current = _lane_of_start(left_of, exists, inner)
+    for k in range(n):
+        if current - 1 in exists and left_of[current][k] > margin and exists[current - 1][k]:
+            current -= 1
+        elif current + 1 in exists and left_of[current + 1][k] < -margin and exists[current + 1][k]:
+            current += 1
+        lane[k] = current
+    return FrameLanes(lane, forward)
+
+
+def _left_of(
+    line: LaneLine, s_cm: Float[np.ndarray, "n"], points_cm: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n"]:
+    """Distance of points to the left of a line at given places along it."""
+    tangent = line.everywhere(s_cm, 1)
+    apart = points_cm - line.everywhere(s_cm)
+    cross = tangent[:, 0] * apart[:, 1] - tangent[:, 1] * apart[:, 0]
+    return cross / np.maximum(np.linalg.norm(tangent, axis=1), 1e-9)
+
+
+def _lane_of_start(
+    left_of: dict[int, Float[np.ndarray, "n"]], exists: dict[int, Bool[np.ndarray, "n"]], inner: range
+) -> int:
+    for i in inner:
+        if exists[i][0] and left_of[i][0] <= 0.0 <= left_of[i + 1][0]:
+            return i
+    return 0

@@ -1,0 +1,111 @@
+"""Where a line was seen, and which gaps in its paint are bridged."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
+
+from datagen.lanes.path import Path
+
+#: Weight of the edge points of one border per path sample from which it counts as seen: at least, and as a
+#: share of what the line usually shows. Clutter is sparse.
+_SEEN, _SEEN_SHARE = 0.5, 0.15
+#: What a gap counts where a parallel line is seen.
+_HELD = 0.4
+
+
+def seen_samples(
+    path: Path,
+    s_cm: Float[np.ndarray, "n"],
+    border: Float[np.ndarray, "n"],
+    weight: Float[np.ndarray, "n"],
+    along_cm: float,
+    alone_cm: float,
+) -> Bool[np.ndarray, "m"]:
+    """Tell at which path samples a marking is seen.
+
+    A place where one border alone is seen counts only near a place where both are: elsewhere it may be
+    anything, a joint or a shadow, and the marking's width does not tell its middle.
+
+    Args:
+        path: The path.
+        s_cm: Position of the marking's edge points.
+        border: 1 for points of the left border, -1 for the right one.
+        weight: Trust in each point.
+        along_cm: Smoothing along the path.
+        alone_cm: How far from both borders one alone is believed.
+    """
+    m = len(path.xy_cm)
+    row = np.clip(np.rint(s_cm / path.step_cm).astype(np.intp), 0, m)
+    row = row % m if path.closed else np.minimum(row, m - 1)
+    mode: Literal["wrap", "constant"] = "wrap" if path.closed else "constant"
+    left, right = (
+        gaussian_filter1d(
+            np.bincount(row[border == sign], weight[border == sign], minlength=m).astype(np.float64),
+            along_cm / path.step_cm,
+            mode=mode,
+        )
+        for sign in (1.0, -1.0)
+    )
+    weaker = np.minimum(left, right)
+    both = weaker > _SEEN
+    if not both.any():
+        return both
+    enough = max(_SEEN, _SEEN_SHARE * float(np.median(weaker[both])))
+    both = weaker > enough
+    lead = m if path.closed else 0
+    apart = distance_transform_edt(~np.pad(both, lead, mode="wrap"))[lead : lead + m]
+    return both | ((np.maximum(left, right) > enough) & (apart * path.step_cm <= alone_cm))
+
+
+def stretches(
+    path: Path,
+    seen: Bool[np.ndarray, "m"],
+    bridge_cm: float,
+    extend_cm: float,
+    held: Bool[np.ndarray, "m"] | None = None,
+) -> Float[np.ndarray, "g 2"]:
+    """Stretches between seen samples whose gaps are no longer than the bridge.
+
+    Args:
+        path: The path.
+        seen: Where the marking was seen.
+        bridge_cm: Longest gap, with the marking seen on both sides.
+        extend_cm: What is believed beyond either end; a stretch shorter than this between two gaps is as
+            likely clutter as line.
+        held: Where a parallel line is seen; a gap counts less there.
+
+    Returns:
+        (from, to); on a closed path a stretch over the seam ends beyond the period.
+    """
+    period, at = path.period_cm, path.s_cm[seen]
+    if at.size < 2:
+        return np.empty((0, 2))
+    cost = np.full(len(seen), path.step_cm) if held is None else np.where(held, _HELD, 1.0) * path.step_cm
+    bare = np.cumsum(cost)[seen]
+    if period is None:
+        cuts = np.flatnonzero(np.diff(bare) > bridge_cm)
+        first, last = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(at) - 1]])
+        found = np.stack([at[first], at[last]], axis=1)
+    else:
+        cuts = np.flatnonzero(np.diff(bare, append=bare[0] + cost.sum()) > bridge_cm)
+        if not cuts.size:
+            return np.array([[0.0, period]])
+        first, last = (cuts + 1) % len(at), np.roll(cuts, -1)
+        found = np.stack([at[first], at[first] + np.mod(at[last] - at[first], period)], axis=1)
+    found = found[found[:, 1] - found[:, 0] > extend_cm] + [-extend_cm, extend_cm]
+    return found if period is not None else np.clip(found, 0.0, path.s_cm[-1])
+
+
+def within(path: Path, parts_cm: Float[np.ndarray, "g 2"]) -> Bool[np.ndarray, "m"]:
+    """Tell which path samples lie in any of the stretches."""
+    inside = np.zeros(len(path.xy_cm), dtype=bool)
+    for start, end in parts_cm:
+        past = path.s_cm - start
+        inside |= (past >= 0.0) & (past <= end - start)
+        if path.period_cm is not None:
+            inside |= np.mod(past, path.period_cm) <= end - start
+    return inside

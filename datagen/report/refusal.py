@@ -1,0 +1,32 @@
+"""A rejected map is kept to be looked at, but gives no labels unless they are asked for all the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from datagen.map_folder import DriveMap
+from lanenet.errors import TrackingLostError
+
+
+def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
+    """Raise if the map was rejected.
+
+    Args:
+        map_folder: Where it lies, with its report.
+        drive_map: The map.
+
+    Raises:
+        TrackingLostError: With the first reason, and where the others stand.
+    """
+    if drive_map.meta.verdict != "reject":
+        return
+    try:
+        reasons = json.loads((map_folder / "report.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
+        reason = str(reasons[0])
+    except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
+        reason = "its report cannot be read"
+    raise TrackingLostError(
+        f"{map_folder}: the map was rejected: {reason}; see {map_folder / 'report.html'}, and label it with "
+        "--force if it is to be used all the same"
+    )

@@ -1,0 +1,176 @@
+"""A small drive from frames to the report: verdict, figures, page, and labels of a rejected map."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from datagen.labels.label_map import label_map
+from datagen.map_folder import read_map
+from datagen.map_settings import MapSettings
+from datagen.pipeline import map_drive
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
+from lanenet.errors import TrackingLostError
+
+FRAMES = 80
+SETTINGS = MapSettings(find_bumper=False)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    settings = {
+        "seed": 1,
+        "frames": FRAMES,
+        "camera": {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0},
+        "track": {"left": {}, "right": {}, "interruptions_per_m": 0.0},
+    }
+    return simulate_drive(SimulationSettings.model_validate(settings), tmp_path_factory.mktemp("d") / "drive")
+
+
+@pytest.fixture(scope="module")
+def mapped(drive: Path) -> tuple[Path, tuple[str, ...]]:
+    out = drive.parent / "map"
+    return out, map_drive(drive, 40.0, None, SETTINGS, out).lines
+
+
+def test_a_clean_drive_is_good_and_says_so_first(mapped):
+    folder, lines = mapped
+    assert lines[0] == "verdict: good"
+    assert read_map(folder).meta.verdict == "good"
+
+
+def test_figures_for_machines(mapped):
+    folder, _ = mapped
+    report = json.loads((folder / "report.json").read_text())
+    assert report["format"].startswith("lanenet-map-report/")
+    held = report["held_out"]
+    assert held["frames"] == FRAMES // 10 == read_map(folder).held_out.sum()
+    both = held["both_lines"]
+    assert 0.0 < both["robust_sd_px_at_160"] < 0.5 and both["p95_px_at_160"] < 1.5
+    assert both["coverage"] > 0.9 and held["coverage_by_chance"] < 0.2
+    assert list(held["lines"]["left"]["bands"]) == ["0-15 cm", "15-30 cm", "30-45 cm", "45-90 cm"]
+    # What the lines and bands hold is what both lines hold.
+    near = [
+        figures["samples"]
+        for line in held["lines"].values()
+        for band, figures in line["bands"].items()
+        if band != "45-90 cm"
+    ]
+    assert sum(near) == both["samples"]
+    assert report["labelled"]["share"] == pytest.approx(
+        1.0 - sum(report["labelled"]["why_not"].values()) / FRAMES
+    )
+    assert report["verdict"]["grade"] == "good"
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.pictures: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "img":
+            self.pictures.append(dict(attrs)["src"] or "")
+        elif tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_stands_alone(mapped):
+    text = (mapped[0] / "report.html").read_text(encoding="utf-8")
+    page = _Page()
+    page.feed(text)
+    assert not page.open
+    assert len(page.pictures) >= 4 and all(src.startswith("data:image/") for src in page.pictures)
+    assert not re.search(r"https?://|<script|<link", text)
+    for words in (
+        "good",
+        "Held-out frames",
+        "left line, 0-15 cm",
+        "Worst held-out",
+        "focal length",
+        "viewport",
+    ):
+        assert words in text
+
+
+def test_held_out_frames_have_no_say_in_the_lines(drive, tmp_path):
+    """With other frames held out the lines move a little; the poses do not move at all."""
+    folders = [tmp_path / name for name in ("a", "b")]
+    for folder, every in zip(folders, (0, 2), strict=True):
+        map_drive(drive, 40.0, None, SETTINGS.model_copy(update={"held_out_every": every}), folder)
+    first, second = (read_map(folder) for folder in folders)
+    np.testing.assert_array_equal(first.poses, second.poses)
+    s = np.linspace(20.0, 150.0, 30)
+    off = np.abs(first.lines[0][0].points(s) - second.lines[0][0].points(s))
+    assert 0.0 < np.nanmax(off) < 1.0
+    assert first.meta.verdict == "usable" and not first.held_out.any()
+
+
+def test_a_rejected_map_is_not_labelled_unless_forced(mapped, tmp_path):
+    folder, _ = mapped
+    meta = (folder / "map.yaml").read_text()
+    try:
+        (folder / "map.yaml").write_text(yaml.safe_dump(yaml.safe_load(meta) | {"verdict": "reject"}))
+        with pytest.raises(TrackingLostError, match=r"rejected: .*robust sd.*--force"):
+            label_map(folder, tmp_path / "l.parquet")
+        assert not list(tmp_path.iterdir())
+        label_map(folder, tmp_path / "l.parquet", force=True)
+        assert (tmp_path / "l.parquet").is_file()
+    finally:
+        (folder / "map.yaml").write_text(meta)
+
+
+@pytest.mark.slow
+def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, tmp_path):
+    """Killed early, late in the work, and while the folder is being filled."""
+    out = tmp_path / "maps" / "one"
+    config = tmp_path / "map.yaml"
+    config.write_text("find_bumper: false\n")
+    command = [sys.executable, "-m", "lanenet", "map", str(drive), "--lane-width", "40"]
+    command += ["--config", str(config), "--out", str(out)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def kill_when(ready, delay_s=0.0):
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+        deadline = time.monotonic() + 180.0
+        while process.poll() is None and not ready():
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        time.sleep(delay_s)
+        assert process.poll() is None, process.communicate()
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+
+    begin = time.monotonic()
+    kill_when(lambda: time.monotonic() > begin + 2.0)
+    assert not out.exists()
+    kill_when(lambda: any(out.parent.glob(".one.*.tmp")))
+    assert not out.exists()
+    kill_when(lambda: any(out.parent.glob(".one.*.tmp/poses.csv")))
+    assert not out.exists()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "verdict: good" in done.stdout
+    before = (out / "poses.csv").read_bytes()
+    # What was killed leaves nothing that the next run does not clear away.
+    assert [path.name for path in out.parent.iterdir()] == ["one"]
+    kill_when(lambda: any(out.parent.glob(".one.*.tmp")))
+    assert (out / "poses.csv").read_bytes() == before and read_map(out).meta.verdict == "good"

@@ -1,0 +1,136 @@
+"""Residuals of projected borders: known shifts come back, clutter and wrong directions do not count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datagen.labels.project import FrameLines
+from datagen.report.residuals import (
+    BorderSamples,
+    ResidualSettings,
+    border_samples,
+    join_samples,
+    summarise,
+)
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.perception.edges import EdgePixels
+
+CAMERA = Camera(
+    "fisheye",
+    160,
+    120,
+    np.array([[80.0, 0.0, 79.5], [0.0, 80.0, 59.5], [0.0, 0.0, 1.0]]),
+    np.array([-0.03, 0.0, 0.0, 0.0]),
+    Mounting(15.0, pitch_down_rad=0.3, ahead_of_front_axle_cm=-3.0),
+    17.0,
+)
+TAPE_CM = 3.0
+KEEP = np.full((120, 160), 255, np.uint8)
+SETTINGS = ResidualSettings()
+
+
+def lane(bend_per_cm: float = 0.0) -> FrameLines:
+    y = np.arange(-20.0, 100.0, 2.0)
+    left, right = (np.column_stack([x + 0.5 * bend_per_cm * y**2, y]) for x in (-18.0, 22.0))
+    return FrameLines(left, right, np.full(6, np.nan))
+
+
+def edges_of(lines: FrameLines, shift_px: float = 0.0, tape_cm: float = TAPE_CM) -> EdgePixels:
+    """Edges exactly on the borders, a tenth of a centimetre apart, moved along their gradient."""
+    uv, normals = [], []
+    for line in (lines.left_cm, lines.right_cm):
+        if not np.isfinite(line).all():
+            continue
+        y = np.arange(-10.0, 95.0, 0.1)
+        x = np.interp(y, line[:, 1], line[:, 0])
+        slope = np.gradient(x, y)
+        across = np.column_stack([np.ones_like(y), -slope]) / np.hypot(1.0, slope)[:, None]
+        for border in (-0.5, 0.5):
+            points = np.column_stack([x, y]) + border * tape_cm * across
+            at = CAMERA.project_ground(points)
+            inwards = CAMERA.project_ground(points - np.sign(border) * 0.01 * across) - at
+            tangent = np.gradient(at, axis=0)
+            normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            normal *= np.sign(np.sum(normal * inwards, axis=1))[:, None]
+            uv.append(at + shift_px * normal)
+            normals.append(normal)
+    return EdgePixels(np.concatenate(uv), np.concatenate(normals))
+
+
+def measure(edges: EdgePixels, lines: FrameLines, **changes: float):
+    return border_samples(edges, lines, TAPE_CM, CAMERA, KEEP, SETTINGS, **changes)
+
+
+@pytest.mark.parametrize("bend_per_cm", [0.0, 0.006, -0.006])
+def test_edges_on_the_borders_have_no_residual(bend_per_cm):
+    found = measure(edges_of(lane(bend_per_cm)), lane(bend_per_cm))
+    assert summarise(found).coverage > 0.98
+    assert summarise(found).p95_px < 0.1
+    assert {bool(v) for v in found.right} == {False, True}
+    assert found.ahead_cm.min() >= 0.0 and found.ahead_cm.max() < 90.0
+
+
+@settings(max_examples=15)
+@given(st.floats(-2.5, 2.5))
+def test_a_shift_along_the_gradient_comes_back_with_its_sign(shift_px):
+    """Markings wider than thought give negative residuals, whatever side the border is on."""
+    figures = summarise(measure(edges_of(lane(), shift_px), lane()))
+    assert figures.median_px == pytest.approx(shift_px, abs=0.06)
+    assert figures.robust_sd_px == pytest.approx(1.4826 * abs(shift_px), abs=0.1)
+
+
+def test_a_wider_tape_lies_outside():
+    assert summarise(measure(edges_of(lane(), tape_cm=TAPE_CM + 1.0), lane())).median_px < -0.2
+
+
+def test_edges_beyond_the_gate_or_of_the_other_direction_are_not_found():
+    edges = edges_of(lane())
+    for wrong in (EdgePixels(edges.uv_px, -edges.normals), edges_of(lane(), 6.0)):
+        found = measure(wrong, lane())
+        # Further away the marking is narrower than the gate, and its other border is within it.
+        near = found.part(found.ahead_cm < 12.0)
+        assert len(near.right) > 20 and not near.found.any()
+    nothing = summarise(measure(EdgePixels(np.empty((0, 2)), np.empty((0, 2))), lane()))
+    assert nothing.coverage == 0.0 and np.isnan(nothing.p95_px) and nothing.samples > 100
+
+
+def test_a_line_in_the_empty_middle_of_the_lane_meets_nothing():
+    alone = replace(lane(), right_cm=np.full((60, 2), np.nan))
+    assert summarise(measure(edges_of(lane()), alone)).coverage > 0.98
+    aside = measure(edges_of(lane()), alone, aside_cm=20.0)
+    near = aside.part(aside.ahead_cm < 45.0)
+    assert len(near.right) > 50 and not near.found.any()
+
+
+def test_only_what_the_frame_shows_counts():
+    keep = KEEP.copy()
+    keep[:, :80] = 0
+    found = border_samples(edges_of(lane()), lane(), TAPE_CM, CAMERA, keep, SETTINGS)
+    assert found.right.all() and len(found.right) > 50
+    unsupported = FrameLines(np.full((5, 2), np.nan), np.full((5, 2), np.nan), np.full(6, np.nan))
+    assert len(measure(edges_of(lane()), unsupported).right) == 0
+
+
+def test_the_tilt_of_the_frame_matters():
+    edges = edges_of(lane())
+    m = CAMERA.mounting
+    nodded = CAMERA.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.01)
+    found = border_samples(edges, lane(), TAPE_CM, nodded, KEEP, SETTINGS)
+    assert summarise(found).robust_sd_px > 0.3
+
+
+def test_figures_of_known_residuals():
+    residual = np.array([-1.0, 0.5, np.nan, 2.0, 0.0])
+    figures = summarise(BorderSamples(np.zeros(5, bool), np.zeros(5), residual))
+    assert figures.samples == 5 and figures.coverage == pytest.approx(0.8)
+    assert figures.robust_sd_px == pytest.approx(1.4826 * 0.75) and figures.median_px == pytest.approx(0.25)
+    assert figures.p95_px == pytest.approx(1.85)
+    wide = figures.as_dict(320)
+    assert wide["p95_px_at_160"] == pytest.approx(0.5 * figures.p95_px)
+    assert np.isnan(summarise(join_samples([])).coverage)

@@ -1,0 +1,109 @@
+"""Drives of which no map can be made end with what was found, what is needed and what to drive instead."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.map_settings import MapSettings
+from datagen.pipeline import map_drive
+from datagen.report.mappable import check_edges, check_moving
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
+from lanenet.data.drive import open_drive
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.perception.edges import EdgeSettings
+
+CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
+SETTINGS = MapSettings(find_bumper=False)
+INSTEAD = "record one or two laps"
+
+
+def simulated(folder: Path, frames: int, **lines: str) -> Path:
+    track = {"interruptions_per_m": 0.0} | {side: {"kind": kind} for side, kind in lines.items()}
+    settings = {"seed": 1, "frames": frames, "camera": CAMERA, "track": track}
+    return simulate_drive(SimulationSettings.model_validate(settings), folder)
+
+
+def written(folder: Path, frames: list[np.ndarray]) -> Path:
+    with DriveWriter(folder) as writer:
+        for k, frame in enumerate(frames):
+            writer.add(frame, 0.05 * k, speed_cm_s=20.0)
+    return folder
+
+
+def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0) -> str:
+    """Message of a drive that is not mapped; nothing may be left behind."""
+    with pytest.raises(TrackingLostError) as caught:
+        map_drive(drive, lane_width_cm, None, SETTINGS, out)
+    assert not out.exists() and not list(out.parent.glob(".*"))
+    message = str(caught.value)
+    assert str(drive) in message and INSTEAD in message
+    return message
+
+
+@pytest.fixture(scope="module")
+def both_lines(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("both") / "drive", 80, left="solid", right="solid")
+
+
+def test_twenty_frames(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
+    assert "20 frames" in refusal(written(tmp_path / "drive", frames), tmp_path / "map")
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 8.0])
+def test_standing_still(tmp_path, both_lines, noise):
+    """The same picture over and over, with the sensor's noise, and a lamp that flickers."""
+    rng = np.random.default_rng(0)
+    still = open_drive(both_lines).image(20).astype(float)
+    frames = [
+        np.clip(still + rng.normal(0.0, noise, still.shape) + rng.uniform(-3.0, 3.0), 0, 255).astype(np.uint8)
+        for _ in range(70)
+    ]
+    assert "stands still" in refusal(written(tmp_path / "drive", frames), tmp_path / "map")
+
+
+def test_a_moving_car_does_not_stand_still(both_lines):
+    check_moving(open_drive(both_lines))
+
+
+def test_real_drives_move_and_have_edges(shared_data):
+    for name in ("donkey_circuit", "garage_tape", "usi_mat"):
+        drive = open_drive(shared_data / name)
+        check_moving(drive)
+        check_edges(drive, EdgeSettings())
+
+
+def test_a_bare_floor_has_no_edges(tmp_path):
+    ramp = np.tile(np.linspace(60, 90, 80).astype(np.uint8)[None, :, None], (60, 1, 3))
+    frames = [np.roll(ramp, k, axis=1) // 2 + k % 40 for k in range(70)]
+    drive = open_drive(written(tmp_path / "drive", [f.astype(np.uint8) for f in frames]))
+    with pytest.raises(TrackingLostError, match=r"edge points.*expected 20"):
+        check_edges(drive, EdgeSettings())
+
+
+def test_one_line_only(tmp_path):
+    drive = simulated(tmp_path / "drive", 80, left="none", right="solid")
+    message = refusal(drive, tmp_path / "map")
+    assert "one line only" in message and "right one along 9" in message
+
+
+def test_no_line_at_all(tmp_path):
+    drive = simulated(tmp_path / "drive", 80, left="none", right="none")
+    assert re.search("no lane|no line|no pair of lines", refusal(drive, tmp_path / "map"))
+
+
+@pytest.mark.parametrize("given_cm", [20.0, 80.0])
+def test_a_lane_width_wrong_by_two_is_found_where_the_camera_is_known(tmp_path, both_lines, given_cm):
+    with pytest.raises(
+        CalibrationError, match=rf"{given_cm:g} cm apart .* (39|40|41) cm apart .*camera's height"
+    ):
+        map_drive(both_lines, given_cm, None, SETTINGS, tmp_path / "map")
+    assert not (tmp_path / "map").exists()

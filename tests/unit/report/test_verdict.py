@@ -1,0 +1,93 @@
+"""Verdicts at their bounds, and the reasons they give."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from datagen.report.verdict import MapEvidence, VerdictSettings, judge
+
+GOOD = MapEvidence(
+    robust_sd_px=0.4,
+    p95_px=1.2,
+    coverage=0.8,
+    labelled_share=0.95,
+    not_labelled={"pose uncertain": 5},
+    revisits=12,
+    closure_across_heights=0.03,
+    camera_known=False,
+    sigma={"focal": 0.006, "pitch": 0.002},
+    given_lane_cm=40.0,
+    found_lane_cm=None,
+)
+KNOWN = replace(GOOD, camera_known=True, sigma={}, found_lane_cm=40.5)
+NAN = float("nan")
+
+
+def graded(evidence: MapEvidence, **changes):
+    return judge(replace(evidence, **changes), VerdictSettings())
+
+
+def test_a_good_map_says_what_it_rests_on():
+    verdict = judge(GOOD, VerdictSettings())
+    assert verdict.grade == "good"
+    assert "0.40 px" in verdict.reasons[0] and "95 %" in verdict.reasons[0]
+
+
+def test_what_sets_the_scale_is_named():
+    assert (
+        "lane width of 40 cm is the one thing that sets the scale"
+        in judge(GOOD, VerdictSettings()).remarks[0]
+    )
+    assert judge(KNOWN, VerdictSettings()).remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "grade", "reason"),
+    [
+        ({"robust_sd_px": 0.5, "p95_px": 1.5, "labelled_share": 0.85}, "good", "0.50 px"),
+        ({"robust_sd_px": 0.51}, "usable", "robust sd 0.51 px"),
+        ({"robust_sd_px": 1.01}, "reject", "robust sd 1.01 px"),
+        ({"p95_px": 1.6}, "usable", "p95 1.60 px"),
+        ({"p95_px": 3.1}, "reject", "p95 3.10 px"),
+        ({"labelled_share": 0.8}, "usable", r"80 % .*85 % \(5 pose uncertain\)"),
+        ({"labelled_share": 0.69}, "reject", "69 %"),
+        ({"coverage": 0.2}, "usable", "20 %"),
+        ({"coverage": 0.1}, "reject", "10 %"),
+        ({"coverage": 0.0, "robust_sd_px": NAN, "p95_px": NAN}, "reject", "no edge"),
+        ({"coverage": NAN, "robust_sd_px": NAN, "p95_px": NAN}, "usable", "no frame was held out"),
+        ({"revisits": 0, "closure_across_heights": None}, "usable", "drive two laps"),
+        ({"sigma": {"focal": 0.03}}, "usable", "focal length open by 3.0 %"),
+        ({"sigma": {"focal": 0.05}}, "reject", "focal"),
+        ({"sigma": {"pitch": 0.015}}, "usable", "pitch open by 0.015 rad"),
+        ({"closure_across_heights": 0.2}, "usable", "0.20 camera heights"),
+        ({"closure_across_heights": 0.5}, "reject", "0.50 camera heights"),
+    ],
+)
+def test_bounds(changes, grade, reason):
+    verdict = graded(GOOD, **changes)
+    assert verdict.grade == grade
+    assert re.search(reason, verdict.reasons[0])
+
+
+@pytest.mark.parametrize(
+    ("found_cm", "grade"),
+    [(32.5, "good"), (49.0, "good"), (31.0, "usable"), (52.0, "usable"), (24.0, "reject"), (80.0, "reject")],
+)
+def test_the_lane_width_is_checked_where_the_camera_sets_the_scale(found_cm, grade):
+    verdict = graded(KNOWN, found_lane_cm=found_cm)
+    assert verdict.grade == grade
+    if grade != "good":
+        assert f"{found_cm:.0f} cm" in verdict.reasons[0] and "40 cm" in verdict.reasons[0]
+
+
+def test_a_known_camera_needs_no_loop():
+    assert graded(KNOWN, revisits=0, closure_across_heights=None).grade == "good"
+
+
+def test_the_worst_reason_comes_first_and_none_is_lost():
+    verdict = graded(GOOD, robust_sd_px=0.6, p95_px=9.0, labelled_share=0.8)
+    assert verdict.grade == "reject" and len(verdict.reasons) == 3
+    assert verdict.reasons[0].startswith("residual on held-out frames: p95 9.00")

@@ -1,0 +1,143 @@
+"""The bundle adjustment: drifted poses and nods come back from edge pixels alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixels
+from tape_road import tape_road
+
+from datagen.slam.bundle import BundleSettings, _Problem, adjust, point_trust
+from datagen.slam.places import path_lengths
+
+#: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
+SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _error(found: np.ndarray, true: np.ndarray) -> float:
+    """Largest distance from the true path, as a share of its length."""
+    return float(np.linalg.norm(found[:, :2] - true[:, :2], axis=1).max() / path_lengths(true)[-1])
+
+
+@pytest.mark.parametrize("model", ["fisheye", "pinhole"])
+@pytest.mark.parametrize(("seed", "way", "turn_rad"), [(0, 0.03, 0.002), (1, -0.04, -0.003)])
+def test_drifted_poses_come_back(model, seed, way, turn_rad):
+    camera = fisheye() if model == "fisheye" else pinhole()
+    road = tape_road(70)
+    start = drifted(road.poses, way, turn_rad)
+    assert _error(start, road.poses) > 0.03
+    found = adjust(pixels(road, camera), start, camera, SMALL, _rng(seed), free=())
+    assert _error(found.poses, road.poses) < 1e-3
+    assert np.abs(found.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(0.1)
+    np.testing.assert_allclose(found.poses[0], road.poses[0], atol=1e-3)
+    assert found.robust_sd_px < 0.05
+    assert np.abs(found.tilt).max() < 1e-3
+    assert found.pairs == sum(70 - lag for lag in SMALL.lags)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_nods_of_each_frame_come_back(seed):
+    camera, road, rng = fisheye(), tape_road(70), _rng(seed)
+    tilt = rng.normal(size=(70, 2)) * [0.012, 0.005]
+    edges = pixels(road, camera, tilt)
+    found = adjust(edges, drifted(road.poses, 0.02, 0.001), camera, SMALL, rng, free=())
+    for k in (0, 1):
+        assert np.corrcoef(found.tilt[5:, k], tilt[5:, k])[0, 1] > 0.98
+        assert np.std(found.tilt[5:, k] - tilt[5:, k]) < 1e-3
+    assert _error(found.poses, road.poses) < 2e-3
+    # Without the frames' own tilt the same edges do not agree.
+    stiff = SMALL.model_copy(update={"frame_pitch": 1e-6, "frame_roll": 1e-6})
+    worse = adjust(edges, drifted(road.poses, 0.02, 0.001), camera, stiff, _rng(seed), free=())
+    assert worse.misfit > 1.5 * found.misfit and worse.robust_sd_px > 2.0 * found.robust_sd_px
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_break_is_not_bridged(seed):
+    camera, road = fisheye(), tape_road(80)
+    edges = pixels(road, camera)
+    breaks = np.zeros(80, dtype=bool)
+    breaks[40] = True
+    problem = _Problem(edges, camera, SMALL, _rng(seed), (), (), breaks)
+    first = problem.pairs.min(axis=1)
+    assert not ((first < 40) & (problem.pairs.max(axis=1) >= 40)).any()
+    assert len(problem.pairs) == 2 * sum(40 - lag for lag in SMALL.lags)
+    # Put down a metre away: both pieces come back, each as it lies.
+    start = drifted(road.poses, 0.02, 0.001)
+    start[40:] = drifted(road.poses[40:], 0.02, 0.001) + [100.0, 60.0, 0.0]
+    found = adjust(edges, start, camera, SMALL, _rng(seed), free=(), breaks=breaks)
+    lay = found.poses[40] - road.poses[40]
+    assert np.linalg.norm(lay[:2] - [100.0, 60.0]) < 2.0
+    assert _error(found.poses[:40], road.poses[:40]) < 1e-3
+    c, s = np.cos(lay[2]), np.sin(lay[2])
+    turned = (road.poses[40:, :2] - road.poses[40, :2]) @ np.array([[c, s], [-s, c]])
+    apart = found.poses[40:, :2] - found.poses[40, :2] - turned
+    assert np.linalg.norm(apart, axis=1).max() < 1e-3 * path_lengths(road.poses[40:])[-1]
+
+
+def test_points_that_meet_no_edge_again_weigh_little():
+    in_view = np.array([10, 10, 10, 10, 1, 0, 2])
+    matched = np.array([10, 9, 4, 0, 1, 0, 2])
+    trust = point_trust(in_view, matched)
+    np.testing.assert_allclose(trust, [1.0, 1.0, 0.02, 0.02, 0.3, 0.02, 1.0])
+    more = point_trust(np.full(41, 40), np.arange(41))
+    assert (np.diff(more) >= 0.0).all() and more.min() > 0.0 and more.max() == 1.0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_that_stays_in_the_picture_does_not_hold_the_car_back(seed):
+    """Dirt on the lens would have the car stand: a third of all points, at the same pixels in each frame."""
+    camera, road, rng = fisheye(), tape_road(60), _rng(seed)
+    edges = pixels(road, camera)
+    dirt = rng.uniform([0.0, 50.0], [159.0, 119.0], (60, 2))
+    angle = rng.uniform(-np.pi, np.pi, 60)
+    normals = np.column_stack([np.cos(angle), np.sin(angle)])
+    noisy = [type(e)(np.concatenate([e.uv_px, dirt]), np.concatenate([e.normals, normals])) for e in edges]
+    found = adjust(noisy, drifted(road.poses, 0.02, 0.001), camera, SMALL, rng, free=())
+    assert _error(found.poses, road.poses) < 3e-3
+
+
+def test_the_same_seed_gives_the_same_and_another_nearly():
+    camera, road = fisheye(), tape_road(30)
+    edges, start = pixels(road, camera), drifted(road.poses, 0.02, 0.001)
+    one, same, other = (adjust(edges, start, camera, SMALL, _rng(seed)) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.poses, same.poses)
+    np.testing.assert_array_equal(one.residual_px, same.residual_px)
+    assert one.camera.hash == same.camera.hash
+    assert not np.array_equal(one.poses, other.poses)
+    assert _error(one.poses, other.poses) < 0.02
+
+
+def test_a_mirrored_world_gives_the_mirrored_result():
+    camera, road = fisheye(), tape_road(40)
+    other = mirrored(camera)
+    flip = np.array([1.0, -1.0, -1.0])
+    edges, start = pixels(road, camera), drifted(road.poses, 0.02, 0.001)
+    seen = pixels(road.mirrored(), other)
+    np.testing.assert_allclose(seen[0].uv_px, edges[0].uv_px * [-1.0, 1.0] + [159.0, 0.0], atol=1e-9)
+    here, there = (
+        adjust(e, p, c, SMALL, _rng(1)) for e, p, c in ((edges, start, camera), (seen, start * flip, other))
+    )
+    np.testing.assert_allclose(there.poses * flip, here.poses, atol=0.01)
+    np.testing.assert_allclose(there.tilt * [1.0, -1.0], here.tilt, atol=1e-4)
+    np.testing.assert_allclose(
+        camera_numbers(mirrored(there.camera)), camera_numbers(here.camera), rtol=1e-3, atol=1e-3
+    )
+    assert there.misfit == pytest.approx(here.misfit, abs=2e-3)
+
+
+@pytest.mark.parametrize("command", [0.4, 2.5])
+def test_ways_follow_the_commands_where_the_pictures_are_silent(command):
+    """A stretch without a mark across the road: only the commanded way tells how far the car went."""
+    camera, road = fisheye(), tape_road(30)
+    edges = pixels(road, camera)
+    edges[14:18] = [type(e)(e.uv_px[:0], e.normals[:0]) for e in edges[14:18]]
+    expected = np.ones(30)
+    expected[15:18] = command
+    settings = SMALL.model_copy(update={"lags": (1,), "speed_change": 1e-4})
+    found = adjust(edges, road.poses, camera, settings, _rng(), free=(), expected=expected)
+    way = np.diff(path_lengths(found.poses))
+    np.testing.assert_allclose(way[14:17] / np.median(way[:12]), command, rtol=0.02)

@@ -1,0 +1,61 @@
+"""The bundle adjustment finds the camera where it may, and leaves alone what it may not change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pixel_road import camera_numbers, fisheye, pixels, tape_loop
+from tape_road import TapeRoad, tape_road
+
+from datagen.slam.bundle import CAMERA_NAMES, BundleSettings, adjust
+
+#: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
+SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))
+LAP = 60
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _around(frames: int = 100) -> tuple[TapeRoad, list[tuple[int, int]]]:
+    """A lap and two thirds, and pairs of frames that show the same place."""
+    return tape_loop(frames, LAP), [(k, k + LAP) for k in range(0, frames - LAP, 2)]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_wrong_camera_comes_back_when_the_loop_is_closed(seed):
+    camera, (road, loops) = fisheye(), _around()
+    m = camera.mounting
+    wrong = fisheye(
+        pitch_down_rad=m.pitch_down_rad + 0.02,
+        yaw_rad=m.yaw_rad + 0.01,
+        ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + 1.5,
+    )
+    wrong.K[:2, :2] *= 1.05
+    found = adjust(pixels(road, camera), road.poses, wrong, SMALL, _rng(seed), loops=loops)
+    f = found.camera
+    assert f.K[0, 0] == pytest.approx(camera.K[0, 0], rel=0.005)
+    assert f.K[1, 1] / f.K[0, 0] == pytest.approx(camera.K[1, 1] / camera.K[0, 0])
+    assert f.D[0] == pytest.approx(camera.D[0], abs=0.005)
+    assert f.mounting.pitch_down_rad == pytest.approx(m.pitch_down_rad, abs=0.003)
+    assert f.mounting.roll_rad == pytest.approx(m.roll_rad, abs=0.002)
+    assert f.mounting.yaw_rad == pytest.approx(m.yaw_rad, abs=0.002)
+    assert f.mounting.ahead_of_front_axle_cm == pytest.approx(m.ahead_of_front_axle_cm, abs=0.3)
+    assert f.mounting.height_cm == m.height_cm and f.wheelbase_cm == camera.wheelbase_cm
+    assert found.pairs == sum(100 - lag for lag in SMALL.lags) + 2 * len(loops)
+    # The loop makes the focal length known far better than it was.
+    assert 0.0 < found.sigma["focal"] < 0.02 < SMALL.focal
+
+
+@pytest.mark.parametrize("free", [(), ("pitch", "yaw"), ("focal", "k1")])
+def test_what_is_not_free_stays(free):
+    camera, road = fisheye(pitch_down_rad=0.29, yaw_rad=-0.03), tape_road(30)
+    found = adjust(pixels(road, fisheye()), road.poses, camera, SMALL, _rng(), free=free)
+    moved = np.abs(camera_numbers(found.camera) - camera_numbers(camera))
+    for k, name in enumerate(CAMERA_NAMES):
+        if name in free:
+            assert moved[k] > 1e-6 and found.sigma[name] > 1e-7, name
+        else:
+            assert moved[k] < 1e-12 and found.sigma[name] == pytest.approx(1e-9, rel=0.01), name
+    np.testing.assert_array_equal(found.camera.D[1:], camera.D[1:])
