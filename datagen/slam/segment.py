@@ -33,6 +33,9 @@ from lanenet.perception.edges import EdgePixels
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
+#: What revisits may miss once closed (medians along and across the road, in camera heights), and how much
+#: worse frames may agree than before: places that only look alike, as on an open road, miss more.
+_MAX_MISSED, _MAX_MISFIT = (0.6, 0.3), 1.1
 #: The camera is adjusted until its focal length moves by less than this share, or so often.
 _SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
 
@@ -174,7 +177,10 @@ def _close(
             edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
             expected=expected, believed=believed,
         )  # fmt: skip
-        if best is None or closed.misfit < best.bundle.misfit:
+        along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
+        fits = along < _MAX_MISSED[0] and across < _MAX_MISSED[1]
+        fits &= closed.misfit < _MAX_MISFIT * opened.misfit
+        if fits and (best is None or closed.misfit < best.bundle.misfit):
             best = _Closure(revisits, missed, drift, closed)
     return best
 
