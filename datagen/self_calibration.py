@@ -41,8 +41,8 @@ _USUAL = ("cx", "cy", "roll")
 #: How far principal points usually are from the middle, for images of 160 px, and cameras from level, [rad]:
 #: real ones differ by more than the adjustment's priors, which are close to keep what is nearly degenerate.
 _CENTRE_PX, _LEVEL_RAD = 2.0, 0.04
-#: Strain that is worth a word.
-_STRAINED = 1.5
+#: Strain beyond which a camera is no result, and strain that is worth a word.
+MAX_STRAIN, _STRAINED = 2.0, 1.5
 #: Range of the heading from which a drive may turn: with a wrong camera the filter creeps and sees few bends.
 _WORTH_ANEW_RAD = 0.25 * np.pi
 #: A start whose focal length is this close to what was found from it is good enough.
@@ -51,7 +51,7 @@ _CLOSE_START = 0.03
 _ANEW = (1.0, 1.2)
 #: What the adjustment's own standard deviations are multiplied by, as measured on simulated drives with known
 #: cameras (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
-SIGMA_FACTOR = 3.0
+SIGMA_FACTOR = 2.0
 
 
 def refining(settings: BundleSettings) -> BundleSettings:
@@ -279,11 +279,13 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
         f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras differ: "
         "something in them is not on a flat road, such as lamps mirrored in the floor"
     )
+    if found.strain > MAX_STRAIN:
+        raise CalibrationError(
+            f"{where}: {strained}. {DRIVE_INSTEAD.capitalize()}, without such things in view"
+        )
     if found.sigma["focal"] > MAX_FOCAL_SIGMA:
-        why = f"; {strained}" if found.strain > _STRAINED else ""
         raise CalibrationError(
             f"{where}: the focal length is known to {100.0 * found.sigma['focal']:.1f} % only ({driven}, "
-            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %{why}. "
-            f"{DRIVE_INSTEAD.capitalize()}"
+            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %: {DRIVE_INSTEAD}"
         )
     return [strained] if found.strain > _STRAINED else []

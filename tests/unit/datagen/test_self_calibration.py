@@ -142,6 +142,14 @@ def test_a_wide_focal_length_is_refused():
         check_observable(found(lap, focal_sigma=0.06), "d", True)
 
 
+def test_pictures_that_bend_the_camera_are_refused():
+    camera = found(np.linspace(0.0, 4.0 * np.pi, 400))
+    (note,) = check_observable(replace(camera, strain=1.8), "tub", False)
+    assert "1.8 times as far as cameras differ" in note
+    with pytest.raises(CalibrationError, match=r"^tub: .*2\.3 times as far .*mirrored.*Drive two laps"):
+        check_observable(replace(camera, strain=2.3), "tub", True)
+
+
 def test_uncertainties_are_widened_and_an_open_loop_knows_no_more_of_the_lens_than_the_prior():
     priors = BundleSettings()
     closed = honest_sigma(SIGMA, True, 0.4, priors, 320)
