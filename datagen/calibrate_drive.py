@@ -241,7 +241,7 @@ def _check_count(drive: Drive, count: int, what: str) -> None:
 
 def _lane_of(found: FoundCamera, settings: MapSettings, where: Path, needed: bool) -> LaneScale | None:
     try:
-        return measure_lane(found.solved, settings.trace, found.sigma)
+        return measure_lane(found.solved, settings, found.sigma)
     except TrackingLostError as error:
         if needed:
             raise CalibrationError(

@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
+from datagen.lanes.fit import fit_lines
+from datagen.lanes.line import LaneLine
 from datagen.lanes.path import edges_along_path, path_of_poses
-from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
+from datagen.lanes.trace import TracedLane, trace_lane
+from datagen.map_settings import MapSettings
 from datagen.slam.calibrate import nudged
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import SIDES
 
 _STEP_HEIGHTS, _AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
 #: Way along which the width of the lane is one measurement: what one frame shows of it.
@@ -32,18 +37,25 @@ class LaneScale:
     sigma: float
 
 
-def traced_width_cm(lane: TracedLane) -> float:
-    """Width of a traced lane where both lines are seen; finer than the widths that tracing tries."""
-    width = lane.left_cm - lane.right_cm
-    return float(np.nanmedian(width)) if np.isfinite(width).any() else lane.lane_cm
+def spacing_cm(lines: list[LaneLine], s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "k"]:
+    """Distances between the two fitted lines of the driven lane at path positions where both are seen."""
+    left, right = (next(x for x in lines if x.side == side and x.rank == 0) for side in SIDES)
+    apart = np.linalg.norm(left.points(s_cm) - right.points(s_cm), axis=1)
+    return apart[np.isfinite(apart)]
 
 
-def measure_lane(solved: SolvedSegment, settings: TraceSettings, sigma: dict[str, float]) -> LaneScale:
+def fitted_width_cm(lines: list[LaneLine], lane: TracedLane, s_cm: Float[np.ndarray, "m"]) -> float:
+    """Width of a lane from its fitted lines: tracing alone knows it to the width of a cell, 2 % and more."""
+    apart = spacing_cm(lines, s_cm)
+    return float(np.median(apart)) if apart.size else lane.lane_cm
+
+
+def measure_lane(solved: SolvedSegment, settings: MapSettings, sigma: dict[str, float]) -> LaneScale:
     """Find the driven lane of a segment and measure how wide it is.
 
     Args:
         solved: The segment, with its camera.
-        settings: How lines are looked for.
+        settings: How lines are looked for and fitted.
         sigma: Standard deviations of the camera's numbers, see
             :class:`datagen.slam.bundle.BundleResult`.
 
@@ -53,10 +65,10 @@ def measure_lane(solved: SolvedSegment, settings: TraceSettings, sigma: dict[str
     height, wheelbase = solved.camera.mounting.height_cm, solved.camera.wheelbase_cm
     path = path_of_poses(solved.poses, _STEP_HEIGHTS * height, _AHEAD_HEIGHTS * height)
     edges = edges_along_path(path, solved.scans, solved.poses, wheelbase, _REACH_HEIGHTS * height)
-    lane = trace_lane(path, edges, height, None, settings)
-    width_cm = traced_width_cm(lane)
-    both = lane.left_cm - lane.right_cm
-    both = both[np.isfinite(both)]
+    lane = trace_lane(path, edges, height, None, settings.trace)
+    lines = fit_lines(path, edges, lane, height, settings.fit)
+    width_cm = fitted_width_cm(lines, lane, path.s_frames_cm)
+    both = spacing_cm(lines, path.s_cm)
     spread = 1.4826 * float(np.median(np.abs(both - width_cm))) if both.size else 0.1 * width_cm
     count = max(1.0, both.size * _STEP_HEIGHTS / _ALIKE_HEIGHTS)
     by_camera = width_sigma(solved.camera, sigma, width_cm)

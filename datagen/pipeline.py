@@ -12,6 +12,7 @@ from jaxtyping import Bool
 
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
+from datagen.lane_scale import fitted_width_cm
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
 from datagen.lanes.path import edges_along_path, path_of_poses
@@ -125,7 +126,7 @@ def _map_drive(
     check_lane(parts, drive)
     factor = 1.0
     if known is None:
-        factor = lane_width_cm / float(np.median([part.lane.lane_cm for part in parts]))
+        factor = lane_width_cm / _mapped_lane_cm(parts)
         camera = with_known_scale(camera, factor, settings.guess)
     drive_map = _assemble(drive, drive_path, lane_width_cm, camera, parts, factor, known is None)
     drive_map = replace(drive_map, held_out=np.concatenate([held_out[part.rows] for part in parts]))
@@ -240,6 +241,10 @@ def _find_lane(
     return MappedSegment(rows, solved, path.s_frames_cm, lane, lines, free_cm)
 
 
+def _mapped_lane_cm(parts: list[MappedSegment]) -> float:
+    return float(np.median([fitted_width_cm(part.lines, part.lane, part.s_frames_cm) for part in parts]))
+
+
 def _assemble(
     drive: Drive,
     drive_path: Path,
@@ -255,7 +260,7 @@ def _assemble(
         format=FORMAT,
         drive=str(drive_path),
         lane_width_cm=lane_width_cm,
-        mapped_lane_cm=factor * float(np.median([part.lane.lane_cm for part in parts])),
+        mapped_lane_cm=factor * _mapped_lane_cm(parts),
         tape_cm=factor * float(np.median([line.marking_cm for part in parts for line in part.lines[:2]])),
         scale_from="lane width" if scale_from_lane else "camera",
         laps=int(laps.max()) if any(part.solved.revisits for part in parts) else 0,

@@ -30,6 +30,8 @@ DRIVE_INSTEAD = (
 MIN_FRAMES = 200
 #: Range of the heading below which nothing but a prior tells the focal length from the pitch.
 MIN_TURNING_RAD = np.pi
+#: Places that have to be seen twice: fewer may be chance.
+MIN_REVISITS = 6
 #: Relative standard deviation of the focal length beyond which a camera is no result.
 MAX_FOCAL_SIGMA = 0.05
 #: Numbers that stay as they start until a place is seen twice.
@@ -39,15 +41,17 @@ _USUAL = ("cx", "cy", "roll")
 #: How far principal points usually are from the middle, for images of 160 px, and cameras from level, [rad]:
 #: real ones differ by more than the adjustment's priors, which are close to keep what is nearly degenerate.
 _CENTRE_PX, _LEVEL_RAD = 2.0, 0.04
-#: Strain that is worth a word.
-_STRAINED = 1.5
+#: Strain beyond which a camera is no result, and strain that is worth a word.
+MAX_STRAIN, _STRAINED = 2.0, 1.5
+#: Range of the heading from which a drive may turn: with a wrong camera the filter creeps and sees few bends.
+_WORTH_ANEW_RAD = 0.25 * np.pi
 #: A start whose focal length is this close to what was found from it is good enough.
 _CLOSE_START = 0.03
 #: Focal lengths to start from anew, relative to the first, where that closes no loop.
 _ANEW = (1.0, 1.2)
 #: What the adjustment's own standard deviations are multiplied by, as measured on simulated drives with known
 #: cameras (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
-SIGMA_FACTOR = 3.0
+SIGMA_FACTOR = 2.0
 
 
 def refining(settings: BundleSettings) -> BundleSettings:
@@ -178,7 +182,7 @@ def _started_anew(
             if abs(found.camera.K[0, 0] / start.K[0, 0] - 1.0) < _CLOSE_START:
                 return found
             focal_px = float(found.camera.K[0, 0])
-        elif len(drive) < MIN_FRAMES or turning_rad(first.poses) < MIN_TURNING_RAD:
+        elif len(drive) < MIN_FRAMES or turning_rad(first.poses) < _WORTH_ANEW_RAD:
             return first
         else:
             focal_px = float(searched.K[0, 0]) * factor
@@ -187,7 +191,8 @@ def _started_anew(
         turned = searched.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
         start = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
         again = solve_segment(drive, start, settings, rng, progress, find_camera=True)
-        if found.revisits and not again.revisits:
+        if len(again.revisits) < 0.5 * len(found.revisits):
+            # The map that more places agree on.
             return found
         found = again
     return found if found.revisits else first
@@ -258,26 +263,29 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
             f"too straight: {driven}, its heading stays within {np.rad2deg(turned):.0f} degrees, expected "
             f"{np.rad2deg(MIN_TURNING_RAD):.0f}"
         )
-    elif not found.closed:
-        problem = f"no place was seen twice: {driven}, with bends of {np.rad2deg(turned):.0f} degrees"
+    elif len(solved.revisits) < MIN_REVISITS:
+        problem = (
+            f"{len(solved.revisits) or 'no'} places were seen twice, expected {MIN_REVISITS}: {driven}, with "
+            f"bends of {np.rad2deg(turned):.0f} degrees"
+        )
     if problem is not None:
         if not accept_open_loop:
             raise CalibrationError(
                 f"{where}: {problem}. The pictures alone do not tell the focal length then: {DRIVE_INSTEAD}, "
                 "or accept a focal length that is guessed (--accept-open-loop)"
             )
-        return [
-            f"{problem}: the focal length is the start's, give or take {100.0 * found.sigma['focal']:.0f} %"
-        ]
+        return [f"{problem}: the focal length is guessed, give or take {100.0 * found.sigma['focal']:.0f} %"]
     strained = (
         f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras differ: "
         "something in them is not on a flat road, such as lamps mirrored in the floor"
     )
+    if found.strain > MAX_STRAIN:
+        raise CalibrationError(
+            f"{where}: {strained}. {DRIVE_INSTEAD.capitalize()}, without such things in view"
+        )
     if found.sigma["focal"] > MAX_FOCAL_SIGMA:
-        why = f"; {strained}" if found.strain > _STRAINED else ""
         raise CalibrationError(
             f"{where}: the focal length is known to {100.0 * found.sigma['focal']:.1f} % only ({driven}, "
-            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %{why}. "
-            f"{DRIVE_INSTEAD.capitalize()}"
+            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %: {DRIVE_INSTEAD}"
         )
     return [strained] if found.strain > _STRAINED else []

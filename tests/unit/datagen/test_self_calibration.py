@@ -11,7 +11,8 @@ import pytest
 
 import datagen.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera
-from datagen.lane_scale import traced_width_cm, width_sigma
+from datagen.lane_scale import fitted_width_cm, spacing_cm, width_sigma
+from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_settings import MapSettings
 from datagen.pictures import straight_frames
@@ -41,7 +42,7 @@ SIGMA = dict(zip(CAMERA_NAMES, (0.01, 0.4, 0.4, 0.004, 0.004, 0.003, 0.006, 0.04
 REVISIT = Revisit(10, 200, np.zeros(3), 0.8, 1)
 
 
-def found(heading: np.ndarray, revisits: int = 4, focal_sigma: float = 0.02) -> FoundCamera:
+def found(heading: np.ndarray, revisits: int = 8, focal_sigma: float = 0.02) -> FoundCamera:
     """A drive of 3 cm per frame with this heading."""
     n = len(heading)
     steps = 3.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -120,7 +121,8 @@ def test_two_laps_determine_the_camera():
         ),
         # Swinging along a straight road is no bend, and places seen twice there cannot be.
         (0.4 * np.sin(np.arange(400) / 8.0), 4, "too straight.* within 46 degrees"),
-        (np.linspace(0.0, 6.0, 400), 0, "no place was seen twice.* bends of 344 degrees"),
+        (np.linspace(0.0, 6.0, 400), 0, "no places were seen twice.* bends of 344 degrees"),
+        (np.linspace(0.0, 6.0, 400), 3, "3 places were seen twice, expected 6"),
     ],
 )
 def test_a_drive_that_leaves_the_focal_length_open_is_refused(heading, revisits, message):
@@ -130,14 +132,22 @@ def test_a_drive_that_leaves_the_focal_length_open_is_refused(heading, revisits,
     assert "two laps of a closed track, or of a figure of eight" in str(caught.value)
     assert str(caught.value).startswith("tub: ") and "--accept-open-loop" in str(caught.value)
     (note,) = check_observable(camera, "tub", True)
-    assert "the focal length is the start's, give or take 30 %" in note
+    assert "the focal length is guessed, give or take 30 %" in note
 
 
 def test_a_wide_focal_length_is_refused():
     lap = np.linspace(0.0, 4.0 * np.pi, 400)
     assert check_observable(found(lap, focal_sigma=0.049), "d", False) == []
-    with pytest.raises(CalibrationError, match=r"known to 6\.0 % only .*4 revisits.*expected 5 %"):
+    with pytest.raises(CalibrationError, match=r"known to 6\.0 % only .*8 revisits.*expected 5 %"):
         check_observable(found(lap, focal_sigma=0.06), "d", True)
+
+
+def test_pictures_that_bend_the_camera_are_refused():
+    camera = found(np.linspace(0.0, 4.0 * np.pi, 400))
+    (note,) = check_observable(replace(camera, strain=1.8), "tub", False)
+    assert "1.8 times as far as cameras differ" in note
+    with pytest.raises(CalibrationError, match=r"^tub: .*2\.3 times as far .*mirrored.*Drive two laps"):
+        check_observable(replace(camera, strain=2.3), "tub", True)
 
 
 def test_uncertainties_are_widened_and_an_open_loop_knows_no_more_of_the_lens_than_the_prior():
@@ -184,7 +194,7 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
         assert camera.mounting.roll_rad == 0.0 and camera.K[0, 2] == 79.5 and find_camera
         focal_px, closed = answers[len(asked) - 1]
         adjusted = nudged(nudged(nudged(CAMERA, "roll", 0.04), "cx", 2.0), "focal", np.log(focal_px / 80.0))
-        solved = found(lap, 4 if closed else 0).solved
+        solved = found(lap, 8 if closed else 0).solved
         bundle = replace(solved.bundle, camera=adjusted)
         return replace(solved, camera=adjusted, bundle=bundle)
 
@@ -230,14 +240,26 @@ def test_priors_about_a_known_camera_are_never_wider():
     )
 
 
+def straight_line(side: str, x_cm: float, seen: list[tuple[float, float]]) -> LaneLine:
+    """A line along y at x, over 400 cm, seen in some stretches."""
+    knots = np.concatenate([np.zeros(3), np.linspace(0.0, 400.0, 5), np.full(3, 400.0)])
+    greville = np.array([knots[i + 1 : i + 4].mean() for i in range(7)])
+    points = np.column_stack([np.full(7, x_cm), greville])
+    return LaneLine(side, knots, points, np.array(seen).reshape(-1, 2), 0.1)
+
+
 def test_the_lane_is_measured_where_both_lines_are_seen():
-    nan = np.nan
-    lane = TracedLane(
-        np.array([20.0, 21.0, nan, 22.0]), np.array([-20.0, nan, -18.0, -19.0]), np.zeros(4), 39.0, 2.0
-    )
-    assert traced_width_cm(lane) == pytest.approx(40.5)
-    one_sided = replace(lane, right_cm=np.full(4, nan))
-    assert traced_width_cm(one_sided) == 39.0
+    left = straight_line("left", -20.3, [(0.0, 150.0), (300.0, 400.0)])
+    right = straight_line("right", 20.2, [(100.0, 400.0)])
+    beside = replace(straight_line("left", -60.0, [(0.0, 400.0)]), rank=1)
+    at = np.arange(5.0, 400.0, 10.0)
+    lane = TracedLane(at, at, at, 39.0, 2.0)
+    apart = spacing_cm([left, right, beside], at)
+    # 100 to 150 cm and 300 to 400 cm.
+    np.testing.assert_allclose(apart, np.full(15, 40.5))
+    assert fitted_width_cm([left, right, beside], lane, at) == pytest.approx(40.5)
+    unseen = straight_line("right", 20.2, [])
+    assert fitted_width_cm([left, unseen], lane, at) == 39.0
 
 
 def test_the_width_of_the_lane_depends_on_the_camera_as_the_geometry_says():
