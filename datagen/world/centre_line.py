@@ -51,6 +51,18 @@ def integrate_curvature(curvature_per_cm: Float[np.ndarray, "n"], step_cm: float
     return CentreLine(np.stack([z.real, z.imag], axis=1), heading, curvature_per_cm, step_cm)
 
 
+def check_slack_cm(line: CentreLine) -> float:
+    """How much nearer two stretches may be than the points at which they are compared.
+
+    Points of the check may straddle the nearest ones by half a stride on both curves.
+    """
+    return 0.25 * _check_stride(line) * line.step_cm
+
+
+def _check_stride(line: CentreLine) -> int:
+    return max(1, round(_CHECK_CM / line.step_cm))
+
+
 def comes_near_itself(
     line: CentreLine, separation_cm: float, closed: bool, after_cm: float = 0.0, middle_cm: float = 0.0
 ) -> tuple[float, float, float] | None:
@@ -66,12 +78,11 @@ def comes_near_itself(
     Returns:
         The two places along the road and their distance, [cm]; None where it keeps clear.
     """
-    stride = max(1, round(_CHECK_CM / line.step_cm))
+    stride = _check_stride(line)
     heading = line.heading_rad[::stride]
     points = line.xy_cm[::stride] + middle_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     s_cm = np.arange(len(line.xy_cm))[::stride] * line.step_cm
-    # Points of the check may straddle the nearest ones by half a stride on both curves.
-    separation_cm += 0.25 * stride * line.step_cm
+    separation_cm += check_slack_cm(line)
     lap_cm = len(line.xy_cm) * line.step_cm if closed else None
     return nearest_approach(points, s_cm, separation_cm, lap_cm, after_cm)
 

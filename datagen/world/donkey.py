@@ -40,12 +40,22 @@ class DonkeySettings(Settings):
     throttle_exponent: float | None = Field(default=None, gt=0.0)
 
 
-def draw_donkey(settings: DonkeySettings, rng: np.random.Generator) -> DonkeySettings:
-    """Fill in what is None; all values are drawn, so that fixing one does not move another."""
+def draw_donkey(
+    settings: DonkeySettings, rng: np.random.Generator, needed_steering_rad: float = 0.0
+) -> DonkeySettings:
+    """Fill in what is None; all values are drawn, so that fixing one does not move another.
+
+    Args:
+        settings: Values that are set stay.
+        rng: Source of randomness.
+        needed_steering_rad: What the road asks for; a drawn full lock is no less.
+    """
     values: dict[str, Any] = {}
     for name, (low, high) in _RANGES.items():
         drawn, fixed = float(rng.uniform(low, high)), getattr(settings, name)
         values[name] = drawn if fixed is None else fixed
+    if settings.full_steering_rad is None:
+        values["full_steering_rad"] = max(values["full_steering_rad"], needed_steering_rad)
     return DonkeySettings(**values)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from datagen.world.centre_line import CentreLine, comes_near_itself, open_centre_line
+from datagen.world.centre_line import CentreLine, check_slack_cm, comes_near_itself, open_centre_line
 from datagen.world.furniture import COLOURS, Colour
 from datagen.world.furniture_layout import listed_furniture, random_furniture
 from datagen.world.furniture_paint import Painted
@@ -63,6 +63,7 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
     """
     # The order is part of the format: a new part of the road takes a new child at the end.
     shape_rng, kind_rng, interruption_rng, wear_rng, furniture_rng = rng.spawn(5)
+    _check_widths(settings)
     _check_radii(settings)
     line = _centre_line(settings, shape_rng)
     n = len(line.xy_cm)
@@ -114,6 +115,7 @@ def check_drivable(
     min_radius_cm: float,
     settings: TrackSettings | None = None,
     car: str = "the car",
+    backward: bool = False,
 ) -> None:
     """Refuse a road with bends that a car cannot turn.
 
@@ -122,6 +124,7 @@ def check_drivable(
         min_radius_cm: Of the car: wheelbase over the tangent of the largest steering angle.
         settings: What the road was built from, whose file and piece the error names.
         car: Named in the error.
+        backward: Whether the road is driven against the order of its pieces.
 
     Raises:
         ConfigError: With the tightest bend and its place.
@@ -135,11 +138,23 @@ def check_drivable(
             where = settings.origin
             # The pieces are listed in the direction of the driven lane of the file.
             if settings.pieces and abs(track.length_cm - length_of(settings.pieces)) < 1.0:
-                place = f"in {_piece_at(settings, s_cm)}"
+                place = f"in {_piece_at(settings, track.length_cm - s_cm if backward else s_cm)}"
         raise ConfigError(
             f"{where}: found a bend of radius {1.0 / tightest:.1f} cm {place}, expected at least "
             f"{min_radius_cm:.1f}, which is what {car} turns"
         )
+
+
+def _check_widths(settings: TrackSettings) -> None:
+    """Refuse lines that leave no lane between them."""
+    for name, (_, marking) in settings.lines.items():
+        width_cm = settings.line_width_cm if marking.width_cm is None else marking.width_cm
+        whole_cm = 2.0 * width_cm + marking.double_gap_cm if marking.kind == "double" else width_cm
+        if whole_cm >= settings.lane_width_cm:
+            raise ConfigError(
+                f"{settings.origin}: key '{name}': found a line {whole_cm:g} cm wide, expected less than the "
+                f"lane_width_cm {settings.lane_width_cm:g}"
+            )
 
 
 def _check_radii(settings: TrackSettings) -> None:
@@ -173,10 +188,11 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
         )
         if found is not None:
             first, second, distance = found
+            least_cm = road_cm + settings.line_width_cm + check_slack_cm(line)
             raise ConfigError(
                 f"{settings.origin}: pieces: the road meets itself: {_piece_at(settings, first)} and "
                 f"{_piece_at(settings, second)} come within {distance:.1f} cm of each other, expected at "
-                f"least its width of {road_cm + settings.line_width_cm:g} cm"
+                f"least {least_cm:.1f}: its width, and what the check leaves open"
             )
         return line
     # The other lane must keep to the smallest radius as well, and it lies inside left bends.

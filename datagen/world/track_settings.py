@@ -167,26 +167,36 @@ def preset(name: str) -> TrackSettings:
     return check_settings(TrackSettings, {"preset": name}, "track")
 
 
-def load_track_settings(path: Path) -> TrackSettings:
+def load_track_settings(path: Path, above: tuple[Path, ...] = ()) -> TrackSettings:
     """Read a road from a YAML file.
+
+    Args:
+        path: The file.
+        above: Files of which this one is the base.
 
     Raises:
         ConfigError: Naming the file, the key, what was found and what was expected.
     """
-    data, _ = _with_base(read_yaml(path), str(path))
+    if path.resolve() in above:
+        raise ConfigError(f"{path}: key 'file': found a file that is its own base, expected another one")
+    data, _ = _with_base(read_yaml(path), str(path), (*above, path.resolve()))
     settings = check_settings(TrackSettings, data, str(path))
     settings._origin = str(path)
     return settings
 
 
-def _with_base(data: dict[str, Any], origin: str = "track") -> tuple[dict[str, Any], str]:
+def _with_base(
+    data: dict[str, Any], origin: str = "track", above: tuple[Path, ...] = ()
+) -> tuple[dict[str, Any], str]:
     """Put the keys of a file or preset below the given ones, and tell where they come from."""
     name, file = data.get("preset"), data.get("file")
     if name is not None and file is not None:
         raise ConfigError(f"found preset {name!r} and file '{file}', expected one of them")
     if file is not None:
         path = Path(file)
-        base, origin = load_track_settings(path).model_dump(exclude_unset=True), str(path)
+        if above and (above[-1].parent / path).exists():  # beside the file that names it
+            path = above[-1].parent / path
+        base, origin = load_track_settings(path, above).model_dump(exclude_unset=True), str(path)
         base.pop("preset", None)
         data = _merge(base, {key: value for key, value in data.items() if key != "file"})
         return _with_length(data, origin), origin

@@ -26,6 +26,7 @@ from lanenet.geometry.camera import Camera
 _START_CM = 40.0  # rear axle at the start of an open road
 _SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
 _LOOP_CM = 1200.0
+_STEERING_RESERVE = 1.2
 
 
 class SimulationSettings(Settings):
@@ -118,7 +119,7 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
         look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})
     if settings.random_look:
         look = random_look(look, look_rng, tuple(marking.colour_bgr for marking in track.markings))
-    donkey = draw_donkey(settings.donkey, donkey_rng)
+    donkey = draw_donkey(settings.donkey, donkey_rng, _needed_steering_rad(settings, track))
     settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
     camera = settings.camera.build(settings.car.wheelbase_cm)
     start_cm = 0.0 if track.closed else _START_CM
@@ -166,6 +167,13 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     return settings.model_copy(update={"track": track})
 
 
+def _needed_steering_rad(settings: SimulationSettings, track: Track) -> float:
+    """Steering that the tightest bend takes, with some left for corrections, up to what the servo gives."""
+    car = settings.car
+    bend_rad = math.atan(car.wheelbase_cm * float(np.max(np.abs(track.curvature_per_cm))))
+    return min(_STEERING_RESERVE * bend_rad, car.max_steering_rad)
+
+
 def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
     track = random_track(settings.track, rng)
     car = settings.car
@@ -176,5 +184,5 @@ def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Trac
         return track
     # On two lanes it is the other one that is driven, whose bends are others.
     track = track.reversed()
-    check_drivable(track, min_radius_cm, settings.track, named)
+    check_drivable(track, min_radius_cm, settings.track, named, backward=True)
     return track
