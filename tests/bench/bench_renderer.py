@@ -37,7 +37,8 @@ EVERY_EFFECT = LookSettings(
     line_wear=0.5, lamps_per_m=0.7, clutter_per_m=2.5, wall_level=30.0, vignetting=0.4, blur_px=1.0,
     noise_level=4.0, jpeg_quality=80, objects_per_m=1.0, objects_on_road=0.2, shadows_per_m=0.4,
     exposure_drift=0.1, exposure_step=0.1, white_balance_drift=0.03, white_balance_step=0.03, exposure_s=0.02,
-    readout_s=0.02, shake_pitch_rad=0.006, shake_roll_rad=0.004,
+    readout_s=0.02, shake_pitch_rad=0.006, shake_roll_rad=0.004, lamp_streak=1.5, lamp_edge=3.0,
+    lamp_size=0.8, glints_per_m=2.0, specks_per_m=3.0, prints_per_m=0.5, stain_level=6.0, crack_level=10.0,
 )  # fmt: skip
 NO_THINGS = EVERY_EFFECT.model_copy(
     update={"lamps_per_m": 0.0, "clutter_per_m": 0.0, "objects_per_m": 0.0, "shadows_per_m": 0.0}
