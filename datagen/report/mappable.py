@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -11,16 +10,16 @@ from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
 from datagen.map_report import MappedSegment
 from datagen.report.quality import MapQuality
 from datagen.report.residuals import summarise
+from datagen.slam.stillness import small_picture
 from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.lane import SIDES
-from lanenet.perception.edges import EdgeSettings, find_edges, to_gray
+from lanenet.perception.edges import EdgeSettings, find_edges
 
 #: What to do about a drive that cannot be mapped.
 DRIVE_INSTEAD = "record one or two laps without a pause, with the car between two lines that the camera sees"
 
 _LOOKS = 40
-_SIZE = (24, 18)
 #: Pictures from all over a drive that differ by less than this [gray levels, means of blocks] are the same.
 _SAME = 1.0
 #: Noise and flicker change neighbours as much as frames far apart; a moving car changes these more.
@@ -73,7 +72,7 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
 
 def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:
     """Means of blocks of a frame, without its brightness: noise is gone, and so is most of flicker."""
-    small = cv2.resize(to_gray(drive.image(k)), _SIZE, interpolation=cv2.INTER_AREA).astype(np.float64)
+    small = small_picture(drive, k).astype(np.float64)
     return (small - small.mean()).ravel()
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from lanenet.data.drive import Drive
 from lanenet.perception.edges import to_gray
@@ -44,12 +44,17 @@ def following_frames(drive: Drive, notes: list[str]) -> Drive:
 
 
 def small_pictures(drive: Drive) -> Float32[np.ndarray, "n h w"]:
-    """Return every frame in gray, averaged over large patches, gray levels."""
+    """Return every frame as :func:`small_picture`."""
     small = np.empty((len(drive), SMALL_HEIGHT, SMALL_WIDTH), np.float32)
     for k in range(len(drive)):
-        gray = to_gray(drive.image(k))
-        small[k] = cv2.resize(gray, (SMALL_WIDTH, SMALL_HEIGHT), interpolation=cv2.INTER_AREA)
+        small[k] = small_picture(drive, k)
     return small
+
+
+def small_picture(drive: Drive, k: int) -> UInt8[np.ndarray, "h w"]:
+    """Return the drive's k-th frame in gray, averaged over large patches, gray levels."""
+    size = (SMALL_WIDTH, SMALL_HEIGHT)
+    return np.asarray(cv2.resize(to_gray(drive.image(k)), size, interpolation=cv2.INTER_AREA))
 
 
 def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:
