@@ -100,7 +100,7 @@ def export_checkpoint(checkpoint: Path, out: Path | None = None) -> Path:
 
 def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
     """Write weights and their description as safetensors."""
-    tensors = {name: value.detach().contiguous() for name, value in network.state_dict().items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     with atomic_file(path) as temporary:
         temporary.write_bytes(save(tensors, metadata=meta.to_properties()))
 

@@ -12,10 +12,12 @@ from synthetic_labels import make_label_set
 
 from lanenet.config import load_settings
 from lanenet.data.label_set import read_labels, write_labels
-from lanenet.errors import CheckpointError, LabelFormatError, LanenetError
+from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 from lanenet.learn.evaluate import network_predictor, point_errors
-from lanenet.learn.train import learning_rate_at, masked_loss, train
+from lanenet.learn.network import new_network
+from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
+from lanenet.learn.train import train
 from lanenet.perception.network import read_model_meta
 
 torch.set_num_threads(1)
@@ -94,6 +96,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     metrics = json.loads((finished.folder / "metrics.json").read_text())
     assert metrics["val_rmse_cm"] == finished.val_rmse_cm
     assert metrics["val"]["reference"] == "map"
+    assert len(metrics["sigma_factors"]) == 6 and metrics["val_presence"]["visible_lines"] == 80
     with (finished.folder / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["epoch"]) for row in rows] == [1, 2, 3]
@@ -164,24 +167,57 @@ def test_divergence_is_an_error(data, tmp_path):
         run(data, tmp_path / "wild", TINY.model_copy(update={"learning_rate": 1e30}))
 
 
-def test_masked_labels_give_neither_loss_nor_gradient():
-    points = torch.zeros(2, 6, requires_grad=True)
-    labels = torch.full((2, 6), float("nan"))
-    labels[0, 2], labels[1, 4] = 1.0, 10.0
-    loss = masked_loss(points, labels, 2.0)
-    loss.backward()
-    # 0.5 * 1^2 / 2 inside, 10 - 0.5 * 2 outside.
-    assert float(loss.detach()) == pytest.approx((0.25 + 9.0) / 2.0)
-    assert torch.isfinite(points.grad).all()
-    assert points.grad.count_nonzero() == 2
-
-
 def test_learning_rate_rises_and_falls():
     settings = LearnSettings(learning_rate=1.0, warmup=0.1)
     rates = [learning_rate_at(step, 100, settings) for step in range(100)]
     assert int(np.argmax(rates)) == 10 and rates[10] == 1.0
     assert (np.diff(rates[:11]) > 0).all() and (np.diff(rates[10:]) < 0).all()
     assert 0.0 < rates[0] < 0.2 and 0.0 < rates[-1] < 1e-3
+
+
+def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
+    settings = LearnSettings(network=NetworkSettings(kind="alexnet"), head_rate=10.0, weight_decay=0.1)
+    network = new_network(settings.network, 24, 32, 0)
+    optimizer = new_optimizer(network, settings)
+    set_learning_rate(optimizer, 1e-4)
+    groups = {id(p): group for group in optimizer.param_groups for p in group["params"]}
+    assert len(groups) == len(list(network.parameters()))
+    assert groups[id(network.head.weight)]["lr"] == pytest.approx(1e-3)
+    assert groups[id(network.trunk.features[0].weight)]["lr"] == pytest.approx(1e-4)
+    assert groups[id(network.head.weight)]["weight_decay"] == 0.1
+    assert groups[id(network.head.bias)]["weight_decay"] == 0.0
+    small = new_network(NetworkSettings(), 24, 32, 0)
+    set_learning_rate(compact := new_optimizer(small, LearnSettings()), 1e-4)
+    assert {group["lr"] for group in compact.param_groups} == {1e-4}
+
+
+def test_patience_ends_a_run_that_gets_no_better(data, tmp_path):
+    # So small a rate that only the first epochs change anything that counts.
+    settings = TINY.model_copy(update={"epochs": 12, "patience": 2, "learning_rate": 3e-2, "ema_decay": 0.0})
+    seen = []
+    result = run(data, tmp_path / "patient", settings, lambda epoch, *_: seen.append(epoch))
+    assert seen[-1] == result.best_epoch + 2 < 12
+    assert run(data, tmp_path / "patient", settings) == replace(result, computed=False)
+
+
+def test_a_gpu_that_is_not_there_is_named(data, tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(ConfigError, match="device: cuda"):
+        run(data, tmp_path / "gpu", TINY.model_copy(update={"device": "cuda"}))
+
+
+def test_the_curve_can_be_watched_in_tensorboard(data, finished, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    settings = TINY.model_copy(update={"tensorboard": True})
+    with pytest.raises(KilledError):
+        run(data, tmp_path / "watched", settings, kill_at(2))
+    run(data, tmp_path / "watched", settings)
+    events = EventAccumulator(str(tmp_path / "watched" / "tensorboard")).Reload()
+    shown = events.Scalars("val_rmse_cm")
+    assert [e.step for e in shown] == [1, 2, 3]
+    assert min(e.value for e in shown) == pytest.approx(finished.val_rmse_cm, rel=1e-5)
 
 
 def test_a_network_does_not_learn_from_the_truth(tmp_path):
