@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_file, write_json, write_text
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.export import (
+    CALIBRATION_NAME,
     CONFIG_NAME,
     MODEL_NAME,
     RASTERS_NAME,
@@ -31,7 +33,8 @@ from lanenet.perception.network import ANY_CAMERA, ModelMeta
 
 CURVE_NAME = "curve"
 
-_N_CHECK_RASTERS = 16
+_N_CHECK_RASTERS = 48
+_N_CALIBRATION_RASTERS = 96
 #: A network that learned from this many cameras is not bound to one of them.
 _MANY_CAMERAS = 8
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
@@ -74,11 +77,11 @@ def write_checkpoint(
         perception=samples.perception,
         lane_width_range_cm=samples.lane_width_range_cm,
     )
-    chosen = np.unique(np.linspace(0, len(val) - 1, _N_CHECK_RASTERS).astype(np.intp))
-    rasters, _, _ = val.plain_batch(chosen)
+    rasters = _spread_rasters(val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)
+    write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
     write_curve(folder, history)
     best = min(history, key=lambda record: record.val_rmse_cm)
@@ -101,6 +104,12 @@ def write_checkpoint(
         "val": errors.as_dict(),
     }
     write_json(folder / METRICS_NAME, metrics)
+
+
+def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:
+    """Return rasters of frames that are spread evenly over all."""
+    chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
+    return samples.plain_batch(chosen)[0]
 
 
 def camera_names(hashes: Sequence[str]) -> tuple[str, ...]:

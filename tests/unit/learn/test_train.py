@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -17,8 +18,9 @@ from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 from lanenet.learn.evaluate import network_predictor, point_errors
 from lanenet.learn.network import new_network
 from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
+from lanenet.learn.quantise import Int8Report, export_int8
 from lanenet.learn.train import train
-from lanenet.perception.network import read_model_meta
+from lanenet.perception.network import open_model, read_model_meta
 
 torch.set_num_threads(1)
 
@@ -90,6 +92,8 @@ def test_the_folder_holds_what_it_should(finished, data):
         "metrics.json",
         "curve.csv",
         "curve.png",
+        "calibration_rasters.png",
+        "check_rasters.png",
         "last.pt",
     }
     assert load_settings(LearnSettings, finished.folder / "config.yaml") == TINY
@@ -125,6 +129,30 @@ def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last,
     b = load_file(finished.folder / "weights.safetensors")
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     assert (result.best_epoch, result.val_rmse_cm) == (finished.best_epoch, finished.val_rmse_cm)
+
+
+def test_the_model_can_be_quantised(finished, tmp_path):
+    path, report = export_int8(finished.folder, tmp_path / "model-int8.onnx")
+    floats, meta = open_model(finished.model_path)
+    small, small_meta = open_model(path)
+    assert small_meta == meta and small_meta.training_hash
+    assert {"QuantizeLinear", "DequantizeLinear"} <= {node.op_type for node in onnx.load(path).graph.node}
+    labels = make_label_set(30, 9)
+    rasters = np.stack([labels.raster(i) for i in range(30)])[:, None]
+    a, b = (session.run(["points_cm"], {"raster": rasters})[0] for session in (floats, small))
+    assert 0.0 < np.sqrt(np.mean((a - b) ** 2)) < 0.5
+    figures = json.loads(path.with_suffix(".json").read_text())
+    assert 0.0 < figures["rms_difference_cm"] <= figures["largest_difference_cm"]
+    assert figures["recommended"] == report.recommended
+    assert figures["size_bytes"] == path.stat().st_size
+
+
+def test_int8_is_recommended_only_where_it_is_faster_and_close():
+    good = Int8Report(0.02, 0.1, 0.05, 0.06, 1000, 4000)
+    assert good.recommended and good.lines[-1].endswith("use it")
+    for worse in ({"rms_difference_cm": 0.06}, {"median_ms": 0.07}):
+        other = replace(good, **worse)
+        assert not other.recommended and other.lines[-1].endswith("keep model.onnx")
 
 
 def test_a_finished_run_is_not_repeated(data, finished):
