@@ -146,13 +146,17 @@ def lines_present(
 ) -> Float[np.ndarray, "2"]:
     """Tell which lines can be seen: 1 for a line with enough edge points along it in the window, else 0.
 
+    NaN for a line whose course is not known, as in labels from a simulator's truth.
+
     Args:
         edges_cm: Edge points of the road, without those of other things, frame car.
         lines_cm: Left and right lane line, frame car.
         window: Grid of the raster.
     """
     near = [_near_line(edges_cm, line, window, _PRESENT_REACH_CM) for line in lines_cm]
-    return np.array([n.sum() >= _PRESENT_POINTS for n in near], np.float32)
+    known = [np.isfinite(line).all(axis=1).sum() > 1 for line in lines_cm]
+    seen = [n.sum() >= _PRESENT_POINTS for n in near]
+    return np.where(known, seen, np.nan).astype(np.float32)
 
 
 def _near_line(

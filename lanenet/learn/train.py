@@ -92,8 +92,8 @@ def train(
     saved = read_state(out / STATE_NAME, run_hash)
     samples, val = _read_both(settings, train_paths, val_paths)
     out.mkdir(parents=True, exist_ok=True)
-    with _threads(settings.threads):
-        run = _Run(settings, samples, saved)
+    with torch_threads(settings.threads):
+        run = TrainingRun(settings, samples, saved)
         with tensorboard_curve(out, len(run.history) + 1, settings.tensorboard) as show:
             while not run.ended:
                 record = run.run_epoch(val)
@@ -123,10 +123,15 @@ def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
     network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
 
 
-class _Run:
-    """Weights, optimiser and curve of a run in memory."""
+class TrainingRun:
+    """Weights, optimiser and curve of a run in memory.
 
-    def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None) -> None:
+    Attributes:
+        network: What is trained.
+        history: One record per finished epoch.
+    """
+
+    def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None = None) -> None:
         self.settings, self.samples = settings, samples
         self.device = _device(settings)
         self.network = self._new_network()
@@ -258,7 +263,7 @@ def _random_numbers(seed: int, epoch: int, device: torch.device) -> Iterator[Non
 
 
 @contextmanager
-def _threads(threads: int) -> Iterator[None]:
+def torch_threads(threads: int) -> Iterator[None]:
     """Set torch's threads for a while; the setting belongs to the whole process."""
     before = torch.get_num_threads()
     if threads:

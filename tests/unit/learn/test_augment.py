@@ -150,7 +150,7 @@ def test_an_empty_frame_can_be_augmented():
         WINDOW,
         NOTHING.model_copy(update={"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0}),
     )
-    assert not rasters.any() and np.isnan(points).all() and not present.any()
+    assert not rasters.any() and np.isnan(points).all() and np.isnan(present).all()
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.5])
