@@ -29,7 +29,7 @@ class LaneSamples:
         wheelbase_cm: The wheelbase that all sets share.
         perception: How all sets' edge points were found.
         lane_width_cm: Mean lane width over the frames.
-        lane_width_range_cm: The narrowest and the widest lane.
+        lane_widths_cm: Narrowest and widest lane of a set.
         camera_hashes: Of the cameras that took the frames, sorted.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
         points_cm: Labels of each frame, NaN where masked, n x 6.
@@ -72,7 +72,7 @@ class LaneSamples:
             )
         widths = [labels.meta.lane_width_cm for labels, _ in pairs]
         self.lane_width_cm = float(np.mean(widths))
-        self.lane_width_range_cm = (float(min(widths)), float(max(widths)))
+        self.lane_widths_cm = (float(min(widths)), float(max(widths)))
         self.points_cm: Float[np.ndarray, "n 6"] = np.array([labels.points_cm[i] for labels, i in pairs])
         edges = [np.asarray(labels.edges[i][:, :2], np.float32) for labels, i in pairs]
         self.edges_cm = np.concatenate(edges)

@@ -29,14 +29,12 @@ from lanenet.learn.export import (
 from lanenet.learn.network import LaneNet
 from lanenet.learn.predict import Answers
 from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord
-from lanenet.perception.network import ANY_CAMERA, ModelMeta
+from lanenet.perception.network import ModelMeta
 
 CURVE_NAME = "curve"
 
 _N_CHECK_RASTERS = 48
 _N_CALIBRATION_RASTERS = 96
-#: A network that learned from this many cameras is not bound to one of them.
-_MANY_CAMERAS = 8
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
 
 
@@ -68,14 +66,14 @@ def write_checkpoint(
     errors = answers.errors
     meta = ModelMeta(
         window=samples.window,
-        camera_hashes=camera_names(samples.camera_hashes),
+        camera_hashes=tuple(samples.camera_hashes),
         wheelbase_cm=samples.wheelbase_cm,
         lane_width_cm=samples.lane_width_cm,
         training_hash=run_hash,
         rmse_cm=errors.point_rmse_cm,
         reference=errors.reference,
         perception=samples.perception,
-        lane_width_range_cm=samples.lane_width_range_cm,
+        lane_width_range_cm=samples.lane_widths_cm,
     )
     rasters = _spread_rasters(val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
@@ -110,11 +108,6 @@ def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 
     """Return rasters of frames that are spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
     return samples.plain_batch(chosen)[0]
-
-
-def camera_names(hashes: Sequence[str]) -> tuple[str, ...]:
-    """Return what a model says of its cameras: their hashes, or that any will do once they were many."""
-    return (ANY_CAMERA,) if len(hashes) >= _MANY_CAMERAS else tuple(hashes)
 
 
 def presence_figures(answers: Answers) -> dict[str, float]:
