@@ -98,7 +98,7 @@ class LossSettings(Settings):
 
     kind: Literal["student", "laplace", "gaussian"] = "student"
     evenness: float = Field(default=1.0, ge=0.0, le=2.0)
-    presence: float = Field(default=0.2, ge=0.0)
+    presence: float = Field(default=1.0, ge=0.0)
 
 
 class LearnSettings(Settings):
