@@ -19,7 +19,7 @@ HEAVY = (
 )
 #: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
 #: written only if the extra is there.
-NAMED_IMPORTS = {"lanenet/data/": {"pyarrow", "lanenet/learn/sweep.py": ("optuna",)}}
+NAMED_IMPORTS = {"lanenet/data/": {"pyarrow"}, "lanenet/learn/sweep.py": {"optuna"}}
 #: The one function that does it.
 IMPORTER = "lanenet/data/files.py"
 
