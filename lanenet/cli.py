@@ -15,7 +15,16 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, judge_cli, onboard_cli, reality_cli, val_cli, world_cli
+from lanenet import (
+    calibrate_cli,
+    console,
+    export_cli,
+    judge_cli,
+    onboard_cli,
+    reality_cli,
+    val_cli,
+    world_cli,
+)
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption, check_ending
@@ -32,6 +41,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("torch", "torchvision", "onnx", "onnxscript", "safetensors", "tensorboard"), "train"),
     **dict.fromkeys(("scipy", "numba", "pyarrow"), "data"),
     "matplotlib": "viz",
+    "optuna": "sweep",
     **dict.fromkeys(("smbus2", "serial"), "car"),
 }
 
@@ -69,6 +79,7 @@ app = typer.Typer(
 
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
+app.add_typer(export_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)
 app.add_typer(judge_cli.app)
@@ -183,6 +194,31 @@ def train(
     console.next_command(*words, "--out", "lanes.csv")
 
 
+@app.command(epilog="Example: lanenet sweep configs/small.yaml learn.epochs=10 --minutes 60")
+def sweep(
+    config: _Config,
+    overrides: _Overrides = None,
+    minutes: Annotated[
+        float, typer.Option(min=0.0, help="No longer than this; goes on when called again.")
+    ] = 60.0,
+    trials: Annotated[int, typer.Option(min=1, help="No more finished trials than this, in all.")] = 100,
+) -> None:
+    """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
+    from datagen.datasets import prepare
+    from lanenet.learn.sweep import sweep as sweep_networks
+
+    settings: Any = load_settings(run_settings_schema(), config, overrides)
+    with console.progress_bar("data") as progress:
+        data = prepare(settings.data, settings.work_folder, progress)
+    out = settings.work_folder / "sweep"
+    with console.progress_bar("trials") as progress:
+        table = sweep_networks(
+            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
+        )
+    console.show_lines(table.splitlines()[:14])
+    console.wrote(out / "sweep.md", out / "trials.csv")
+
+
 @app.command(epilog="Example: lanenet simulate configs/drive.yaml seed=3 --out drives/three")
 def simulate(
     config: _Config,
@@ -247,18 +283,3 @@ def label(
     console.show_lines(report.lines)
     console.wrote(out)
     console.next_command("val", "MODEL", out)
-
-
-@app.command(epilog="Example: lanenet export checkpoints/small --out small.onnx")
-def export(
-    checkpoint: Annotated[
-        Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.", show_default=False)
-    ],
-    out: Annotated[Path | None, typer.Option(help="Model to write; default CHECKPOINT/model.onnx.")] = None,
-) -> None:
-    """Write a checkpoint as one ONNX file, checked against PyTorch."""
-    from lanenet.learn.export import export_checkpoint
-
-    path = export_checkpoint(checkpoint, out)
-    console.wrote(path)
-    console.next_command("bench", "--model", path)

@@ -24,6 +24,9 @@ _SEGMENT_CM = (4.0, 40.0)
 _STRETCH_CM = (4.0, 20.0)
 #: Both edges of a wide tape, and what a blurred frame puts beside them.
 _LINE_REACH_CM = 4.0
+#: A line is seen if at least this many edge points lie this close to it.
+_PRESENT_POINTS = 12
+_PRESENT_REACH_CM = 3.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ def augment_batch(
     rngs: Sequence[np.random.Generator],
     window: BirdseyeWindow,
     settings: AugmentSettings,
-) -> tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"]]:
+) -> tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]:
     """Change each sample of a batch by its own draw.
 
     Args:
@@ -72,9 +75,10 @@ def augment_batch(
         settings: What is changed, and how much.
 
     Returns:
-        Rasters of 0 and 255, and labels, [cm], NaN where masked.
+        Rasters of 0 and 255; labels, [cm], NaN where masked; 1 for each line that can be seen, else 0.
     """
     size = len(edges_cm)
+    present = np.empty((size, 2), np.float32)
     rasters = np.zeros((size, 1, window.rows, window.columns), np.uint8)
     labels = np.empty((size, 6), np.float32)
     for i in range(size):
@@ -83,11 +87,13 @@ def augment_batch(
         labels[i] = window.labelled(labels_of_view(points_cm[i], lines_cm[i], view))
         keep = _draw_kept(edges_cm[i], lines_cm[i], window, settings, rng)
         moved = view.move(edges_cm[i][keep])
+        left, right = (view.move(line) for line in (lines_cm[i][::-1] if view.mirror else lines_cm[i]))
+        present[i] = lines_present(moved, (left, right), window)
         if settings.jitter_cm > 0.0:
             moved += settings.jitter_cm * rng.standard_normal(moved.shape, dtype=np.float32)
         extra = _draw_clutter(window, settings, rng)
         window.rasterise(np.concatenate([moved, extra]), out=rasters[i, 0])
-    return rasters, labels
+    return rasters, labels, present
 
 
 def labels_of_view(points_cm: Float[np.ndarray, "6"], lines_cm: Lines, view: _View) -> Float[np.ndarray, "6"]:
@@ -135,10 +141,31 @@ def _draw_kept(
     return keep
 
 
+def lines_present(
+    edges_cm: Float[np.ndarray, "m 2"], lines_cm: Lines, window: BirdseyeWindow
+) -> Float[np.ndarray, "2"]:
+    """Tell which lines can be seen: 1 for a line with enough edge points along it in the window, else 0.
+
+    NaN for a line whose course is not known, as in labels from a simulator's truth.
+
+    Args:
+        edges_cm: Edge points of the road, without those of other things, frame car.
+        lines_cm: Left and right lane line, frame car.
+        window: Grid of the raster.
+    """
+    near = [_near_line(edges_cm, line, window, _PRESENT_REACH_CM) for line in lines_cm]
+    known = [np.isfinite(line).all(axis=1).sum() > 1 for line in lines_cm]
+    seen = [n.sum() >= _PRESENT_POINTS for n in near]
+    return np.where(known, seen, np.nan).astype(np.float32)
+
+
 def _near_line(
-    edges_cm: Float[np.ndarray, "m 2"], line_cm: Float[np.ndarray, "k 2"], window: BirdseyeWindow
+    edges_cm: Float[np.ndarray, "m 2"],
+    line_cm: Float[np.ndarray, "k 2"],
+    window: BirdseyeWindow,
+    reach_cm: float = _LINE_REACH_CM,
 ) -> Bool[np.ndarray, "m"]:
-    """True for points inside the window within about ``_LINE_REACH_CM`` of a polyline.
+    """True for points inside the window within about ``reach_cm`` of a polyline.
 
     The line is painted as a band on the window's grid and each point looks up its cell: a frame has some
     hundred points and segments, and comparing all pairs costs a thousand times as much.
@@ -150,7 +177,7 @@ def _near_line(
     for piece in pieces:
         cells = window.cells(piece[np.isfinite(piece).all(axis=1)])
         corners = np.rint(np.clip(cells[:, ::-1], -1e4, 1e4) * 16.0).astype(np.int32)
-        thickness = max(1, round(2.0 * _LINE_REACH_CM / window.cell_cm))
+        thickness = max(1, round(2.0 * reach_cm / window.cell_cm))
         cv2.polylines(band, [corners.reshape(-1, 1, 2)], False, 255, thickness, cv2.LINE_8, 4)
     row, column = np.rint(window.cells(edges_cm)).astype(np.intp).T
     inside = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import Path
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from lanenet.config import Settings
 
@@ -36,23 +38,67 @@ class AugmentSettings(Settings):
     clutter_points: int = Field(default=30, ge=0, le=2000)
 
 
+#: Channels of the convolutions and width of the fully connected layer of the compact family.
+_SIZES: dict[str, tuple[tuple[int, ...], int]] = {
+    "nano": ((8, 16, 24, 32), 32),
+    "small": ((16, 32, 48, 64), 64),
+    "base": ((24, 48, 96, 128), 96),
+}
+
+
 class NetworkSettings(Settings):
-    """Size of the network.
+    """Which network, and its size.
 
     Attributes:
-        channels: Output channels of the convolutions; each halves rows and columns.
-        hidden: Width of the fully connected layer before the six outputs.
+        kind: ``nano``, ``small`` and ``base`` are one trunk in three sizes; ``alexnet`` is the paper's.
+        channels: Output channels of the convolutions: the first divides rows and columns by four, each other
+            one by two. None takes those of the kind.
+        hidden: Width of the fully connected layer before the outputs; None takes that of the kind.
+        weights: File with pretrained weights of AlexNet as torchvision names them; None starts from random
+            ones.
     """
 
-    channels: tuple[int, ...] = (8, 16, 32, 48, 64)
-    hidden: int = Field(default=64, ge=4, le=1024)
+    kind: Literal["nano", "small", "base", "alexnet"] = "small"
+    channels: tuple[int, ...] | None = None
+    hidden: int | None = Field(default=None, ge=4, le=1024)
+    weights: Path | None = None
 
     @field_validator("channels")
     @classmethod
-    def _check_channels(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        if not 1 <= len(value) <= 6 or any(not 1 <= c <= 512 for c in value):
+    def _check_channels(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if value is not None and (not 1 <= len(value) <= 6 or any(not 1 <= c <= 512 for c in value)):
             raise ValueError("expected one to six layers of 1 to 512 channels")
         return value
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> NetworkSettings:
+        if self.kind == "alexnet" and (self.channels is not None or self.hidden is not None):
+            raise ValueError("alexnet has a size of its own: expected neither channels nor hidden")
+        if self.kind != "alexnet" and self.weights is not None:
+            raise ValueError(f"weights are for alexnet; {self.kind} starts from random ones")
+        return self
+
+    @property
+    def size(self) -> tuple[tuple[int, ...], int]:
+        """Channels and hidden width of a compact network."""
+        channels, hidden = _SIZES[self.kind]
+        return self.channels or channels, self.hidden or hidden
+
+
+class LossSettings(Settings):
+    """What a network is trained to make small; see :func:`lanenet.learn.loss.lane_loss`.
+
+    Attributes:
+        kind: How errors are thought to be spread about the answer: ``student`` (heavy tails, round middle),
+            ``laplace`` (heavy tails, sharp middle) or ``gaussian`` (no outliers).
+        evenness: Power of the predicted spread that each point's term is multiplied with: 0 is the plain
+            likelihood, which cares little for points that it holds for uncertain; 1 gives them more weight.
+        presence: Weight of the presence of the lines beside the points.
+    """
+
+    kind: Literal["student", "laplace", "gaussian"] = "student"
+    evenness: float = Field(default=1.0, ge=0.0, le=2.0)
+    presence: float = Field(default=1.0, ge=0.0)
 
 
 class LearnSettings(Settings):
@@ -60,38 +106,47 @@ class LearnSettings(Settings):
 
     Attributes:
         seed: Of the first weights, of the order of the samples and of the augmentation.
-        epochs: Passes over the training samples.
+        epochs: Passes over the training samples, at most.
+        patience: The training ends once this many epochs in a row have brought no better validation error;
+            0 never ends it early.
         batch_size: Samples per step.
         learning_rate: Peak of the learning rate (AdamW).
+        head_rate: The learning rate of AlexNet's new layer is this many times higher.
         weight_decay: Of AdamW, on the weights but not on biases and norms.
         warmup: Share of all steps over which the learning rate rises from zero; a cosine leads it down.
         ema_decay: Of the running mean of the weights, which is what is evaluated and exported.
-        huber_cm: Errors below this count squared, above it linearly.
+        loss: What is made small.
         min_quality: Training frames whose labels have a lower quality are left out.
+        device: Where the network is computed: ``auto`` takes a GPU if there is one.
         threads: Threads of the computation; 0 leaves the choice to torch. One thread gives the same weights
             on any number of cores, and does not stall when other programs are busy; a second core prepares
             the next batches meanwhile.
         checkpoint_every: Epochs between two writings of the state from which a stopped run goes on.
+        tensorboard: Write the curve for TensorBoard too, into ``tensorboard/`` beside the state.
         augment: Changes of the samples.
-        network: Size of the network.
+        network: Which network, and its size.
     """
 
     seed: int = Field(default=0, ge=0)
     epochs: int = Field(default=12, ge=1)
+    patience: int = Field(default=0, ge=0)
     batch_size: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=3e-3, gt=0.0)
+    head_rate: float = Field(default=10.0, gt=0.0)
     weight_decay: float = Field(default=1e-2, ge=0.0)
     warmup: float = Field(default=0.05, ge=0.0, lt=1.0)
     ema_decay: float = Field(default=0.995, ge=0.0, lt=1.0)
-    huber_cm: float = Field(default=2.0, gt=0.0)
+    loss: LossSettings = LossSettings()
     min_quality: float = Field(default=0.0, ge=0.0, le=1.0)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     threads: int = Field(default=1, ge=0)
     checkpoint_every: int = Field(default=1, ge=1)
+    tensorboard: bool = False
     augment: AugmentSettings = AugmentSettings()
     network: NetworkSettings = NetworkSettings()
 
     @property
     def hash(self) -> str:
-        """Short hash of every setting that decides the result (not: threads, checkpoint_every)."""
-        data = self.model_dump(mode="json", exclude={"threads", "checkpoint_every"})
+        """Short hash of every setting that decides the result (not: threads and other matters of the run)."""
+        data = self.model_dump(mode="json", exclude={"device", "threads", "checkpoint_every", "tensorboard"})
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]

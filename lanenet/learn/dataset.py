@@ -14,8 +14,11 @@ from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
-from lanenet.learn.augment import augment_batch
+from lanenet.learn.augment import augment_batch, lines_present
 from lanenet.learn.config import AugmentSettings
+
+#: Rasters, labels in cm (NaN where masked) and, per line, 1 if it can be seen (0 if not, NaN if unknown).
+Batch = tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]
 
 
 class LaneSamples:
@@ -26,6 +29,7 @@ class LaneSamples:
         wheelbase_cm: The wheelbase that all sets share.
         perception: How all sets' edge points were found.
         lane_width_cm: Mean lane width over the frames.
+        lane_widths_cm: Narrowest and widest lane of a set.
         camera_hashes: Of the cameras that took the frames, sorted.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
         points_cm: Labels of each frame, NaN where masked, n x 6.
@@ -68,6 +72,7 @@ class LaneSamples:
             )
         widths = [labels.meta.lane_width_cm for labels, _ in pairs]
         self.lane_width_cm = float(np.mean(widths))
+        self.lane_widths_cm = (float(min(widths)), float(max(widths)))
         self.points_cm: Float[np.ndarray, "n 6"] = np.array([labels.points_cm[i] for labels, i in pairs])
         edges = [np.asarray(labels.edges[i][:, :2], np.float32) for labels, i in pairs]
         self.edges_cm = np.concatenate(edges)
@@ -84,19 +89,18 @@ class LaneSamples:
         """Return the edge points of one frame, [cm], frame car."""
         return self.edges_cm[self.edge_start[index] : self.edge_start[index + 1]]
 
-    def plain_batch(
-        self, indices: Int[np.ndarray, "b"]
-    ) -> tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"]]:
-        """Return rasters and labels of frames as they are."""
+    def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
+        """Return rasters, labels and presence of the lines of frames as they are."""
         rasters = np.empty((len(indices), 1, self.window.rows, self.window.columns), np.uint8)
         for slot, index in enumerate(indices):
             self.window.rasterise(self.edges_of(int(index)), out=rasters[slot, 0])
-        return rasters, self.points_cm[indices].astype(np.float32)
+        present = [lines_present(self.edges_of(int(i)), self.lines[i], self.window) for i in indices]
+        return rasters, self.points_cm[indices].astype(np.float32), np.array(present, np.float32)
 
     def augmented_batch(
         self, indices: Int[np.ndarray, "b"], settings: AugmentSettings, seed: int, epoch: int
-    ) -> tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"]]:
-        """Return rasters and labels of frames, each changed by its own draw.
+    ) -> Batch:
+        """Return rasters, labels and presence of the lines of frames, each changed by its own draw.
 
         The draw depends on ``seed``, ``epoch`` and the index of the frame alone, so a sample is the same
         whatever the batch, the order and the number of workers.
@@ -112,7 +116,7 @@ class LaneSamples:
 
     def epoch(
         self, settings: AugmentSettings, seed: int, epoch: int, batch_size: int, workers: int = 1
-    ) -> Iterator[tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"]]]:
+    ) -> Iterator[Batch]:
         """Yield the augmented batches of one epoch in a shuffled order that (seed, epoch) decides.
 
         A last batch of a single sample is left out: batch normalisation cannot use it.
@@ -133,7 +137,7 @@ class LaneSamples:
                 yield self.augmented_batch(chunk, settings, seed, epoch)
             return
         with ThreadPoolExecutor(workers) as pool:
-            ahead: list[Future[tuple[np.ndarray, np.ndarray]]] = []
+            ahead: list[Future[Batch]] = []
             try:
                 for chunk in chunks:
                     ahead.append(pool.submit(self.augmented_batch, chunk, settings, seed, epoch))

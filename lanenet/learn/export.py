@@ -37,6 +37,7 @@ CONFIG_NAME = "config.yaml"
 WEIGHTS_NAME = "weights.safetensors"
 MODEL_NAME = "model.onnx"
 RASTERS_NAME = "check_rasters.png"
+CALIBRATION_NAME = "calibration_rasters.png"
 
 
 def export_onnx(
@@ -100,7 +101,7 @@ def export_checkpoint(checkpoint: Path, out: Path | None = None) -> Path:
 
 def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
     """Write weights and their description as safetensors."""
-    tensors = {name: value.detach().contiguous() for name, value in network.state_dict().items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     with atomic_file(path) as temporary:
         temporary.write_bytes(save(tensors, metadata=meta.to_properties()))
 
@@ -174,7 +175,7 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
         CheckpointError: If the picture is missing or does not fit the window.
     """
     if not path.is_file():
-        raise CheckpointError(f"{path}: no such file; the export is checked on its rasters")
+        raise CheckpointError(f"{path}: no such file; an export needs its rasters")
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
     rows, columns = meta.window.rows, meta.window.columns
     if image is None or image.shape[1] != columns or image.shape[0] % rows:
@@ -185,7 +186,7 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
 
 def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
     example = torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)
-    with _silence():
+    with quiet():
         program = torch.onnx.export(
             deployed,
             (example,),
@@ -227,8 +228,8 @@ def _largest_difference(
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep the exporter's chatter (prints, log lines, warnings) to itself."""
+def quiet() -> Iterator[None]:
+    """Keep the exporters' chatter (prints, log lines, warnings) to itself."""
     previous = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

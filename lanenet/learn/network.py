@@ -1,26 +1,51 @@
-"""The network: a small convolutional trunk and a regression of six points in cm."""
+"""The networks: a trunk, and a head that answers six points in cm, their spread and which lines are there."""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM
+from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM, SIDES
+from lanenet.learn.alexnet import N_FEATURES, AlexNetTrunk
 from lanenet.learn.config import NetworkSettings
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]
+#: The predicted standard deviation stays within these, [cm], before it is calibrated.
+SIGMA_RANGE_CM = (0.05, 50.0)
+
+_N_OUTPUTS = 2 * N_POINTS + len(SIDES)
+_LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
+
+
+class LaneOutput(NamedTuple):
+    """What a network answers.
+
+    Attributes:
+        points_cm: The six points, frame car, n x 6.
+        sigma_cm: Standard deviation of each of them, n x 6.
+        presence_logit: Per line the logarithm of the odds that it can be seen, n x 2.
+    """
+
+    points_cm: Tensor
+    sigma_cm: Tensor
+    presence_logit: Tensor
 
 
 class LaneNet(nn.Module):
-    """Bird's-eye raster in, six points in cm out.
+    """Bird's-eye raster in, six points in cm with their spread and the presence of two lines out.
 
-    An AlexNet in kind (wide first filter, then 3 x 3 filters, then fully connected layers) with strided
-    convolutions and batch normalisation, 1/500 of its size: a raster of edges has no texture to learn.
+    The compact networks are an AlexNet in kind (a wide first filter with a stride of four, then 3 x 3
+    filters, then fully connected layers) with strided convolutions and batch normalisation, 1/600 of its
+    size: a raster of edges has no texture to learn. The last feature map is not averaged over rows and
+    columns, since the place of a line is the answer.
 
     Args:
-        settings: Size of the network.
+        settings: Which network, and its size.
         rows: Rows of the raster.
         columns: Columns of the raster.
 
@@ -31,33 +56,35 @@ class LaneNet(nn.Module):
     def __init__(self, settings: NetworkSettings, rows: int, columns: int) -> None:
         super().__init__()
         self.rows, self.columns = rows, columns
-        layers: list[nn.Module] = []
-        before, height, width = 1, rows, columns
-        for i, channels in enumerate(settings.channels):
-            kernel = 5 if i == 0 else 3
-            layers += [
-                nn.Conv2d(before, channels, kernel, stride=2, padding=kernel // 2, bias=False),
-                nn.BatchNorm2d(channels),
-                nn.ReLU(inplace=True),
-            ]
-            before, height, width = channels, (height + 1) // 2, (width + 1) // 2
-        self.trunk = nn.Sequential(*layers)
-        self.head = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(before * height * width, settings.hidden),
-            nn.ReLU(inplace=True),
-            nn.Linear(settings.hidden, N_POINTS),
-        )
+        self.trunk: nn.Module
+        self.head: nn.Module
+        if settings.kind == "alexnet":
+            self.trunk, self.head = AlexNetTrunk(), nn.Linear(N_FEATURES, _N_OUTPUTS)
+        else:
+            channels, hidden = settings.size
+            self.trunk, n_features = _compact_trunk(channels, rows, columns)
+            self.head = nn.Sequential(
+                nn.Linear(n_features, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, _N_OUTPUTS)
+            )
         # The layers predict (x - mean) / scale, so that all six outputs are of order one.
         self.mean_cm: Tensor
         self.scale_cm: Tensor
+        # What the spread is multiplied with so that it is right on frames that the network has not seen.
+        self.sigma_factor: Tensor
         self.register_buffer("mean_cm", torch.zeros(N_POINTS))
         self.register_buffer("scale_cm", torch.ones(N_POINTS))
+        self.register_buffer("sigma_factor", torch.ones(N_POINTS))
+        # Convolutions of few channels are up to twice as fast on a CPU with the channels side by side.
+        self.to(memory_format=torch.channels_last)
 
-    def forward(self, raster: Float[Tensor, "n 1 r c"]) -> Float[Tensor, "n 6"]:
-        """Return the six points, [cm], frame car, of rasters with values 0..1."""
-        scaled: Tensor = self.head(self.trunk(raster))
-        return scaled * self.scale_cm + self.mean_cm
+    def forward(self, raster: Float[Tensor, "n 1 r c"]) -> LaneOutput:
+        """Find the lane in rasters with values 0..1."""
+        outputs: Tensor = self.head(self.trunk(raster))
+        points, spread, presence = torch.split(outputs, [N_POINTS, N_POINTS, len(SIDES)], dim=1)
+        middle, half = 0.5 * (_LOG_LOW + _LOG_HIGH), 0.5 * (_LOG_HIGH - _LOG_LOW)
+        # A soft limit: a hard one has no gradient beyond it.
+        sigma = torch.exp(middle + half * torch.tanh(spread / half)) * self.sigma_factor
+        return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
 
     @property
     def n_parameters(self) -> int:
@@ -66,7 +93,7 @@ class LaneNet(nn.Module):
 
 
 class DeployedLaneNet(nn.Module):
-    """What the ONNX file holds: bytes in, points, parabolas, lane centre and steering target out."""
+    """What the ONNX file holds: bytes in; points, spread, presence, parabolas, centre and steering out."""
 
     def __init__(self, network: LaneNet) -> None:
         super().__init__()
@@ -77,25 +104,41 @@ class DeployedLaneNet(nn.Module):
 
     def forward(
         self, raster: UInt8[Tensor, "n 1 r c"]
-    ) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n 2 3"], Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
+    ) -> tuple[
+        Float[Tensor, "n 6"],
+        Float[Tensor, "n 6"],
+        Float[Tensor, "n 2"],
+        Float[Tensor, "n 2 3"],
+        Float[Tensor, "n 1"],
+        Float[Tensor, "n 1"],
+    ]:
         """Find the lane in rasters.
 
         Args:
             raster: Bird's-eye rasters, 255 where there is an edge, 0 elsewhere.
 
         Returns:
-            The six points, [cm]; (a, b, c) of the left and right parabola; x of the lane centre at 15 cm,
-            [cm]; the steering target, [rad], positive left.
+            The six points, [cm]; their standard deviations, [cm]; probability that the left and the right
+            line can be seen; (a, b, c) of the left and right parabola; x of the lane centre at 15 cm, [cm];
+            the steering target, [rad], positive left.
 
         Source:
             Steering: Kozlowski et al. 2024, eq. 3. The centre is ahead, so atan equals atan2 here.
         """
-        points: Tensor = self.network(raster.to(torch.float32) * (1.0 / 255.0))
-        lines = points.reshape(-1, 2, len(ROWS_CM))
+        output: LaneOutput = self.network(raster.to(torch.float32) * (1.0 / 255.0))
+        lines = output.points_cm.reshape(-1, 2, len(ROWS_CM))
         middle_row = ROWS_CM.index(LOOKAHEAD_CM)
         centre = lines[:, :, middle_row].mean(dim=1, keepdim=True)
         steering = torch.atan(-centre / LOOKAHEAD_CM)
-        return points, lines @ self.parabola_from_points, centre, steering
+        presence = torch.sigmoid(output.presence_logit)
+        return (
+            output.points_cm,
+            output.sigma_cm,
+            presence,
+            lines @ self.parabola_from_points,
+            centre,
+            steering,
+        )
 
 
 def input_of_rasters(rasters: UInt8[Tensor, "n 1 r c"]) -> Float[Tensor, "n 1 r c"]:
@@ -104,7 +147,30 @@ def input_of_rasters(rasters: UInt8[Tensor, "n 1 r c"]) -> Float[Tensor, "n 1 r 
 
 
 def new_network(settings: NetworkSettings, rows: int, columns: int, seed: int) -> LaneNet:
-    """Make a network with first weights drawn from ``seed``, without touching torch's global generator."""
+    """Make a network with first weights drawn from ``seed``, without touching torch's global generator.
+
+    Raises:
+        CheckpointError: If pretrained weights are asked for and cannot be read.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return LaneNet(settings, rows, columns)
+        network = LaneNet(settings, rows, columns)
+    if settings.weights is not None:
+        assert isinstance(network.trunk, AlexNetTrunk)
+        network.trunk.load_pretrained(settings.weights)
+    return network
+
+
+def _compact_trunk(channels: tuple[int, ...], rows: int, columns: int) -> tuple[nn.Module, int]:
+    """Return the convolutions and the number of features that they leave."""
+    layers: list[nn.Module] = []
+    before, height, width = 1, rows, columns
+    for i, after in enumerate(channels):
+        kernel, stride = (7, 4) if i == 0 else (3, 2)
+        layers += [
+            nn.Conv2d(before, after, kernel, stride=stride, padding=kernel // 2, bias=False),
+            nn.BatchNorm2d(after),
+            nn.ReLU(inplace=True),
+        ]
+        before, height, width = after, -(-height // stride), -(-width // stride)
+    return nn.Sequential(*layers, nn.Flatten()), before * height * width

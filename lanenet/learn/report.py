@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_file, write_json, write_text
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples
-from lanenet.learn.evaluate import ErrorTable
 from lanenet.learn.export import (
+    CALIBRATION_NAME,
     CONFIG_NAME,
     MODEL_NAME,
     RASTERS_NAME,
@@ -25,12 +27,14 @@ from lanenet.learn.export import (
     write_weights,
 )
 from lanenet.learn.network import LaneNet
+from lanenet.learn.predict import Answers
 from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord
 from lanenet.perception.network import ModelMeta
 
 CURVE_NAME = "curve"
 
-_N_CHECK_RASTERS = 16
+_N_CHECK_RASTERS = 48
+_N_CALIBRATION_RASTERS = 96
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
 
 
@@ -40,7 +44,7 @@ def write_checkpoint(
     network: LaneNet,
     samples: LaneSamples,
     val: LaneSamples,
-    errors: ErrorTable,
+    answers: Answers,
     history: Sequence[EpochRecord],
     run_hash: str,
 ) -> None:
@@ -52,13 +56,14 @@ def write_checkpoint(
         network: Weights of the best epoch.
         samples: Training frames.
         val: Validation frames.
-        errors: Of the network on ``val``.
+        answers: Of the network on ``val``.
         history: Training curve.
         run_hash: Of settings and data.
 
     Raises:
         CheckpointError: If the exported model does not answer as PyTorch does.
     """
+    errors = answers.errors
     meta = ModelMeta(
         window=samples.window,
         camera_hashes=tuple(samples.camera_hashes),
@@ -68,12 +73,13 @@ def write_checkpoint(
         rmse_cm=errors.point_rmse_cm,
         reference=errors.reference,
         perception=samples.perception,
+        lane_width_range_cm=samples.lane_widths_cm,
     )
-    chosen = np.unique(np.linspace(0, len(val) - 1, _N_CHECK_RASTERS).astype(np.intp))
-    rasters, _ = val.plain_batch(chosen)
+    rasters = _spread_rasters(val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)
+    write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
     write_curve(folder, history)
     best = min(history, key=lambda record: record.val_rmse_cm)
@@ -87,6 +93,8 @@ def write_checkpoint(
         "train_frames": len(samples),
         "val_frames": len(val),
         "parameters": network.n_parameters,
+        "sigma_factors": network.sigma_factor.tolist(),
+        "val_presence": presence_figures(answers),
         "onnx_difference_cm": difference,
         "median_samples_per_s": float(np.median([record.samples_per_s for record in history])),
         "seed": settings.seed,
@@ -94,6 +102,54 @@ def write_checkpoint(
         "val": errors.as_dict(),
     }
     write_json(folder / METRICS_NAME, metrics)
+
+
+def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:
+    """Return rasters of frames that are spread evenly over all."""
+    chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
+    return samples.plain_batch(chosen)[0]
+
+
+def presence_figures(answers: Answers) -> dict[str, float]:
+    """Return how often lines that can be seen, and lines that cannot, are told rightly; NaN without any."""
+    told = np.isfinite(answers.present)
+    said, there = answers.presence[told] >= 0.5, answers.present[told] == 1.0
+    return {
+        "visible_found": float(said[there].mean()) if there.any() else float("nan"),
+        "absent_found": float((~said[~there]).mean()) if (~there).any() else float("nan"),
+        "visible_lines": int(there.sum()),
+        "absent_lines": int((~there).sum()),
+    }
+
+
+@contextmanager
+def tensorboard_curve(
+    folder: Path, first_epoch: int, wanted: bool
+) -> Iterator[Callable[[EpochRecord], None]]:
+    """Yield what writes each epoch's record for TensorBoard, or does nothing.
+
+    Args:
+        folder: Checkpoint folder; the events go into its ``tensorboard``.
+        first_epoch: What an earlier run wrote from this epoch on is left out.
+        wanted: False does nothing, and does not need the package.
+    """
+    if not wanted:
+        yield lambda record: None
+        return
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(str(folder / "tensorboard"), purge_step=first_epoch)
+
+    def show(record: EpochRecord) -> None:
+        for name, value in vars(record).items():
+            if name != "epoch":
+                writer.add_scalar(name, value, record.epoch)
+        writer.flush()
+
+    try:
+        yield show
+    finally:
+        writer.close()
 
 
 def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:

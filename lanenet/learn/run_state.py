@@ -79,7 +79,8 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
     Raises:
         LabelFormatError: If a file cannot be read.
     """
-    text = f"{settings.hash} {hash_files(train_paths)} {hash_files(val_paths)}"
+    weights = [] if settings.network.weights is None else [settings.network.weights]
+    text = f"{settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -11,17 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lanenet.data.label_set import read_labels
-from lanenet.errors import LabelFormatError, LanenetError
+from lanenet.errors import ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
-from lanenet.learn.evaluate import ErrorTable, point_errors
 from lanenet.learn.export import MODEL_NAME
+from lanenet.learn.loss import lane_loss, sigma_factors
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
-from lanenet.learn.report import write_checkpoint
+from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
+from lanenet.learn.predict import predict
+from lanenet.learn.report import tensorboard_curve, write_checkpoint
 from lanenet.learn.run_state import (
     STATE_NAME,
     EpochRecord,
@@ -34,8 +35,6 @@ from lanenet.learn.run_state import (
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]
-
-_EVAL_BATCH = 256
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,9 @@ def train(
 
     Raises:
         LabelFormatError: If the label sets cannot be read or learned together.
-        CheckpointError: If the folder holds a run with other settings or data.
+        CheckpointError: If the folder holds a run with other settings or data, or pretrained weights cannot
+            be read.
+        ConfigError: If a GPU is asked for and there is none.
         LanenetError: If the training diverges.
     """
     run_hash = hash_run(settings, train_paths, val_paths)
@@ -91,88 +92,75 @@ def train(
     saved = read_state(out / STATE_NAME, run_hash)
     samples, val = _read_both(settings, train_paths, val_paths)
     out.mkdir(parents=True, exist_ok=True)
-    with _threads(settings.threads):
-        run = _Run(settings, samples, saved)
-        while len(run.history) < settings.epochs:
-            record = run.run_epoch(val)
-            if record.epoch % settings.checkpoint_every == 0 or record.epoch == settings.epochs:
-                write_state(out / STATE_NAME, run.state(), run_hash)
-            if progress is not None:
-                progress(
-                    record.epoch,
-                    settings.epochs,
-                    record.train_rmse_cm,
-                    record.val_rmse_cm,
-                    record.samples_per_s,
-                )
+    with torch_threads(settings.threads):
+        run = TrainingRun(settings, samples, saved)
+        with tensorboard_curve(out, len(run.history) + 1, settings.tensorboard) as show:
+            while not run.ended:
+                record = run.run_epoch(val)
+                if record.epoch % settings.checkpoint_every == 0 or run.ended:
+                    write_state(out / STATE_NAME, run.state(), run_hash)
+                show(record)
+                if progress is not None:
+                    progress(
+                        record.epoch,
+                        settings.epochs,
+                        record.train_rmse_cm,
+                        record.val_rmse_cm,
+                        record.samples_per_s,
+                    )
         network = run.best_network()
-        errors = evaluate_network(network, val)
+        calibrate_sigma(network, val)
+        answers = predict(network, val)
         best = run.state().best_record
-        write_checkpoint(out, settings, network, samples, val, errors, run.history, run_hash)
-    return TrainResult(out, out / MODEL_NAME, best.epoch, errors.all.rmse_cm, True)
+        write_checkpoint(out, settings, network, samples, val, answers, run.history, run_hash)
+    return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
 
 
-def learning_rate_at(step: int, total: int, settings: LearnSettings) -> float:
-    """Return the learning rate of a step (from 0): a straight rise, then a cosine down to zero."""
-    rise = settings.warmup * total
-    if step < rise:
-        return settings.learning_rate * (step + 1) / (rise + 1)
-    share = (step - rise) / max(total - rise, 1.0)
-    return settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
+def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
+    """Scale a network's spread so that 68 % of its errors on frames it did not learn from lie within it."""
+    answers = predict(network, val)
+    factors = sigma_factors(answers.points_cm - answers.truth_cm, answers.sigma_cm)
+    network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
 
 
-def masked_loss(
-    points_cm: Float[Tensor, "n 6"], labels_cm: Float[Tensor, "n 6"], huber_cm: float
-) -> Float[Tensor, ""]:
-    """Return the mean smooth L1 loss over the labelled points, [cm]; masked labels are NaN."""
-    known = torch.isfinite(labels_cm)
-    # Index, not multiply: 0 * NaN is NaN, and so would be its gradient.
-    return nn.functional.smooth_l1_loss(points_cm[known], labels_cm[known], beta=huber_cm)
+class TrainingRun:
+    """Weights, optimiser and curve of a run in memory.
 
+    Attributes:
+        network: What is trained.
+        history: One record per finished epoch.
+    """
 
-def evaluate_network(network: LaneNet, samples: LaneSamples) -> ErrorTable:
-    """Return the errors of a network on frames as they are."""
-    was_training = network.training
-    network.eval()
-    predictions = []
-    with torch.inference_mode():
-        for start in range(0, len(samples), _EVAL_BATCH):
-            rasters, _ = samples.plain_batch(np.arange(start, min(start + _EVAL_BATCH, len(samples))))
-            predictions.append(network(input_of_rasters(torch.from_numpy(rasters))).numpy())
-    network.train(was_training)
-    return point_errors(np.concatenate(predictions).astype(np.float64), samples.points_cm, samples.reference)
-
-
-class _Run:
-    """Weights, optimiser and curve of a run in memory."""
-
-    def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None) -> None:
+    def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None = None) -> None:
         self.settings, self.samples = settings, samples
-        rows, columns = samples.window.rows, samples.window.columns
-        self.network = new_network(settings.network, rows, columns, settings.seed)
+        self.device = _device(settings)
+        self.network = self._new_network()
         mean, scale = samples.normalisation(settings.augment.mirror > 0.0)
         self.network.mean_cm.copy_(torch.from_numpy(mean))
         self.network.scale_cm.copy_(torch.from_numpy(scale))
-        self.ema = LaneNet(settings.network, rows, columns)
-        self.ema.load_state_dict(self.network.state_dict())
-        decayed = [p for p in self.network.parameters() if p.ndim > 1]
-        plain = [p for p in self.network.parameters() if p.ndim <= 1]
-        self.optimizer = torch.optim.AdamW(
-            [
-                {"params": decayed, "weight_decay": settings.weight_decay},
-                {"params": plain, "weight_decay": 0.0},
-            ],
-            lr=settings.learning_rate,
-        )
+        self.optimizer = new_optimizer(self.network, settings)
         self.step = 0
         self.history: list[EpochRecord] = []
         self.best: dict[str, Tensor] | None = None
         self.total = max(1, settings.epochs * samples.steps_per_epoch(settings.batch_size))
+        self.mean = RunningMean(self._new_network(), self.network, settings.ema_decay)
         if saved is not None:
             self.network.load_state_dict(saved.network)
-            self.ema.load_state_dict(saved.ema)
+            self.mean.network.load_state_dict(saved.ema)
             self.optimizer.load_state_dict(saved.optimizer)
             self.step, self.history, self.best = saved.step, list(saved.history), saved.best
+
+    def _new_network(self) -> LaneNet:
+        window, settings = self.samples.window, self.settings
+        return new_network(settings.network, window.rows, window.columns, settings.seed).to(self.device)
+
+    @property
+    def ended(self) -> bool:
+        """True after the last epoch, and once the validation error has long not sunk."""
+        done, patience = len(self.history), self.settings.patience
+        if done >= self.settings.epochs:
+            return True
+        return 0 < patience <= done and done - self.state().best_record.epoch >= patience
 
     def run_epoch(self, val: LaneSamples) -> EpochRecord:
         """Train one epoch and evaluate it."""
@@ -180,23 +168,23 @@ class _Run:
         started = time.perf_counter()
         squares, count, n_samples, rate = 0.0, 0, 0, 0.0
         self.network.train()
-        for rasters, labels in self.samples.epoch(
-            settings.augment, settings.seed, epoch, settings.batch_size
-        ):
-            rate = learning_rate_at(self.step, self.total, settings)
-            targets = torch.from_numpy(labels)
-            points = self._step(input_of_rasters(torch.from_numpy(rasters)), targets, rate)
-            error = (points - targets)[torch.isfinite(targets)]
-            squares += float((error * error).sum())
-            count += error.numel()
-            n_samples += len(rasters)
-            if not math.isfinite(squares):
-                raise LanenetError(
-                    f"training diverged in epoch {epoch + 1}: the error is not finite; lower learning_rate "
-                    f"(now {settings.learning_rate:g})"
-                )
+        batches = self.samples.epoch(settings.augment, settings.seed, epoch, settings.batch_size)
+        with _random_numbers(settings.seed, epoch, self.device):
+            for rasters, labels, present in batches:
+                rate = learning_rate_at(self.step, self.total, settings)
+                targets = torch.from_numpy(labels).to(self.device)
+                points = self._step(rasters, targets, torch.from_numpy(present).to(self.device), rate)
+                error = (points - targets)[torch.isfinite(targets)]
+                squares += float((error * error).sum())
+                count += error.numel()
+                n_samples += len(rasters)
+                if not math.isfinite(squares):
+                    raise LanenetError(
+                        f"training diverged in epoch {epoch + 1}: the error is not finite; lower "
+                        f"learning_rate (now {settings.learning_rate:g})"
+                    )
         seconds = time.perf_counter() - started
-        val_rmse_cm = evaluate_network(self.ema, val).all.rmse_cm
+        val_rmse_cm = predict(self.mean.network, val).errors.all.rmse_cm
         record = EpochRecord(
             epoch=epoch + 1,
             train_rmse_cm=math.sqrt(squares / max(count, 1)),
@@ -205,37 +193,28 @@ class _Run:
             samples_per_s=n_samples / seconds,
         )
         if not self.history or val_rmse_cm < min(r.val_rmse_cm for r in self.history):
-            self.best = {name: value.clone() for name, value in self.ema.state_dict().items()}
+            self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
         self.history.append(record)
         return record
 
-    def _step(self, inputs: Tensor, targets: Tensor, rate: float) -> Tensor:
+    def _step(self, rasters: np.ndarray, targets: Tensor, present: Tensor, rate: float) -> Tensor:
         """Take one step; answers the points that it started from."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        points: Tensor = self.network(inputs)
-        if bool(torch.isfinite(targets).any()):
-            self.optimizer.zero_grad(set_to_none=True)
-            loss = masked_loss(points, targets, self.settings.huber_cm)
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
+        set_learning_rate(self.optimizer, rate)
+        output = self.network(input_of_rasters(torch.from_numpy(rasters).to(self.device)))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss = lane_loss(output, targets, present, self.settings.loss)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
         self.step += 1
-        # Short at first, so that the first epochs are not judged by their random beginning.
-        decay = min(self.settings.ema_decay, (1.0 + self.step) / (10.0 + self.step))
-        with torch.no_grad():
-            current = self.network.state_dict()
-            for name, mean in self.ema.state_dict().items():
-                if mean.is_floating_point():
-                    mean.lerp_(current[name], 1.0 - decay)
-                else:
-                    mean.copy_(current[name])
-        return points.detach()
+        self.mean.update(self.step)
+        points: Tensor = output.points_cm.detach()
+        return points
 
     def state(self) -> RunState:
         """Return what :class:`RunState` keeps of this run."""
         return RunState(
             network=self.network.state_dict(),
-            ema=self.ema.state_dict(),
+            ema=self.mean.network.state_dict(),
             optimizer=self.optimizer.state_dict(),
             step=self.step,
             history=self.history,
@@ -268,8 +247,23 @@ def _read_both(
     return samples, val
 
 
+def _device(settings: LearnSettings) -> torch.device:
+    found = torch.cuda.is_available()
+    if settings.device == "cuda" and not found:
+        raise ConfigError("device: cuda, but PyTorch finds no GPU here; expected cpu or auto")
+    return torch.device("cuda" if found and settings.device != "cpu" else "cpu")
+
+
 @contextmanager
-def _threads(threads: int) -> Iterator[None]:
+def _random_numbers(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
+    """Let torch's own draws (dropout) follow from the seed and the epoch, and leave its generators alone."""
+    with torch.random.fork_rng(devices=[torch.cuda.current_device()] if device.type == "cuda" else []):
+        torch.manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
+        yield
+
+
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
     """Set torch's threads for a while; the setting belongs to the whole process."""
     before = torch.get_num_threads()
     if threads:

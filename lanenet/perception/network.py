@@ -1,177 +1,54 @@
-"""The network as a detector: an ONNX file, its description and one frame after the other."""
+"""The network as a detector: an ONNX file and one frame after the other."""
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import onnxruntime
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from lanenet.config import check_settings
-from lanenet.errors import ConfigError, ModelMismatchError
+from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, POINT_NAMES, ROWS_CM
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.perception.birdseye import RoadEdgeExtractor
+from lanenet.perception.confidence import confidence
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.model_file import (
+    ANY_CAMERA,
+    INPUT_NAME,
+    OUTPUT_NAMES,
+    ModelMeta,
+    open_model,
+    read_model_meta,
+)
 
-FORMAT = "lanenet-model/1"
-INPUT_NAME = "raster"
-OUTPUT_NAMES = ("points_cm", "parabolas", "centre_cm", "steering_rad")
+__all__ = [
+    "ANY_CAMERA",
+    "INPUT_NAME",
+    "OUTPUT_NAMES",
+    "ModelMeta",
+    "NetworkDetector",
+    "open_model",
+    "read_model_meta",
+]
 
-_UNITS = {"points_cm": "cm", "parabolas": "1/cm, 1, cm", "centre_cm": "cm", "steering_rad": "rad"}
-_SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positive left"}
-
-#: Edge points in the window from which on the number of points no longer limits the confidence.
-_ENOUGH_POINTS = 120
 #: A frame with more edges than this share of its road pixels is noise.
 _MAX_EDGE_SHARE = 0.15
-#: Standard deviation of the lane width that the confidence expects, as a share of the width.
-_WIDTH_TOLERANCE = 0.15
-
-
-@dataclass(frozen=True)
-class ModelMeta:
-    """What a model file says about itself.
-
-    Attributes:
-        window: Bird's-eye window of its rasters.
-        camera_hashes: Of the cameras whose frames it was trained on.
-        wheelbase_cm: Of the car that it was trained on.
-        lane_width_cm: Mean lane width of its training data, between the middles of the markings.
-        training_hash: Hash of the contents of its training files.
-        rmse_cm: Error of each point on validation frames; NaN where it was not measured.
-        reference: What the errors were measured against: ``truth``, ``map`` or ``map and truth``.
-        perception: How the edge points of its rasters were found.
-    """
-
-    window: BirdseyeWindow
-    camera_hashes: tuple[str, ...]
-    wheelbase_cm: float
-    lane_width_cm: float
-    training_hash: str
-    rmse_cm: tuple[float, ...]
-    reference: str
-    perception: PerceptionSettings = field(default_factory=PerceptionSettings)
-
-    def to_properties(self) -> dict[str, str]:
-        """Return the description as the text properties of an ONNX file."""
-        errors = [None if math.isnan(v) else v for v in self.rmse_cm]
-        return {
-            "format": FORMAT,
-            "rows_cm": json.dumps(ROWS_CM),
-            "points": json.dumps(POINT_NAMES),
-            "units": json.dumps(_UNITS),
-            "signs": json.dumps(_SIGNS),
-            "window": json.dumps(asdict(self.window)),
-            "camera_hashes": json.dumps(self.camera_hashes),
-            "wheelbase_cm": json.dumps(self.wheelbase_cm),
-            "lane_width_cm": json.dumps(self.lane_width_cm),
-            "training_hash": self.training_hash,
-            "rmse_cm": json.dumps(errors),
-            "reference": self.reference,
-            "perception": self.perception.model_dump_json(),
-        }
-
-    @staticmethod
-    def from_properties(properties: Mapping[str, str], where: str) -> ModelMeta:
-        """Read the description back.
-
-        Args:
-            properties: Text properties of an ONNX file.
-            where: Names the file in the error.
-
-        Raises:
-            ModelMismatchError: If the format is unknown, a property is missing or unreadable, or the six
-                outputs mean something else.
-        """
-        found = properties.get("format")
-        if found != FORMAT:
-            what = f"format {found!r}" if found else "no format"
-            raise ModelMismatchError(f"{where}: {what}, expected {FORMAT!r}; export the model again")
-
-        def value(key: str) -> Any:
-            try:
-                return json.loads(properties[key])
-            except KeyError:
-                raise ModelMismatchError(f"{where}: property {key!r} is missing") from None
-            except ValueError:
-                raise ModelMismatchError(f"{where}: property {key!r} is not JSON") from None
-
-        for key, expected in (("rows_cm", list(ROWS_CM)), ("points", list(POINT_NAMES)), ("signs", _SIGNS)):
-            if value(key) != expected:
-                raise ModelMismatchError(f"{where}: {key} {value(key)}, expected {expected}")
-        try:
-            meta = ModelMeta(
-                window=BirdseyeWindow(**value("window")),
-                camera_hashes=tuple(str(v) for v in value("camera_hashes")),
-                wheelbase_cm=float(value("wheelbase_cm")),
-                lane_width_cm=float(value("lane_width_cm")),
-                training_hash=str(properties.get("training_hash", "")),
-                rmse_cm=tuple(math.nan if v is None else float(v) for v in value("rmse_cm")),
-                reference=str(properties.get("reference", "")),
-                perception=check_settings(PerceptionSettings, value("perception"), "perception"),
-            )
-        except (TypeError, ValueError, ConfigError) as error:
-            raise ModelMismatchError(f"{where}: unreadable description ({error})") from None
-        if len(meta.rmse_cm) != N_POINTS:
-            raise ModelMismatchError(f"{where}: rmse_cm has {len(meta.rmse_cm)} values, expected {N_POINTS}")
-        return meta
-
-
-def open_model(path: Path, threads: int = 1) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
-    """Open a model file and check that it is what its description says.
-
-    Args:
-        path: ONNX file that :mod:`lanenet.learn` exported.
-        threads: Threads of the computation.
-
-    Raises:
-        ModelMismatchError: If the file is missing, is not an ONNX file, or its description is of another
-            format or does not fit its own inputs and outputs.
-    """
-    if not path.is_file():
-        raise ModelMismatchError(f"{path}: no such file, expected an ONNX model")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime has no common base class of its own
-        reason = str(error).splitlines()[0][:200]
-        raise ModelMismatchError(f"{path}: cannot be opened as an ONNX model ({reason})") from None
-    meta = ModelMeta.from_properties(session.get_modelmeta().custom_metadata_map, str(path))
-    inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
-    expected = {INPUT_NAME: ("tensor(uint8)", [1, meta.window.rows, meta.window.columns])}
-    if inputs != expected:
-        raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
-    outputs = [o.name for o in session.get_outputs()]
-    if not set(OUTPUT_NAMES) <= set(outputs):
-        raise ModelMismatchError(f"{path}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
-    return session, meta
-
-
-def read_model_meta(path: Path) -> ModelMeta:
-    """Return what a model file says about itself.
-
-    Raises:
-        ModelMismatchError: As :func:`open_model`.
-    """
-    return open_model(path)[1]
+#: With a model that does not tell the presence of lines: marked cells from which on they count as seen.
+_ENOUGH_CELLS = 120
+#: A camera fits a model for any camera if it sees at least this share of the far half of the window.
+_LEAST_SHARE_SEEN = 1.0 / 3.0
 
 
 class NetworkDetector:
-    """Frame in, lane out, by the network; keeps nothing from frame to frame.
+    """Frame in, lane out, by the network; from earlier frames it keeps the lane's width alone.
 
     Attributes:
         meta: What the model says about itself.
+        memory: Rebuilds the missing line of a frame with one; None if that is switched off.
     """
 
     def __init__(
@@ -183,6 +60,8 @@ class NetworkDetector:
         window: BirdseyeWindow | None = None,
         threads: int = 1,
         mask: UInt8[np.ndarray, "h w"] | None = None,
+        memory: bool = True,
+        lane_width_cm: float | None = None,
     ) -> None:
         """Open a model for a camera.
 
@@ -195,6 +74,8 @@ class NetworkDetector:
             threads: Threads of the computation.
             mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
                 leave out.
+            memory: Rebuild the line that a frame lacks from the other one and the lane's width.
+            lane_width_cm: That width, if it is known; None takes it from the frames that show both lines.
 
         Raises:
             CalibrationError: If the mask's size is not the camera's.
@@ -206,24 +87,19 @@ class NetworkDetector:
             raise ModelMismatchError(
                 f"{model_path}: made for the window {self.meta.window}, but {window} is in use"
             )
-        camera_hash = camera.hash
-        if not any_camera and camera_hash not in self.meta.camera_hashes:
-            raise ModelMismatchError(
-                f"{model_path}: trained with camera {', '.join(self.meta.camera_hashes) or 'unknown'}, but "
-                f"this camera is {camera_hash}; train with this camera, or allow any camera if both are "
-                "calibrated and see about the same road"
-            )
+        if not any_camera:
+            _check_camera(self.meta, camera, model_path)
+        self.memory = LaneMemory(lane_width_cm) if memory else None
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
-        self._sigma_cm: Float[np.ndarray, "6"] = np.array(self.meta.rmse_cm)
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
         """Find the lane in one frame.
 
         Returns:
-            All six points, with the model's validation errors as their standard deviations; an empty
-            estimate of confidence 0 if no edge lies in the window, or if the frame is all edges.
+            All six points with their standard deviations; an empty estimate of confidence 0 if no edge lies
+            in the window, or if the frame is all edges.
 
         Raises:
             CalibrationError: If the frame's size is not the camera's.
@@ -240,44 +116,58 @@ class NetworkDetector:
             return LaneEstimate()
         if raster.base is not self._raster and raster is not self._raster:
             self._raster[0, 0] = raster
-        points, steering = self._session.run(("points_cm", "steering_rad"), {INPUT_NAME: self._raster})
-        points_cm = np.asarray(points[0], np.float64)
+        if self.meta.tells_sigma:
+            found = self._session.run(("points_cm", "sigma_cm", "presence"), {INPUT_NAME: self._raster})
+            points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
+        else:
+            (points,) = self._session.run(("points_cm",), {INPUT_NAME: self._raster})
+            points_cm, sigma_cm = np.asarray(points[0], np.float64), np.array(self.meta.rmse_cm)
+            presence = np.full(len(SIDES), min(1.0, n_cells / _ENOUGH_CELLS))
+        if self.memory is not None:
+            points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        row = 1
+        centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))
         return LaneEstimate(
             points_cm=points_cm,
-            sigma_cm=self._sigma_cm.copy(),
-            steering_rad=float(steering[0, 0]),
-            confidence=confidence(points_cm, n_cells, self.meta.lane_width_cm),
+            sigma_cm=sigma_cm,
+            steering_rad=proportional_angle_rad(centre_cm, ROWS_CM[row]),
+            confidence=confidence(points_cm, sigma_cm, presence, self.meta.widths_cm),
+            presence=presence,
         )
 
     def reset(self) -> None:
-        """Do nothing: there is no state."""
+        """Forget the lane's width that earlier frames showed."""
+        if self.memory is not None:
+            self.memory.reset()
 
 
-def confidence(points_cm: Float[np.ndarray, "6"], n_cells: int, lane_width_cm: float) -> float:
-    """Judge an answer by how much was seen and by whether it is a lane of the known width.
+def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
+    """Refuse a camera that a model was not trained for.
 
-    ``min(1, n / 120) * exp(-0.5 * ((w - W) / (0.15 W))^2)`` with n the marked cells of the raster, W the lane
-    width of the training data and w the width of the answer at y = 15 cm, measured across the lane: the gap
-    along x divided by sqrt(1 + slope^2), with the mean slope dx/dy of the two parabolas there.
-
-    Args:
-        points_cm: The six points, frame car.
-        n_cells: Cells of the raster that hold an edge.
-        lane_width_cm: W.
-
-    Returns:
-        0 to 1; 0 if the right line does not lie to the right of the left one.
-
-    Source:
-        Own choice; values in ``tests/unit/perception/test_network.py``.
+    Raises:
+        ModelMismatchError: Naming both cameras, or how much of the window this one sees.
     """
-    lines = points_cm.reshape(2, len(ROWS_CM))
-    row = 1
-    gap = float(lines[1, row] - lines[0, row])
-    if not gap > 0.0:
-        return 0.0
-    a, b, _ = PARABOLA_FROM_POINTS @ lines.mean(axis=0)
-    slope = 2.0 * a * ROWS_CM[row] + b
-    width = gap / math.sqrt(1.0 + slope * slope)
-    off = (width - lane_width_cm) / (_WIDTH_TOLERANCE * lane_width_cm)
-    return min(1.0, n_cells / _ENOUGH_POINTS) * math.exp(-0.5 * off * off)
+    if meta.any_camera:
+        share = _share_seen(meta.window, camera)
+        if share < _LEAST_SHARE_SEEN:
+            raise ModelMismatchError(
+                f"{model_path}: made for any camera that sees its window, {meta.window}; this one sees "
+                f"{share:.0%} of the window's far half, expected at least {_LEAST_SHARE_SEEN:.0%}"
+            )
+    elif camera.hash not in meta.camera_hashes:
+        raise ModelMismatchError(
+            f"{model_path}: trained with camera {', '.join(meta.camera_hashes) or 'unknown'}, but "
+            f"this camera is {camera.hash}; train with this camera, or allow any camera if both are "
+            "calibrated and see about the same road"
+        )
+
+
+def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
+    """Return the share of the far half of a window that lies in a camera's picture."""
+    row, column = np.mgrid[0 : window.rows / 2 : 16j, 0 : window.columns - 1 : 32j]
+    pixels = camera.project_ground(window.points(np.stack([row.ravel(), column.ravel()], axis=1)))
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(
+            axis=1
+        )
+    return float(inside.mean())

@@ -7,7 +7,7 @@ from synthetic_labels import WINDOW, make_label_set
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import mirror_points
-from lanenet.learn.augment import _near_line, augment_batch, labels_of_view, make_view
+from lanenet.learn.augment import _near_line, augment_batch, labels_of_view, lines_present, make_view
 from lanenet.learn.config import AugmentSettings
 
 NOTHING = AugmentSettings(
@@ -25,10 +25,35 @@ LABELS = make_label_set(12, seed=5)
 EDGES = [e[:, :2] for e in LABELS.edges]
 
 
-def augment(changes, window=WINDOW, seed=0):
+def augment_all(changes, window=WINDOW, seed=0):
     rngs = [np.random.default_rng((seed, i)) for i in range(len(EDGES))]
     chosen = NOTHING.model_copy(update=changes)
     return augment_batch(EDGES, LABELS.lines, LABELS.points_cm, rngs, window, chosen)
+
+
+def augment(changes, window=WINDOW, seed=0):
+    return augment_all(changes, window, seed)[:2]
+
+
+def test_a_dropped_line_is_told_as_absent():
+    *_, both = augment_all({})
+    assert (both == 1.0).all()
+    rasters, _, present = augment_all({"missing_line": 1.0})
+    assert (present.sum(axis=1) == 1.0).all() and len(np.unique(present[:, 0])) == 2
+    # Cells of the right half, in which the right line lies, are marked if it is there.
+    right = rasters[:, 0, :, 16:].any(axis=(1, 2))
+    np.testing.assert_array_equal(right, present[:, 1] == 1.0)
+
+
+def test_presence_counts_points_beside_the_line():
+    window = BirdseyeWindow()
+    y = np.linspace(1.0, 60.0, 12)
+    lines = tuple(np.stack([np.full(2, x), [-10.0, 90.0]], axis=1) for x in (-20.0, 20.0))
+    left = np.stack([np.full(12, -22.0), y], axis=1)
+    np.testing.assert_array_equal(lines_present(left, lines, window), [1.0, 0.0])
+    np.testing.assert_array_equal(lines_present(left[1:], lines, window), [0.0, 0.0])
+    np.testing.assert_array_equal(lines_present(left + [6.0, 0.0], lines, window), [0.0, 0.0])
+    np.testing.assert_array_equal(lines_present(-left * [1.0, -1.0], lines, window), [0.0, 1.0])
 
 
 def test_without_changes_the_sample_stays():
@@ -117,7 +142,7 @@ def test_clutter_only_adds():
 
 def test_an_empty_frame_can_be_augmented():
     edges, lines = np.empty((0, 2), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
-    rasters, points = augment_batch(
+    rasters, points, present = augment_batch(
         [edges],
         [lines],
         np.full((1, 6), np.nan),
@@ -125,7 +150,7 @@ def test_an_empty_frame_can_be_augmented():
         WINDOW,
         NOTHING.model_copy(update={"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0}),
     )
-    assert not rasters.any() and np.isnan(points).all()
+    assert not rasters.any() and np.isnan(points).all() and np.isnan(present).all()
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.5])

@@ -63,7 +63,7 @@ def test_one_file_that_old_runtimes_read(checkpoint):
 def test_onnx_agrees_with_torch_for_any_batch(checkpoint, n):
     session = onnxruntime.InferenceSession(checkpoint / "model.onnx", providers=["CPUExecutionProvider"])
     names = [o.name for o in session.get_outputs()]
-    assert names == ["points_cm", "parabolas", "centre_cm", "steering_rad"]
+    assert names == ["points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad"]
     found = session.run(None, {"raster": RASTERS[:n]})
     with torch.inference_mode():
         expected = DeployedLaneNet(make_network()).eval()(torch.from_numpy(RASTERS[:n]))
@@ -96,7 +96,7 @@ def test_predictor_answers_as_the_network_and_not_for_empty_rasters(checkpoint):
     labels.edges[1] = labels.edges[1][:0]
     found = network_predictor(checkpoint / "model.onnx")(labels)
     with torch.inference_mode():
-        expected = make_network()(input_of_rasters(torch.from_numpy(RASTERS[:3]))).numpy()
+        expected = make_network()(input_of_rasters(torch.from_numpy(RASTERS[:3]))).points_cm.numpy()
     np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], atol=1e-3)
     assert np.isnan(found[1]).all()
     with pytest.raises(ModelMismatchError, match="window"):

@@ -22,9 +22,11 @@ def test_frames_of_two_sets_stay_in_order(tmp_path):
     assert len(both) == 7
     assert both.camera_hashes == ["cam0", "cam1"]
     assert both.reference == "map and truth"
-    rasters, points = both.plain_batch(np.array([5, 0]))
+    rasters, points, present = both.plain_batch(np.array([5, 0]))
     np.testing.assert_array_equal(rasters[0, 0], b.raster(2))
     np.testing.assert_allclose(points[1], a.points_cm[0], atol=1e-4)
+    np.testing.assert_array_equal(present, np.ones((2, 2)))
+    assert both.lane_widths_cm == (40.0, 40.0)
 
 
 @pytest.mark.parametrize(
@@ -69,16 +71,16 @@ def test_workers_do_not_change_an_epoch():
     runs = [list(data.epoch(settings, 0, 0, 8, workers)) for workers in (0, 1, 3)]
     for run in runs[1:]:
         assert len(run) == len(runs[0]) == data.steps_per_epoch(8) == 7
-        for (raster, points), (raster0, points0) in zip(run, runs[0], strict=True):
-            np.testing.assert_array_equal(raster, raster0)
-            np.testing.assert_array_equal(points, points0)
+        for batch, first in zip(run, runs[0], strict=True):
+            for values, expected in zip(batch, first, strict=True):
+                np.testing.assert_array_equal(values, expected)
 
 
 def test_an_epoch_shows_each_sample_once_in_an_order_of_its_own():
     data = samples(49)
     plain = AugmentSettings(mirror=0.0, shift_cm=0.0, rotate_rad=0.0)
     first, second = (
-        np.concatenate([points for _, points in data.epoch(plain, 0, epoch, 8)]) for epoch in (0, 1)
+        np.concatenate([points for _, points, _ in data.epoch(plain, 0, epoch, 8)]) for epoch in (0, 1)
     )
     # 49 = 6 x 8 + 1: the single last sample is left out.
     assert len(first) == 48 and data.steps_per_epoch(8) == 6

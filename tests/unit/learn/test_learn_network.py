@@ -2,26 +2,97 @@ import numpy as np
 import pytest
 import torch
 
+from lanenet.errors import CheckpointError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import parabolas_from_points
 from lanenet.geometry.steering import proportional_angle_rad
 from lanenet.learn.config import NetworkSettings
-from lanenet.learn.network import DeployedLaneNet, LaneNet, input_of_rasters, new_network
+from lanenet.learn.network import SIGMA_RANGE_CM, DeployedLaneNet, LaneNet, input_of_rasters, new_network
 
 torch.set_num_threads(1)
 
+ALEXNET = NetworkSettings(kind="alexnet")
 
-def test_default_network_is_compact():
+
+@pytest.fixture(scope="module")
+def alexnet():
+    return new_network(ALEXNET, 24, 32, 0).eval()
+
+
+def test_the_family_grows_and_stays_compact():
     window = BirdseyeWindow()
-    network = LaneNet(NetworkSettings(), window.rows, window.columns)
-    assert network(torch.zeros(3, 1, window.rows, window.columns)).shape == (3, 6)
-    assert network.n_parameters <= 150_000
+    networks = [
+        LaneNet(NetworkSettings(kind=k), window.rows, window.columns) for k in ("nano", "small", "base")
+    ]
+    sizes = [network.n_parameters for network in networks]
+    assert sizes == sorted(sizes) and sizes[0] < 50_000 < sizes[1] <= 150_000 < sizes[2]
+    output = networks[1](torch.zeros(3, 1, window.rows, window.columns))
+    assert [tuple(value.shape) for value in output] == [(3, 6), (3, 6), (3, 2)]
+
+
+def test_channels_and_hidden_go_before_the_kind():
+    assert NetworkSettings(kind="nano", channels=(4, 8)).size == (
+        (4, 8),
+        NetworkSettings(kind="nano").size[1],
+    )
+    a = LaneNet(NetworkSettings(kind="nano", channels=(4, 8), hidden=16), 24, 32)
+    b = LaneNet(NetworkSettings(kind="base", channels=(4, 8), hidden=16), 24, 32)
+    assert a.n_parameters == b.n_parameters
 
 
 @pytest.mark.parametrize("shape", [(96, 128), (33, 47), (1, 1)])
 def test_any_window_fits(shape):
     network = LaneNet(NetworkSettings(channels=(2, 3), hidden=4), *shape).eval()
-    assert network(torch.zeros(1, 1, *shape)).shape == (1, 6)
+    assert network(torch.zeros(1, 1, *shape)).points_cm.shape == (1, 6)
+
+
+def test_alexnet_is_the_papers_and_300_times_as_large(alexnet):
+    # 61,100,840 values of AlexNet, without the 4096 x 1000 + 1000 of its last layer, with one of 14 outputs.
+    assert alexnet.n_parameters == 61_100_840 - 4_097_000 + 4096 * 14 + 14
+    window = BirdseyeWindow()
+    small = LaneNet(NetworkSettings(), window.rows, window.columns)
+    assert alexnet.n_parameters >= 300 * small.n_parameters
+    raster = torch.zeros(1, 1, 24, 32)
+    raster[0, 0, :, 8] = 1.0
+    with torch.inference_mode():
+        marked, empty = alexnet(raster).points_cm, alexnet(0.0 * raster).points_cm
+    assert not torch.equal(marked, empty)
+
+
+def test_pretrained_weights_are_taken_up_but_for_the_last_layer(alexnet, tmp_path):
+    from torchvision.models import alexnet as torchvision_alexnet
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        published = torchvision_alexnet(weights=None).state_dict()
+    path = tmp_path / "alexnet.pth"
+    torch.save(published, path)
+    network = new_network(NetworkSettings(kind="alexnet", weights=path), 24, 32, 0)
+    own = network.trunk.state_dict()
+    assert torch.equal(own["features.0.weight"], published["features.0.weight"])
+    assert torch.equal(own["classifier.4.bias"], published["classifier.4.bias"])
+    assert torch.equal(network.head.weight, alexnet.head.weight)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"rubbish", "cannot be read as weights"),
+        ({}, r"expected AlexNet's 'features\.0\.weight' of shape \(64, 3, 11, 11\), found nothing"),
+        ({"features.0.weight": torch.zeros(2)}, r"found shape \(2,\)"),
+        ([1], "expected a dict of tensors, found list"),
+    ],
+)
+def test_faulty_pretrained_weights_are_refused(alexnet, tmp_path, content, message):
+    path = tmp_path / "w.pth"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        alexnet.trunk.load_pretrained(path)
+    assert str(path) in str(caught.value)
 
 
 def test_first_weights_follow_from_the_seed_and_leave_the_global_generator_alone():
@@ -39,7 +110,17 @@ def test_buffers_scale_the_output():
     plain = network(raster)
     network.mean_cm.fill_(7.0)
     network.scale_cm.fill_(2.0)
-    torch.testing.assert_close(network(raster), 2.0 * plain + 7.0)
+    network.sigma_factor.fill_(3.0)
+    torch.testing.assert_close(network(raster).points_cm, 2.0 * plain.points_cm + 7.0)
+    torch.testing.assert_close(network(raster).sigma_cm, 3.0 * plain.sigma_cm)
+
+
+@pytest.mark.parametrize(("bias", "limit"), [(-1e3, SIGMA_RANGE_CM[0]), (1e3, SIGMA_RANGE_CM[1])])
+def test_the_spread_stays_within_its_range(bias, limit):
+    network = LaneNet(NetworkSettings(channels=(2,), hidden=4), 24, 32).eval()
+    network.head[-1].bias.data[6:12] = bias
+    sigma = network(torch.zeros(1, 1, 24, 32)).sigma_cm
+    torch.testing.assert_close(sigma, torch.full((1, 6), limit))
 
 
 def test_deployed_outputs_follow_from_the_points():
@@ -48,8 +129,12 @@ def test_deployed_outputs_follow_from_the_points():
     rng = np.random.default_rng(0)
     raster = torch.from_numpy(np.where(rng.random((5, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8))
     with torch.inference_mode():
-        points, parabolas, centre, steering = (v.numpy() for v in DeployedLaneNet(network)(raster))
-        np.testing.assert_allclose(points, network(input_of_rasters(raster)).numpy(), atol=1e-5)
+        deployed = (v.numpy() for v in DeployedLaneNet(network)(raster))
+        points, sigma, presence, parabolas, centre, steering = deployed
+        plain = network(input_of_rasters(raster))
+    np.testing.assert_allclose(points, plain.points_cm.numpy(), atol=1e-5)
+    np.testing.assert_allclose(sigma, plain.sigma_cm.numpy(), atol=1e-5)
+    np.testing.assert_allclose(presence, 1.0 / (1.0 + np.exp(-plain.presence_logit.numpy())), atol=1e-6)
     np.testing.assert_allclose(parabolas, parabolas_from_points(points), atol=1e-4)
     np.testing.assert_allclose(centre[:, 0], (points[:, 1] + points[:, 4]) / 2.0, atol=1e-5)
     expected = [proportional_angle_rad(float(c), 15.0) for c in centre[:, 0]]

@@ -4,19 +4,24 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 from safetensors.torch import load_file
 from synthetic_labels import make_label_set
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lanenet.config import load_settings
 from lanenet.data.label_set import read_labels, write_labels
-from lanenet.errors import CheckpointError, LabelFormatError, LanenetError
+from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 from lanenet.learn.evaluate import network_predictor, point_errors
-from lanenet.learn.train import learning_rate_at, masked_loss, train
-from lanenet.perception.network import read_model_meta
+from lanenet.learn.network import new_network
+from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
+from lanenet.learn.quantise import Int8Report, export_int8
+from lanenet.learn.train import train
+from lanenet.perception.network import open_model, read_model_meta
 
 torch.set_num_threads(1)
 
@@ -88,12 +93,15 @@ def test_the_folder_holds_what_it_should(finished, data):
         "metrics.json",
         "curve.csv",
         "curve.png",
+        "calibration_rasters.png",
+        "check_rasters.png",
         "last.pt",
     }
     assert load_settings(LearnSettings, finished.folder / "config.yaml") == TINY
     metrics = json.loads((finished.folder / "metrics.json").read_text())
     assert metrics["val_rmse_cm"] == finished.val_rmse_cm
     assert metrics["val"]["reference"] == "map"
+    assert len(metrics["sigma_factors"]) == 6 and metrics["val_presence"]["visible_lines"] == 80
     with (finished.folder / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["epoch"]) for row in rows] == [1, 2, 3]
@@ -111,7 +119,7 @@ def test_the_folder_holds_what_it_should(finished, data):
 
 @pytest.mark.parametrize(("last", "every"), [(1, 1), (2, 1), (2, 5)])
 def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last, every):
-    settings = TINY.model_copy(update={"checkpoint_every": every})
+    settings = TINY.model_copy(update={"checkpoint_every": every, "tensorboard": True})
     with pytest.raises(KilledError):
         run(data, tmp_path / "a", settings, kill_at(last))
     assert not (tmp_path / "a" / "model.onnx").exists()
@@ -122,6 +130,34 @@ def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last,
     b = load_file(finished.folder / "weights.safetensors")
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
     assert (result.best_epoch, result.val_rmse_cm) == (finished.best_epoch, finished.val_rmse_cm)
+    # Each epoch stands once in the curve, also one that was computed again.
+    events = EventAccumulator(str(tmp_path / "a" / "tensorboard")).Reload()
+    assert [e.step for e in events.Scalars("val_rmse_cm")] == [1, 2, 3]
+    assert min(e.value for e in events.Scalars("val_rmse_cm")) == pytest.approx(result.val_rmse_cm, rel=1e-5)
+
+
+def test_the_model_can_be_quantised(finished, tmp_path):
+    path, report = export_int8(finished.folder, tmp_path / "model-int8.onnx")
+    floats, meta = open_model(finished.model_path)
+    small, small_meta = open_model(path)
+    assert small_meta == meta and small_meta.training_hash
+    assert {"QuantizeLinear", "DequantizeLinear"} <= {node.op_type for node in onnx.load(path).graph.node}
+    labels = make_label_set(30, 9)
+    rasters = np.stack([labels.raster(i) for i in range(30)])[:, None]
+    a, b = (session.run(["points_cm"], {"raster": rasters})[0] for session in (floats, small))
+    assert 0.0 < np.sqrt(np.mean((a - b) ** 2)) < 0.5
+    figures = json.loads(path.with_suffix(".json").read_text())
+    assert 0.0 < figures["rms_difference_cm"] <= figures["largest_difference_cm"]
+    assert figures["recommended"] == report.recommended
+    assert figures["size_bytes"] == path.stat().st_size
+
+
+def test_int8_is_recommended_only_where_it_is_faster_and_close():
+    good = Int8Report(0.02, 0.1, 0.05, 0.06, 1000, 4000)
+    assert good.recommended and good.lines[-1].endswith("use it")
+    for worse in ({"rms_difference_cm": 0.06}, {"median_ms": 0.07}):
+        other = replace(good, **worse)
+        assert not other.recommended and other.lines[-1].endswith("keep model.onnx")
 
 
 def test_a_finished_run_is_not_repeated(data, finished):
@@ -164,24 +200,44 @@ def test_divergence_is_an_error(data, tmp_path):
         run(data, tmp_path / "wild", TINY.model_copy(update={"learning_rate": 1e30}))
 
 
-def test_masked_labels_give_neither_loss_nor_gradient():
-    points = torch.zeros(2, 6, requires_grad=True)
-    labels = torch.full((2, 6), float("nan"))
-    labels[0, 2], labels[1, 4] = 1.0, 10.0
-    loss = masked_loss(points, labels, 2.0)
-    loss.backward()
-    # 0.5 * 1^2 / 2 inside, 10 - 0.5 * 2 outside.
-    assert float(loss.detach()) == pytest.approx((0.25 + 9.0) / 2.0)
-    assert torch.isfinite(points.grad).all()
-    assert points.grad.count_nonzero() == 2
-
-
 def test_learning_rate_rises_and_falls():
     settings = LearnSettings(learning_rate=1.0, warmup=0.1)
     rates = [learning_rate_at(step, 100, settings) for step in range(100)]
     assert int(np.argmax(rates)) == 10 and rates[10] == 1.0
     assert (np.diff(rates[:11]) > 0).all() and (np.diff(rates[10:]) < 0).all()
     assert 0.0 < rates[0] < 0.2 and 0.0 < rates[-1] < 1e-3
+
+
+def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
+    settings = LearnSettings(network=NetworkSettings(kind="alexnet"), head_rate=10.0, weight_decay=0.1)
+    network = new_network(settings.network, 24, 32, 0)
+    optimizer = new_optimizer(network, settings)
+    set_learning_rate(optimizer, 1e-4)
+    groups = {id(p): group for group in optimizer.param_groups for p in group["params"]}
+    assert len(groups) == len(list(network.parameters()))
+    assert groups[id(network.head.weight)]["lr"] == pytest.approx(1e-3)
+    assert groups[id(network.trunk.features[0].weight)]["lr"] == pytest.approx(1e-4)
+    assert groups[id(network.head.weight)]["weight_decay"] == 0.1
+    assert groups[id(network.head.bias)]["weight_decay"] == 0.0
+    small = new_network(NetworkSettings(), 24, 32, 0)
+    set_learning_rate(compact := new_optimizer(small, LearnSettings()), 1e-4)
+    assert {group["lr"] for group in compact.param_groups} == {1e-4}
+
+
+def test_patience_ends_a_run_that_gets_no_better(data, tmp_path):
+    # So small a rate that only the first epochs change anything that counts.
+    settings = TINY.model_copy(update={"epochs": 12, "patience": 2, "learning_rate": 3e-2, "ema_decay": 0.0})
+    seen = []
+    result = run(data, tmp_path / "patient", settings, lambda epoch, *_: seen.append(epoch))
+    assert seen[-1] == result.best_epoch + 2 < 12
+    assert run(data, tmp_path / "patient", settings) == replace(result, computed=False)
+
+
+def test_a_gpu_that_is_not_there_is_named(data, tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(ConfigError, match="device: cuda"):
+        run(data, tmp_path / "gpu", TINY.model_copy(update={"device": "cuda"}))
 
 
 def test_a_network_does_not_learn_from_the_truth(tmp_path):

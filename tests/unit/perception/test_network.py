@@ -5,18 +5,15 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from lanenet.errors import CalibrationError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.geometry.lane import mirror_points
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.network import ModelMeta, NetworkDetector, confidence, read_model_meta
+from lanenet.perception.network import ModelMeta, NetworkDetector, read_model_meta
 
 torch.set_num_threads(1)
 
@@ -73,7 +70,7 @@ def test_a_frame_gives_points_errors_and_steering(model_path):
     assert estimate.mask.all()
     # Hardly any training is in these weights: the answer is the mean lane, more or less.
     np.testing.assert_allclose(estimate.points_cm, LANE, atol=3.0)
-    np.testing.assert_array_equal(estimate.sigma_cm, META.rmse_cm)
+    assert (estimate.sigma_cm > 0.0).all() and ((estimate.presence > 0.0) & (estimate.presence < 1.0)).all()
     centre = (estimate.points_cm[1] + estimate.points_cm[4]) / 2.0
     assert estimate.steering_rad == pytest.approx(math.atan2(-centre, 15.0), abs=1e-5)
     assert 0.0 < estimate.confidence <= 1.0
@@ -103,7 +100,7 @@ def test_frames_do_not_leak_into_each_other(model_path):
     np.testing.assert_array_equal(first.points_cm, again.points_cm)
     # What the caller does with a result does not reach the next one.
     again.sigma_cm[:] = 99.0
-    assert detector.detect(striped_frame()).sigma_cm[0] == 1.0
+    np.testing.assert_array_equal(detector.detect(striped_frame()).sigma_cm, first.sigma_cm)
 
 
 def test_a_raster_gives_what_its_frame_gives(model_path):
@@ -138,7 +135,7 @@ def test_a_frame_of_another_size_is_refused(model_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "lanenet-model/9"}, "format 'lanenet-model/9', expected 'lanenet-model/1'"),
+        ({"format": "lanenet-model/9"}, "format 'lanenet-model/9', expected 'lanenet-model/2'"),
         ({"format": None}, "no format"),
         ({"window": None}, "'window' is missing"),
         ({"window": "{"}, "'window' is not JSON"),
@@ -146,6 +143,7 @@ def test_a_frame_of_another_size_is_refused(model_path):
         ({"rows_cm": "[0.0, 10.0, 20.0]"}, "rows_cm"),
         ({"signs": '{"steering_rad": "positive right"}'}, "signs"),
         ({"rmse_cm": "[1.0]"}, "rmse_cm has 1 values, expected 6"),
+        ({"lane_width_range_cm": "[30.0]"}, "unreadable description"),
     ],
 )
 def test_faulty_descriptions_are_refused(model_path, tmp_path, changes, message):
@@ -164,26 +162,79 @@ def test_files_that_are_no_models_are_refused(tmp_path):
 
 
 def test_description_survives_the_trip():
-    meta = ModelMeta.from_properties(META.to_properties(), "here")
-    assert replace(meta, rmse_cm=()) == replace(META, rmse_cm=())
+    told = replace(META, lane_width_range_cm=(30.0, 50.0))
+    meta = ModelMeta.from_properties(told.to_properties(), "here")
+    assert replace(meta, rmse_cm=()) == replace(told, rmse_cm=())
+    assert ModelMeta.from_properties(META.to_properties(), "here").widths_cm == META.widths_cm == (40.0, 40.0)
     np.testing.assert_equal(meta.rmse_cm, META.rmse_cm)
 
 
-def test_confidence_values():
-    assert confidence(LANE, 120, 40.0) == 1.0
-    assert confidence(LANE, 30, 40.0) == pytest.approx(0.25)
-    # One tolerance (15 % of 40 cm) too wide.
-    assert confidence(LANE * 1.15, 500, 40.0) == pytest.approx(math.exp(-0.5))
-    assert confidence(-LANE, 500, 40.0) == 0.0
-    assert confidence(np.full(6, np.nan), 500, 40.0) == 0.0
+def test_a_model_for_any_camera_takes_those_that_see_its_window(model_path, tmp_path):
+    path = change_properties(model_path, tmp_path / "any.onnx", camera_hashes='["any"]')
+    other = CAMERA.with_mounting(height_cm=17.0)
+    assert NetworkDetector(path, other).meta.any_camera
+    with pytest.raises(ModelMismatchError, match="sees 0% of the window's far half"):
+        NetworkDetector(path, CAMERA.with_mounting(pitch_down_rad=-0.6))
+    assert NetworkDetector(path, CAMERA.with_mounting(yaw_rad=3.0), any_camera=True).meta.any_camera
 
 
-@given(turn=st.floats(-0.6, 0.6), shift=st.floats(-10, 10))
-def test_confidence_measures_the_width_across_the_lane(turn, shift):
-    rows = np.array([0.0, 15.0, 30.0])
-    lane = np.concatenate([side / math.cos(turn) + shift + rows * math.tan(turn) for side in (-20.0, 20.0)])
-    assert confidence(lane, 500, 40.0) == pytest.approx(1.0)
-    assert confidence(mirror_points(lane), 500, 40.0) == pytest.approx(1.0)
+def test_a_model_without_outputs_for_its_doubt_is_still_read(model_path, tmp_path):
+    model = onnx.load(model_path)
+    for output in [o for o in model.graph.output if o.name in ("sigma_cm", "presence")]:
+        model.graph.output.remove(output)
+    onnx.save(model, tmp_path / "bare.onnx")
+    with pytest.raises(ModelMismatchError, match="outputs"):
+        read_model_meta(tmp_path / "bare.onnx")
+    old = {"format": "lanenet-model/1", "lane_width_range_cm": None}
+    path = change_properties(tmp_path / "bare.onnx", tmp_path / "old.onnx", **old)
+    detector = NetworkDetector(path, CAMERA)
+    assert not detector.meta.tells_sigma and detector.meta.widths_cm == (40.0, 40.0)
+    frame = striped_frame()
+    estimate = detector.detect(frame)
+    np.testing.assert_array_equal(estimate.sigma_cm, META.rmse_cm)
+    new = NetworkDetector(model_path, CAMERA, memory=False).detect(frame)
+    np.testing.assert_array_equal(estimate.points_cm, new.points_cm)
+    one_cell = np.zeros((24, 32), np.uint8)
+    one_cell[10, 10] = 255
+    assert detector.detect_raster(one_cell).confidence < 0.02 < 0.3 < estimate.confidence
+
+
+class _Session:
+    """Answers in turn what a network would."""
+
+    def __init__(self, answers):
+        self.answers = list(answers)
+
+    def run(self, names, inputs):
+        points, sigma, presence = self.answers.pop(0)
+        return [np.array([v], np.float32) for v in (points, sigma, presence)]
+
+
+def test_a_missing_line_is_rebuilt_from_the_width_of_earlier_frames(model_path, tmp_path, monkeypatch):
+    path = change_properties(model_path, tmp_path / "m.onnx", lane_width_range_cm="[25.0, 50.0]")
+    raster = np.full((24, 32), 255, np.uint8)
+    narrow = 0.75 * LANE
+    doubtful = np.concatenate([narrow[:3], LANE[3:]])
+    sigma = np.full(6, 0.4)
+    wide_sigma = np.concatenate([sigma[:3], np.full(3, 5.0)])
+    both, left_only = (narrow, sigma, [0.99, 0.98]), (doubtful, wide_sigma, [0.99, 0.05])
+
+    def estimates(answers, **options):
+        detector = NetworkDetector(path, CAMERA, **options)
+        monkeypatch.setattr(detector, "_session", _Session(answers))
+        return [detector.detect_raster(raster) for _ in answers], detector
+
+    frames, detector = estimates([both] * 12 + [left_only])
+    np.testing.assert_allclose(frames[-1].points_cm, narrow, atol=1e-3)
+    assert frames[-1].sigma_cm[4] < 1.0 and frames[-1].steering_rad == pytest.approx(0.0, abs=1e-4)
+    detector.reset()
+    monkeypatch.setattr(detector, "_session", _Session([left_only]))
+    np.testing.assert_allclose(detector.detect_raster(raster).points_cm, doubtful, atol=1e-4)
+    forgetful, _ = estimates([both] * 12 + [left_only], memory=False)
+    np.testing.assert_allclose(forgetful[-1].points_cm, doubtful, atol=1e-4)
+    assert forgetful[-1].confidence < frames[-1].confidence
+    told, _ = estimates([left_only], lane_width_cm=30.0)
+    np.testing.assert_allclose(told[-1].points_cm, narrow, atol=1e-3)
 
 
 def test_a_frame_of_noise_gives_no_lane(model_path):

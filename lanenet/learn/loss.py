@@ -1,0 +1,90 @@
+"""What the training makes small: a robust likelihood of the points, and the presence of the lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lanenet.geometry.lane import N_POINTS, ROWS_CM
+from lanenet.learn.config import LossSettings
+from lanenet.learn.network import LaneOutput
+
+#: Share of a normal distribution within one standard deviation.
+ONE_SIGMA = 0.6827
+#: Tails of Student's distribution: its degrees of freedom.
+_FREEDOM = 4.0
+#: Half the width that holds 68.27 % over the scale: of Student's distribution, and of Laplace's.
+_STUDENT_SIGMA, _LAPLACE_SIGMA = 1.1417, 1.1479
+#: Fewer points than this do not tell a share of 68 %.
+_ENOUGH_POINTS = 50
+
+
+def lane_loss(
+    output: LaneOutput,
+    labels_cm: Float[Tensor, "n 6"],
+    present: Float[Tensor, "n 2"],
+    settings: LossSettings,
+) -> Float[Tensor, ""]:
+    """Return the mean negative log likelihood of the known labels, and the cross-entropy of the presence.
+
+    The spread that the network predicts is half the width of the interval that holds 68.27 % of the errors,
+    for each kind of distribution: the scale follows from it.
+
+    Args:
+        output: Answers of the network.
+        labels_cm: NaN where masked; such points have no part in the loss and give no gradient.
+        present: 1 for a line that can be seen, 0 for one that cannot, NaN where that is unknown.
+        settings: Kind and weights.
+
+    Returns:
+        The loss; zero, with a gradient of zero, if nothing is known.
+
+    Source:
+        The weighting by the predicted spread: Seitzer et al. 2022, "On the pitfalls of heteroscedastic
+        uncertainty estimation with probabilistic neural networks", eq. 5.
+    """
+    known = torch.isfinite(labels_cm)
+    # Index, not multiply: 0 * NaN is NaN, and so would be its gradient.
+    error, sigma = output.points_cm[known] - labels_cm[known], output.sigma_cm[known]
+    if settings.kind == "student":
+        z = error * _STUDENT_SIGMA / sigma
+        terms = 0.5 * (_FREEDOM + 1.0) * torch.log1p(z * z / _FREEDOM) + torch.log(sigma)
+    elif settings.kind == "laplace":
+        terms = error.abs() * _LAPLACE_SIGMA / sigma + torch.log(sigma)
+    else:
+        z = error / sigma
+        terms = 0.5 * z * z + torch.log(sigma)
+    weights = sigma.detach() ** settings.evenness
+    points = (weights * terms).sum() / max(terms.numel(), 1)
+    told = torch.isfinite(present)
+    entropy = nn.functional.binary_cross_entropy_with_logits(
+        output.presence_logit[told], present[told], reduction="sum"
+    )
+    return points + settings.presence * entropy / max(int(told.sum()), 1)
+
+
+def sigma_factors(
+    error_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]
+) -> Float[np.ndarray, "6"]:
+    """Find what predicted spreads have to be multiplied with so that 68.27 % of the errors lie within them.
+
+    Both sides share the factor of a row: a network that is trained with mirrored samples knows no side.
+
+    Args:
+        error_cm: Errors on frames that the network did not learn from; NaN where there is no label.
+        sigma_cm: The predicted standard deviations.
+
+    Returns:
+        A factor per point; 1 for the points of a row with too few errors.
+    """
+    known = np.isfinite(error_cm)
+    factors = np.ones(N_POINTS)
+    for row in range(len(ROWS_CM)):
+        columns = [row, row + len(ROWS_CM)]
+        chosen = known[:, columns]
+        if chosen.sum() >= _ENOUGH_POINTS:
+            ratio = np.abs(error_cm[:, columns][chosen]) / sigma_cm[:, columns][chosen]
+            factors[columns] = max(float(np.quantile(ratio, ONE_SIGMA)), 1e-3)
+    return factors

@@ -1,0 +1,188 @@
+"""A recorded search for the window, the size, the loss and the learning rate, judged on validation drives."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from lanenet.data.files import require, write_text
+from lanenet.data.label_set import LabelSet, read_labels
+from lanenet.errors import LanenetError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.dataset import LaneSamples, check_same
+from lanenet.learn.run_state import hash_run
+from lanenet.learn.sweep_table import trials_csv, trials_table
+from lanenet.learn.train import TrainingRun, torch_threads
+
+#: Called with (finished trials, trials).
+Progress = Callable[[int, int], None]
+
+DATABASE_NAME = "sweep.db"
+
+#: What is tried; the first value of each is tried first, together: the small network as it is.
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "cell_cm": (0.75, 0.5, 1.0, 1.5),
+    "far_cm": (72.0, 48.0, 96.0),
+    "half_width_cm": (48.0, 36.0, 60.0),
+    "first_channels": (16, 8, 12, 24),
+    "layers": (4, 3, 5),
+    "hidden": (64, 32, 128),
+    "loss": ("student", "laplace", "gaussian"),
+    "evenness": (1.0, 0.0, 0.5, 2.0),
+}
+#: From and to.
+LEARNING_RATE = (5e-4, 1e-2)
+
+#: Trials that all run to their end before others are measured against them, and epochs that each gets.
+_UNPRUNED, _LEAST_EPOCHS = 5, 3
+_OUT_OF_TIME = math.inf
+
+
+def sweep(
+    settings: LearnSettings,
+    train_paths: Sequence[Path],
+    val_paths: Sequence[Path],
+    out: Path,
+    seconds: float,
+    trials: int,
+    progress: Progress | None = None,
+) -> str:
+    """Try networks until the time is up, and write the table of all that were tried.
+
+    The trials lie in an SQLite file. A later call with the same data and settings goes on with them; a trial
+    that was interrupted is tried again from its start.
+
+    Args:
+        settings: Of each training, but for what is tried.
+        train_paths: Label sets to learn from.
+        val_paths: Label sets that judge.
+        out: Folder for ``sweep.db``, ``trials.csv`` and ``sweep.md``.
+        seconds: No trial goes on for longer than this after the start.
+        trials: No more finished trials than this, those of earlier calls included.
+        progress: Called after each trial.
+
+    Returns:
+        The table, as Markdown.
+
+    Raises:
+        MissingExtraError: If optuna is not installed.
+        LabelFormatError: If the label sets cannot be read or learned together.
+    """
+    optuna: Any = require("optuna", "sweep")
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    deadline = time.monotonic() + seconds
+    sets = [read_labels(path) for path in train_paths]
+    val_sets = [read_labels(path) for path in val_paths]
+    check_same(sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))
+    out.mkdir(parents=True, exist_ok=True)
+    study = _open_study(
+        optuna, out / DATABASE_NAME, hash_run(settings, train_paths, val_paths), settings.seed
+    )
+    states = optuna.trial.TrialState
+    finished = (states.COMPLETE, states.PRUNED)
+    with torch_threads(settings.threads):
+        while (done := len(study.get_trials(states=finished))) < trials and time.monotonic() < deadline:
+            trial = study.ask()
+            window, chosen = _draw(trial, settings)
+            samples = LaneSamples([_seen_in(s, window) for s in sets], [str(p) for p in train_paths])
+            val = LaneSamples([_seen_in(s, window) for s in val_sets], [str(p) for p in val_paths])
+            value = _try(trial, TrainingRun(chosen, samples), val, deadline)
+            if value == _OUT_OF_TIME:
+                study.tell(trial, state=states.FAIL)
+                study.enqueue_trial(trial.params)
+                break
+            study.tell(trial, value, states.COMPLETE if value is not None else states.PRUNED)
+            _write_tables(study, out)
+            if progress is not None:
+                progress(done + 1, trials)
+    return _write_tables(study, out)
+
+
+def _open_study(optuna: Any, path: Path, key: str, seed: int) -> Any:
+    """Open the trials of the same data and settings; those that a kill has left open are put in the queue."""
+    name = hashlib.sha256(f"{key} {CHOICES} {LEARNING_RATE}".encode()).hexdigest()[:16]
+    # Each call draws other trials, and the first call always the same.
+    study = optuna.create_study(
+        study_name=name,
+        storage=f"sqlite:///{path.resolve()}",
+        load_if_exists=True,
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=_UNPRUNED, n_warmup_steps=_LEAST_EPOCHS),
+    )
+    study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
+    state = optuna.trial.TrialState
+    for trial in study.get_trials(states=(state.RUNNING,)):
+        study.tell(trial.number, state=state.FAIL)
+        study.enqueue_trial(trial.params)
+    if not study.trials:
+        first = {name: values[0] for name, values in CHOICES.items()}
+        study.enqueue_trial(first | {"learning_rate": LearnSettings().learning_rate})
+    return study
+
+
+def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSettings]:
+    """Draw what a trial tries."""
+    drawn = {name: trial.suggest_categorical(name, values) for name, values in CHOICES.items()}
+    cell_cm, half_cm = drawn["cell_cm"], drawn["half_width_cm"]
+    window = BirdseyeWindow(
+        left_cm=-half_cm,
+        near_cm=0.0,
+        cell_cm=cell_cm,
+        rows=round(drawn["far_cm"] / cell_cm),
+        columns=round(2.0 * half_cm / cell_cm),
+    )
+    # As in the family: each layer has as many channels more as the first one has.
+    channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
+    network = {"kind": "small", "channels": channels, "hidden": drawn["hidden"]}
+    loss = {"kind": drawn["loss"], "evenness": drawn["evenness"], "presence": settings.loss.presence}
+    rate = trial.suggest_float("learning_rate", *LEARNING_RATE, log=True)
+    data = settings.model_dump() | {"network": network, "loss": loss, "learning_rate": rate}
+    return window, LearnSettings.model_validate(data)
+
+
+def _seen_in(labels: LabelSet, window: BirdseyeWindow) -> LabelSet:
+    """Return labels with another window; they stay as they are, so that every trial is asked the same."""
+    return replace(labels, meta=replace(labels.meta, window=window))
+
+
+def _try(trial: Any, run: TrainingRun, val: LaneSamples, deadline: float) -> float | None:
+    """Train; answers the best validation error, [cm], None if given up early, or ``_OUT_OF_TIME``."""
+    trial.set_user_attr("parameters", run.network.n_parameters)
+    began = time.process_time()
+    while not run.ended:
+        try:
+            record = run.run_epoch(val)
+        except LanenetError:
+            # A learning rate that makes the training diverge is an answer, too.
+            return None
+        trial.report(record.val_rmse_cm, record.epoch)
+        trial.set_user_attr("epochs", record.epoch)
+        trial.set_user_attr("cpu_s", time.process_time() - began)
+        if not run.ended and time.monotonic() >= deadline:
+            return _OUT_OF_TIME
+        if not run.ended and trial.should_prune():
+            return None
+    return min(record.val_rmse_cm for record in run.history)
+
+
+def _write_tables(study: Any, out: Path) -> str:
+    done = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+    rows = [
+        {
+            "trial": trial.number,
+            "state": trial.state.name.lower(),
+            "val_rmse_cm": trial.value,
+            **trial.params,
+            **{key: trial.user_attrs.get(key) for key in ("parameters", "epochs", "cpu_s")},
+        }
+        for trial in done
+    ]
+    table = trials_table(rows)
+    write_text(out / "trials.csv", trials_csv(rows))
+    write_text(out / "sweep.md", table)
+    return table

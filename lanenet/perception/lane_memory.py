@@ -1,0 +1,80 @@
+"""What a detector remembers of the lane's width, and the line that it rebuilds with it."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.geometry.lane import lane_width_cm
+from lanenet.geometry.parallel import parallel_points
+
+#: A line with a probability below this counts as not seen; above the other one, as seen beyond doubt.
+_SEEN, _SURE = 0.5, 0.9
+#: Frames whose widths are remembered, and how many are needed.
+_LENGTH, _ENOUGH = 100, 10
+#: Standard deviation of a remembered width, as a share of it: no road keeps its width better.
+_WIDTH_SIGMA = 0.02
+
+
+class LaneMemory:
+    """The median width of the frames that showed both lines.
+
+    One line tells where the other is, if the width of the lane is known. A network that was trained on lanes
+    of many widths cannot know it from one line; the frames before can.
+
+    Attributes:
+        given_cm: A width that is known beforehand, which goes before the remembered one; None without one.
+    """
+
+    def __init__(self, given_cm: float | None = None) -> None:
+        self.given_cm = given_cm
+        self._widths_cm: deque[float] = deque(maxlen=_LENGTH)
+
+    @property
+    def width_cm(self) -> float | None:
+        """The lane's width; None while it is unknown."""
+        if self.given_cm is not None:
+            return self.given_cm
+        return float(np.median(self._widths_cm)) if len(self._widths_cm) >= _ENOUGH else None
+
+    def reset(self) -> None:
+        """Forget the frames; a given width stays."""
+        self._widths_cm.clear()
+
+    def complete(
+        self,
+        points_cm: Float[np.ndarray, "6"],
+        sigma_cm: Float[np.ndarray, "6"],
+        presence: Float[np.ndarray, "2"],
+    ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
+        """Learn from a frame with both lines; rebuild the missing line of a frame with one.
+
+        The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
+        it is surer of itself.
+
+        Args:
+            points_cm: The six points, frame car.
+            sigma_cm: Their standard deviations.
+            presence: Probability that each line can be seen.
+
+        Returns:
+            Points and standard deviations, changed for the missing line only.
+        """
+        if presence.min() > _SURE:
+            width_cm = lane_width_cm(points_cm)
+            if width_cm > 0.0:
+                self._widths_cm.append(width_cm)
+            return points_cm, sigma_cm
+        if (presence < _SEEN).sum() != 1 or self.width_cm is None:
+            return points_cm, sigma_cm
+        missing = int(np.argmin(presence))
+        # The left line is 0: the missing right line lies to the right of it, and the other way round.
+        side = 1.0 if missing == 1 else -1.0
+        lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
+        rebuilt = parallel_points(lines[1 - missing], side * self.width_cm)
+        rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * self.width_cm)
+        if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
+            lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
+        return lines.reshape(6), sigmas.reshape(6)

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from lanenet.perception.lane_memory import LaneMemory
+
+LANE = np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0])
+SIGMA = np.full(6, 0.5)
+BOTH, LEFT, RIGHT = np.array([0.99, 0.99]), np.array([0.9, 0.1]), np.array([0.1, 0.9])
+LOST_RIGHT, LOST_LEFT = np.repeat([0.5, 6.0], 3), np.repeat([6.0, 0.5], 3)
+
+
+def taught(widths_cm, **options):
+    memory = LaneMemory(**options)
+    for width in widths_cm:
+        memory.complete(LANE * width / 40.0, SIGMA, BOTH)
+    return memory
+
+
+def test_the_width_is_the_median_of_sure_frames():
+    assert taught([40.0] * 9).width_cm is None
+    memory = taught([38.0, 40.0, 39.0] * 5 + [90.0] * 3)
+    assert memory.width_cm == pytest.approx(40.0, abs=1.01)
+    memory.complete(LANE * 2.0, SIGMA, np.array([0.99, 0.6]))
+    memory.complete(-LANE, SIGMA, BOTH)
+    assert memory.width_cm == pytest.approx(40.0, abs=1.01)
+    # Only the last hundred frames count.
+    for _ in range(100):
+        memory.complete(LANE * 0.5, SIGMA, BOTH)
+    assert memory.width_cm == pytest.approx(20.0)
+    memory.reset()
+    assert memory.width_cm is None
+
+
+@pytest.mark.parametrize(("presence", "sigma", "seen"), [(LEFT, LOST_RIGHT, 0), (RIGHT, LOST_LEFT, 1)])
+def test_either_line_is_rebuilt_from_the_other(presence, sigma, seen):
+    guess = LANE.copy().reshape(2, 3)
+    guess[1 - seen] += 7.0
+    points, spread = taught([30.0] * 20).complete(guess.ravel(), sigma, presence)
+    expected = LANE.copy().reshape(2, 3)
+    expected[1 - seen] = expected[seen] + (30.0 if seen == 0 else -30.0)
+    np.testing.assert_allclose(points, expected.ravel(), atol=1e-6)
+    # The seen line's doubt, and 2 % of the width.
+    np.testing.assert_allclose(spread.reshape(2, 3)[1 - seen], np.hypot(0.5, 0.6))
+    np.testing.assert_array_equal(spread.reshape(2, 3)[seen], 0.5)
+    assert guess[1 - seen, 0] != points.reshape(2, 3)[1 - seen, 0]
+
+
+def test_a_network_that_is_surer_keeps_its_answer():
+    points, spread = taught([30.0] * 20).complete(LANE, SIGMA, LEFT)
+    np.testing.assert_array_equal(points, LANE)
+    np.testing.assert_array_equal(spread, SIGMA)
+
+
+def test_without_a_width_or_any_line_nothing_is_rebuilt():
+    for memory, presence in ((LaneMemory(), LEFT), (taught([30.0] * 20), np.array([0.2, 0.3]))):
+        points, _ = memory.complete(LANE, LOST_RIGHT, presence)
+        np.testing.assert_array_equal(points, LANE)
+
+
+def test_a_given_width_goes_before_the_remembered_one_and_is_not_forgotten():
+    memory = taught([40.0] * 20, given_cm=33.0)
+    memory.reset()
+    points, _ = memory.complete(LANE, LOST_RIGHT, LEFT)
+    np.testing.assert_allclose(points[3:], 13.0, atol=1e-6)
+
+
+def test_a_bend_tighter_than_the_lane_keeps_the_guess():
+    # Radius 1 / (2 a) = 25 cm at most: no lane of 40 cm fits inside it.
+    rows = np.array([0.0, 15.0, 30.0])
+    bend = np.concatenate([-20.0 + 0.02 * rows**2, 20.0 + 0.02 * rows**2])
+    points, spread = taught([40.0] * 20).complete(bend, LOST_RIGHT, LEFT)
+    np.testing.assert_array_equal(points, bend)
+    np.testing.assert_array_equal(spread, LOST_RIGHT)
