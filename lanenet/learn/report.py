@@ -70,7 +70,7 @@ def write_checkpoint(
         perception=samples.perception,
     )
     chosen = np.unique(np.linspace(0, len(val) - 1, _N_CHECK_RASTERS).astype(np.intp))
-    rasters, _ = val.plain_batch(chosen)
+    rasters, _, _ = val.plain_batch(chosen)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)

@@ -31,6 +31,7 @@ from lanenet.learn.run_state import (
     read_state,
     write_state,
 )
+from lanenet.learn.start import load_start_weights
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]
@@ -137,7 +138,7 @@ def evaluate_network(network: LaneNet, samples: LaneSamples) -> ErrorTable:
     predictions = []
     with torch.inference_mode():
         for start in range(0, len(samples), _EVAL_BATCH):
-            rasters, _ = samples.plain_batch(np.arange(start, min(start + _EVAL_BATCH, len(samples))))
+            rasters, _, _ = samples.plain_batch(np.arange(start, min(start + _EVAL_BATCH, len(samples))))
             predictions.append(network(input_of_rasters(torch.from_numpy(rasters))).numpy())
     network.train(was_training)
     return point_errors(np.concatenate(predictions).astype(np.float64), samples.points_cm, samples.reference)
@@ -153,6 +154,8 @@ class _Run:
         mean, scale = samples.normalisation(settings.augment.mirror > 0.0)
         self.network.mean_cm.copy_(torch.from_numpy(mean))
         self.network.scale_cm.copy_(torch.from_numpy(scale))
+        if settings.start_from is not None:
+            load_start_weights(self.network, settings.start_from, samples.window)
         self.ema = LaneNet(settings.network, rows, columns)
         self.ema.load_state_dict(self.network.state_dict())
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
@@ -180,8 +183,8 @@ class _Run:
         started = time.perf_counter()
         squares, count, n_samples, rate = 0.0, 0, 0, 0.0
         self.network.train()
-        for rasters, labels in self.samples.epoch(
-            settings.augment, settings.seed, epoch, settings.batch_size
+        for rasters, labels, _ in self.samples.epoch(
+            settings.augment, settings.seed, epoch, settings.batch_size, balance=settings.balance
         ):
             rate = learning_rate_at(self.step, self.total, settings)
             targets = torch.from_numpy(labels)
