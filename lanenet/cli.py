@@ -150,6 +150,8 @@ def train(
     checkpoint = settings.checkpoints_dir / settings.name
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress)
+    if data.left_out:
+        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
     # A folder per settings and data: a stopped run finds its own state again, and no other.
     run_hash = hash_run(settings.learn, data.train, data.validation)
     run_folder = settings.work_folder / f"train-{run_hash}"
