@@ -26,7 +26,7 @@ class SyntheticSettings(Settings):
             and a driver of its own; ``all``: and a camera near one of ``cameras``.
         cameras: Lenses and mountings that the drives' cameras are drawn near, by turns; none takes the
             simulation's.
-        may_fail: Up to this share of the drives to learn from may be left out because their map is rejected
+        may_fail: Up to this share of the drives that are mapped may be left out because their map is rejected
             or their road cannot be driven. Random roads do not all make good drives.
         simulation: What all drives share; their ``seed`` is set here.
     """

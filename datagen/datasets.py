@@ -42,7 +42,7 @@ class PreparedData:
         test_frames: For each of ``test`` the simulated drive, whose truth it holds, or the map.
         camera: Camera file, where all drives share one camera.
         example: A frame of a synthetic test drive, to try the model on.
-        left_out: Why synthetic drives to learn from are not among them.
+        left_out: Why some synthetic drives are not among them.
     """
 
     train: list[Path]
@@ -68,7 +68,7 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
 
     Raises:
         ConfigError: If no part has any drive.
-        TrackingLostError: If more drives to learn from fail than may.
+        TrackingLostError: If more drives fail than may.
         LanenetError: What the first failing job raised; or that its process died, naming the drive.
     """
     jobs: list[dict[str, Any]] = []
@@ -117,10 +117,11 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
 
 
 def _check_left_out(settings: DataSettings, left_out: list[str]) -> None:
-    allowed = settings.synthetic.may_fail * settings.synthetic.train
+    mapped = settings.synthetic.train + settings.synthetic.validation
+    allowed = settings.synthetic.may_fail * mapped
     if len(left_out) > allowed:
         raise TrackingLostError(
-            f"{len(left_out)} of {settings.synthetic.train} synthetic drives to learn from give no labels, "
+            f"{len(left_out)} of {mapped} synthetic drives to be mapped give no labels, "
             f"expected at most {allowed:.0f} (data.synthetic.may_fail); the first: {left_out[0]}"
         )
 
@@ -178,7 +179,7 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
         "role": role,
         "name": name,
         "simulation": simulation,
-        "may_fail": role == "train" and synthetic.may_fail > 0.0,
+        "may_fail": role != "test" and synthetic.may_fail > 0.0,
         # The simulated camera does not see its car.
         "map": settings.map.model_copy(update={"find_bumper": False}),
         "window": settings.window,

@@ -44,8 +44,8 @@ def split_along_time(
 def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list[LabelSet]:
     """Cut a drive's labels where laps begin: all early laps, the last but one, the last.
 
-    A lap that was not driven to its end belongs to the one before it. Where the map is in several pieces, each
-    piece counts its own laps.
+    A lap that was not driven to its end belongs to the one before it. Where the map is in several pieces,
+    each piece counts its own laps.
 
     Args:
         labels: Labels of one drive, in the order of its frames.

@@ -141,6 +141,7 @@ def train(
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
+    from lanenet.data.label_set import read_labels
     from lanenet.evaluation import default_names, evaluate, open_tests
     from lanenet.learn.publish import publish
     from lanenet.learn.run_state import hash_run
@@ -165,6 +166,7 @@ def train(
             sources,
             default_names(sources, with_model=True),
             run_folder / "model.onnx",
+            training=[read_labels(path) for path in dict.fromkeys(data.train)],
             marking_cm=marking,
             # Which camera made which test drive is settled by the config.
             any_camera=True,

@@ -8,11 +8,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lanenet.geometry.lane import N_POINTS, parabolas_from_points
+from lanenet.geometry.lane import N_POINTS, SIDES, parabolas_from_points
 
 
 def _no_points() -> Float[np.ndarray, "6"]:
     return np.full(N_POINTS, np.nan)
+
+
+def _no_presence() -> Float[np.ndarray, "2"]:
+    return np.full(len(SIDES), np.nan)
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,8 @@ class LaneEstimate:
         radius_cm: Radius of curvature of the lane's middle; infinite where straight, NaN where the detector
             does not know it.
         offset_cm: The car's place right of the lane's middle; NaN where the detector does not know it.
+        presence: Probability that the left and the right line can be seen; NaN where the detector does not
+            know it.
     """
 
     points_cm: Float[np.ndarray, "6"] = field(default_factory=_no_points)
@@ -35,6 +41,7 @@ class LaneEstimate:
     confidence: float = 0.0
     radius_cm: float = float("nan")
     offset_cm: float = float("nan")
+    presence: Float[np.ndarray, "2"] = field(default_factory=_no_presence)
 
     @property
     def mask(self) -> np.ndarray:

@@ -22,6 +22,7 @@ from lanenet.data.detections import read_detections
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.evaluate import RasterAnswers
 from lanenet.onboard.bench import example_camera, example_frames
 
 
@@ -272,15 +273,19 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
     (folder / "model.onnx").write_bytes(b"")
     opened: list[Path] = []
 
-    def network_predictor(path: Path) -> Any:
-        opened.append(path)
-        return lambda labels: labels.points_cm + 1.0
+    class OneOff:
+        def __init__(self, path: Path) -> None:
+            opened.append(path)
+
+        def answer_labels(self, labels: LabelSet) -> RasterAnswers:
+            n = len(labels)
+            return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
     @dataclass(frozen=True)
     class Meta:
         window: BirdseyeWindow
 
-    monkeypatch.setattr("lanenet.learn.evaluate.network_predictor", network_predictor)
+    monkeypatch.setattr("lanenet.learn.evaluate.RasterModel", OneOff)
     monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: Meta(BirdseyeWindow()))
     return opened
 

@@ -1,0 +1,52 @@
+"""What a label set knows of its frames beside the labels: which lines show, and how new the place is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lanenet.data.label_set import LabelSet
+from lanenet.learn.augment import join_frames, plain_batch
+from lanenet.learn.breakdown import nearest_pose_cm
+
+
+def lines_seen(labels: LabelSet) -> Float[np.ndarray, "n 2"]:
+    """Return whether each frame's raster shows the left and the right line: 1, 0, or NaN for unknown."""
+    frames = join_frames([edges[:, :2] for edges in labels.edges], labels.lines, labels.points_cm)
+    return plain_batch(frames, np.arange(len(labels)), labels.meta.window)[2].astype(np.float64)
+
+
+def way_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[np.ndarray, "n"]:
+    """Return how far each frame is from the nearest training frame of the same map, [cm].
+
+    Two label sets are of one map if their drive has the same name, their camera is the same and both take
+    their labels from a map: parts of one recorded drive. NaN where no training set is of this map.
+    """
+    same = [
+        other.poses
+        for other in training
+        if labels.meta.source == other.meta.source == "map"
+        and labels.meta.camera_hash == other.meta.camera_hash
+        and labels.drive[:1] == other.drive[:1]
+    ]
+    return nearest_pose_cm(labels.poses, np.concatenate([np.empty((0, 3)), *same]))
+
+
+def at_frames(
+    values: Float[np.ndarray, "n *k"], frames: Int[np.ndarray, "n"], wanted: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "m *k"]:
+    """Return the values of frames by their numbers; NaN for a number that there is no value for.
+
+    Args:
+        values: A row per frame.
+        frames: Numbers of the rows, increasing.
+        wanted: Numbers to look up.
+    """
+    result = np.full((len(wanted), *values.shape[1:]), np.nan)
+    if len(frames):
+        row = np.minimum(np.searchsorted(frames, wanted), len(frames) - 1)
+        found = frames[row] == wanted
+        result[found] = values[row[found]]
+    return result
