@@ -145,7 +145,10 @@ def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
         model = _model_at(path)
         if model is None:
             raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
-        name = path.resolve().stem if path.is_file() else path.resolve().name
+        name = path.resolve().stem
+        if path.is_dir() or name == "model":
+            # A checkpoint's file is called as every other one's.
+            name = model.resolve().parent.name
         if name in models or name in COMPARED:
             raise ConfigError(f"--also {path}: the name {name!r} is taken, expected another one")
         models[name] = model

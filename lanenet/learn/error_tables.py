@@ -199,7 +199,7 @@ def _percent(stats: ErrorStats) -> str:
 
 
 def show_cm(value: float) -> str:
-    """Show a length with three digits or so: a tenth of a millimetre says nothing about an error of a metre."""
+    """Show a length with three digits or so: a tenth of a millimetre is nothing beside a metre."""
     if math.isnan(value):
         return "-"
     return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
