@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lanenet.data.label_set import LabelSet
+from lanenet.data.pieces import map_pieces
 from lanenet.errors import ConfigError
 
 #: A lap with less than this share of the frames of the median lap was not driven to its end.
 _WHOLE_LAP = 0.5
-#: A step longer than so many median ones leads into another stretch of the map, and is no way driven.
-_JUMP = 5.0
 
 
 def split_along_time(
@@ -72,9 +71,7 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
 def way_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:
     """Return the way driven up to each labelled frame, [cm]; it stays where the map is interrupted."""
     steps = np.linalg.norm(np.diff(labels.poses[:, :2], axis=0), axis=1)
-    frames = np.maximum(np.diff(labels.frame), 1)
-    longest = _JUMP * np.median(steps / frames) if len(steps) else 0.0
-    steps = np.where(steps > longest * frames, 0.0, steps)
+    steps[np.diff(map_pieces(labels.frame, labels.poses)) != 0] = 0.0
     return np.concatenate([np.zeros(min(1, len(labels))), np.cumsum(steps)])
 
 

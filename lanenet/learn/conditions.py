@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lanenet.data.label_set import LabelSet
+from lanenet.data.pieces import map_pieces
 from lanenet.learn.augment import join_frames, plain_batch
 from lanenet.learn.breakdown import nearest_pose_cm
 
@@ -22,16 +23,27 @@ def way_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[
     """Return how far each frame is from the nearest training frame of the same map, [cm].
 
     Two label sets are of one map if their drive has the same name, their camera is the same and both take
-    their labels from a map: parts of one recorded drive. NaN where no training set is of this map.
+    their labels from a map: parts of one recorded drive. NaN where no training frame is of this map, or of
+    this piece of it.
     """
     same = [
-        other.poses
+        other
         for other in training
         if labels.meta.source == other.meta.source == "map"
         and labels.meta.camera_hash == other.meta.camera_hash
         and labels.drive[:1] == other.drive[:1]
     ]
-    return nearest_pose_cm(labels.poses, np.concatenate([np.empty((0, 3)), *same]))
+    parts = [*same, labels]
+    frames, poses = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "poses"))
+    learned = np.arange(len(frames)) < len(frames) - len(labels)
+    order = np.argsort(frames, kind="stable")
+    pieces = np.empty(len(frames), np.int64)
+    pieces[order] = map_pieces(frames[order], poses[order])
+    result = np.full(len(labels), np.nan)
+    for piece in np.unique(pieces[~learned]):
+        mine = pieces[~learned] == piece
+        result[mine] = nearest_pose_cm(labels.poses[mine], poses[learned & (pieces == piece)])
+    return result
 
 
 def at_frames(

@@ -15,17 +15,22 @@ def test_lines_are_seen_where_their_edges_are():
 
 
 def test_only_parts_of_the_same_map_are_near():
-    test, training = make_label_set(3, 0), make_label_set(2, 1)
-    test.poses[:, 0] = [0.0, 5.0, 9.0]
-    training.poses[:, 0] = [1.0, 20.0]
-    np.testing.assert_allclose(way_to_training_cm(test, [training]), [1.0, 4.0, 8.0])
+    training, test = make_label_set(3, 1), make_label_set(3, 0)
+    training.poses[:, 0] = [1.0, 4.0, 8.0]
+    test = replace(test, frame=np.array([3, 4, 5]))
+    test.poses[:, 0] = [12.0, 8.0, 4.5]
+    np.testing.assert_allclose(way_to_training_cm(test, [training]), [4.0, 0.0, 0.5])
+    # After a jump the poses are those of another piece, in a frame of its own.
+    away = replace(test, poses=test.poses.copy(), frame=np.array([3, 4, 5]))
+    away.poses[1:, 0] += 400.0
+    np.testing.assert_allclose(way_to_training_cm(away, [training]), [4.0, np.nan, np.nan])
     others = [
-        replace(training, drive=["other"] * 2),
+        replace(training, drive=["other"] * 3),
         replace(training, meta=replace(training.meta, camera_hash="other")),
         replace(training, meta=replace(training.meta, source="truth")),
     ]
     assert np.isnan(way_to_training_cm(test, others)).all()
-    np.testing.assert_allclose(way_to_training_cm(test, [*others, training]), [1.0, 4.0, 8.0])
+    np.testing.assert_allclose(way_to_training_cm(test, [*others, training]), [4.0, 0.0, 0.5])
 
 
 def test_values_are_looked_up_by_frame_number():
