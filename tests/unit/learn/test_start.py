@@ -30,7 +30,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def checkpoint(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("start")
-    result = train(TINY, *data, folder / "run")
+    result = train(TINY.model_copy(update={"epochs": 12}), *data, folder / "run")
     publish(result.folder, folder / "start", "start", {})
     return folder / "start"
 
