@@ -160,7 +160,8 @@ def robust_table(rows: Sequence[RobustRow]) -> TextTable:
         "8 cm; 95%: interval of the RMSE over drives; in 68%: errors within a standard deviation; found: "
         "lines that are there and called so, and lines that are not and called absent",
         texts=2,
-        last_of_group=rows[-1].model,
+        # With one model every line would be a group of its own.
+        last_of_group=rows[-1].model if len({row.model for row in rows}) > 1 else "",
     )
 
 
