@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +18,12 @@ from datagen.done import fingerprint, forget_done, is_done, key_of, mark_done
 from datagen.jobs import run_jobs
 from datagen.labels.truth import truth_labels
 from datagen.pipeline import MapSettings, label_map, map_drive
+from datagen.splits import split_along_time, split_by_lap
 from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.variety import first_world, vary_simulation
+from lanenet.data.files import write_text
 from lanenet.data.label_set import LabelSet, read_labels, write_labels
-from lanenet.errors import ConfigError
+from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
 Progress = Callable[[int, int], None]
@@ -40,6 +42,7 @@ class PreparedData:
         test_frames: For each of ``test`` the simulated drive, whose truth it holds, or the map.
         camera: Camera file, where all drives share one camera.
         example: A frame of a synthetic test drive, to try the model on.
+        left_out: Why some synthetic drives are not among them.
     """
 
     train: list[Path]
@@ -49,6 +52,7 @@ class PreparedData:
     test_frames: list[Path]
     camera: Path | None
     example: Path | None
+    left_out: tuple[str, ...] = ()
 
 
 def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = None) -> PreparedData:
@@ -64,6 +68,7 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
 
     Raises:
         ConfigError: If no part has any drive.
+        TrackingLostError: If more drives fail than may.
         LanenetError: What the first failing job raised; or that its process died, naming the drive.
     """
     jobs: list[dict[str, Any]] = []
@@ -71,13 +76,13 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
         for number in range(getattr(settings.synthetic, role)):
             jobs.append(_synthetic_job(settings, role, number, work_dir))
     for drive in settings.drives:
-        job = {
+        recorded = {
             "kind": "recorded",
             "settings": drive,
             "window": settings.window,
             "folder": work_dir / "drives",
         }
-        jobs.append(job)
+        jobs.append(recorded)
     for role in ("train", "validation"):
         if not settings.drives and not getattr(settings.synthetic, role):
             raise ConfigError(f"data: no {role} drives; set data.synthetic.{role} or list data.drives")
@@ -85,10 +90,17 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
     results = run_jobs(_run_job, named, settings.workers or os.cpu_count() or 1, progress)
     parts: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
     frames: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
+    left_out = []
     for job, result in zip(jobs, results, strict=True):
+        if isinstance(result, str):
+            left_out.append(f"{_job_name(job)}: {result}")
+            continue
         for role, path in result.items():
-            parts[role].append(path)
+            # Named several times, a recording counts as several drives to learn from.
+            times = job["settings"].counts_as if job["kind"] == "recorded" and role == "train" else 1
+            parts[role] += [path] * times
             frames[role].append(_frames_of(job))
+    _check_left_out(settings, left_out)
     camera = _shared_camera(settings, work_dir)
     pictures = sorted((work_dir / "synthetic" / "drives" / "test_00" / "images").glob("*.jpg"))
     example = pictures[len(pictures) // 2] if pictures and settings.synthetic.test else None
@@ -100,7 +112,18 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
         frames["test"],
         camera,
         example,
+        tuple(left_out),
     )
+
+
+def _check_left_out(settings: DataSettings, left_out: list[str]) -> None:
+    mapped = settings.synthetic.train + settings.synthetic.validation
+    allowed = settings.synthetic.may_fail * mapped
+    if len(left_out) > allowed:
+        raise TrackingLostError(
+            f"{len(left_out)} of {mapped} synthetic drives to be mapped give no labels, "
+            f"expected at most {allowed:.0f} (data.synthetic.may_fail); the first: {left_out[0]}"
+        )
 
 
 def _job_name(job: dict[str, Any]) -> str:
@@ -118,10 +141,15 @@ def _frames_of(job: dict[str, Any]) -> Path:
 
 
 def _shared_camera(settings: DataSettings, work_dir: Path) -> Path | None:
-    """Camera file of the run's drives, if they share one: the simulation's, or the only recording's."""
-    if not settings.drives and settings.synthetic.train:
-        return work_dir / "synthetic" / "drives" / "train_00" / "camera.yaml"
+    """Camera file of the run's drives, if they share one: the simulation's, or the only recording's.
+
+    Where every drive has its own, that of the drive that the example is from.
+    """
     synthetic = settings.synthetic
+    if synthetic.variety == "all" and synthetic.test:
+        return work_dir / "synthetic" / "drives" / "test_00" / "camera.yaml"
+    if not settings.drives and synthetic.train and synthetic.variety != "all":
+        return work_dir / "synthetic" / "drives" / "train_00" / "camera.yaml"
     if len(settings.drives) == 1 and not (synthetic.train or synthetic.validation or synthetic.test):
         return work_dir / "drives" / "maps" / _recorded_name(settings.drives[0]) / "camera.yaml"
     return None
@@ -135,14 +163,23 @@ def _recorded_name(settings: RecordedSettings) -> str:
 def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Path) -> dict[str, Any]:
     # Roles draw from separate streams, so that more training drives leave the test drives as they are.
     stream = ("train", "validation", "test").index(role)
-    seed = int(np.random.SeedSequence([settings.synthetic.seed, stream, number]).generate_state(1)[0])
-    simulation = settings.synthetic.simulation.model_copy(update={"seed": seed})
+    synthetic = settings.synthetic
+    varied = synthetic.variety != "none"
+    simulation = vary_simulation(
+        synthetic.simulation,
+        np.random.SeedSequence([synthetic.seed, stream, number]),
+        number,
+        cameras=(synthetic.cameras or (synthetic.simulation.camera,)) if synthetic.variety == "all" else (),
+        road=varied,
+        driver=varied,
+    )
     name = f"{role}_{number:02d}"
     return {
         "kind": "synthetic",
         "role": role,
         "name": name,
         "simulation": simulation,
+        "may_fail": role != "test" and synthetic.may_fail > 0.0,
         # The simulated camera does not see its car.
         "map": settings.map.model_copy(update={"find_bumper": False}),
         "window": settings.window,
@@ -150,17 +187,18 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
     }
 
 
-def _run_job(job: dict[str, Any]) -> dict[Role, Path]:
-    """Make one drive's label sets; runs in a process of its own."""
+def _run_job(job: dict[str, Any]) -> dict[Role, Path] | str:
+    """Make one drive's label sets, or say why it has none; runs in a process of its own."""
     import cv2
 
     cv2.setNumThreads(1)
     if job["kind"] == "synthetic":
-        return {job["role"]: _synthetic_labels(job)}
+        made = _synthetic_labels(job)
+        return made if isinstance(made, str) else {job["role"]: made}
     return _recorded_labels(job["settings"], job["window"], job["folder"])
 
 
-def _synthetic_labels(job: dict[str, Any]) -> Path:
+def _synthetic_labels(job: dict[str, Any]) -> Path | str:
     folder: Path = job["folder"]
     simulation: SimulationSettings = job["simulation"]
     drive, drive_map = folder / "drives" / job["name"], folder / "maps" / job["name"]
@@ -170,23 +208,35 @@ def _synthetic_labels(job: dict[str, Any]) -> Path:
     mapping: MapSettings = job["map"]
     parts.append((mapping.perception if job["role"] == "test" else mapping).model_dump(mode="json"))
     key = key_of(parts)
+    failure = labels.with_suffix(".failed.txt")
     if is_done(labels, key):
         return labels
+    if is_done(failure, key):
+        return failure.read_text(encoding="utf-8")
     # From here on, what lies there is neither the old labels nor the new ones.
     forget_done(labels)
-    simulate_drive(simulation, drive)
-    if job["role"] == "test":
-        truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
-        write_labels(labels, truth)
-    else:
-        map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
-        label_map(drive_map, labels, perception=job["map"].perception, window=job["window"])
+    try:
+        # Of a random road, that of the first seed that leaves room for one.
+        seed = first_world(simulation).settings.seed
+        simulate_drive(simulation.model_copy(update={"seed": seed}), drive)
+        if job["role"] == "test":
+            truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
+            write_labels(labels, truth)
+        else:
+            map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
+            label_map(drive_map, labels, perception=job["map"].perception, window=job["window"])
+    except (TrackingLostError, CalibrationError, ConfigError) as error:
+        if not job["may_fail"]:
+            raise
+        write_text(failure, str(error))
+        mark_done(failure, key)
+        return str(error)
     mark_done(labels, key)
     return labels
 
 
 def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder: Path) -> dict[Role, Path]:
-    """Map and label a recorded drive, and split it along time: to learn from, a gap, to judge by."""
+    """Map and label a recorded drive, and split it: to learn from, to choose by, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
     inputs = [settings.model_dump(mode="json"), asdict(window), fingerprint(settings.path)]
@@ -200,39 +250,15 @@ def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder:
         forget_done(whole)
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
         label_map(drive_map, whole, window=window)
-        shares = (settings.train_share, settings.validation_share)
-        pieces = split_along_time(read_labels(whole), shares, settings.gap_frames)
+        pieces = _split(read_labels(whole), settings)
         for path, piece in zip(parts.values(), pieces, strict=True):
             write_labels(path, piece)
         mark_done(whole, key)
     return parts
 
 
-def split_along_time(labels: LabelSet, shares: tuple[float, ...], gap_frames: int) -> list[LabelSet]:
-    """Cut a drive's labels along its time, with a gap of frame numbers at each cut.
-
-    Args:
-        labels: Labels of one drive, in the order of its frames.
-        shares: Share of the frames of each part but the last, which gets the rest.
-        gap_frames: No two frames of different parts are this close or closer.
-
-    Returns:
-        One more part than there are shares.
-
-    Raises:
-        ConfigError: If a part would be empty.
-    """
-    cuts = np.rint(np.cumsum([0.0, *shares]) * len(labels)).astype(int)
-    cuts = np.append(np.minimum(cuts, len(labels)), len(labels))
-    parts = []
-    free_from = -np.inf
-    for start, end in pairwise(cuts):
-        rows = np.arange(start, end)
-        rows = rows[labels.frame[rows] > free_from]
-        if not rows.size:
-            raise ConfigError(
-                f"shares {shares} with a gap of {gap_frames} frames leave a part of {len(labels)} empty"
-            )
-        parts.append(labels.subset(rows))
-        free_from = labels.frame[rows[-1]] + gap_frames
-    return parts
+def _split(labels: LabelSet, settings: RecordedSettings) -> list[LabelSet]:
+    if settings.split == "lap":
+        return split_by_lap(labels, settings.gap_frames, settings.gap_cm)
+    shares = (settings.train_share, settings.validation_share)
+    return split_along_time(labels, shares, settings.gap_frames, settings.gap_cm)

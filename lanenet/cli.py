@@ -152,6 +152,7 @@ def train(
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
+    from lanenet.data.label_set import read_labels
     from lanenet.evaluation import default_names, evaluate, open_tests
     from lanenet.learn.publish import publish
     from lanenet.learn.run_state import hash_run
@@ -161,6 +162,8 @@ def train(
     checkpoint = settings.checkpoints_dir / settings.name
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress)
+    if data.left_out:
+        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
     # A folder per settings and data: a stopped run finds its own state again, and no other.
     run_hash = hash_run(settings.learn, data.train, data.validation)
     run_folder = settings.work_folder / f"train-{run_hash}"
@@ -174,6 +177,7 @@ def train(
             sources,
             default_names(sources, with_model=True),
             run_folder / "model.onnx",
+            training=[read_labels(path) for path in dict.fromkeys(data.train)],
             marking_cm=marking,
             # Which camera made which test drive is settled by the config.
             any_camera=True,

@@ -6,7 +6,7 @@ where they are needed: the car has neither SciPy nor PyArrow.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.learn.compare import Comparison, SourceAnswers
     from lanenet.onboard.compare import ComparedName
+    from lanenet.perception.estimate import Detector
 
 #: Called with (source, frames done, frames).
 Progress = Callable[[str, int, int], None]
@@ -31,10 +32,12 @@ class Opened:
     Attributes:
         path: Where it lies.
         content: A label set, which holds edge points only, or frames with labels.
+        beside: The label set of the frames, if there is one: it knows which lines can be seen.
     """
 
     path: Path
     content: LabelSet | LabelledFrames
+    beside: LabelSet | None = None
 
     @property
     def frames(self) -> LabelledFrames | None:
@@ -43,6 +46,13 @@ class Opened:
 
         return self.content if isinstance(self.content, LabelledFrames) else None
 
+    @property
+    def labels(self) -> LabelSet | None:
+        """The label set, if there is one."""
+        from lanenet.data.label_set import LabelSet
+
+        return self.content if isinstance(self.content, LabelSet) else self.beside
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -50,8 +60,9 @@ class Evaluation:
 
     Attributes:
         comparison: The figures.
-        files: Contents of the report by ending: ``.md``, and where they can be made ``.png`` (errors by row)
-            and ``-worst.jpg`` (the frames that the first detector got most wrong).
+        files: Contents of the report by ending: ``.md``, and where they can be made ``.png`` (errors by row),
+            ``-breakdown.png`` (errors by bend, and how right the doubt is) and ``-worst.jpg`` (the frames
+            that the first detector got most wrong).
     """
 
     comparison: Comparison
@@ -69,17 +80,28 @@ def open_source(path: Path, window: BirdseyeWindow) -> Opened:
         LanenetError: If it is none of these, or cannot be read.
     """
     from lanenet.data.label_set import read_labels
-    from lanenet.data.labelled_frames import read_truth_frames
 
     if not path.exists():
         raise DriveFormatError(f"{path}: no such model or source")
     if path.is_file():
         return Opened(path, read_labels(path))
+    frames = _open_frames(path, window)
+    if frames.reference == "map":
+        return Opened(path, frames)
+    from datagen.labels.truth import truth_labels
+
+    return Opened(path, frames, truth_labels(path, window=window))
+
+
+def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
+    """Open a map folder or a simulated drive."""
     if (path / "map.yaml").is_file():
         from datagen.labels.mapped_drive import read_map_frames
 
-        return Opened(path, read_map_frames(path, window))
-    return Opened(path, read_truth_frames(path, window))
+        return read_map_frames(path, window)
+    from lanenet.data.labelled_frames import read_truth_frames
+
+    return read_truth_frames(path, window)
 
 
 def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
@@ -99,14 +121,12 @@ def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
         label_set = read_labels(labels_path)
         opened = Opened(labels_path, label_set)
         if frames_path.is_dir():
-            whole = open_source(frames_path, label_set.meta.window).frames
-            assert whole is not None
+            whole = _open_frames(frames_path, label_set.meta.window)
             # A recorded drive was cut along its time; the network has learned from its first part.
             part = whole.numbered(int(label_set.frame[0]), int(label_set.frame[-1]))
             meta = label_set.meta
-            opened = Opened(
-                frames_path, replace(part, perception=meta.perception, marking_cm=meta.marking_cm)
-            )
+            part = replace(part, perception=meta.perception, marking_cm=meta.marking_cm)
+            opened = Opened(frames_path, part, label_set)
         sources.append(opened)
     return sources
 
@@ -124,6 +144,8 @@ def evaluate(
     names: Sequence[ComparedName],
     model: Path | None,
     *,
+    also: Mapping[str, Path] | None = None,
+    training: Sequence[LabelSet] = (),
     marking_cm: float | None = None,
     any_camera: bool = False,
     progress: Progress | None = None,
@@ -131,9 +153,12 @@ def evaluate(
     """Run detectors over sources and report their errors.
 
     Args:
-        sources: Labelled frames, and label sets if only the network and the lane filter are compared.
+        sources: Labelled frames, and label sets if only networks and the lane filter are compared.
         names: Detectors; the first is what the others are held against.
         model: ONNX file of the network.
+        also: ONNX files of more networks, by the name that they get in the tables.
+        training: What the network has learned from, where it is known: errors are told by the distance from
+            it.
         marking_cm: Thickness of the tape for the lane filter; None takes the source's, or the default.
         any_camera: Accept a model that was trained with another camera than that of the frames.
         progress: Called with (source, frames done, frames).
@@ -141,17 +166,21 @@ def evaluate(
     Raises:
         LanenetError: If a source cannot be read or does not fit a detector.
     """
+    from lanenet.learn.breakdown_picture import breakdown_picture
     from lanenet.learn.compare import compare_detectors
     from lanenet.learn.error_picture import error_picture
     from lanenet.learn.error_tables import as_markdown
     from lanenet.onboard.worst_frames import draw_worst, find_worst, jpeg_bytes
 
-    answered = [_answer(s, names, model, marking_cm, any_camera, progress) for s in sources]
+    models = {} if model is None else {"network": model}
+    models |= also or {}
+    answered = [_answer(s, names, models, training, marking_cm, any_camera, progress) for s in sources]
     comparison = compare_detectors(answered)
     files: dict[str, str | bytes] = {".md": as_markdown(comparison)}
-    picture = error_picture(comparison)
-    if picture is not None:
-        files[".png"] = picture
+    for ending, picture in ((".png", error_picture), ("-breakdown.png", breakdown_picture)):
+        drawn = picture(comparison)
+        if drawn is not None:
+            files[ending] = drawn
     pairs = [(s.frames, a.answers_cm[comparison.first]) for s, a in zip(sources, answered, strict=True)]
     with_frames = [(frames, answer) for frames, answer in pairs if frames is not None]
     if with_frames:
@@ -162,23 +191,36 @@ def evaluate(
     return Evaluation(comparison, files)
 
 
+def _in_order(names: Sequence[ComparedName], models: Mapping[str, Path]) -> list[str]:
+    """All detectors in the order of the tables: more networks follow the first one."""
+    more = [name for name in models if name != "network"]
+    return [*(n for n in names if n == "network"), *more, *(n for n in names if n != "network")]
+
+
 def _answer(
     source: Opened,
     names: Sequence[ComparedName],
-    model: Path | None,
+    models: Mapping[str, Path],
+    training: Sequence[LabelSet],
     marking_cm: float | None,
     any_camera: bool,
     progress: Progress | None,
 ) -> SourceAnswers:
     from lanenet.learn.compare import SourceAnswers
+    from lanenet.learn.conditions import at_frames, lines_seen, way_to_training_cm
     from lanenet.onboard.compare import answer_frames, build_compared
 
-    frames, name = source.frames, str(source.path)
+    frames, labels, name = source.frames, source.labels, str(source.path)
     if frames is None:
-        labels: Any = source.content
-        answers = _answer_labels(labels, names, model, marking_cm)
-        return SourceAnswers(name, "label set", labels.meta.source, labels.points_cm, answers)
-    detectors = build_compared(names, frames, model=model, marking_cm=marking_cm, any_camera=any_camera)
+        assert labels is not None
+        return _answer_labels(name, labels, names, models, training, marking_cm)
+    detectors: dict[str, Detector] = {}
+    for key in _in_order(names, models):
+        kind: Any = "network" if key in models else key
+        built = build_compared(
+            [kind], frames, model=models.get(key), marking_cm=marking_cm, any_camera=any_camera
+        )
+        detectors[key] = built[kind]
 
     def report(done: int, total: int) -> None:
         if progress is not None:
@@ -186,22 +228,56 @@ def _answer(
 
     answers = answer_frames(frames, detectors, report)
     kind = "simulated drive" if frames.reference == "truth" else "map"
-    return SourceAnswers(name, kind, frames.reference, frames.points_cm, answers)
+    conditions, visible = {"light": answers.brightness}, None
+    if labels is not None:
+        visible = at_frames(lines_seen(labels), labels.frame, frames.frames)
+        way = way_to_training_cm(labels, training)
+        conditions["place"] = at_frames(way, labels.frame, frames.frames)
+    return SourceAnswers(
+        name,
+        kind,
+        frames.reference,
+        frames.points_cm,
+        answers.points_cm,
+        answers.sigma_cm,
+        answers.presence,
+        visible,
+        conditions,
+    )
 
 
 def _answer_labels(
-    labels: LabelSet, names: Sequence[ComparedName], model: Path | None, marking_cm: float | None
-) -> dict[str, Any]:
-    from lanenet.learn.evaluate import network_predictor
+    name: str,
+    labels: LabelSet,
+    names: Sequence[ComparedName],
+    models: Mapping[str, Path],
+    training: Sequence[LabelSet],
+    marking_cm: float | None,
+) -> SourceAnswers:
+    from lanenet.learn.compare import SourceAnswers
+    from lanenet.learn.conditions import lines_seen, way_to_training_cm
+    from lanenet.learn.evaluate import RasterModel
     from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
 
-    answers: dict[str, Any] = {}
-    for name in names:
-        if name == "network":
-            assert model is not None
-            answers[name] = network_predictor(model)(labels)
+    points: dict[str, Any] = {}
+    sigma: dict[str, Any] = {}
+    presence: dict[str, Any] = {}
+    for key in _in_order(names, models):
+        if key in models:
+            found = RasterModel(models[key]).answer_labels(labels)
+            points[key], sigma[key], presence[key] = found.points_cm, found.sigma_cm, found.presence
         else:
             meta = labels.meta
             settings = filter_settings(meta.lane_width_cm, meta.marking_cm, marking_cm)
-            answers[name] = lane_filter_points_cm(labels, settings)
-    return answers
+            points[key] = lane_filter_points_cm(labels, settings)
+    return SourceAnswers(
+        name,
+        "label set",
+        labels.meta.source,
+        labels.points_cm,
+        points,
+        sigma,
+        presence,
+        lines_seen(labels),
+        {"place": way_to_training_cm(labels, training)},
+    )

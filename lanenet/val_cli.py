@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,7 +32,9 @@ def val(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Also write the report under this name: .md, .json, .png and -worst.jpg."),
+        typer.Option(
+            help="Also write the report under this name: .md, .json, .png, -breakdown.png, -worst.jpg."
+        ),
     ] = None,
     detectors: Annotated[
         str | None,
@@ -47,6 +49,24 @@ def val(
     any_camera: Annotated[
         bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
     ] = False,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(help="Another model or checkpoint for the same tables; may be given again."),
+    ] = None,
+    trained_on: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Label set that MODEL has learned from; may be given again. Parts of the same map are told "
+            "by their distance from it.",
+        ),
+    ] = None,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust",
+            help="Also change the frames: lines missing, clutter, unknown objects, a wrong calibration.",
+        ),
+    ] = False,
 ) -> None:
     """Show errors in cm of a model and of the other detectors on the same frames.
 
@@ -55,6 +75,7 @@ def val(
     needed.
     """
     from lanenet.data.files import atomic_file, write_json, write_text
+    from lanenet.data.label_set import read_labels
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network import read_model_meta
 
@@ -64,11 +85,22 @@ def val(
     names = _chosen(detectors, no_baselines, model, sources)
     if detectors is None and not no_baselines and any(source.frames is None for source in sources):
         console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
+    more = _more_models(also or [])
+    if robust:
+        _check_robust(model, sources)
     with console.progress_bar("val") as progress:
         evaluation = evaluate(
-            sources, names, model, marking_cm=marking, any_camera=any_camera, progress=progress
+            sources,
+            names,
+            model,
+            also=more,
+            training=[read_labels(path) for path in trained_on or []],
+            marking_cm=marking,
+            any_camera=any_camera,
+            progress=progress,
         )
     show(evaluation.comparison)
+    robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
         write_json(Path(f"{out}.json"), evaluation.comparison.as_dict())
         console.wrote(Path(f"{out}.json"))
@@ -80,6 +112,11 @@ def val(
                 with atomic_file(path) as temporary:
                     temporary.write_bytes(content)
             console.wrote(path)
+        if robustness is not None:
+            table, figures = robustness
+            write_text(Path(f"{out}-robust.md"), table)
+            write_json(Path(f"{out}-robust.json"), figures)
+            console.wrote(Path(f"{out}-robust.md"), Path(f"{out}-robust.json"))
         if ".png" not in evaluation.files:
             console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
     best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
@@ -99,15 +136,66 @@ def show(comparison: Comparison) -> None:
         Console().print(table.as_rich())
 
 
+def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
+    """Models by the names that they get in the tables: those of their folders or files."""
+    from lanenet.onboard.compare import COMPARED
+
+    models: dict[str, Path] = {}
+    for path in paths:
+        model = _model_at(path)
+        if model is None:
+            raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
+        name = path.resolve().stem
+        if path.is_dir() or name == "model":
+            # A checkpoint's file is called as every other one's.
+            name = model.resolve().parent.name
+        if name in models or name in COMPARED:
+            raise ConfigError(f"--also {path}: the name {name!r} is taken, expected another one")
+        models[name] = model
+    return models
+
+
+def _check_robust(model: Path | None, sources: Sequence[Opened]) -> None:
+    if model is None:
+        raise ConfigError("--robust: expected a model before the sources (lanenet val MODEL SOURCE --robust)")
+    without = [source.path for source in sources if source.labels is None]
+    if without:
+        raise ConfigError(
+            f"--robust: {without[0]} is a map; expected simulated drives or label sets (lanenet label)"
+        )
+
+
+def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[str, dict[str, object]]:
+    """Measure, show and return the table as Markdown and as plain values."""
+    from rich.console import Console
+
+    from lanenet.learn.evaluate import RasterModel
+    from lanenet.learn.robust import as_dict, measure_robustness, robust_table
+
+    opened = {name: RasterModel(path) for name, path in models.items()}
+    label_sets = [source.labels for source in sources if source.labels is not None]
+    with console.progress_bar("robust") as progress:
+        rows = measure_robustness(opened, label_sets, [str(source.path) for source in sources], progress)
+    table = robust_table(rows)
+    Console().print(table.as_rich())
+    return table.as_markdown(), as_dict(rows)
+
+
+def _model_at(path: Path) -> Path | None:
+    """The model that a path stands for: a file, or that of a checkpoint folder."""
+    if (path / "model.onnx").is_file() or (path / "checkpoint.yaml").is_file():
+        return path / "model.onnx"
+    return path if path.suffix.lower() == ".onnx" else None
+
+
 def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
     """The model, if the first path is one, and the sources."""
-    first = paths[0]
-    folder = (first / "model.onnx").is_file() or (first / "checkpoint.yaml").is_file()
-    if not (folder or first.suffix.lower() == ".onnx"):
+    first, model = paths[0], _model_at(paths[0])
+    if model is None:
         return None, paths
     if not paths[1:]:
         raise ConfigError(f"{first}: expected a SOURCE after the model: a simulated drive, map or label set")
-    return first / "model.onnx" if folder else first, paths[1:]
+    return model, paths[1:]
 
 
 def _chosen(

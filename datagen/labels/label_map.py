@@ -87,6 +87,7 @@ def label_map(
             source="map",
             perception=perception,
             marking_cm=drive_map.meta.tape_cm,
+            camera_cm=drive_map.camera.mounting.at_cm,
         ),
         drive=[drive.name] * len(rows),
         file=[""] * len(rows),

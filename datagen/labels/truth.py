@@ -5,13 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
+from datagen.world.track_file import read_track
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+
+_SAMPLE_CM = 2.0
 
 
 def truth_labels(
@@ -42,7 +47,7 @@ def truth_labels(
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
-    nothing = np.empty((0, 2))
+    poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
     return LabelSet(
         meta=LabelMeta(
             window=window,
@@ -52,15 +57,36 @@ def truth_labels(
             source="truth",
             perception=perception,
             marking_cm=marking_cm,
+            camera_cm=drive.camera.mounting.at_cm,
         ),
         drive=[drive.name] * n,
         file=[""] * n,
         frame=drive.frames,
         t_s=drive.t_s,
         lap=np.zeros(n, dtype=np.int64),
-        poses=np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1),
+        poses=poses,
         points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
         edges=edges,
-        lines=[(nothing, nothing)] * n,
+        lines=_true_lines(drive_path, poses, drive.camera.wheelbase_cm),
         quality=np.ones(n),
     )
+
+
+def _true_lines(
+    drive_path: Path, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The lines of the driven lane in each frame, as thin as a map's; none without a road."""
+    if not (drive_path / "track.json").is_file():
+        nothing = np.empty((0, 2))
+        return [(nothing, nothing)] * len(poses)
+    track = read_track(drive_path / "track.json")
+    every = max(1, round(_SAMPLE_CM / track.step_cm))
+    lines = []
+    place: float | None = None
+    for pose in poses:
+        # Where the road comes near itself, the car is on the stretch that it was on before.
+        front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
+        place = track.nearest(front, place)[0]
+        left, right = track.lines_car(pose, wheelbase_cm, place)
+        lines.append((left[::every], right[::every]))
+    return lines

@@ -13,15 +13,13 @@ from pydantic import Field
 from datagen.reality.measure import MeasuredDrive, measure_frames
 from datagen.world.drive_loop import scripted_states
 from datagen.world.render_pool import prepare_process
-from datagen.world.variety import camera_like, vary_camera, vary_driver, vary_road
-from datagen.world.world import SimulationSettings, build_world
+from datagen.world.variety import camera_like, first_world, vary_simulation
+from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
-from lanenet.errors import ConfigError, LanenetError
+from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import PerceptionSettings
-
-_TRIES = 8
 
 
 class RealitySettings(Settings):
@@ -63,17 +61,15 @@ def drawn_simulation(settings: RealitySettings, cameras: Sequence[Camera], numbe
         number: Of the synthetic drive.
     """
     # The number alone decides: more drives leave the first ones as they are.
-    sequence = np.random.SeedSequence([settings.seed, number])
-    seed = int(sequence.generate_state(1)[0])
-    camera_rng, road_rng, driver_rng = np.random.default_rng(sequence).spawn(3)
-    changes: dict[str, object] = {"seed": seed, "frames": (settings.frames - 1) * settings.every + 1}
-    if settings.vary_camera and cameras:
-        changes["camera"] = vary_camera(camera_like(cameras[number % len(cameras)]), camera_rng)
-    track = vary_road(road_rng) if settings.vary_road else settings.simulation.track
-    changes["track"] = track
-    if settings.vary_driver:
-        changes["driver"] = vary_driver(track.lane_width_cm, driver_rng)
-    return settings.simulation.model_copy(update=changes)
+    simulation = settings.simulation.model_copy(update={"frames": (settings.frames - 1) * settings.every + 1})
+    return vary_simulation(
+        simulation,
+        np.random.SeedSequence([settings.seed, number]),
+        number,
+        cameras=[camera_like(camera) for camera in cameras] if settings.vary_camera else [],
+        road=settings.vary_road,
+        driver=settings.vary_driver,
+    )
 
 
 def measure_synthetic(settings: RealitySettings, cameras: Sequence[Camera], number: int) -> MeasuredDrive:
@@ -82,15 +78,7 @@ def measure_synthetic(settings: RealitySettings, cameras: Sequence[Camera], numb
     Raises:
         ConfigError: If the settings leave no road.
     """
-    simulation = drawn_simulation(settings, cameras, number)
-    for attempt in range(_TRIES):
-        try:
-            world = build_world(simulation)
-            break
-        except ConfigError:  # a random road may find no room for itself
-            if attempt == _TRIES - 1:
-                raise
-            simulation = simulation.model_copy(update={"seed": simulation.seed + 1})
+    world = first_world(drawn_simulation(settings, cameras, number))
     states = list(scripted_states(world))[:: settings.every]
     images = [
         world.renderer.render(state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s)

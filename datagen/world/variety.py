@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings
 from datagen.world.track_settings import TrackSettings, preset
+from datagen.world.world import SimulationSettings, World, build_world
+from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 
 #: Share of the drives on roads drawn from scratch; the others are on presets.
 _DRAWN_SHARE = 0.5
 #: Presets of roads that home-made cars are driven on.
 _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
+_TRIES = 8
 
 
 def camera_like(camera: Camera) -> CameraSettings:
@@ -104,3 +108,47 @@ def vary_driver(lane_width_cm: float, rng: np.random.Generator) -> DriverSetting
         wander_cm=lane_width_cm * (0.08 + 0.22 * wander),
         recover_cm=lane_width_cm * (0.2 + 0.2 * recover),
     )
+
+
+def vary_simulation(
+    simulation: SimulationSettings,
+    sequence: np.random.SeedSequence,
+    number: int,
+    *,
+    cameras: Sequence[CameraSettings] = (),
+    road: bool = True,
+    driver: bool = True,
+) -> SimulationSettings:
+    """Draw one of many drives; its seed is the sequence's first number.
+
+    Args:
+        simulation: What all drives share.
+        sequence: Decides everything that is drawn.
+        number: Of the drive; the cameras take turns.
+        cameras: The drive's camera is drawn near one of these; none leaves the simulation's.
+        road: Draw the kind of road.
+        driver: Draw how the car is driven.
+    """
+    camera_rng, road_rng, driver_rng = np.random.default_rng(sequence).spawn(3)
+    changes: dict[str, object] = {"seed": int(sequence.generate_state(1)[0])}
+    if cameras:
+        changes["camera"] = vary_camera(cameras[number % len(cameras)], camera_rng)
+    track = vary_road(road_rng) if road else simulation.track
+    changes["track"] = track
+    if driver:
+        changes["driver"] = vary_driver(track.lane_width_cm, driver_rng)
+    return simulation.model_copy(update=changes)
+
+
+def first_world(simulation: SimulationSettings) -> World:
+    """Build a drive's world; where a random road finds no room for itself, that of one of the next seeds.
+
+    Raises:
+        ConfigError: If several seeds leave no road.
+    """
+    for _ in range(_TRIES - 1):
+        try:
+            return build_world(simulation)
+        except ConfigError:
+            simulation = simulation.model_copy(update={"seed": simulation.seed + 1})
+    return build_world(simulation)

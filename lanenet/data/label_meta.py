@@ -40,6 +40,7 @@ class _MetaFile(Settings):
     perception: PerceptionSettings
     marking_cm: float | None = Field(default=None, gt=0.0)
     config_hash: str = ""
+    camera_cm: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class LabelMeta:
         perception: How the edge points were found; the car has to find them the same way.
         marking_cm: Width of the markings; None if unknown.
         config_hash: Hash of the settings that made the labels; empty if unknown.
+        camera_cm: Optical centre right of, ahead of and above the front axle; None if unknown.
     """
 
     window: BirdseyeWindow
@@ -65,6 +67,7 @@ class LabelMeta:
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
     marking_cm: float | None = None
     config_hash: str = ""
+    camera_cm: tuple[float, float, float] | None = None
 
 
 def meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
@@ -113,4 +116,5 @@ def meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
         perception=file.perception,
         marking_cm=file.marking_cm,
         config_hash=file.config_hash,
+        camera_cm=file.camera_cm,
     )

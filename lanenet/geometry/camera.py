@@ -47,6 +47,11 @@ class Mounting:
         """Optical centre, [cm], frame car with z up."""
         return np.array([self.right_of_centre_cm, self.ahead_of_front_axle_cm, self.height_cm])
 
+    @property
+    def at_cm(self) -> tuple[float, float, float]:
+        """:attr:`position_car_cm` as plain numbers, for files."""
+        return self.right_of_centre_cm, self.ahead_of_front_axle_cm, self.height_cm
+
     @cached_property
     def camera_from_car(self) -> Float[np.ndarray, "3 3"]:
         """Rotation that turns vectors of the car frame (z up) into the camera frame."""

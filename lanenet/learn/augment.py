@@ -10,23 +10,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import mirror_points, rows_of_polyline
+from lanenet.learn.augment_kernels import (
+    Amounts,
+    Frames,
+    augment_frames,
+    near_lines,
+    rasterise_frames,
+)
 from lanenet.learn.config import AugmentSettings
+from lanenet.learn.mounting_kernels import misplace_points
+from lanenet.learn.raster_kernels import Grid
 
 Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
+#: Rasters of 0 and 255; labels, [cm], NaN where masked; whether each line is seen: 1, 0 or NaN for unknown.
+Batch = tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]
 
-_SEGMENT_CM = (4.0, 40.0)
-_STRETCH_CM = (4.0, 20.0)
-#: Both edges of a wide tape, and what a blurred frame puts beside them.
-_LINE_REACH_CM = 4.0
-#: A line is seen if at least this many edge points lie this close to it.
-_PRESENT_POINTS = 12
-_PRESENT_REACH_CM = 3.0
+#: Where a camera is taken to be whose label set does not say so: right of, ahead of and above the front axle.
+TYPICAL_CAMERA_CM = (0.0, 0.0, 18.0)
 
 
 @dataclass(frozen=True)
@@ -42,166 +46,184 @@ class _View:
         return points_cm @ self.matrix + self.offset_cm
 
 
-def make_view(mirror: bool, shift_cm: float, turn_rad: float) -> _View:
-    """Place the car anew: the road is mirrored, then the car is moved to the right and turned to the left.
+def make_view(mirror: bool, shift_cm: float, turn_rad: float, scale: float = 1.0) -> _View:
+    """Place the car anew: the road is scaled and mirrored, then the car moved to the right and turned left.
 
     Args:
         mirror: Swap left and right.
         shift_cm: Way of the front axle to the right, [cm].
         turn_rad: Turn about the front axle, [rad], positive left.
+        scale: Every length of road and camera is multiplied by this.
     """
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     sign = -1.0 if mirror else 1.0
-    matrix = np.array([[sign * c, -sign * s], [s, c]])
+    matrix = scale * np.array([[sign * c, -sign * s], [s, c]])
     return _View(mirror, matrix, np.array([-shift_cm * c, shift_cm * s]))
 
 
-def augment_batch(
+def join_frames(
     edges_cm: Sequence[Float[np.ndarray, "_ 2"]],
     lines_cm: Sequence[Lines],
-    points_cm: Float[np.ndarray, "b 6"],
-    rngs: Sequence[np.random.Generator],
-    window: BirdseyeWindow,
-    settings: AugmentSettings,
-) -> tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]:
-    """Change each sample of a batch by its own draw.
+    points_cm: Float[np.ndarray, "n 6"],
+    camera_cm: Float[np.ndarray, "n 3"] | None = None,
+) -> Frames:
+    """Lay frames one after the other, as the compiled loops take them.
 
     Args:
-        edges_cm: Edge points of each sample, frame car.
-        lines_cm: Left and right lane line of each sample, in the direction of travel, frame car.
-        points_cm: Labels of each sample; a point that is masked here stays masked.
-        rngs: One generator per sample.
-        window: Grid of the rasters.
-        settings: What is changed, and how much.
-
-    Returns:
-        Rasters of 0 and 255; labels, [cm], NaN where masked; 1 for each line that can be seen, else 0.
+        edges_cm: Edge points of each frame, frame car.
+        lines_cm: Left and right lane line of each frame, in the direction of travel, frame car.
+        points_cm: Labels of each frame; a point that is masked here stays masked.
+        camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
+            one for all.
     """
     size = len(edges_cm)
-    present = np.empty((size, 2), np.float32)
-    rasters = np.zeros((size, 1, window.rows, window.columns), np.uint8)
-    labels = np.empty((size, 6), np.float32)
-    for i in range(size):
-        rng = rngs[i]
-        view = _draw_view(settings, rng)
-        labels[i] = window.labelled(labels_of_view(points_cm[i], lines_cm[i], view))
-        keep = _draw_kept(edges_cm[i], lines_cm[i], window, settings, rng)
-        moved = view.move(edges_cm[i][keep])
-        left, right = (view.move(line) for line in (lines_cm[i][::-1] if view.mirror else lines_cm[i]))
-        present[i] = lines_present(moved, (left, right), window)
-        if settings.jitter_cm > 0.0:
-            moved += settings.jitter_cm * rng.standard_normal(moved.shape, dtype=np.float32)
-        extra = _draw_clutter(window, settings, rng)
-        window.rasterise(np.concatenate([moved, extra]), out=rasters[i, 0])
-    return rasters, labels, present
-
-
-def labels_of_view(points_cm: Float[np.ndarray, "6"], lines_cm: Lines, view: _View) -> Float[np.ndarray, "6"]:
-    """Return the labels that a moved car has, from the lane lines, [cm].
-
-    A point that the label set masks stays masked: its map does not vouch for that stretch of the line.
-    """
-    moved = [view.move(line) for line in (lines_cm[::-1] if view.mirror else lines_cm)]
-    known = np.isfinite(mirror_points(points_cm) if view.mirror else points_cm)
-    labels = np.concatenate([rows_of_polyline(line) for line in moved])
-    return np.where(known, labels, np.nan)
-
-
-def _draw_view(settings: AugmentSettings, rng: np.random.Generator) -> _View:
-    mirror, shift, turn = rng.random(3).tolist()
-    return make_view(
-        mirror < settings.mirror,
-        (2.0 * shift - 1.0) * settings.shift_cm,
-        (2.0 * turn - 1.0) * settings.rotate_rad,
+    polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
+    lines_of_edges = []
+    for k in range(size):
+        near = np.empty(len(edges_cm[k]), np.uint8)
+        near_lines(np.asarray(edges_cm[k], np.float32), polylines[2 * k], polylines[2 * k + 1], near)
+        lines_of_edges.append(near)
+    typical = np.tile(np.array(TYPICAL_CAMERA_CM), (size, 1))
+    return Frames(
+        edges_cm=np.concatenate([np.empty((0, 2), np.float32), *edges_cm]).astype(np.float32),
+        edge_lines=np.concatenate([np.empty(0, np.uint8), *lines_of_edges]),
+        edge_start=_starts(edges_cm),
+        lines_cm=np.concatenate([np.empty((0, 2)), *polylines]),
+        line_start=_starts(polylines),
+        points_cm=np.ascontiguousarray(points_cm, np.float64),
+        camera_cm=typical if camera_cm is None else np.ascontiguousarray(camera_cm, np.float64),
     )
 
 
-def _draw_kept(
-    edges_cm: Float[np.ndarray, "m 2"],
-    lines_cm: Lines,
+def plain_batch(frames: Frames, indices: Int[np.ndarray, "b"], window: BirdseyeWindow) -> Batch:
+    """Return rasters, labels and seen lines of frames as they are."""
+    rasters, present = _empty(len(indices), window)
+    rasterise_frames(rasters, np.asarray(indices, np.int64), frames, _grid(window), present)
+    return rasters, frames.points_cm[indices].astype(np.float32), present
+
+
+def augment_batch(
+    frames: Frames,
+    indices: Int[np.ndarray, "b"],
     window: BirdseyeWindow,
     settings: AugmentSettings,
-    rng: np.random.Generator,
-) -> Bool[np.ndarray, "m"]:
-    """Decide which edge points stay: some drop singly, some by a stretch, some with their line."""
-    share, stretch, line, side = rng.random(4).tolist()
-    keep: np.ndarray = rng.random(len(edges_cm), dtype=np.float32) >= share * settings.drop_points
-    if stretch < settings.missing_stretch and len(edges_cm):
-        centre = edges_cm[rng.integers(len(edges_cm))]
-        radius = rng.uniform(*_STRETCH_CM)
-        # A ring about the car hides a band of road right across; a disc hides a piece of one line.
-        if rng.random() < 0.5:
-            distance = np.hypot(edges_cm[:, 0] - centre[0], edges_cm[:, 1] - centre[1])
-        else:
-            distance = np.abs(np.hypot(edges_cm[:, 0], edges_cm[:, 1]) - np.hypot(centre[0], centre[1]))
-            radius *= 0.5
-        keep &= distance > radius
-    if line < settings.missing_line:
-        keep &= ~_near_line(edges_cm, lines_cm[int(side < 0.5)], window)
-    return keep
+    seed: int,
+    epoch: int,
+    streams: Int[np.ndarray, "b"] | None = None,
+) -> Batch:
+    """Change each sample of a batch by its own draw.
+
+    Args:
+        frames: What :func:`join_frames` answers.
+        indices: Frames of the batch.
+        window: Grid of the rasters.
+        settings: What is changed, and how much.
+        seed: Of the run.
+        epoch: Counted from 0.
+        streams: Number of each sample's draw; None takes its index. A frame that comes twice in an epoch
+            needs two.
+
+    Returns:
+        Rasters, labels and seen lines; a sample follows from seed, epoch, stream and frame alone.
+    """
+    rasters, present = _empty(len(indices), window)
+    labels = np.empty((len(indices), 6), np.float32)
+    chosen = np.asarray(indices, np.int64)
+    augment_frames(
+        rasters,
+        labels,
+        present,
+        chosen,
+        chosen if streams is None else np.asarray(streams, np.int64),
+        seed,
+        epoch,
+        frames,
+        _grid(window),
+        _amounts(settings),
+    )
+    return rasters, labels, present
 
 
 def lines_present(
     edges_cm: Float[np.ndarray, "m 2"], lines_cm: Lines, window: BirdseyeWindow
 ) -> Float[np.ndarray, "2"]:
-    """Tell which lines can be seen: 1 for a line with enough edge points along it in the window, else 0.
+    """Say which lines of the lane a raster of edge points shows.
 
-    NaN for a line whose course is not known, as in labels from a simulator's truth.
+    A line is there if the edge points within 4 cm of its polyline mark cells of the raster over a length of
+    at least 9 cm (both edges of a tape count), and not there if they do so over less than 3 cm.
 
     Args:
-        edges_cm: Edge points of the road, without those of other things, frame car.
-        lines_cm: Left and right lane line, frame car.
+        edges_cm: Edge points, frame car.
+        lines_cm: Left and right lane line, frame car; NaN rows break them.
         window: Grid of the raster.
+
+    Returns:
+        Left and right: 1 there, 0 not there; NaN in between, and where the place of the line is unknown.
     """
-    near = [_near_line(edges_cm, line, window, _PRESENT_REACH_CM) for line in lines_cm]
-    known = [np.isfinite(line).all(axis=1).sum() > 1 for line in lines_cm]
-    seen = [n.sum() >= _PRESENT_POINTS for n in near]
-    return np.where(known, seen, np.nan).astype(np.float32)
+    frames = join_frames([np.asarray(edges_cm, np.float32)], [lines_cm], np.full((1, 6), np.nan))
+    return plain_batch(frames, np.zeros(1, np.int64), window)[2][0]
 
 
-def _near_line(
-    edges_cm: Float[np.ndarray, "m 2"],
-    line_cm: Float[np.ndarray, "k 2"],
-    window: BirdseyeWindow,
-    reach_cm: float = _LINE_REACH_CM,
-) -> Bool[np.ndarray, "m"]:
-    """True for points inside the window within about ``reach_cm`` of a polyline.
+def misplaced(
+    points_cm: Float[np.ndarray, "n 2"],
+    camera_cm: Float[np.ndarray, "3"],
+    *,
+    height: float = 0.0,
+    pitch_rad: float = 0.0,
+    roll_rad: float = 0.0,
+) -> Float[np.ndarray, "n 2"]:
+    """Return where points of the road seem to lie when the camera's mounting is known wrongly.
 
-    The line is painted as a band on the window's grid and each point looks up its cell: a frame has some
-    hundred points and segments, and comparing all pairs costs a thousand times as much.
+    The rays of the camera are turned by the error of its mounting and met with the road again, below a camera
+    of the wrong height. The camera is taken to look straight ahead. A wrong pitch then moves the points alike
+    whatever the pitch is; a wrong roll is one about the level line ahead.
+
+    Args:
+        points_cm: True points, frame car.
+        camera_cm: Optical centre: right of, ahead of and above the front axle.
+        height: The height is taken too large by this share.
+        pitch_rad: The camera is taken to look down by so much more than it does.
+        roll_rad: It is taken to lean to the right by so much more.
+
+    Returns:
+        Seeming points, [cm], frame car; NaN where the turned ray misses the road.
+
+    Source:
+        Own derivation; ``tests/unit/learn/test_augment.py`` compares it with two cameras.
     """
-    band = np.zeros((window.rows, window.columns), np.uint8)
-    whole = np.isfinite(line_cm).all(axis=1)
-    pieces = np.split(line_cm, np.flatnonzero(~whole))
-    # OpenCV takes (column, row) in whole numbers; four fractional bits keep a sixteenth of a cell.
-    for piece in pieces:
-        cells = window.cells(piece[np.isfinite(piece).all(axis=1)])
-        corners = np.rint(np.clip(cells[:, ::-1], -1e4, 1e4) * 16.0).astype(np.int32)
-        thickness = max(1, round(2.0 * reach_cm / window.cell_cm))
-        cv2.polylines(band, [corners.reshape(-1, 1, 2)], False, 255, thickness, cv2.LINE_8, 4)
-    row, column = np.rint(window.cells(edges_cm)).astype(np.intp).T
-    inside = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
-    near = np.zeros(len(edges_cm), bool)
-    near[inside] = band[row[inside], column[inside]] > 0
-    return near
+    moved = np.empty(points_cm.shape)
+    misplace_points(
+        np.asarray(points_cm, np.float64),
+        np.asarray(camera_cm, np.float64),
+        1.0 + height,
+        pitch_rad,
+        roll_rad,
+        moved,
+    )
+    return moved
 
 
-def _draw_clutter(
-    window: BirdseyeWindow, settings: AugmentSettings, rng: np.random.Generator
-) -> Float[np.ndarray, "m 2"]:
-    """Draw edge points of things that are not lanes: straight edges and single points, [cm], frame car."""
-    n_segments = int(rng.integers(settings.clutter_segments + 1))
-    n_points = int(rng.integers(settings.clutter_points + 1))
-    low = np.array([window.left_cm, window.near_cm])
-    size = np.array([window.right_cm, window.far_cm]) - low
-    ends = low + rng.random((n_segments + n_points, 2)) * size
-    centre, single = ends[:n_segments], ends[n_segments:]
-    if n_segments:
-        direction = rng.random(n_segments) * np.pi
-        half = 0.5 * rng.uniform(*_SEGMENT_CM, n_segments)
-        # As dense as the raster: no holes in the segment.
-        t = np.linspace(-1.0, 1.0, int(_SEGMENT_CM[1] / window.cell_cm))
-        along = np.stack([np.cos(direction), np.sin(direction)], axis=1) * half[:, None]
-        segments = centre[:, None, :] + t[None, :, None] * along[:, None, :]
-        single = np.concatenate([segments.reshape(-1, 2), single])
-    return single.astype(np.float32)
+def _starts(parts: Sequence[np.ndarray]) -> Int[np.ndarray, "_"]:
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def _empty(size: int, window: BirdseyeWindow) -> tuple[np.ndarray, np.ndarray]:
+    return np.empty((size, 1, window.rows, window.columns), np.uint8), np.empty((size, 2), np.float32)
+
+
+def _grid(window: BirdseyeWindow) -> Grid:
+    return Grid(
+        np.float32(window.left_cm),
+        np.float32(window.far_cm),
+        np.float32(window.cell_cm),
+        window.rows,
+        window.columns,
+        float(window.left_cm),
+        float(window.right_cm),
+    )
+
+
+def _amounts(settings: AugmentSettings) -> Amounts:
+    values = settings.model_dump()
+    values["limit"] = int(values.pop("draw") == "limit")
+    return Amounts(**values)

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.learn.breakdown import (
+    GROUPS,
+    Breakdown,
+    doubt_of,
+    errors_by_group,
+    lane_curvature,
+    presence_of,
+    rmse_interval_cm,
+)
 from lanenet.learn.evaluate import ErrorStats, ErrorTable, error_stats, point_errors
 
 FORMAT = "lanenet-evaluation/1"
@@ -27,6 +36,10 @@ class SourceAnswers:
         reference: Where the labels come from: ``truth`` or ``map``.
         truth_cm: Six labels per frame; NaN where there is none.
         answers_cm: By detector, six points per frame; NaN where it has no answer.
+        sigma_cm: By detector, the standard deviations that it tells; who tells none may be left out.
+        presence: By detector, its probability that the left and the right line are there; likewise.
+        visible: Whether each line can be seen: 1, 0, or NaN for unknown; None if unknown throughout.
+        conditions: By name (see :data:`lanenet.learn.breakdown.GROUPS`) its value for each frame.
     """
 
     name: str
@@ -34,6 +47,10 @@ class SourceAnswers:
     reference: str
     truth_cm: Float[np.ndarray, "n 6"]
     answers_cm: Mapping[str, Float[np.ndarray, "_ 6"]]
+    sigma_cm: Mapping[str, Float[np.ndarray, "_ 6"]] = field(default_factory=dict)
+    presence: Mapping[str, Float[np.ndarray, "_ 2"]] = field(default_factory=dict)
+    visible: Float[np.ndarray, "n 2"] | None = None
+    conditions: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,6 +96,7 @@ class Comparison:
             answer only what is easy look good on their own answers.
         sources: The errors by source.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
+        breakdown: Where the errors come from.
     """
 
     reference: str
@@ -86,6 +104,7 @@ class Comparison:
     shared: dict[str, SharedErrors]
     sources: tuple[SourceErrors, ...]
     errors_cm: dict[str, Float[np.ndarray, "n 6"]]
+    breakdown: Breakdown
 
     @property
     def first(self) -> str:
@@ -102,6 +121,7 @@ class Comparison:
                 "shared_with": None if shared is None else self.first,
                 "shared": None if shared is None else shared.own.as_dict(),
                 "first_on_shared": None if shared is None else shared.first.as_dict(),
+                **self.breakdown.of(name),
             }
         sources = [
             {
@@ -167,7 +187,48 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         shared=shared,
         sources=tuple(_source_errors(source) for source in sources),
         errors_cm=errors,
+        breakdown=_break_down(sources, names, truth, errors),
     )
+
+
+def _break_down(
+    sources: Sequence[SourceAnswers],
+    names: Sequence[str],
+    truth_cm: Float[np.ndarray, "n 6"],
+    errors_cm: Mapping[str, Float[np.ndarray, "n 6"]],
+) -> Breakdown:
+    labelled = np.isfinite(truth_cm)
+    values = {"bend": lane_curvature(truth_cm)}
+    for condition in GROUPS:
+        if any(condition in source.conditions for source in sources):
+            unknown = [np.full(len(source.truth_cm), np.nan) for source in sources]
+            parts = [s.conditions.get(condition, u) for s, u in zip(sources, unknown, strict=True)]
+            values[condition] = np.concatenate(parts)
+    groups = {
+        condition: {n: errors_by_group(condition, value, errors_cm[n], labelled) for n in names}
+        for condition, value in values.items()
+    }
+    ends = np.cumsum([len(source.truth_cm) for source in sources])[:-1]
+    visible = _joined(sources, [s.visible for s in sources], 2)
+    doubt, presence, interval = {}, {}, {}
+    for name in names:
+        # The same drives are drawn for every detector.
+        interval[name] = rmse_interval_cm(np.split(errors_cm[name], ends), np.random.default_rng(0))
+        own = doubt_of(errors_cm[name], _joined(sources, [s.sigma_cm.get(name) for s in sources], 6))
+        if own is not None:
+            doubt[name] = own
+        told = presence_of(_joined(sources, [s.presence.get(name) for s in sources], 2), visible)
+        if told is not None:
+            presence[name] = told
+    return Breakdown(groups, interval, doubt, presence)
+
+
+def _joined(
+    sources: Sequence[SourceAnswers], parts: Sequence[np.ndarray | None], width: int
+) -> Float[np.ndarray, "n w"]:
+    """One after the other; NaN for a source that has none."""
+    unknown = [np.full((len(source.truth_cm), width), np.nan) for source in sources]
+    return np.concatenate([u if part is None else part for u, part in zip(unknown, parts, strict=True)])
 
 
 def _source_errors(source: SourceAnswers) -> SourceErrors:

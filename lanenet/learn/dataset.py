@@ -5,20 +5,22 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
-from lanenet.learn.augment import augment_batch, lines_present
-from lanenet.learn.config import AugmentSettings
+from lanenet.learn.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
+from lanenet.learn.config import AugmentSettings, Balance
+from lanenet.perception.birdseye import PerceptionSettings
 
-#: Rasters, labels in cm (NaN where masked) and, per line, 1 if it can be seen (0 if not, NaN if unknown).
-Batch = tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]
+#: Stands for the hashes of cameras that are too many to be named.
+_MANY_CAMERAS = 8
 
 
 class LaneSamples:
@@ -26,16 +28,18 @@ class LaneSamples:
 
     Attributes:
         window: The bird's-eye window that all sets share.
-        wheelbase_cm: The wheelbase that all sets share.
-        perception: How all sets' edge points were found.
+        wheelbase_cm: Mean wheelbase over the frames; labels are in the frame of the front axle, so that it
+            matters for steering only.
+        perception: How all sets' edge points were found; where the sets leave out different rows of the image
+            (their cars see different parts of themselves), no row is left out here.
         lane_width_cm: Mean lane width over the frames.
         lane_widths_cm: Narrowest and widest lane of a set.
-        camera_hashes: Of the cameras that took the frames, sorted.
+        camera_hashes: Of the cameras that took the frames, sorted; ``any`` alone where they are so many that
+            the network has to do with any calibrated camera.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
         points_cm: Labels of each frame, NaN where masked, n x 6.
-        edges_cm: Edge points of all frames, one after the other, frame car.
-        edge_start: Frame i owns edge points ``edge_start[i]`` to ``edge_start[i + 1]``.
-        lines: Left and right polyline of each frame, frame car.
+        frames: Edge points, lane lines and labels, as the compiled loops take them.
+        set_start: Set i owns the frames ``set_start[i]`` to ``set_start[i + 1]``.
     """
 
     def __init__(
@@ -57,65 +61,96 @@ class LaneSamples:
             check_same(label_sets[0].meta, other.meta, names[0], name)
         first = label_sets[0].meta
         self.window: BirdseyeWindow = first.window
-        self.wheelbase_cm = first.wheelbase_cm
-        self.perception = first.perception
-        self.camera_hashes = sorted({labels.meta.camera_hash for labels in label_sets})
+        same = all(labels.meta.perception == first.perception for labels in label_sets)
+        self.perception = first.perception if same else _of_all_rows(first.perception)
         self.reference = reference_of(label_sets)
         kept = [
             np.flatnonzero((labels.quality >= min_quality) & np.isfinite(labels.points_cm).any(axis=1))
             for labels in label_sets
         ]
+        self.set_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum([len(rows) for rows in kept])])
         pairs = [(labels, i) for labels, rows in zip(label_sets, kept, strict=True) for i in rows]
         if not pairs:
             raise LabelFormatError(
                 f"{', '.join(names)}: no frame has a label and a quality of at least {min_quality:g}"
             )
-        widths = [labels.meta.lane_width_cm for labels, _ in pairs]
-        self.lane_width_cm = float(np.mean(widths))
-        self.lane_widths_cm = (float(min(widths)), float(max(widths)))
+        metas = [labels.meta for labels in label_sets]
+        hashes = sorted({meta.camera_hash for meta in metas})
+        self.camera_hashes = [ANY_CAMERA] if len(hashes) > _MANY_CAMERAS else hashes
+        self.lane_widths_cm = (min(m.lane_width_cm for m in metas), max(m.lane_width_cm for m in metas))
+        self.lane_width_cm = float(np.mean([labels.meta.lane_width_cm for labels, _ in pairs]))
+        self.wheelbase_cm = float(np.mean([labels.meta.wheelbase_cm for labels, _ in pairs]))
         self.points_cm: Float[np.ndarray, "n 6"] = np.array([labels.points_cm[i] for labels, i in pairs])
-        edges = [np.asarray(labels.edges[i][:, :2], np.float32) for labels, i in pairs]
-        self.edges_cm = np.concatenate(edges)
-        self.edge_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum([len(e) for e in edges])])
-        self.lines = [
-            (np.asarray(labels.lines[i][0], np.float64), np.asarray(labels.lines[i][1], np.float64))
-            for labels, i in pairs
-        ]
+        self.frames = join_frames(
+            [labels.edges[i][:, :2] for labels, i in pairs],
+            [labels.lines[i] for labels, i in pairs],
+            self.points_cm,
+            np.array([labels.meta.camera_cm or TYPICAL_CAMERA_CM for labels, _ in pairs]),
+        )
 
     def __len__(self) -> int:
         return len(self.points_cm)
 
-    def edges_of(self, index: int) -> Float[np.ndarray, "m 2"]:
-        """Return the edge points of one frame, [cm], frame car."""
-        return self.edges_cm[self.edge_start[index] : self.edge_start[index + 1]]
+    @property
+    def any_camera(self) -> bool:
+        """Whether the frames come from so many cameras that the network has to do with any calibrated one."""
+        return self.camera_hashes == [ANY_CAMERA]
 
     def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
-        """Return rasters, labels and presence of the lines of frames as they are."""
-        rasters = np.empty((len(indices), 1, self.window.rows, self.window.columns), np.uint8)
-        for slot, index in enumerate(indices):
-            self.window.rasterise(self.edges_of(int(index)), out=rasters[slot, 0])
-        present = [lines_present(self.edges_of(int(i)), self.lines[i], self.window) for i in indices]
-        return rasters, self.points_cm[indices].astype(np.float32), np.array(present, np.float32)
+        """Return rasters, labels and seen lines of frames as they are."""
+        return plain_batch(self.frames, indices, self.window)
 
     def augmented_batch(
-        self, indices: Int[np.ndarray, "b"], settings: AugmentSettings, seed: int, epoch: int
+        self,
+        indices: Int[np.ndarray, "b"],
+        settings: AugmentSettings,
+        seed: int,
+        epoch: int,
+        streams: Int[np.ndarray, "b"] | None = None,
     ) -> Batch:
-        """Return rasters, labels and presence of the lines of frames, each changed by its own draw.
+        """Return rasters, labels and seen lines of frames, each changed by its own draw.
 
-        The draw depends on ``seed``, ``epoch`` and the index of the frame alone, so a sample is the same
-        whatever the batch, the order and the number of workers.
+        The draw depends on ``seed``, ``epoch`` and the index of the frame alone (or on its number in
+        ``streams``), so a sample is the same whatever the batch, the order and the number of workers.
         """
-        return augment_batch(
-            [self.edges_of(int(i)) for i in indices],
-            [self.lines[i] for i in indices],
-            self.points_cm[indices],
-            [np.random.default_rng((seed, epoch, int(i))) for i in indices],
-            self.window,
-            settings,
-        )
+        return augment_batch(self.frames, indices, self.window, settings, seed, epoch, streams)
+
+    def order(
+        self, seed: int, epoch: int, balance: Balance = "none"
+    ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Return the frames of an epoch in a shuffled order, and the number of each one's draw.
+
+        Args:
+            seed: Of the run.
+            epoch: Counted from 0.
+            balance: ``none`` shows each frame once; ``drive`` shows each label set equally often, and within
+                it no frame twice as long as another one is left.
+        """
+        n = len(self)
+        # The number after the last sample's: a stream of its own.
+        rng = np.random.default_rng((seed, epoch, n))
+        if balance == "none":
+            frames = rng.permutation(n)
+            return frames, frames
+        sets = [np.arange(a, b) for a, b in pairwise(self.set_start.tolist()) if b > a]
+        shown, streams = [], []
+        # The first sets get what the division leaves over.
+        for number, rows in enumerate(sets):
+            wanted = n // len(sets) + (number < n % len(sets))
+            rounds = -(-wanted // len(rows))
+            shown.append(np.concatenate([rng.permutation(rows) for _ in range(rounds)])[:wanted])
+            streams.append(shown[-1] + n * (np.arange(wanted) // len(rows)))
+        mixed = rng.permutation(n)
+        return np.concatenate(shown)[mixed], np.concatenate(streams)[mixed]
 
     def epoch(
-        self, settings: AugmentSettings, seed: int, epoch: int, batch_size: int, workers: int = 1
+        self,
+        settings: AugmentSettings,
+        seed: int,
+        epoch: int,
+        batch_size: int,
+        workers: int = 1,
+        balance: Balance = "none",
     ) -> Iterator[Batch]:
         """Yield the augmented batches of one epoch in a shuffled order that (seed, epoch) decides.
 
@@ -127,20 +162,20 @@ class LaneSamples:
             epoch: Counted from 0.
             batch_size: Samples per batch.
             workers: Threads that prepare batches ahead; 0 prepares each when it is asked for.
+            balance: How often each label set is shown, see :meth:`order`.
         """
-        # The number after the last sample's: a stream of its own.
-        order = np.random.default_rng((seed, epoch, len(self))).permutation(len(self))
-        chunks = [order[k : k + batch_size] for k in range(0, len(order), batch_size)]
-        chunks = [chunk for chunk in chunks if len(chunk) > 1]
+        order, streams = self.order(seed, epoch, balance)
+        slices = [slice(k, k + batch_size) for k in range(0, len(order), batch_size)]
+        jobs = [(order[k], settings, seed, epoch, streams[k]) for k in slices if len(order[k]) > 1]
         if workers == 0:
-            for chunk in chunks:
-                yield self.augmented_batch(chunk, settings, seed, epoch)
+            for job in jobs:
+                yield self.augmented_batch(*job)
             return
         with ThreadPoolExecutor(workers) as pool:
             ahead: list[Future[Batch]] = []
             try:
-                for chunk in chunks:
-                    ahead.append(pool.submit(self.augmented_batch, chunk, settings, seed, epoch))
+                for job in jobs:
+                    ahead.append(pool.submit(self.augmented_batch, *job))
                     if len(ahead) > workers + 1:
                         yield ahead.pop(0).result()
                 for future in ahead:
@@ -182,7 +217,7 @@ def read_samples(paths: Sequence[Path], min_quality: float = 0.0) -> LaneSamples
 
 
 def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
-    """Refuse two label sets that do not describe the same raster and car.
+    """Refuse two label sets that do not describe the same raster.
 
     Raises:
         LabelFormatError: Naming both files and what differs.
@@ -191,16 +226,17 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
         raise LabelFormatError(
             f"{name_b}: window {b.window}, but {name_a} has {a.window}; label both with the same window"
         )
-    if a.perception != b.perception:
+    if _of_all_rows(a.perception) != _of_all_rows(b.perception):
         raise LabelFormatError(
             f"{name_b}: its edges were found with {b.perception}, those of {name_a} with {a.perception}; "
             "label both with the same settings"
         )
-    if abs(a.wheelbase_cm - b.wheelbase_cm) > 1e-6 * abs(a.wheelbase_cm):
-        raise LabelFormatError(
-            f"{name_b}: wheelbase_cm {b.wheelbase_cm:g}, but {name_a} has {a.wheelbase_cm:g}; "
-            "learn one car at a time"
-        )
+
+
+def _of_all_rows(perception: PerceptionSettings) -> PerceptionSettings:
+    """The same perception without the rows that one car has to leave out."""
+    rows = {"top_row": 0, "bottom_rows": 0}
+    return perception.model_copy(update={"range": perception.range.model_copy(update=rows)})
 
 
 def reference_of(label_sets: Sequence[LabelSet]) -> str:

@@ -11,10 +11,12 @@ from rich import box
 from rich.table import Table
 
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
+from lanenet.learn.breakdown import GROUPS, INTERVALS
 from lanenet.learn.compare import Comparison
 from lanenet.learn.evaluate import ErrorStats
 
 _STATS = ("RMSE", "median", "p95", "worst")
+_PRESENCE = ("line precision", "line recall", "absent recall")
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,19 @@ class TextTable:
 
 
 def lay_out(comparison: Comparison) -> list[TextTable]:
-    """Lay out a comparison: by point, on shared points, by source (of several); lengths in cm."""
+    """Lay out a comparison: by point, on shared points, by source and by condition (of several)."""
     tables = [_by_point(comparison)]
     if comparison.shared:
         tables.append(_on_shared_points(comparison))
     if len(comparison.sources) > 1:
         tables.append(_by_source(comparison))
+    for condition, by_detector in comparison.breakdown.groups.items():
+        groups = by_detector[comparison.first].values()
+        # All in one group is what the first table says.
+        if sum(stats.truth_count > 0 for stats in groups) > 1:
+            tables.append(_by_condition(comparison, condition))
+    if comparison.breakdown.doubt or comparison.breakdown.presence:
+        tables.append(_doubt_and_presence(comparison))
     return tables
 
 
@@ -78,7 +87,7 @@ def _by_point(comparison: Comparison) -> TextTable:
     for name, table in comparison.tables.items():
         groups = [table.groups[group] for group in ("all", *POINT_NAMES)]
         values = zip(*(_values(stats) for stats in groups), strict=True)
-        rows = [[label, *map(_cm, row)] for label, row in zip(_STATS, values, strict=True)]
+        rows = [[label, *map(show_cm, row)] for label, row in zip(_STATS, values, strict=True)]
         rows.append(["answered", *map(_percent, groups)])
         lines += [[name if i == 0 else "", *row] for i, row in enumerate(rows)]
     counts = {table.all.truth_count for table in comparison.tables.values()}
@@ -87,6 +96,13 @@ def _by_point(comparison: Comparison) -> TextTable:
         f"{counts.pop()} labelled points of {frames} frames; the columns are the line and the distance ahead "
         "in cm"
     )
+    intervals = [
+        f"{name} {show_cm(ends[0])} to {show_cm(ends[1])}"
+        for name, ends in comparison.breakdown.interval_cm.items()
+        if ends is not None
+    ]
+    if intervals:
+        note += f". 95 % intervals of the RMSE over drives like these: {', '.join(intervals)}"
     return TextTable(
         title=f"Errors in cm against the {comparison.reference}",
         header=["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)],
@@ -103,7 +119,7 @@ def _on_shared_points(comparison: Comparison) -> TextTable:
     for name, shared in comparison.shared.items():
         for label, stats in ((name, shared.own), (first, shared.first)):
             share = _percent(stats) if label == name else ""
-            lines.append([label, share, *map(_cm, _values(stats))])
+            lines.append([label, share, *map(show_cm, _values(stats))])
     return TextTable(
         title=f"Each detector and {first} on the points that both answered, in cm",
         header=["detector", "shared", *_STATS],
@@ -118,7 +134,7 @@ def _by_source(comparison: Comparison) -> TextTable:
     lines = []
     for source in comparison.sources:
         cells = (source.detectors[name] for name in names)
-        shown = [f"{_cm(s.rmse_cm)} {_percent(s)}" for s in cells]
+        shown = [f"{show_cm(s.rmse_cm)} {_percent(s)}" for s in cells]
         # Where all sources are alike, the title of the first table says it.
         name = Path(source.name).name + (f" ({source.reference})" if mixed else "")
         lines.append([name, *shown])
@@ -130,6 +146,50 @@ def _by_source(comparison: Comparison) -> TextTable:
     )
 
 
+def _by_condition(comparison: Comparison, condition: str) -> TextTable:
+    unit, groups = GROUPS[condition]
+    by_detector = comparison.breakdown.groups[condition]
+    lines = []
+    for name, _ in groups:
+        cells = [by_detector[detector][name] for detector in comparison.tables]
+        lines.append([name, str(cells[0].truth_count), *(show_cm(stats.rmse_cm) for stats in cells)])
+    return TextTable(
+        title=f"RMSE in cm by {condition}",
+        header=[condition, "points", *comparison.tables],
+        lines=lines,
+        note=unit,
+    )
+
+
+def _doubt_and_presence(comparison: Comparison) -> TextTable:
+    breakdown, lines = comparison.breakdown, []
+    for name in comparison.tables:
+        doubt, presence = breakdown.doubt.get(name), breakdown.presence.get(name)
+        if doubt is None and presence is None:
+            continue
+        shares: list[float | None] = [None, None] if doubt is None else list(doubt.coverage.values())
+        shares += (
+            [None, None, None]
+            if presence is None
+            else [presence.precision, presence.recall, presence.absent_recall]
+        )
+        sigma = "-" if doubt is None else show_cm(doubt.median_sigma_cm)
+        lines.append([name, sigma, *map(show_share, shares)])
+    return TextTable(
+        title="What detectors say of themselves",
+        header=["detector", "sigma", *(f"{name}% interval" for name in INTERVALS), *_PRESENCE],
+        lines=lines,
+        note="median standard deviation in cm; share of the errors within the intervals; of the lines said "
+        "to be there, those that are, of those that are there, those found, and of those that are not, those "
+        "said to be absent",
+    )
+
+
+def show_share(value: float | None) -> str:
+    """Show a share in per cent; a dash where it is unknown."""
+    return "-" if value is None or math.isnan(value) else f"{100.0 * value:.0f}%"
+
+
 def _values(stats: ErrorStats) -> tuple[float, float, float, float]:
     return stats.rmse_cm, stats.median_cm, stats.p95_cm, stats.worst_cm
 
@@ -138,8 +198,8 @@ def _percent(stats: ErrorStats) -> str:
     return f"{100.0 * stats.coverage:.0f}%" if stats.truth_count else "-"
 
 
-def _cm(value: float) -> str:
-    """Three digits or so: a tenth of a millimetre says nothing about an error of a metre."""
+def show_cm(value: float) -> str:
+    """Show a length with three digits or so: a tenth of a millimetre is nothing beside a metre."""
     if math.isnan(value):
         return "-"
     return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from lanenet.data.label_set import LabelSet
 from lanenet.errors import ModelMismatchError
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES
 from lanenet.perception.network import INPUT_NAME, open_model
 
@@ -108,32 +109,95 @@ def point_errors(
     return ErrorTable(groups, reference)
 
 
+@dataclass(frozen=True)
+class RasterAnswers:
+    """What a model says of rasters.
+
+    Attributes:
+        points_cm: Six points each, frame car; NaN where nothing is marked in the raster.
+        sigma_cm: Their standard deviations; NaN where the model does not tell them.
+        presence: Probability that the left and the right line are there; NaN likewise.
+    """
+
+    points_cm: Float[np.ndarray, "n 6"]
+    sigma_cm: Float[np.ndarray, "n 6"]
+    presence: Float[np.ndarray, "n 2"]
+
+
+class RasterModel:
+    """A model file that answers rasters, as they come from label sets.
+
+    The camera is not compared: a label set's edges are already on the road.
+
+    Attributes:
+        path: The file.
+        meta: What it says about itself.
+    """
+
+    def __init__(self, path: Path, threads: int = 1) -> None:
+        """Open a file.
+
+        Raises:
+            ModelMismatchError: If it cannot be used.
+        """
+        self.path = path
+        self._session, self.meta = open_model(path, threads)
+        outputs = {output.name for output in self._session.get_outputs()}
+        # Models of the first kind tell points alone.
+        self._names = [name for name in ("points_cm", "sigma_cm", "presence") if name in outputs]
+
+    def check_window(self, window: BirdseyeWindow) -> None:
+        """Refuse rasters of another window.
+
+        Raises:
+            ModelMismatchError: Naming both.
+        """
+        if window != self.meta.window:
+            raise ModelMismatchError(
+                f"{self.path}: made for the window {self.meta.window}, but the label set has {window}"
+            )
+
+    def answer(self, rasters: UInt8[np.ndarray, "n 1 r c"]) -> RasterAnswers:
+        """Answer rasters of 0 and 255."""
+        n = len(rasters)
+        found = {"points_cm": N_POINTS, "sigma_cm": N_POINTS, "presence": len(SIDES)}
+        values = {name: np.full((n, width), np.nan) for name, width in found.items()}
+        for start in range(0, n, _CHUNK):
+            part = rasters[start : start + _CHUNK]
+            # As on the car: where nothing is seen there is no answer.
+            seen = np.asarray(part.any(axis=(1, 2, 3)))[:, None]
+            for name, answer in zip(
+                self._names, self._session.run(self._names, {INPUT_NAME: part}), strict=True
+            ):
+                values[name][start : start + _CHUNK] = np.where(seen, answer, np.nan)
+        if "presence" in self._names:
+            # An empty raster shows no line; that is an answer.
+            values["presence"][~rasters.any(axis=(1, 2, 3))] = 0.0
+        return RasterAnswers(**values)
+
+    def answer_labels(self, labels: LabelSet) -> RasterAnswers:
+        """Answer the frames of a label set.
+
+        Raises:
+            ModelMismatchError: If it has another window.
+        """
+        self.check_window(labels.meta.window)
+        rasters = [labels.raster(i)[None] for i in range(len(labels.points_cm))]
+        return self.answer(np.array(rasters, np.uint8).reshape(-1, 1, *self._shape))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.meta.window.rows, self.meta.window.columns
+
+
 def network_predictor(onnx_path: Path, threads: int = 1) -> Predictor:
     """Return a model file as a predictor for label sets.
-
-    The camera is not compared: the label set's edges are already on the road.
 
     Raises:
         ModelMismatchError: If the file cannot be used; when called, if a label set has another window.
     """
-    session, meta = open_model(onnx_path, threads)
-
-    def predict(labels: LabelSet) -> Float[np.ndarray, "n 6"]:
-        if labels.meta.window != meta.window:
-            raise ModelMismatchError(
-                f"{onnx_path}: made for the window {meta.window}, but the label set has {labels.meta.window}"
-            )
-        n = len(labels.points_cm)
-        result = np.full((n, N_POINTS), np.nan)
-        for start in range(0, n, _CHUNK):
-            rasters = np.stack([labels.raster(i) for i in range(start, min(start + _CHUNK, n))])
-            (points,) = session.run(("points_cm",), {INPUT_NAME: rasters[:, None]})
-            # As on the car: where nothing is seen there is no answer.
-            seen = np.asarray(rasters.any(axis=(1, 2)))
-            result[start : start + len(rasters)] = np.where(seen[:, None], points, np.nan)
-        return result
-
-    return predict
+    model = RasterModel(onnx_path, threads)
+    return lambda labels: model.answer_labels(labels).points_cm
 
 
 def _row_names() -> list[str]:

@@ -18,6 +18,7 @@ from lanenet.errors import CheckpointError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import hash_files
 from lanenet.learn.export import MODEL_NAME, WEIGHTS_NAME
+from lanenet.learn.start import hash_of_start
 
 STATE_NAME = "last.pt"
 METRICS_NAME = "metrics.json"
@@ -74,13 +75,15 @@ class RunState:
 
 
 def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
-    """Return a hash of all that decides a run: settings and the contents of its files.
+    """Return a hash of all that decides a run: settings, the contents of its files and its first weights.
 
     Raises:
         LabelFormatError: If a file cannot be read.
+        CheckpointError: If there are no weights to start from.
     """
     weights = [] if settings.network.weights is None else [settings.network.weights]
     text = f"{settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
+    text += hash_of_start(settings.start_from)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

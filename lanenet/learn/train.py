@@ -32,6 +32,7 @@ from lanenet.learn.run_state import (
     read_state,
     write_state,
 )
+from lanenet.learn.start import load_start_weights
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]
@@ -138,6 +139,8 @@ class TrainingRun:
         mean, scale = samples.normalisation(settings.augment.mirror > 0.0)
         self.network.mean_cm.copy_(torch.from_numpy(mean))
         self.network.scale_cm.copy_(torch.from_numpy(scale))
+        if settings.start_from is not None:
+            load_start_weights(self.network, settings.start_from, samples.window)
         self.optimizer = new_optimizer(self.network, settings)
         self.step = 0
         self.history: list[EpochRecord] = []
@@ -168,7 +171,9 @@ class TrainingRun:
         started = time.perf_counter()
         squares, count, n_samples, rate = 0.0, 0, 0, 0.0
         self.network.train()
-        batches = self.samples.epoch(settings.augment, settings.seed, epoch, settings.batch_size)
+        batches = self.samples.epoch(
+            settings.augment, settings.seed, epoch, settings.batch_size, balance=settings.balance
+        )
         with _random_numbers(settings.seed, epoch, self.device):
             for rasters, labels, present in batches:
                 rate = learning_rate_at(self.step, self.total, settings)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
-from lanenet.geometry.lane import N_POINTS
+from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.onboard.detectors import build_detector, filter_settings
 from lanenet.perception.birdseye import RoadEdgeExtractor
 from lanenet.perception.estimate import Detector
@@ -25,6 +26,23 @@ COMPARED: tuple[ComparedName, ...] = ("network", "lane-filter", "hough", "hough-
 ON_LABEL_SETS: tuple[ComparedName, ...] = ("network", "lane-filter")
 
 Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class FrameAnswers:
+    """What detectors said about the frames of a source, by their names.
+
+    Attributes:
+        points_cm: Six points per frame, frame car; NaN where a detector has no answer.
+        sigma_cm: Standard deviation of each point; NaN where a detector does not know it.
+        presence: Probability that the left and the right line can be seen; NaN likewise.
+        brightness: Mean grey level of each frame, 0 to 255.
+    """
+
+    points_cm: dict[str, Float[np.ndarray, "n 6"]]
+    sigma_cm: dict[str, Float[np.ndarray, "n 6"]]
+    presence: dict[str, Float[np.ndarray, "n 2"]]
+    brightness: Float[np.ndarray, "n"]
 
 
 def choose_names(text: str) -> tuple[ComparedName, ...]:
@@ -73,14 +91,27 @@ def build_compared(
             # The perception is the source's: it leaves out the rows in which a car sees itself.
             settings = filter_settings(frames.lane_width_cm, frames.marking_cm, marking_cm)
             detectors[name] = LaneFilter(RoadEdgeExtractor(frames.camera, frames.perception), settings)
+        elif name == "network":
+            # Beside the rows that the model leaves out, those in which this car sees itself.
+            mask = hidden_rows(frames) if frames.perception.range.bottom_rows else None
+            detectors[name] = build_detector(
+                name, frames.camera, model=model, any_camera=any_camera, mask=mask
+            )
         else:
-            detectors[name] = build_detector(name, frames.camera, model=model, any_camera=any_camera)
+            detectors[name] = build_detector(name, frames.camera)
     return detectors
+
+
+def hidden_rows(frames: LabelledFrames) -> UInt8[np.ndarray, "h w"]:
+    """Return a mask of the rows in which a source's car sees itself."""
+    mask = np.zeros((frames.camera.height, frames.camera.width), np.uint8)
+    mask[frames.camera.height - frames.perception.range.bottom_rows :] = 255
+    return mask
 
 
 def answer_frames(
     frames: LabelledFrames, detectors: Mapping[str, Detector], progress: Progress | None = None
-) -> dict[str, Float[np.ndarray, "n 6"]]:
+) -> FrameAnswers:
     """Run detectors over every frame in order; all forget what they saw where the source is interrupted.
 
     Args:
@@ -88,27 +119,34 @@ def answer_frames(
         detectors: By name.
         progress: Called with (frames done, frames).
 
-    Returns:
-        Six points per frame by name, [cm], frame car; NaN where a detector has no answer.
-
     Raises:
         DriveFormatError: If a frame cannot be read; names it.
         CalibrationError: If a frame does not fit the camera; names it.
     """
     n = len(frames)
-    answers = {name: np.full((n, N_POINTS), np.nan) for name in detectors}
+    answers = FrameAnswers(
+        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
+        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
+        {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
+        np.empty(n),
+    )
     for i in range(n):
         try:
             image = frames.image(i)
         except DriveFormatError as error:
             raise DriveFormatError(f"{frames.name}: {error}") from None
+        # Every fourth pixel is enough for a mean.
+        answers.brightness[i] = image[::4, ::4].mean()
         for name, detector in detectors.items():
             if i == 0 or frames.starts[i]:
                 detector.reset()
             try:
-                answers[name][i] = detector.detect(image).points_cm
+                found = detector.detect(image)
             except CalibrationError as error:
                 raise CalibrationError(f"{frames.name}, frame {frames.frames[i]}: {error}") from None
+            answers.points_cm[name][i] = found.points_cm
+            answers.sigma_cm[name][i] = found.sigma_cm
+            answers.presence[name][i] = found.presence
         if progress is not None:
             progress(i + 1, n)
     return answers

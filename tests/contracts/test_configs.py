@@ -71,6 +71,99 @@ def test_a_training_run_is_named_after_its_file(path: Path) -> None:
     assert read_training_run(path).name == path.stem
 
 
+def write_quick_labels(path: Path, window: Any, source: str, camera: str) -> None:
+    """Straight lanes with both edges of their tapes, a few frames of each of three laps."""
+    import numpy as np
+
+    from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+
+    n, y = 60, np.arange(1.0, window.far_cm, 1.0)
+    shift = np.linspace(-3.0, 3.0, n)
+    sides = (-16.0, -14.0, 14.0, 16.0)
+    line = np.stack([0.0 * y, np.linspace(-20.0, 90.0, len(y))], axis=1)
+    edges = [
+        np.concatenate([np.stack([y * 0 + x + s, y, y * 0 + 1, y * 0], axis=1) for x in sides]) for s in shift
+    ]
+    labels = LabelSet(
+        LabelMeta(window, camera, 17.0, 30.0, source),  # type: ignore[arg-type]
+        drive=[path.stem] * n,
+        file=[""] * n,
+        frame=100 * np.arange(n),
+        t_s=np.arange(n, dtype=np.float64),
+        lap=np.repeat([0, 1, 2], n // 3),
+        poses=np.stack([200.0 * np.arange(n), np.zeros(n), np.zeros(n)], axis=1),
+        points_cm=np.stack([s + np.repeat([-15.0, 15.0], 3) for s in shift]),
+        edges=[edge.astype(np.float32) for edge in edges],
+        lines=[(line + [s - 15.0, 0.0], line + [s + 15.0, 0.0]) for s in shift],
+        quality=np.ones(n),
+    )
+    write_labels(path, labels)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a run but driving and mapping, which would take minutes: their place take straight lanes.
+
+    So the window, the split, the network, the augmentation and what it starts from are those of the file.
+    """
+    from datagen import datasets
+    from lanenet.learn.publish import publish
+    from lanenet.learn.train import train
+
+    def map_drive(drive: Path, lane_width_cm: float, camera: Path | None, settings: Any, out: Path) -> None:
+        assert lane_width_cm > 20.0
+
+    def label_map(drive_map: Path, out: Path, *, window: Any, perception: Any = None) -> None:
+        write_quick_labels(out, window, "map", drive_map.name)
+
+    def truth_labels(drive: Path, perception: Any, window: Any, marking_cm: float) -> Path:
+        write_quick_labels(tmp_path / "truth.parquet", window, "truth", drive.name)
+        return tmp_path / "truth.parquet"
+
+    monkeypatch.setattr(datasets, "simulate_drive", lambda simulation, out: out)
+    monkeypatch.setattr(datasets, "map_drive", map_drive)
+    monkeypatch.setattr(datasets, "label_map", label_map)
+    monkeypatch.setattr(datasets, "truth_labels", truth_labels)
+    monkeypatch.setattr(datasets, "write_labels", write_or_move)
+    monkeypatch.setattr(datasets, "fingerprint", str)
+    settings = read_training_run(path)
+    few = {"train": 2, "validation": 1, "test": 1} if settings.data.synthetic.train else {}
+    data = settings.data.model_copy(
+        update={"synthetic": settings.data.synthetic.model_copy(update=few), "workers": 1}
+    )
+    prepared = datasets.prepare(data, tmp_path / "work")
+    drives = sum(drive.counts_as for drive in data.drives)
+    assert len(prepared.train) == few.get("train", 0) + drives
+    n = sum(len(read_labels_of(p)) for p in prepared.train)
+    learn = settings.learn.model_copy(update={"epochs": 1, "batch_size": n // 2, "threads": 1})
+    if learn.start_from is not None:
+        anew = train(
+            learn.model_copy(update={"start_from": None}), prepared.train, prepared.validation, tmp_path / "s"
+        )
+        publish(anew.folder, tmp_path / "start", "start", {})
+        learn = learn.model_copy(update={"start_from": tmp_path / "start"})
+    result = train(learn, prepared.train, prepared.validation, tmp_path / "run")
+    assert result.model_path.is_file() and result.val_rmse_cm < 100.0
+    for part in (prepared.validation, prepared.test):
+        assert part and all(p.is_file() for p in part)
+
+
+def write_or_move(path: Path, labels: Any) -> None:
+    """Write a part of a label set, or put one that lies elsewhere in its place."""
+    from lanenet.data.label_set import write_labels
+
+    if isinstance(labels, Path):
+        labels.rename(path)
+    else:
+        write_labels(path, labels)
+
+
+def read_labels_of(path: Path) -> Any:
+    from lanenet.data.label_set import read_labels
+
+    return read_labels(path)
+
+
 def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
     from lanenet.perception.birdseye import PerceptionSettings
     from lanenet.perception.lane_filter import PAPER, LaneFilterSettings

@@ -16,12 +16,14 @@ from datagen.datasets import (
     _frames_of,
     _job_name,
     _recorded_labels,
+    _shared_camera,
     _synthetic_job,
     prepare,
     split_along_time,
 )
+from datagen.world.simulate import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
 
@@ -118,6 +120,75 @@ def test_every_synthetic_drive_has_a_seed_of_its_own_that_stays(tmp_path):
     assert len(set(many.values())) == 18
     # More drives to learn from leave those that judge as they were.
     assert few.items() <= many.items()
+
+
+def varied(**changes: object) -> DataSettings:
+    few = {"train": 4, "validation": 1, "test": 1, "simulation": {"frames": 60}}
+    return DataSettings.model_validate({"synthetic": {**few, **changes}, "workers": 1})
+
+
+def test_varied_drives_have_roads_and_cameras_of_their_own(tmp_path):
+    def simulations(data: DataSettings) -> list[SimulationSettings]:
+        return [_synthetic_job(data, "train", k, tmp_path)["simulation"] for k in range(4)]
+
+    none, roads = simulations(varied()), simulations(varied(variety="roads"))
+    cameras = simulations(varied(variety="all", cameras=[{}, {"width": 160, "height": 120}]))
+    assert len({s.track for s in none}) == len({s.camera for s in none}) == len({s.driver for s in none}) == 1
+    # What is drawn beside it leaves a drive's seed as it is.
+    assert [s.seed for s in none] == [s.seed for s in roads] == [s.seed for s in cameras]
+    assert len({s.track for s in roads}) == 4 and len({s.camera for s in roads}) == 1
+    assert [s.track for s in roads] == [s.track for s in cameras]
+    assert [s.camera.width for s in cameras] == [320, 160, 320, 160]
+    assert len({s.camera.height_cm for s in cameras}) == 4 and {s.frames for s in cameras} == {60}
+    with pytest.raises(ValidationError, match="variety 'all' only"):
+        varied(variety="roads", cameras=[{}])
+
+
+def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, monkeypatch):
+    mapped: list[str] = []
+
+    def map_drive(path: Path, *_: object) -> None:
+        mapped.append(path.name)
+        if path.name in ("train_01", "train_02"):
+            raise TrackingLostError(f"{path.name}: no lane")
+
+    def label_map(drive_map: Path, out: Path, **_: object) -> None:
+        write_labels(out, _labels(np.arange(30)))
+
+    monkeypatch.setattr("datagen.datasets.simulate_drive", lambda simulation, out: out)
+    monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.label_map", label_map)
+    monkeypatch.setattr("datagen.datasets.truth_labels", lambda *_: _labels(np.arange(30)))
+    with pytest.raises(TrackingLostError, match="train_01: no lane"):
+        prepare(varied(), tmp_path / "strict")
+    mapped.clear()
+    found = prepare(varied(may_fail=0.5), tmp_path / "work")
+    assert [path.stem for path in found.train] == ["train_00", "train_03"]
+    assert len(found.left_out) == 2 and found.left_out[0].startswith("train_01 (seed")
+    assert len(mapped) == 5
+    # What failed is not tried again, and what is there is kept.
+    again = prepare(varied(may_fail=0.5), tmp_path / "work")
+    assert again == found and len(mapped) == 5
+    with pytest.raises(TrackingLostError, match=r"2 of 5 synthetic drives .* expected at most 1"):
+        prepare(varied(may_fail=0.2), tmp_path / "work")
+
+
+def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
+    def recorded_labels(settings: RecordedSettings, *_: object) -> dict[str, Path]:
+        return {role: tmp_path / f"{role}.parquet" for role in ("train", "validation", "test")}
+
+    monkeypatch.setattr("datagen.datasets._recorded_labels", recorded_labels)
+    drives = (RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0, counts_as=3),)
+    found = prepare(DataSettings(drives=drives, workers=1), tmp_path / "work")
+    assert found.train == [tmp_path / "train.parquet"] * 3
+    assert found.validation == [tmp_path / "validation.parquet"] and len(found.test) == 1
+
+
+def test_the_camera_is_that_of_all_drives_or_of_the_example(tmp_path):
+    drives = tmp_path / "synthetic" / "drives"
+    assert _shared_camera(varied(), tmp_path) == drives / "train_00" / "camera.yaml"
+    assert _shared_camera(varied(variety="all"), tmp_path) == drives / "test_00" / "camera.yaml"
+    assert _shared_camera(varied(variety="all", test=0), tmp_path) is None
 
 
 def test_a_run_without_drives_is_refused(tmp_path):

@@ -1,59 +1,78 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from synthetic_labels import WINDOW, make_label_set
 
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map, map_from_car
-from lanenet.geometry.lane import mirror_points
-from lanenet.learn.augment import _near_line, augment_batch, labels_of_view, lines_present, make_view
+from lanenet.geometry.lane import mirror_points, rows_of_polyline
+from lanenet.learn.augment import (
+    augment_batch,
+    join_frames,
+    lines_present,
+    make_view,
+    misplaced,
+    plain_batch,
+)
 from lanenet.learn.config import AugmentSettings
 
 NOTHING = AugmentSettings(
     mirror=0.0,
     shift_cm=0.0,
     rotate_rad=0.0,
+    scale=0.0,
     drop_points=0.0,
+    double_points=0.0,
     jitter_cm=0.0,
     missing_stretch=0.0,
     missing_line=0.0,
+    missing_both=0.0,
+    objects=0,
     clutter_segments=0,
     clutter_points=0,
+    clutter_share=0.0,
+    height=0.0,
+    pitch_rad=0.0,
+    roll_rad=0.0,
 )
 LABELS = make_label_set(12, seed=5)
 EDGES = [e[:, :2] for e in LABELS.edges]
-
-
-def augment_all(changes, window=WINDOW, seed=0):
-    rngs = [np.random.default_rng((seed, i)) for i in range(len(EDGES))]
-    chosen = NOTHING.model_copy(update=changes)
-    return augment_batch(EDGES, LABELS.lines, LABELS.points_cm, rngs, window, chosen)
+FRAMES = join_frames(EDGES, LABELS.lines, LABELS.points_cm)
+ALL = np.arange(12)
 
 
 def augment(changes, window=WINDOW, seed=0):
-    return augment_all(changes, window, seed)[:2]
+    return augment_batch(FRAMES, ALL, window, NOTHING.model_copy(update=changes), seed, 0)[:2]
 
 
-def test_a_dropped_line_is_told_as_absent():
-    *_, both = augment_all({})
-    assert (both == 1.0).all()
-    rasters, _, present = augment_all({"missing_line": 1.0})
-    assert (present.sum(axis=1) == 1.0).all() and len(np.unique(present[:, 0])) == 2
-    # Cells of the right half, in which the right line lies, are marked if it is there.
-    right = rasters[:, 0, :, 16:].any(axis=(1, 2))
-    np.testing.assert_array_equal(right, present[:, 1] == 1.0)
+def labels_of_view(points, lines, view):
+    """Slow and obvious: the moved polylines, asked for their rows."""
+    moved = [view.move(line) for line in (lines[::-1] if view.mirror else lines)]
+    known = np.isfinite(mirror_points(points) if view.mirror else points)
+    return np.where(known, np.concatenate([rows_of_polyline(line) for line in moved]), np.nan)
 
 
-def test_presence_counts_points_beside_the_line():
-    window = BirdseyeWindow()
-    y = np.linspace(1.0, 60.0, 12)
-    lines = tuple(np.stack([np.full(2, x), [-10.0, 90.0]], axis=1) for x in (-20.0, 20.0))
-    left = np.stack([np.full(12, -22.0), y], axis=1)
-    np.testing.assert_array_equal(lines_present(left, lines, window), [1.0, 0.0])
-    np.testing.assert_array_equal(lines_present(left[1:], lines, window), [0.0, 0.0])
-    np.testing.assert_array_equal(lines_present(left + [6.0, 0.0], lines, window), [0.0, 0.0])
-    np.testing.assert_array_equal(lines_present(-left * [1.0, -1.0], lines, window), [0.0, 1.0])
+@given(
+    st.lists(st.tuples(st.floats(-90, 90, width=32), st.floats(-20, 110, width=32)), max_size=60),
+    st.sampled_from([WINDOW, BirdseyeWindow(), BirdseyeWindow(-33.3, 1.7, 0.7, 50, 60)]),
+)
+@settings(max_examples=60, deadline=None)
+def test_rasters_are_those_of_the_window_byte_for_byte(points, window):
+    # Borders of cells, where rounding decides, and points that are not there.
+    border = [
+        [window.left_cm + k * window.cell_cm, window.far_cm - k * window.cell_cm] for k in range(-1, 52)
+    ]
+    edges = np.array([*points, *border, [np.nan, 3.0], [3.0, np.inf]], np.float32)
+    frames = join_frames([edges], [(np.empty((0, 2)), np.empty((0, 2)))], np.full((1, 6), np.nan))
+    expected = window.rasterise(edges)
+    np.testing.assert_array_equal(plain_batch(frames, np.array([0]), window)[0][0, 0], expected)
+    unchanged = augment_batch(frames, np.array([0]), window, NOTHING, 0, 0)[0][0, 0]
+    np.testing.assert_array_equal(unchanged, expected)
 
 
 def test_without_changes_the_sample_stays():
@@ -83,6 +102,27 @@ def test_a_view_is_what_a_moved_car_sees(shift, turn, mirror):
     )
 
 
+@pytest.mark.parametrize("draw", ["even", "limit"])
+def test_rasters_and_labels_are_those_of_one_view(draw):
+    wide = BirdseyeWindow(left_cm=-120.0, near_cm=-20.0, cell_cm=0.5, rows=280, columns=480)
+    changes = {"mirror": 0.5, "shift_cm": 8.0, "rotate_rad": 0.26, "scale": 0.3, "draw": draw}
+    rasters, points = augment(changes, wide)
+    for i in ALL:
+        x = points[i].astype(float)
+        # Undo what the labels tell of the view: parallel lines, 40 cm apart before the scaling.
+        assert np.isfinite(x).all() and (x[3:] > x[:3]).all()
+        cells = np.argwhere(rasters[i, 0])
+        seen = wide.points(cells.astype(float))
+        for side in (0, 1):
+            # Both edges of the tape lie on either side of the label, half a tape away.
+            near = seen[np.abs(seen[:, 1] - 30.0) < 0.5]
+            gap = np.abs(near[:, 0] - x[3 * side + 2])
+            assert gap.min() > 0.3 and np.sort(gap)[1] < 3.0
+    if draw == "limit":
+        plain = augment({}, wide)[1]
+        assert (np.abs(points - plain).max(axis=1) > 3.0).all()
+
+
 @given(shift=st.floats(-6, 6), turn=st.floats(-0.2, 0.2), mirror=st.booleans())
 @settings(max_examples=50, deadline=None)
 def test_labels_of_straight_lines_are_exact(shift, turn, mirror):
@@ -95,14 +135,131 @@ def test_labels_of_straight_lines_are_exact(shift, turn, mirror):
     np.testing.assert_allclose(points, np.concatenate(expected), atol=1e-9)
 
 
-def test_masked_points_and_ended_lines_stay_unknown():
+def test_labels_are_those_of_the_moved_polylines():
     y = np.arange(-50.0, 22.0, 2.0)
-    lines = (np.stack([-20.0 + 0.0 * y, y], 1), np.stack([20.0 + 0.0 * y, y], 1))
-    points = np.array([-20.0, -20.0, np.nan, np.nan, 20.0, np.nan])
-    plain = labels_of_view(points, lines, make_view(False, 1.0, 0.0))
-    np.testing.assert_allclose(plain, [-21.0, -21.0, np.nan, np.nan, 19.0, np.nan])
-    mirrored = labels_of_view(points, lines, make_view(True, 0.0, 0.0))
-    np.testing.assert_allclose(mirrored, mirror_points(points))
+    lines = (np.stack([-20.0 + 0.01 * y * y, y], 1), np.stack([20.0 + 0.3 * y, y], 1))
+    lines[1][30] = np.nan
+    points = np.array([-20.0, -20.0, np.nan, 20.0, 20.0, np.nan])
+    frames = join_frames([np.empty((0, 2), np.float32)], [lines], points[None])
+    window = BirdseyeWindow()
+    for mirror in (0.0, 1.0):
+        for shift in (-5.0, 5.0):
+            # With no other change, "limit" leaves two shifts to draw from.
+            fixed = NOTHING.model_copy(update={"mirror": mirror, "shift_cm": abs(shift), "draw": "limit"})
+            expected = labels_of_view(points, lines, make_view(bool(mirror), shift, 0.0))
+            found = [augment_batch(frames, ALL[:1], window, fixed, k, 0)[1][0] for k in range(20)]
+            assert any(np.allclose(f, window.labelled(expected), atol=1e-4, equal_nan=True) for f in found)
+    assert np.isnan(found[0][[2, 5]]).all()
+
+
+def test_scaling_scales_the_labels():
+    points = augment({"scale": 0.25, "draw": "limit"}, BirdseyeWindow(-90.0, 0.0, 1.0, 100, 180))[1]
+    # The curve itself scales, so that its rows are those of other stretches; the lane's width tells.
+    widths = points[:, 3] - points[:, 0]
+    assert set(np.round(widths, 2)) == {50.0, 32.0}
+
+
+# A roll about a tilted axis would turn the car, too.
+@pytest.mark.parametrize(
+    ("pitch_deg", "height", "pitch", "roll"),
+    [(0.0, 0.1, 0.0, 0.0), (25.0, 0.0, 0.02, 0.0), (25.0, -0.1, -0.02, 0.0), (0.0, 0.0, 0.0, 0.03)],
+)
+def test_wrong_calibration_is_what_two_cameras_disagree_by(pitch_deg, height, pitch, roll):
+    mounting = Mounting(20.0, math.radians(pitch_deg), 0.0, 0.0, -3.0, 1.5)
+    K = np.array([[120.0, 0, 160], [0, 120.0, 120], [0, 0, 1]])
+    true = Camera("fisheye", 320, 240, K, np.zeros(4), mounting, 26.0)
+    wrong = true.with_mounting(
+        height_cm=20.0 * (1.0 + height), pitch_down_rad=mounting.pitch_down_rad + pitch, roll_rad=roll
+    )
+    points = np.array([[0.0, 10.0], [-30.0, 20.0], [25.0, 60.0]])
+    seen = wrong.intersect_ground(true.project_ground(points))
+    found = misplaced(points, mounting.position_car_cm, height=height, pitch_rad=pitch, roll_rad=roll)
+    np.testing.assert_allclose(found, seen, atol=1e-6)
+    assert np.abs(found - points).max() > 0.5
+
+
+def test_rays_that_miss_the_road_have_no_point():
+    far = np.array([[0.0, 3000.0]])
+    assert np.isnan(misplaced(far, np.array([0.0, 0.0, 20.0]), pitch_rad=-0.02)).all()
+    assert np.isfinite(misplaced(far, np.array([0.0, 0.0, 20.0]), pitch_rad=0.02)).all()
+
+
+def test_a_wrong_calibration_moves_the_raster_and_not_the_labels():
+    rasters, points = augment({"pitch_rad": 0.0175, "draw": "limit"}, BirdseyeWindow())
+    np.testing.assert_allclose(points, LABELS.points_cm, atol=1e-4)
+    for i in ALL:
+        edges = [misplaced(EDGES[i], np.array([0.0, 0.0, 18.0]), pitch_rad=p) for p in (-0.0175, 0.0175)]
+        expected = [BirdseyeWindow().rasterise(e.astype(np.float32)) for e in edges]
+        different = [np.count_nonzero(rasters[i, 0] != e) for e in expected]
+        assert min(different) <= 2 < max(different)
+
+
+def test_objects_hide_the_road_and_leave_the_labels():
+    fine = BirdseyeWindow()
+    full = augment({}, fine)[0]
+    rasters, points = augment({"objects": 3, "draw": "limit"}, fine)
+    np.testing.assert_allclose(points, LABELS.points_cm, atol=1e-4)
+    assert (np.count_nonzero(rasters & ~full, axis=(1, 2, 3)) > 0).sum() >= 10
+    assert (np.count_nonzero(full & ~rasters, axis=(1, 2, 3)) > 0).sum() >= 3
+
+
+def test_clutter_adds_the_share_that_was_asked_for():
+    fine = BirdseyeWindow()
+    full = np.count_nonzero(augment({}, fine)[0], axis=(1, 2, 3))
+    more = np.count_nonzero(augment({"clutter_share": 0.3, "draw": "limit"}, fine)[0], axis=(1, 2, 3))
+    np.testing.assert_allclose(more / full - 1.0, 0.3, atol=0.05)
+
+
+def test_doubled_points_lie_beside_the_others():
+    fine = BirdseyeWindow()
+    full = augment({}, fine)[0]
+    rasters = augment({"double_points": 1.0, "draw": "limit"}, fine)[0]
+    assert not np.any(rasters < full)
+    grown = np.zeros_like(full)
+    for row in range(-3, 4):
+        for column in range(-3, 4):
+            grown |= np.roll(full, (row, column), axis=(2, 3))
+    assert np.count_nonzero(rasters) > 1.2 * np.count_nonzero(full) and not np.any(rasters & ~grown)
+
+
+def test_missing_lines_are_not_present_and_the_labels_stay():
+    fine = BirdseyeWindow()
+    for changes, expected in (({}, [2.0]), ({"missing_line": 1.0}, [1.0]), ({"missing_both": 1.0}, [0.0])):
+        rasters, points, present = augment_batch(FRAMES, ALL, fine, NOTHING.model_copy(update=changes), 0, 0)
+        np.testing.assert_array_equal(np.unique(present.sum(axis=1)), expected)
+        assert np.isfinite(points).all()
+        if changes == {"missing_both": 1.0}:
+            assert not rasters.any()
+        if changes == {"missing_line": 1.0}:
+            assert set(map(tuple, present)) == {(0.0, 1.0), (1.0, 0.0)}
+            for raster, (left, _) in zip(rasters, present, strict=True):
+                seen = fine.points(np.argwhere(raster[0]).astype(float))
+                near = seen[seen[:, 1] < 20.0]
+                # The lane leans by at most 0.15, so that its lines stay on their sides near the car.
+                assert (near[:, 0] > 0.0).mean() > 0.9 if left == 0.0 else (near[:, 0] < 0.0).mean() > 0.9
+
+
+def test_mirroring_swaps_which_line_is_there():
+    left_only = EDGES[0][EDGES[0][:, 0] < LABELS.points_cm[0, 1] + 10.0]
+    frames = join_frames([left_only], LABELS.lines[:1], LABELS.points_cm[:1])
+    one = np.array([0])
+    for mirror, expected in ((0.0, [1.0, 0.0]), (1.0, [0.0, 1.0])):
+        changed = NOTHING.model_copy(update={"mirror": mirror})
+        np.testing.assert_array_equal(augment_batch(frames, one, WINDOW, changed, 0, 0)[2][0], expected)
+
+
+def test_presence_needs_enough_edges_near_the_line():
+    fine, lines = BirdseyeWindow(), LABELS.lines[0]
+    near = EDGES[0][: 144 * 2]  # both edges of the left tape, 8 to 80 cm ahead
+    np.testing.assert_array_equal(lines_present(near, lines, fine), [1.0, 0.0])
+    np.testing.assert_array_equal(lines_present(EDGES[0], lines, fine), [1.0, 1.0])
+    # 1.5 cm of one edge are nothing, 5 cm could be anything, 15 cm are a line.
+    for points, expected in ((3, 0.0), (10, np.nan), (30, 1.0)):
+        np.testing.assert_array_equal(lines_present(near[:points], lines, fine), [expected, 0.0])
+    beside = near + np.float32([5.5, 0.0])
+    assert lines_present(beside, lines, fine)[0] == 0.0
+    nowhere = (np.full((3, 2), np.nan), np.empty((0, 2)))
+    assert np.isnan(lines_present(near, nowhere, fine)).all()
 
 
 def test_dropping_keeps_a_share_of_the_points():
@@ -114,23 +271,13 @@ def test_dropping_keeps_a_share_of_the_points():
     np.testing.assert_allclose(points, LABELS.points_cm, atol=1e-4)
 
 
-def test_missing_line_takes_one_line_and_leaves_the_other():
-    rasters, points = augment({"missing_line": 1.0})
-    for i in range(12):
-        kept = WINDOW.points(np.argwhere(rasters[i, 0]).astype(float))
-        middle = LABELS.points_cm[i].reshape(2, 3)[:, 1].mean()
-        near = kept[kept[:, 1] < 24.0]
-        left = int((near[:, 0] < middle).sum())
-        assert 0 in (left, len(near) - left) and len(near) > 0
-    assert np.isfinite(points).all()  # the map still knows the line
-
-
 def test_missing_stretch_takes_a_part():
     full = augment({}, BirdseyeWindow())[0]
     part = augment({"missing_stretch": 1.0}, BirdseyeWindow())[0]
     assert not np.any(part > full)
     gone = 1.0 - np.count_nonzero(part, axis=(1, 2, 3)) / np.count_nonzero(full, axis=(1, 2, 3))
-    assert (gone > 0.0).all() and (gone < 0.9).all()
+    # A point beyond the window takes little or nothing from it.
+    assert (gone > 0.0).sum() >= 10 and (gone < 0.9).all()
 
 
 def test_clutter_only_adds():
@@ -142,26 +289,13 @@ def test_clutter_only_adds():
 
 def test_an_empty_frame_can_be_augmented():
     edges, lines = np.empty((0, 2), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
-    rasters, points, present = augment_batch(
-        [edges],
-        [lines],
-        np.full((1, 6), np.nan),
-        [np.random.default_rng(0)],
-        WINDOW,
-        NOTHING.model_copy(update={"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0}),
-    )
+    frames = join_frames([edges], [lines], np.full((1, 6), np.nan))
+    changes = {"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0, "clutter_share": 1.0}
+    one = np.array([0])
+    rasters, points, present = augment_batch(frames, one, WINDOW, NOTHING.model_copy(update=changes), 0, 0)
     assert not rasters.any() and np.isnan(points).all() and np.isnan(present).all()
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.5])
-def test_near_line_agrees_with_the_distance(turn):
-    rng = np.random.default_rng(1)
-    window = BirdseyeWindow()
-    y = np.linspace(-30.0, 120.0, 8)
-    line = make_view(False, 0.0, turn).move(np.stack([5.0 + 0.0 * y, y], 1))
-    line = np.concatenate([line, [[np.nan, np.nan]]])
-    points = np.stack([rng.uniform(-40, 40, 3000), rng.uniform(2, 70, 3000)], 1)
-    distance = np.abs(make_view(False, 0.0, -turn).move(points)[:, 0] - 5.0)
-    near = _near_line(points, line, window)
-    assert near[distance < 3.0].all()
-    assert not near[distance > 5.5].any()
+def test_lines_cannot_be_missing_more_than_always():
+    with pytest.raises(ValidationError, match="sum to at most 1"):
+        AugmentSettings(missing_line=0.8, missing_both=0.3)

@@ -8,6 +8,13 @@ from lanenet.data.label_set import write_labels
 from lanenet.errors import LabelFormatError
 from lanenet.learn.config import AugmentSettings
 from lanenet.learn.dataset import LaneSamples, hash_files, read_samples
+from lanenet.perception.birdseye import PerceptionSettings
+
+
+def other_edges():
+    labels = make_label_set(2, 0)
+    perception = PerceptionSettings.model_validate({"edges": {"method": "canny"}})
+    return replace(labels, meta=replace(labels.meta, perception=perception))
 
 
 def samples(n=50, seed=0):
@@ -26,14 +33,13 @@ def test_frames_of_two_sets_stay_in_order(tmp_path):
     np.testing.assert_array_equal(rasters[0, 0], b.raster(2))
     np.testing.assert_allclose(points[1], a.points_cm[0], atol=1e-4)
     np.testing.assert_array_equal(present, np.ones((2, 2)))
-    assert both.lane_widths_cm == (40.0, 40.0)
 
 
 @pytest.mark.parametrize(
     ("other", "what"),
     [
         (make_label_set(2, 0, window=replace(WINDOW, cell_cm=2.0)), "window"),
-        (make_label_set(2, 0, wheelbase_cm=20.0), "wheelbase_cm 20"),
+        (other_edges(), "its edges were found with"),
     ],
 )
 def test_sets_that_disagree_are_both_named(other, what):
@@ -71,9 +77,9 @@ def test_workers_do_not_change_an_epoch():
     runs = [list(data.epoch(settings, 0, 0, 8, workers)) for workers in (0, 1, 3)]
     for run in runs[1:]:
         assert len(run) == len(runs[0]) == data.steps_per_epoch(8) == 7
-        for batch, first in zip(run, runs[0], strict=True):
-            for values, expected in zip(batch, first, strict=True):
-                np.testing.assert_array_equal(values, expected)
+        for batch, batch0 in zip(run, runs[0], strict=True):
+            for part, part0 in zip(batch, batch0, strict=True):
+                np.testing.assert_array_equal(part, part0)
 
 
 def test_an_epoch_shows_each_sample_once_in_an_order_of_its_own():
@@ -86,6 +92,45 @@ def test_an_epoch_shows_each_sample_once_in_an_order_of_its_own():
     assert len(first) == 48 and data.steps_per_epoch(8) == 6
     assert len(np.unique(first[:, 0])) == 48
     assert not np.array_equal(first, second)
+
+
+def test_cars_and_their_rows_may_differ():
+    a, b = make_label_set(3, 0, wheelbase_cm=20.0), make_label_set(1, 1, wheelbase_cm=28.0, camera_hash="c")
+    rows = PerceptionSettings.model_validate({"range": {"bottom_rows": 12}})
+    b = replace(b, meta=replace(b.meta, perception=rows, lane_width_cm=60.0, camera_cm=(1.0, 2.0, 15.0)))
+    both = LaneSamples([a, b], ["a", "b"])
+    assert both.wheelbase_cm == pytest.approx(22.0) and both.lane_width_cm == pytest.approx(45.0)
+    assert both.lane_widths_cm == (40.0, 60.0)
+    # Only where all leave out the same rows the network may, too.
+    assert both.perception.range.bottom_rows == 0
+    assert LaneSamples([b, b], ["b", "b"]).perception.range.bottom_rows == 12
+    np.testing.assert_array_equal(both.frames.camera_cm[[0, 3]], [(0.0, 0.0, 18.0), (1.0, 2.0, 15.0)])
+
+
+def test_many_cameras_are_any_camera():
+    sets = [make_label_set(1, k, camera_hash=f"cam{k}") for k in range(9)]
+    few, many = LaneSamples(sets[:8], ["x"] * 8), LaneSamples(sets, ["x"] * 9)
+    assert not few.any_camera and few.camera_hashes == [f"cam{k}" for k in range(8)]
+    assert many.any_camera and many.camera_hashes == ["any"]
+
+
+def test_balance_shows_every_drive_equally_often():
+    data = LaneSamples([make_label_set(n, n) for n in (90, 7, 3)], ["a", "b", "c"])
+    order, streams = data.order(0, 4, "drive")
+    assert len(order) == 100 and data.steps_per_epoch(10) == 10
+    sets = np.searchsorted(data.set_start, order, side="right") - 1
+    np.testing.assert_array_equal(np.bincount(sets), [34, 33, 33])
+    # Within a set no frame is shown twice more than another, and no two showings are the same draw.
+    for number, (a, b) in enumerate(((0, 90), (90, 97), (97, 100))):
+        shown = np.bincount(order[sets == number] - a, minlength=b - a)
+        assert shown.max() - shown.min() <= 1
+    assert len(np.unique(streams)) == 100
+    batches = list(data.epoch(AugmentSettings(), 0, 4, 10, balance="drive"))
+    rasters = np.concatenate([batch[0] for batch in batches])
+    assert len(np.unique(rasters.reshape(100, -1), axis=0)) == 100
+    plain, numbers = data.order(0, 4)
+    np.testing.assert_array_equal(np.sort(plain), np.arange(100))
+    np.testing.assert_array_equal(plain, numbers)
 
 
 def test_an_epoch_can_be_left_early():

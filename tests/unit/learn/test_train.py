@@ -15,6 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lanenet.config import load_settings
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 from lanenet.learn.evaluate import network_predictor, point_errors
 from lanenet.learn.network import new_network
@@ -186,8 +187,9 @@ def test_another_run_in_the_same_folder_is_refused(data, finished, tmp_path):
 
 
 def test_label_sets_must_fit_together(data, tmp_path):
-    write_labels(tmp_path / "other.parquet", make_label_set(5, 0, wheelbase_cm=20.0))
-    with pytest.raises(LabelFormatError, match="wheelbase_cm") as caught:
+    wide = BirdseyeWindow(left_cm=-60.0, near_cm=0.0, cell_cm=3.0, rows=24, columns=40)
+    write_labels(tmp_path / "other.parquet", make_label_set(5, 0, window=wide))
+    with pytest.raises(LabelFormatError, match="window") as caught:
         train(TINY, [data / "train.parquet"], [tmp_path / "other.parquet"], tmp_path / "out")
     assert "train.parquet" in str(caught.value) and "other.parquet" in str(caught.value)
     with pytest.raises(LabelFormatError, match="no label set"):

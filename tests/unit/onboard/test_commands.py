@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,6 +22,7 @@ from lanenet.data.detections import read_detections
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.evaluate import RasterAnswers, RasterModel
 from lanenet.onboard.bench import example_camera, example_frames
 
 
@@ -272,15 +273,26 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
     (folder / "model.onnx").write_bytes(b"")
     opened: list[Path] = []
 
-    def network_predictor(path: Path) -> Any:
-        opened.append(path)
-        return lambda labels: labels.points_cm + 1.0
+    class OneOff(RasterModel):
+        def __init__(self, path: Path) -> None:
+            opened.append(path)
+
+        def check_window(self, window: BirdseyeWindow) -> None:
+            assert window == BirdseyeWindow()
+
+        def answer(self, rasters: np.ndarray) -> RasterAnswers:
+            n = len(rasters)
+            return RasterAnswers(np.zeros((n, 6)), np.full((n, 6), 2.0), np.full((n, 2), 0.9))
+
+        def answer_labels(self, labels: LabelSet) -> RasterAnswers:
+            n = len(labels)
+            return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
     @dataclass(frozen=True)
     class Meta:
         window: BirdseyeWindow
 
-    monkeypatch.setattr("lanenet.learn.evaluate.network_predictor", network_predictor)
+    monkeypatch.setattr("lanenet.learn.evaluate.RasterModel", OneOff)
     monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: Meta(BirdseyeWindow()))
     return opened
 
@@ -304,6 +316,36 @@ def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: 
     assert list(detectors) == ["network", "lane-filter"] and "hold no frames" in result.stderr
     alone = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--no-baselines")
     assert alone.exit_code == 0 and "lane-filter" not in alone.output
+
+
+def test_val_compares_models_and_changes_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = tiny_labels(tmp_path / "l.parquet")
+    opened = fake_checkpoint(tmp_path / "checkpoint", monkeypatch)
+    (tmp_path / "alexnet").mkdir()
+    (tmp_path / "alexnet" / "model.onnx").write_bytes(b"")
+    along = np.array([[0.0, -20.0], [0.0, 60.0]])
+    lines = [(along + [left, 0.0], along + [right, 0.0]) for left, right in labels.points_cm[:, [0, 3]]]
+    training = replace(labels, meta=replace(labels.meta, source="map"), lines=lines)
+    write_labels(tmp_path / "t.parquet", training)
+    words = ["val", tmp_path / "checkpoint", tmp_path / "t.parquet", "--no-baselines", "--robust"]
+    words += ["--also", tmp_path / "alexnet", "--trained-on", tmp_path / "t.parquet"]
+    result = run(*words, "--out", tmp_path / "table")
+    assert result.exit_code == 0, result.output
+    assert {path.parent.name for path in opened} == {"checkpoint", "alexnet"}
+    report = json.loads((tmp_path / "table.json").read_text())
+    assert list(report["detectors"]) == ["network", "alexnet"]
+    network = report["detectors"]["network"]
+    assert network["doubt"]["coverage_68"] == 1.0 and network["presence"]["recall"] == 1.0
+    # Every frame is a training frame.
+    assert network["conditions"]["place"]["under 2 cm"]["count"] == 24
+    robust = json.loads((tmp_path / "table-robust.json").read_text())
+    assert {row["model"] for row in robust["rows"]} == {"network", "alexnet"}
+    assert "| one line missing | alexnet |" in (tmp_path / "table-robust.md").read_text()
+    assert (tmp_path / "table-breakdown.png").stat().st_size > 1000
+    twice = run(*words, "--also", tmp_path / "alexnet" / "model.onnx")
+    assert "the name 'alexnet' is taken" in error_of(twice)
+    assert "expected a model (.onnx)" in error_of(run(*words, "--also", tmp_path / "l.parquet"))
+    assert "expected a model before" in error_of(run("val", tmp_path / "l.parquet", "--robust"))
 
 
 def test_val_runs_all_detectors_on_the_frames_of_a_drive(tmp_path: Path) -> None:

@@ -57,7 +57,8 @@ class Counter:
 
     def detect(self, frame_bgr):
         self.since += 1
-        return LaneEstimate(np.array([self.since, frame_bgr[0, 0, 0], NAN, NAN, NAN, NAN], np.float64))
+        points = np.array([self.since, frame_bgr[0, 0, 0], NAN, NAN, NAN, NAN], np.float64)
+        return LaneEstimate(points, sigma_cm=np.full(6, float(self.since)), presence=np.array([0.25, 0.75]))
 
 
 def test_frames_come_in_order_with_a_reset_at_breaks():
@@ -65,11 +66,14 @@ def test_frames_come_in_order_with_a_reset_at_breaks():
     answers = answer_frames(
         labelled(6, starts=(3,)), {"a": Counter(), "b": Counter()}, lambda *done: seen.append(done)
     )
+    np.testing.assert_array_equal(answers.brightness, np.arange(6))
     for name in ("a", "b"):
         # Also where a source does not say so, the first frame starts afresh.
-        np.testing.assert_array_equal(answers[name][:, 0], [1, 2, 3, 1, 2, 3])
-        np.testing.assert_array_equal(answers[name][:, 1], np.arange(6))
-        assert np.isnan(answers[name][:, 2:]).all()
+        np.testing.assert_array_equal(answers.points_cm[name][:, 0], [1, 2, 3, 1, 2, 3])
+        np.testing.assert_array_equal(answers.points_cm[name][:, 1], np.arange(6))
+        assert np.isnan(answers.points_cm[name][:, 2:]).all()
+        np.testing.assert_array_equal(answers.sigma_cm[name][:, 0], [1, 2, 3, 1, 2, 3])
+        np.testing.assert_array_equal(answers.presence[name], np.tile([0.25, 0.75], (6, 1)))
     assert seen == [(k, 6) for k in range(1, 7)]
 
 
@@ -89,9 +93,9 @@ def test_all_detectors_but_the_network_see_a_rendered_lane():
     pictures = example_frames(camera, 3, np.random.default_rng(1))
     frames = labelled(3, camera=camera, image=lambda i: pictures[i])
     answers = answer_frames(frames, build_compared(COMPARED[1:], frames))
-    assert list(answers) == list(COMPARED[1:])
+    assert list(answers.points_cm) == list(COMPARED[1:])
     for name in ("lane-filter", "hough-value", "painter"):
-        assert np.isfinite(answers[name]).any(), name
+        assert np.isfinite(answers.points_cm[name]).any(), name
 
 
 def test_detectors_are_built_for_the_source():
@@ -119,7 +123,7 @@ def test_hidden_rows_are_hidden_from_the_lane_filter():
         hidden = PerceptionSettings(range=RangeSettings(bottom_rows=rows))
         frames = labelled(1, camera=camera, perception=hidden, image=lambda i: picture)
         found = answer_frames(frames, build_compared(["lane-filter"], frames))
-        answers.append(np.isfinite(found["lane-filter"]).any())
+        answers.append(np.isfinite(found.points_cm["lane-filter"]).any())
     assert answers == [True, False]
 
 

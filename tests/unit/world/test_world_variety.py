@@ -9,7 +9,9 @@ import pytest
 
 from datagen.world.rig import CameraSettings
 from datagen.world.track import random_track
-from datagen.world.variety import camera_like, vary_camera, vary_driver, vary_road
+from datagen.world.variety import camera_like, first_world, vary_camera, vary_driver, vary_road
+from datagen.world.world import SimulationSettings, World, build_world
+from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
 
 
@@ -51,6 +53,24 @@ def test_roads_vary_and_can_be_laid():
     for seed, road in enumerate(own[:4]):
         track = random_track(road.model_copy(update={"length_cm": 400.0}), np.random.default_rng(seed))
         assert len(track.markings) >= 2
+
+
+def test_a_road_without_room_gives_way_to_the_next_seed(monkeypatch):
+    def only_from(seed: int):
+        def build(simulation: SimulationSettings) -> World:
+            if simulation.seed < seed:
+                raise ConfigError("no room")
+            return build_world(simulation)
+
+        monkeypatch.setattr("datagen.world.variety.build_world", build)
+
+    simulation = SimulationSettings(seed=3, frames=20)
+    for seed, expected in ((0, 3), (5, 5), (10, 10)):
+        only_from(seed)
+        assert first_world(simulation).settings.seed == expected
+    only_from(11)
+    with pytest.raises(ConfigError, match="no room"):
+        first_world(simulation)
 
 
 def test_drivers_keep_to_their_lane():

@@ -1,0 +1,274 @@
+"""The loops of the loader: frames are changed point by point and written into rasters, compiled.
+
+Every sample draws from a stream of its own, so that it is the same whatever else is in its batch and
+whichever thread prepares it. numba's cache notices a change of the file that a function stands in, and not of
+one that it calls into: after a change of the modules that this one imports, delete
+``lanenet/learn/__pycache__``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from lanenet.geometry.lane import ROWS_CM
+from lanenet.learn.clutter_kernels import CORNERS, add_clutter, draw_outline, is_inside, mark_outline
+from lanenet.learn.mounting_kernels import misplace
+from lanenet.learn.random_stream import (
+    next_amount,
+    next_bell,
+    next_between,
+    next_number,
+    next_spread,
+    next_uniform,
+    start_stream,
+)
+from lanenet.learn.raster_kernels import mark
+
+#: Both edges of a wide tape, and what a blurred frame puts beside them.
+LINE_REACH_CM = 4.0
+#: A line that marks cells over this length is there for everybody; over less than the second it is not.
+SEEN_CM, UNSEEN_CM = 9.0, 3.0
+
+_STRETCH_CM = (4.0, 20.0)
+_DOUBLE_CM = 1.5
+_LABEL_ROWS_CM = np.array(ROWS_CM)
+
+
+class Amounts(NamedTuple):
+    """:class:`lanenet.learn.config.AugmentSettings` as numbers; ``limit`` is 1 for draws at the limit."""
+
+    mirror: float
+    shift_cm: float
+    rotate_rad: float
+    scale: float
+    drop_points: float
+    double_points: float
+    jitter_cm: float
+    missing_stretch: float
+    missing_line: float
+    missing_both: float
+    objects: int
+    clutter_segments: int
+    clutter_points: int
+    clutter_share: float
+    height: float
+    pitch_rad: float
+    roll_rad: float
+    limit: int
+
+
+class Frames(NamedTuple):
+    """Frames one after the other; the attributes of :class:`lanenet.learn.dataset.LaneSamples`."""
+
+    edges_cm: np.ndarray
+    edge_lines: np.ndarray
+    edge_start: np.ndarray
+    lines_cm: np.ndarray
+    line_start: np.ndarray
+    points_cm: np.ndarray
+    camera_cm: np.ndarray
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def rasterise_frames(out, indices, frames, grid, present):
+    """Fill rasters with frames as they are, and say which lines they show."""
+    cells = np.zeros(2, np.int64)
+    for slot in range(len(indices)):
+        i = indices[slot]
+        out[slot, 0] = 0
+        cells[:] = 0
+        for k in range(frames.edge_start[i], frames.edge_start[i + 1]):
+            if mark(out[slot, 0], frames.edges_cm[k, 0], frames.edges_cm[k, 1], grid):
+                _count(cells, frames.edge_lines[k])
+        for side in range(2):
+            present[slot, side] = _presence(cells[side], frames, 2 * i + side, grid)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, grid, amounts):
+    """Change frames, each by its own draw, and write rasters, labels and which lines the rasters show.
+
+    The order is that of the world: paint comes off, the car is put elsewhere, things stand in its way, and
+    then all of it is seen through a camera whose mounting is known wrongly.
+    """
+    rng = np.empty(1, np.uint64)
+    cells = np.empty(2, np.int64)
+    corners = np.empty((amounts.objects, CORNERS, 2))
+    opaque = np.empty(amounts.objects, np.bool_)
+    for slot in range(len(indices)):
+        i, raster = indices[slot], out[slot, 0]
+        raster[:] = 0
+        cells[:] = 0
+        start_stream(rng, seed, epoch, streams[slot])
+        mirror = next_uniform(rng) < amounts.mirror
+        shift = next_spread(rng, amounts.shift_cm, amounts.limit)
+        turn = next_spread(rng, amounts.rotate_rad, amounts.limit)
+        scale = np.exp(next_spread(rng, np.log1p(amounts.scale), amounts.limit))
+        sign = -1.0 if mirror else 1.0
+        c, s = np.cos(turn), np.sin(turn)
+        # As in `lanenet.learn.augment.make_view`.
+        xx, xy, yx, yy = sign * c * scale, -sign * s * scale, s * scale, c * scale
+        x0, y0 = -shift * c, shift * s
+        _label(labels[slot], frames, i, (mirror, xx, xy, yx, yy, x0, y0), grid)
+        height, pitch, roll = (
+            1.0 + next_spread(rng, amounts.height, amounts.limit),
+            next_spread(rng, amounts.pitch_rad, amounts.limit),
+            next_spread(rng, amounts.roll_rad, amounts.limit),
+        )
+        camera_x = sign * scale * frames.camera_cm[i, 0]
+        camera_y, camera_z = scale * frames.camera_cm[i, 1], scale * frames.camera_cm[i, 2]
+        moves_camera = height != 1.0 or pitch != 0.0 or roll != 0.0
+        n_objects = next_number(rng, amounts.objects, amounts.limit)
+        for k in range(n_objects):
+            opaque[k] = draw_outline(rng, corners[k], grid)
+        gone = _missing_lines(rng, amounts)
+        share = next_amount(rng, amounts.drop_points, amounts.limit)
+        doubled = next_amount(rng, amounts.double_points, amounts.limit)
+        first, last = frames.edge_start[i], frames.edge_start[i + 1]
+        kind, place_x, place_y, radius = _stretch(rng, amounts.missing_stretch, frames.edges_cm, first, last)
+        count = 0
+        for k in range(first, last):
+            lines = frames.edge_lines[k]
+            if lines & gone or (share > 0.0 and next_uniform(rng) < share):
+                continue
+            px, py = frames.edges_cm[k, 0], frames.edges_cm[k, 1]
+            if kind == 1 and (px - place_x) ** 2 + (py - place_y) ** 2 <= radius * radius:
+                continue
+            if kind == 2 and abs(np.sqrt(px * px + py * py) - place_x) <= radius:
+                continue
+            x, y = px * xx + py * yx + x0, px * xy + py * yy + y0
+            hidden = False
+            for o in range(n_objects):
+                hidden = hidden or (opaque[o] and is_inside(x, y, corners[o]))
+            if hidden:
+                continue
+            if moves_camera:
+                x, y = misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll)
+            if amounts.jitter_cm > 0.0:
+                x += amounts.jitter_cm * next_bell(rng)
+                y += amounts.jitter_cm * next_bell(rng)
+            if mark(raster, x, y, grid):
+                count += 1
+                _count(cells, lines)
+            if doubled > 0.0 and next_uniform(rng) < doubled:
+                x += next_between(rng, -_DOUBLE_CM, _DOUBLE_CM)
+                mark(raster, x, y + next_between(rng, -_DOUBLE_CM, _DOUBLE_CM), grid)
+        for side in range(2):
+            line = 2 * i + (1 - side if mirror else side)
+            present[slot, side] = _presence(cells[1 - side if mirror else side], frames, line, grid)
+        for o in range(n_objects):
+            mark_outline(raster, corners[o], grid)
+        add_clutter(rng, raster, count, grid, amounts)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def near_lines(edges_cm, left_cm, right_cm, out):
+    """Set bit 0 for edge points within ``LINE_REACH_CM`` of the left line, bit 1 for the right one."""
+    reach = LINE_REACH_CM * LINE_REACH_CM
+    for k in range(len(edges_cm)):
+        x, y = edges_cm[k, 0], edges_cm[k, 1]
+        found = 0
+        for side in range(2):
+            line = left_cm if side == 0 else right_cm
+            for j in range(len(line) - 1):
+                ax, ay = line[j, 0], line[j, 1]
+                bx, by = line[j + 1, 0] - ax, line[j + 1, 1] - ay
+                length = bx * bx + by * by
+                t = ((x - ax) * bx + (y - ay) * by) / length if length > 0.0 else 0.0
+                t = min(max(t, 0.0), 1.0)
+                # NaN, where a polyline is broken, is never near.
+                if (x - ax - t * bx) ** 2 + (y - ay - t * by) ** 2 <= reach:
+                    found |= 1 << side
+                    break
+        out[k] = found
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _label(labels, frames, i, view, grid):
+    """Labels of the moved car: where its lines cross the rows, for points that the label set vouches for.
+
+    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points beside the window have no
+    label, as in :meth:`BirdseyeWindow.labelled`.
+    """
+    mirror, xx, xy, yx, yy, x0, y0 = view
+    for side in range(2):
+        old = 1 - side if mirror else side
+        first, last = frames.line_start[2 * i + old], frames.line_start[2 * i + old + 1]
+        for row in range(3):
+            labels[3 * side + row] = np.nan
+            if np.isnan(frames.points_cm[i, 3 * old + row]):
+                continue
+            y_row = _LABEL_ROWS_CM[row]
+            for k in range(first, last - 1):
+                ax, ay = frames.lines_cm[k, 0], frames.lines_cm[k, 1]
+                bx, by = frames.lines_cm[k + 1, 0], frames.lines_cm[k + 1, 1]
+                a = ax * xy + ay * yy + y0
+                b = bx * xy + by * yy + y0
+                if a <= y_row and b > y_row:
+                    t = (y_row - a) / (b - a)
+                    x_a, x_b = ax * xx + ay * yx + x0, bx * xx + by * yx + x0
+                    x = x_a + t * (x_b - x_a)
+                    if grid.label_left_cm <= x <= grid.label_right_cm:
+                        labels[3 * side + row] = x
+                    break
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _presence(cells, frames, line, grid):
+    """1 for a line that is seen, 0 for one that is not, NaN between them or where its place is unknown."""
+    known = False
+    for k in range(frames.line_start[line], frames.line_start[line + 1]):
+        known = known or not np.isnan(frames.lines_cm[k, 0])
+    seen_cm = cells * grid.cell_cm
+    if not known or UNSEEN_CM <= seen_cm < SEEN_CM:
+        return np.nan
+    return 1.0 if seen_cm >= SEEN_CM else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _count(cells, lines):
+    cells[0] += lines & 1
+    cells[1] += lines >> 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _missing_lines(rng, amounts):
+    """Bits of the lines that are wholly gone."""
+    chance, side = next_uniform(rng), next_uniform(rng)
+    if chance < amounts.missing_both:
+        return 3
+    if chance < amounts.missing_both + amounts.missing_line:
+        return 1 if side < 0.5 else 2
+    return 0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _stretch(rng, chance, edges_cm, first, last):
+    """Draw a stretch without paint: kind (0 none, 1 disc, 2 ring about the car), its place and its size.
+
+    A ring hides a band of road right across; a disc hides a piece of one line.
+    """
+    draw, which, kind, size = (
+        next_uniform(rng),
+        next_uniform(rng),
+        next_uniform(rng),
+        next_between(rng, _STRETCH_CM[0], _STRETCH_CM[1]),
+    )
+    if draw >= chance or last == first:
+        return 0, 0.0, 0.0, 0.0
+    k = first + int(which * (last - first))
+    x, y = np.float64(edges_cm[k, 0]), np.float64(edges_cm[k, 1])
+    if kind < 0.5:
+        return 1, x, y, size
+    return 2, np.sqrt(x * x + y * y), 0.0, 0.5 * size
