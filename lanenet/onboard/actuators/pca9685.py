@@ -1,7 +1,7 @@
 """Servo and speed controller on a PCA9685, the 16-channel pulse generator of most Donkeycars, over I2C.
 
-The chip goes on with the last pulses when the computer falls silent: it has no watchdog of its own. Where that
-matters, use a board with one (``firmware/lanenet_uno``).
+The chip goes on with the last pulses when the computer falls silent: it has no watchdog of its own. Where
+that matters, use a board with one (``firmware/lanenet_uno``).
 
 Source: NXP PCA9685 data sheet, revision 4: registers in 7.3, prescaler in 7.3.5, restart in 7.3.1.1.
 """

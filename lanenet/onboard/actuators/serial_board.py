@@ -17,7 +17,7 @@ from pydantic import Field
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
 from lanenet.onboard.actuators.line_protocol import BAUD, VERSION, Line, LineReader, encode
-from lanenet.onboard.actuators.pulses import PulseSettings, Pulses, command_pulses, neutral_pulses
+from lanenet.onboard.actuators.pulses import Pulses, PulseSettings, command_pulses, neutral_pulses
 
 _log = logging.getLogger(__name__)
 #: A line takes 2 ms; a port that takes none of it for so long is dead.
@@ -73,8 +73,8 @@ class SerialBoard:
             )
         except (OSError, ValueError) as error:
             raise HardwareError(
-                f"{settings.port}: cannot be opened ({error}); is the board plugged in (ls /dev/serial/by-id), "
-                "and are you in its group (sudo usermod -aG dialout $USER)?"
+                f"{settings.port}: cannot be opened ({error}); is the board plugged in (ls "
+                "/dev/serial/by-id), and are you in its group (sudo usermod -aG dialout $USER)?"
             ) from None
         self._reader, self._report = LineReader(), None
         try:
@@ -101,8 +101,8 @@ class SerialBoard:
                         version = line.numbers[0]
                 if version not in (None, VERSION):
                     raise HardwareError(
-                        f"{self._settings.port}: the board speaks version {version} of the protocol, expected "
-                        f"{VERSION}; load the sketch firmware/lanenet_uno"
+                        f"{self._settings.port}: the board speaks version {version} of the protocol, "
+                        f"expected {VERSION}; load the sketch firmware/lanenet_uno"
                     )
                 if version is not None and self._report is not None and self._report[3:] == pulses:
                     return
@@ -137,8 +137,8 @@ class SerialBoard:
         silent_s = time.monotonic() - self._heard_s
         if silent_s > self._settings.silence_s:
             raise HardwareError(
-                f"{self._settings.port}: the board has been silent for {silent_s:.2f} s, expected a report every "
-                "0.05 s; check its cable and supply"
+                f"{self._settings.port}: the board has been silent for {silent_s:.2f} s, expected a report "
+                "every 0.05 s; check its cable and supply"
             )
 
     def neutral(self) -> None:

@@ -152,7 +152,7 @@ def test_command_that_hangs_cannot_undo_neutral(bus, actuator):
     assert hung.wait(5.0)
     start_s = time.monotonic()
     actuator.neutral()
-    assert time.monotonic() - start_s < 0.1
+    assert time.monotonic() - start_s < 0.2
     assert bus.chip.counts(0) == 370
     hang.set()
     command.join(5.0)

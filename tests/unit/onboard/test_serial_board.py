@@ -176,7 +176,7 @@ def test_boards_watchdog_stops_within_its_time(board, actuator):
     last_s = time.monotonic()
     stopped_s = board.wait_for(NEUTRAL)
     # The loaded test machine may wake either process late, hence the room above 100 ms.
-    assert 0.06 < stopped_s - last_s < 0.16
+    assert 0.06 < stopped_s - last_s < 0.25
 
 
 def test_kept_alive_the_board_goes_on(board, actuator):
