@@ -66,3 +66,20 @@ def mirror_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n
     """Mirror left and right: x changes sign and the lines swap."""
     points = np.asarray(points_cm)
     return -np.concatenate([points[..., 3:], points[..., :3]], axis=-1)
+
+
+def lane_width_cm(points_cm: Float[np.ndarray, "6"]) -> float:
+    """Return the distance between the two lines at y = 15 cm, measured across the lane.
+
+    The gap along x divided by sqrt(1 + slope^2), with the mean slope dx/dy of the two parabolas there.
+
+    Args:
+        points_cm: The six points, frame car.
+
+    Returns:
+        Width; NaN where a point is missing, negative where the lines are swapped.
+    """
+    lines = np.asarray(points_cm, np.float64).reshape(2, len(ROWS_CM))
+    a, b, _ = PARABOLA_FROM_POINTS @ lines.mean(axis=0)
+    slope = 2.0 * a * ROWS_CM[1] + b
+    return float((lines[1, 1] - lines[0, 1]) / np.sqrt(1.0 + slope * slope))
