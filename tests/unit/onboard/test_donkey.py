@@ -22,7 +22,7 @@ from lanenet.perception.estimate import LaneEstimate
 
 ROOT = Path(__file__).resolve().parents[3]
 CHECKPOINT = ROOT / "checkpoints" / "small"
-CONFIG = ROOT / "configs" / "car" / "donkey.yaml"
+CONFIG = ROOT / "configs" / "donkeycar" / "pilot.yaml"
 
 
 @pytest.fixture
