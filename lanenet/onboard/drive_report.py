@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
@@ -61,6 +62,13 @@ class Step:
     throttle: float
     confidence: float
 
+    @property
+    def text(self) -> str:
+        """The step as people read it."""
+        command = f"steering {np.rad2deg(self.steering_rad):+5.1f} deg, throttle {self.throttle:.2f}"
+        seen = f", confidence {self.confidence:.2f}" if np.isfinite(self.confidence) else ""
+        return f"{self.state}: {command}{seen}{f' ({self.reason})' if self.reason else ''}"
+
 
 @dataclass
 class DriveReport:
@@ -75,6 +83,7 @@ class DriveReport:
         seconds: Time from the first turn to the last.
         ended: Why the drive ended.
         by_fault: Whether it ended because the car had to stop.
+        recording: Folder of the recording, if it holds a frame.
         recorded: Frames in the recording.
         unrecorded: Frames that the card was too slow for, or that came after the recording had stopped.
     """
@@ -87,6 +96,7 @@ class DriveReport:
     seconds: float = 0.0
     ended: str = ""
     by_fault: bool = False
+    recording: Path | None = None
     recorded: int = 0
     unrecorded: int = 0
 
@@ -94,6 +104,11 @@ class DriveReport:
     def rate_hz(self) -> float:
         """Frames per second over the whole drive."""
         return self.frames / self.seconds if self.seconds > 0.0 else 0.0
+
+    @property
+    def text(self) -> str:
+        """The figures that matter while driving."""
+        return f"{self.rate_hz:5.1f}/s  p99 {self.work.percentile_ms(99.0):.1f} ms"
 
     def lines(self) -> list[str]:
         """Return the summary that is shown at the end."""

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -33,6 +34,7 @@ _WAIT_S = 0.04
 class FrameRecorder(Protocol):
     """Takes the frames of a drive; never blocks and never raises."""
 
+    path: Path
     recorded: int
     dropped: int
 
@@ -65,6 +67,7 @@ class DriveLoop:
         armed: bool = False,
         steering_only: bool = False,
         recorder: FrameRecorder | None = None,
+        record_commands: bool = True,
         watch: Callable[[Step], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -81,6 +84,7 @@ class DriveLoop:
             armed: Lets the motor turn, after a countdown.
             steering_only: Moves the wheels of a car that is not armed.
             recorder: Keeps the frames.
+            record_commands: Record what the car was told; not where nobody hears it.
             watch: Called after every turn.
             clock: The clock of the frames' times.
         """
@@ -89,6 +93,7 @@ class DriveLoop:
         self._safety, self._limiter, self._speed = safety, limiter, speed
         self._armed, self._moves = armed, armed or steering_only
         self._recorder, self._watch, self._clock = recorder, watch, clock
+        self._record_commands = record_commands
         self._judge, self._check = SafetyJudge(safety, armed), FrameCheck(safety)
         self._until_s = -math.inf
         self._number = -1
@@ -201,8 +206,9 @@ class DriveLoop:
         steering_rad, throttle = self._limiter.steering_rad, self._limiter.throttle
         if frame is not None and self._recorder is not None:
             # What an unarmed car is not told is not recorded: whoever drives it then is somebody else.
-            commands = {"steering_rad": steering_rad} if self._moves else {}
-            commands |= {"throttle": throttle} if self._armed else {}
+            steers, drives = self._record_commands and self._moves, self._record_commands and self._armed
+            commands = {"steering_rad": steering_rad} if steers else {}
+            commands |= {"throttle": throttle} if drives else {}
             self._recorder.add(frame.image_bgr, frame.t_s, **commands)
         self.report.states[verdict.state] += 1
         step = Step(
@@ -244,6 +250,7 @@ class DriveLoop:
             if self._recorder is not None:
                 self._recorder.close()
                 self.report.recorded = self._recorder.recorded
+                self.report.recording = self._recorder.path if self._recorder.recorded else None
                 self.report.unrecorded = self._recorder.dropped
 
 
