@@ -169,10 +169,14 @@ def drive(
     console.wrote(report.recording)
     if report.by_fault:
         raise LanenetError(f"the car had to stop: {report.ended}; it does not start again by itself")
-    if report.recording is None:
-        console.next_command("drive", config, *(overrides or []), "--arm")
-    else:
+    if report.recording is not None:
         console.next_command("map", report.recording, "--lane-width", "CM", "--out", "MAP")
+    elif settings.actuator is not None and not arm:
+        console.next_command(
+            "drive", config, *(overrides or []), "--arm" if steering_only else "--steering-only"
+        )
+    else:
+        console.next_command("bench")
 
 
 @app.command(epilog="Example: lanenet bench --model checkpoints/small/model.onnx --out bench.json")

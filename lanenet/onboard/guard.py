@@ -219,7 +219,7 @@ class GuardedActuator:
         elif word == "ready":
             self._ready = True
         elif word == "neutral":
-            log.warning("guard: neutral: %s", text)
+            log.debug("the guard went to neutral: %s", text)
         elif word == "closed":
             self._closed = True
         else:

@@ -37,6 +37,7 @@ class Guard:
         self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
         self._until_s = -math.inf
         self._heard_s = time.monotonic()
+        self._logged_s = -math.inf
         self._driving = False
         #: Once set, no command is taken any more.
         self._over = ""
@@ -97,7 +98,12 @@ class Guard:
         now_s = time.monotonic()
         if self._driving and now_s >= self._until_s:
             self._neutral()
-            self._say(f"neutral no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms")
+            reason = f"no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms"
+            self._say(f"neutral {reason}")
+            # A loop that hangs cannot tell it. Each second once: a slow camera lets every command run out.
+            if now_s - self._logged_s > 1.0:
+                self._logged_s = now_s
+                log.warning("neutral: %s", reason)
         elif not self._driving and not readable:
             self._actuator.neutral()
         if not self._over and now_s - self._heard_s > self._give_up_s and math.isfinite(self._until_s):

@@ -97,6 +97,8 @@ class DriveLoop:
         self._judge, self._check = SafetyJudge(safety, armed), FrameCheck(safety)
         self._until_s = -math.inf
         self._number = -1
+        self._verdict = Verdict(State.DISARMED, 0.0, False)
+        self._step = Step(-1, State.DISARMED, "", 0.0, 0.0, math.nan)
         self._told = (State.DISARMED, "")
         self._asked = ""
 
@@ -171,7 +173,12 @@ class DriveLoop:
             self._send(*command, self._until_s)
             self.report.work.add(self._clock() - begin_s)
             self.report.latency.add(self._clock() - frame.t_s)
-        elif now_s >= self._until_s or verdict.state is State.ENDED:
+        elif now_s < self._until_s and verdict.state is not State.ENDED:
+            # The last command still holds: a frame may be missing without any harm.
+            if frame is None:
+                return self._step
+            verdict = self._verdict
+        else:
             # Standing, the wheels stay as they are: a car that still rolls keeps to its bend.
             self._limiter.neutral(now_s)
             self._send(self._limiter.steering_rad, 0.0, now_s + self._safety.watchdog_s)
@@ -211,10 +218,9 @@ class DriveLoop:
             commands |= {"throttle": throttle} if drives else {}
             self._recorder.add(frame.image_bgr, frame.t_s, **commands)
         self.report.states[verdict.state] += 1
-        step = Step(
-            -1 if frame is None else frame.number,
-            verdict.state, verdict.reason, steering_rad, throttle, confidence,
-        )  # fmt: skip
+        number = -1 if frame is None else frame.number
+        step = Step(number, verdict.state, verdict.reason, steering_rad, throttle, confidence)
+        self._verdict, self._step = verdict, step
         self._tell(verdict)
         if verdict.state is State.ENDED:
             self.report.ended, self.report.by_fault = verdict.reason, True

@@ -202,7 +202,8 @@ def test_a_short_gap_goes_on_with_the_throttle_rising_again() -> None:
     car = Car(120, dict.fromkeys(range(60, 70), lambda: None), armed=True)
     report = car.loop.run()
     assert report.ended == "the recording is over"
-    assert report.states == {State.DRIVING: 110, State.STOPPED: 10}
+    # The last command holds for 90 ms: two frames may be missing without a stop.
+    assert report.states == {State.DRIVING: 110, State.STOPPED: 8}
     by_time = [(t, throttle) for t, kind, _, throttle, _ in car.wire.log if kind == "send"]
     after = [throttle for t, throttle in by_time if t > 100.0 + 70.5 / RATE_HZ]
     assert after[0] < 0.1 and after[-1] == pytest.approx(0.25)
