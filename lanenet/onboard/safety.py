@@ -63,7 +63,7 @@ class SafetySettings(Settings):
     slow_share: float = Field(default=0.5, gt=0.0, le=1.0)
     stop_below: float = Field(default=0.2, ge=0.0, le=1.0)
     slow_for_s: float = Field(default=3.0, gt=0.0)
-    end_after_s: float = Field(default=1.0, gt=0.0)
+    end_after_s: float = Field(default=1.0, ge=0.2)
     allow_repeated_frames: bool = False
 
 

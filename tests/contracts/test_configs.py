@@ -44,9 +44,16 @@ def read_detector_settings(path: Path) -> Any:
     return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
 
 
+def read_car(path: Path) -> Any:
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    return load_drive_settings(path)
+
+
 #: What reads the YAML files of each folder below configs/.
 READERS = {
     ".": read_training_run,
+    "car": read_car,
     "drives": read_simulation,
     "tracks": read_track,
     "cameras": read_camera_file,
