@@ -96,7 +96,7 @@ class LaneController:
         smooth = self._smoother.update(estimate, dt_s, speed_cm_s * dt_s, steering_rad)
         if self._settings.width_memory:
             self._learn_width(estimate)
-        steering = self._target_rad(smooth)
+        steering = self._target_rad(estimate, smooth)
         curvature = lane_curvature_per_cm(smooth, self._steering.look_ahead_cm)
         if math.isfinite(steering):
             # A car that turns back into a straight lane is in a bend of its own.
@@ -104,13 +104,14 @@ class LaneController:
             curvature = own if not math.isfinite(curvature) else max(curvature, own)
         return Wish(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth)
 
-    def _target_rad(self, estimate: LaneEstimate) -> float:
+    def _target_rad(self, estimate: LaneEstimate, smooth: LaneEstimate) -> float:
         if self._settings.own_target:
             limit, wished = self._steering.max_steering_rad, estimate.steering_rad
             return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
         if self._steering.lane_width_cm != self._width_cm:
             self._steering = self._steering.model_copy(update={"lane_width_cm": self._width_cm})
-        return steering_target_rad(estimate, self._steering)
+        # Smoothing carries one line on, and never a frame that shows none.
+        return steering_target_rad(smooth, self._steering) if estimate.mask.any() else math.nan
 
     def _learn_width(self, estimate: LaneEstimate) -> None:
         # Points of the frame itself: a line that is only carried on knows nothing new.

@@ -50,9 +50,16 @@ def read_donkeycar_pilot(path: Path) -> Any:
     return LanePilot.from_file(path)
 
 
+def read_car(path: Path) -> Any:
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    return load_drive_settings(path)
+
+
 #: What reads the YAML files of each folder below configs/.
 READERS = {
     ".": read_training_run,
+    "car": read_car,
     "drives": read_simulation,
     "tracks": read_track,
     "cameras": read_camera_file,

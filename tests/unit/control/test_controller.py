@@ -106,6 +106,12 @@ def test_a_bend_slows_down_and_an_unknown_lane_has_no_answer() -> None:
     assert math.isnan(nothing.steering_rad) and nothing.speed_cm_s == 30.0
 
 
+def test_smoothing_does_not_carry_a_blind_frame() -> None:
+    controller = LaneController(settings())
+    controller.wish(LaneEstimate(lane(), confidence=1.0), 0.0)
+    assert math.isnan(controller.wish(LaneEstimate(confidence=1.0), 0.03).steering_rad)
+
+
 def test_the_detectors_own_target_stays_within_the_lock() -> None:
     controller = LaneController(settings(own_target=True))
     assert controller.wish(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1
