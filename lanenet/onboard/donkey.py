@@ -43,7 +43,10 @@ from lanenet.data.camera_file import read_camera
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.detectors import DetectorName, build_detector
+from lanenet.onboard.detectors import build_detector
+from lanenet.onboard.drive_settings import DriveDetectorSettings
+from lanenet.onboard.masks import read_mask
+from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.views import birdseye_view, undistorting_view
@@ -53,26 +56,18 @@ class DonkeySettings(Settings):
     """Settings of the pilot; files are relative to the settings' own.
 
     Attributes:
-        detector: Which one finds the lane.
-        model: ONNX file of ``network``.
         camera: Camera file; ``hough`` and ``painter`` do without.
-        any_camera: Use a model with another camera than it was trained with.
-        lane_width_cm: For ``lane-filter``.
-        detector_config: Settings file of ``lane-filter``, ``hough`` or ``painter``.
-        control: Steering, smoothing and speed; Donkeycar's angle of 1 is ``steering.max_steering_rad``.
-        max_throttle: No throttle is larger.
+        detector: What finds the lane.
+        control: Steering and speed.
+        limits: What no command exceeds; Donkeycar's angle of 1 is ``max_steering_rad``.
         min_confidence: A frame of less confidence counts as one without a lane.
         hold_s: Without a lane the car goes on as before for this long, then it stops.
     """
 
-    detector: DetectorName = "network"
-    model: Path | None = None
     camera: Path | None = None
-    any_camera: bool = False
-    lane_width_cm: float | None = Field(default=None, gt=0.0)
-    detector_config: Path | None = None
+    detector: DriveDetectorSettings = DriveDetectorSettings()
     control: ControlSettings
-    max_throttle: float = Field(default=0.25, gt=0.0, le=1.0)
+    limits: LimitSettings = Field(default_factory=LimitSettings)
     min_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
     hold_s: float = Field(default=0.2, ge=0.0)
 
@@ -102,21 +97,24 @@ class LanePilot:
         def found(path: Path | None) -> Path | None:
             return None if path is None else folder / path.expanduser()
 
-        self.camera = None if settings.camera is None else read_camera(folder / settings.camera.expanduser())
+        camera, mask = found(settings.camera), found(settings.detector.mask)
+        self.camera = None if camera is None else read_camera(camera)
         self.estimate = LaneEstimate()
         self._settings = settings
         self._detector: Detector = build_detector(
-            settings.detector,
+            settings.detector.kind,
             self.camera,
-            model=found(settings.model),
-            lane_width_cm=settings.lane_width_cm,
-            any_camera=settings.any_camera,
-            config=found(settings.detector_config),
+            model=found(settings.detector.model),
+            lane_width_cm=settings.detector.lane_width_cm,
+            any_camera=settings.detector.any_camera,
+            config=found(settings.detector.config),
+            mask=None if mask is None else read_mask(mask),
         )
         self._controller = LaneController(settings.control)
+        self._limiter = CommandLimiter(settings.limits)
         self._clock = clock
         self._seen_s = -math.inf
-        self._steering_rad = self._speed_cm_s = 0.0
+        self._wish = (0.0, 0.0)
 
     @staticmethod
     def from_file(path: str | Path) -> LanePilot:
@@ -145,16 +143,17 @@ class LanePilot:
             self.estimate = self._detector.detect(bgr)
             self._follow(now_s)
         if now_s - self._seen_s > self._settings.hold_s:
-            self._speed_cm_s = 0.0
-        throttle = throttle_of(self._speed_cm_s, self._settings.control.speed)
-        angle = -self._steering_rad / self._settings.control.steering.max_steering_rad
-        return min(max(angle, -1.0), 1.0), min(throttle, self._settings.max_throttle)
+            self._wish = (self._wish[0], 0.0)
+        steering_rad, speed_cm_s = self._wish
+        throttle = throttle_of(speed_cm_s, self._settings.control.speed)
+        steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
+        return -steering_rad / self._settings.limits.max_steering_rad, throttle
 
     def _follow(self, now_s: float) -> None:
-        wish = self._controller.wish(self.estimate, now_s, self._speed_cm_s, self._steering_rad)
+        wish = self._controller.wish(self.estimate, now_s, self._wish[1], self._limiter.steering_rad)
         if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(wish.steering_rad):
             self._seen_s = now_s
-            self._steering_rad, self._speed_cm_s = wish.steering_rad, wish.speed_cm_s
+            self._wish = (wish.steering_rad, wish.speed_cm_s)
 
     def run_threaded(self, image_rgb: UInt8[np.ndarray, "h w 3"] | None) -> tuple[float, float]:
         """Do the same as :meth:`run`: the pilot is faster than a camera and needs no thread."""
