@@ -16,7 +16,8 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
     """Call ``stop`` with the signal's name instead of dying; a second signal raises KeyboardInterrupt.
 
-    A hang-up that is ignored, as under ``nohup``, stays ignored. Elsewhere than in the main thread, where Python allows no handlers, nothing is changed.
+    A hang-up that is ignored, as under ``nohup``, stays ignored. Elsewhere than in the main thread, where
+    Python allows no handlers, nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
