@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import UInt8
 
+    from lanenet.onboard.drive_settings import DriveSettings
     from lanenet.onboard.sources import Source
 
 app = typer.Typer()
@@ -246,18 +247,69 @@ def analyse(
     console.next_command("doctor", "--camera", camera)
 
 
-@app.command(epilog="Example: lanenet doctor --camera camera.yaml")
-def doctor(camera: _CameraOption = None) -> None:
-    """Check the installation, and a camera file if one is given."""
+@app.command(epilog="Example: lanenet doctor --config configs/car/picamera_pca9685.yaml")
+def doctor(
+    camera: _CameraOption = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML of a car, whose devices are tried.", show_default=False)
+    ] = None,
+    wheels_off_ground: Annotated[
+        bool,
+        typer.Option(
+            "--wheels-off-ground",
+            help="Turn wheels and motor, ask what they did, and write it into --config.",
+        ),
+    ] = False,
+) -> None:
+    """Check the installation, a camera file if one is given, and a whole car with --config."""
     from lanenet.onboard.doctor import run_checks
+    from lanenet.onboard.drive_settings import load_drive_settings
 
+    settings = None if config is None else load_drive_settings(config)
+    if wheels_off_ground:
+        if config is None or settings is None:
+            raise ConfigError("--wheels-off-ground: expected the car's file as well (--config car.yaml)")
+        _try_wheels(config, settings)
+        return
     checks = run_checks(camera)
+    if settings is not None:
+        from lanenet.onboard.doctor_car import check_car
+
+        checks += check_car(settings)
     for check in checks:
         typer.echo(f"{check.state:8s}{check.name}: {check.text}")
     problems = sum(check.state == "problem" for check in checks)
     if problems:
         raise LanenetError(f"{problems} problem(s) found, see above")
-    console.next_command("train", "configs/small.yaml")
+    if settings is None or config is None:
+        console.next_command("train", "configs/small.yaml")
+    elif settings.actuator is None:
+        console.next_command("drive", config, "--dry-run")
+    else:
+        console.next_command("doctor", "--config", config, "--wheels-off-ground")
+
+
+def _try_wheels(config: Path, settings: DriveSettings) -> None:
+    """Ask about the wheels on the terminal, and write what was found into the car's file."""
+    from lanenet.data.files import write_text
+    from lanenet.onboard.drive import build_sink
+    from lanenet.onboard.wheel_trial import pulses_of, try_wheels
+    from lanenet.onboard.yaml_edit import set_values
+
+    def ask(question: str, letters: str) -> str:
+        while True:
+            answer = typer.prompt(f"{question} [{'/'.join(letters)}]", type=str).strip().lower()[:1]
+            if answer and answer in letters:
+                return str(answer)
+
+    pulses_of(settings)
+    result = try_wheels(settings, build_sink(settings), ask)
+    console.show_lines(result.lines)
+    if result.changes:
+        text = config.read_text(encoding="utf-8")
+        write_text(config, set_values(text, result.changes, str(config)))
+        console.wrote(config)
+    console.next_command("drive", config, "--steering-only")
 
 
 def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:

@@ -61,7 +61,7 @@ def build_loop(
         open_source(settings.source),
         build_drive_detector(settings, camera),
         LaneController(settings.control),
-        _sink(settings, dry_run),
+        NoActuator() if dry_run else build_sink(settings),
         safety,
         CommandLimiter(settings.limits),
         settings.control.speed,
@@ -88,8 +88,9 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
     )
 
 
-def _sink(settings: DriveSettings, dry_run: bool) -> CommandSink:
-    if dry_run or settings.actuator is None:
+def build_sink(settings: DriveSettings) -> CommandSink:
+    """Return the car's actuator behind its guard, not open yet; one that does nothing where there is none."""
+    if settings.actuator is None:
         return NoActuator()
     actuator, safety = settings.actuator, settings.safety
     # What was left out has to stay so: there a Donkeycar's myconfig.py may have a say.

@@ -44,6 +44,12 @@ def read_detector_settings(path: Path) -> Any:
     return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
 
 
+def read_donkeycar_pilot(path: Path) -> Any:
+    from lanenet.onboard.donkey import LanePilot
+
+    return LanePilot.from_file(path)
+
+
 def read_car(path: Path) -> Any:
     from lanenet.onboard.drive_settings import load_drive_settings
 
@@ -58,6 +64,7 @@ READERS = {
     "tracks": read_track,
     "cameras": read_camera_file,
     "detectors": read_detector_settings,
+    "donkeycar": read_donkeycar_pilot,
 }
 
 

@@ -88,7 +88,7 @@ class Chip:
 
 
 class Bus:
-    """A bus with one chip; transfers fail while ``broken``, and the next ``glitches`` are not acknowledged."""
+    """A bus with one chip: transfers fail while ``broken``, and the next ``glitches`` of them do, too."""
 
     def __init__(self, chip, address=0x40):
         self.chip, self.address = chip, address

@@ -305,7 +305,7 @@ def test_program_that_ends_is_started_again(program, tmp_path):
 
 def test_what_the_program_says_is_shown(program):
     settings = RpicamSettings(program=program(), camera=5, **SMALL)
-    with pytest.raises(HardwareError, match="the program ended: ERROR: .* no cameras available"):
+    with pytest.raises(HardwareError, match=r"the program ended: ERROR: .* no cameras available"):
         open_source(settings).open()
     with pytest.raises(HardwareError, match="cannot be run"):
         open_source(RpicamSettings(program="/nowhere/rpicam-vid", **SMALL)).open()

@@ -110,7 +110,8 @@ def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
         ('PWM_STEERING_THROTTLE = {"PWM_THROTTLE_INVERTED": True}', "PWM_THROTTLE_INVERTED: found True"),
         ('STEERING_LEFT_PWM = "460"', "STEERING_LEFT_PWM: expected a number, found '460'"),
         (
-            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "PCA9685.1:40.1", "PWM_THROTTLE_PIN": "PCA9685.1:41.0"}',
+            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "PCA9685.1:40.1", '
+            '"PWM_THROTTLE_PIN": "PCA9685.1:41.0"}',
             "two chips",
         ),
         (

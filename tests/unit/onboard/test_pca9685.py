@@ -133,7 +133,7 @@ def test_no_bus_no_chip_no_package(bus, monkeypatch):
 
 def test_another_chip_is_refused(bus):
     bus.chip.write = lambda data: setattr(bus.chip, "pointer", data[0])
-    with pytest.raises(HardwareError, match="register PRE_SCALE.*holds 30, expected 101"):
+    with pytest.raises(HardwareError, match=r"register PRE_SCALE.*holds 30, expected 101"):
         make_actuator(SETTINGS).open()
 
 

@@ -257,7 +257,7 @@ def silent_port():
 
 def test_silent_board_and_missing_port(silent_port, tmp_path):
     pytest.importorskip("serial", reason="pyserial is not installed")
-    with pytest.raises(HardwareError, match="no answer within 0.3 s; is the sketch"):
+    with pytest.raises(HardwareError, match=r"no answer within 0\.3 s; is the sketch"):
         make_actuator(SerialBoardSettings(port=silent_port[0], start_s=0.3)).open()
     with pytest.raises(HardwareError, match=r"cannot be opened.*dialout"):
         make_actuator(SerialBoardSettings(port=str(tmp_path / "ttyACM0"))).open()
