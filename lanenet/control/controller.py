@@ -108,10 +108,10 @@ class LaneController:
         if self._settings.own_target:
             limit, wished = self._steering.max_steering_rad, estimate.steering_rad
             return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
-        if self._steering.lane_width_cm != self._width_cm:
-            self._steering = self._steering.model_copy(update={"lane_width_cm": self._width_cm})
         # Smoothing carries one line on, and never a frame that shows none.
-        return steering_target_rad(smooth, self._steering) if estimate.mask.any() else math.nan
+        if not estimate.mask.any():
+            return math.nan
+        return steering_target_rad(smooth, self._steering, self._width_cm)
 
     def _learn_width(self, estimate: LaneEstimate) -> None:
         # Points of the frame itself: a line that is only carried on knows nothing new.

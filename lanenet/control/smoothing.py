@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.geometry.lane import N_POINTS, ROWS_CM, parabolas_from_points
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, parabola_through
 from lanenet.perception.estimate import LaneEstimate
 
-_ROWS = np.array(ROWS_CM)
 #: A confidence below this weighs no less, so that the weight stays finite.
 _MIN_CONFIDENCE = 0.05
+#: Nothing is known more exactly.
+_MIN_SIGMA_CM = 1e-3
+#: Rows that come nearer together belong to a line that runs across the way.
+_MIN_STEP_CM = 1.0
 
 
 class SmoothingSettings(Settings):
@@ -41,15 +44,14 @@ class LaneSmoother:
     def __init__(self, settings: SmoothingSettings, wheelbase_cm: float) -> None:
         """Take the settings; ``wheelbase_cm`` turns steering into motion."""
         self._settings, self._wheelbase_cm = settings, wheelbase_cm
-        self._points_cm: Float[np.ndarray, "6"] = np.full(N_POINTS, np.nan)
-        self._variance: Float[np.ndarray, "6"] = np.full(N_POINTS, np.inf)
-        self._unseen_s: Float[np.ndarray, "6"] = np.zeros(N_POINTS)
+        self.reset()
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
-        self._points_cm = np.full(N_POINTS, np.nan)
-        self._variance = np.full(N_POINTS, np.inf)
-        self._unseen_s = np.zeros(N_POINTS)
+        # Plain numbers: six of them are not worth the cost of arrays at every frame.
+        self._points_cm = [math.nan] * N_POINTS
+        self._variance = [math.inf] * N_POINTS
+        self._unseen_s = [0.0] * N_POINTS
 
     def update(
         self, estimate: LaneEstimate, dt_s: float, travel_cm: float = 0.0, steering_rad: float = 0.0
@@ -71,40 +73,40 @@ class LaneSmoother:
         if not self._settings.enabled:
             return estimate
         self._predict(max(dt_s, 0.0), travel_cm, steering_rad)
-        seen = np.isfinite(estimate.points_cm)
-        sigma_cm = np.where(
-            np.isfinite(estimate.sigma_cm), estimate.sigma_cm, self._settings.default_sigma_cm
-        )
         confidence = estimate.confidence if math.isfinite(estimate.confidence) else 0.0
-        measured = np.maximum(sigma_cm, 1e-3) ** 2 / max(confidence, _MIN_CONFIDENCE)
-        both = seen & np.isfinite(self._points_cm)
-        gain = self._variance[both] / (self._variance[both] + measured[both])
-        self._points_cm[both] += gain * (estimate.points_cm[both] - self._points_cm[both])
-        self._variance[both] *= 1.0 - gain
-        new = seen & ~both
-        self._points_cm[new] = estimate.points_cm[new]
-        self._variance[new] = measured[new]
-        self._unseen_s[seen] = 0.0
-        known = np.isfinite(self._points_cm)
-        return replace(
-            estimate,
-            points_cm=self._points_cm.copy(),
-            sigma_cm=np.where(known, np.sqrt(self._variance), np.nan),
-        )
+        weight = 1.0 / max(confidence, _MIN_CONFIDENCE)
+        seen = zip(estimate.points_cm.tolist(), estimate.sigma_cm.tolist(), strict=True)
+        for i, (x_cm, sigma_cm) in enumerate(seen):
+            if not math.isfinite(x_cm):
+                continue
+            sigma_cm = sigma_cm if math.isfinite(sigma_cm) else self._settings.default_sigma_cm
+            measured = weight * max(sigma_cm, _MIN_SIGMA_CM) ** 2
+            if math.isfinite(self._points_cm[i]):
+                gain = self._variance[i] / (self._variance[i] + measured)
+                self._points_cm[i] += gain * (x_cm - self._points_cm[i])
+                self._variance[i] *= 1.0 - gain
+            else:
+                self._points_cm[i], self._variance[i] = x_cm, measured
+            self._unseen_s[i] = 0.0
+        spread = zip(self._points_cm, self._variance, strict=True)
+        sigmas_cm = [math.sqrt(variance) if math.isfinite(x) else math.nan for x, variance in spread]
+        return replace(estimate, points_cm=np.array(self._points_cm), sigma_cm=np.array(sigmas_cm))
 
     def _predict(self, dt_s: float, travel_cm: float, steering_rad: float) -> None:
-        self._unseen_s += dt_s
-        self._variance += dt_s * self._settings.drift_cm_per_sqrt_s**2
-        gone = self._unseen_s > self._settings.hold_s
-        self._points_cm[gone], self._variance[gone] = np.nan, np.inf
+        growth = dt_s * self._settings.drift_cm_per_sqrt_s**2
+        for i in range(N_POINTS):
+            self._unseen_s[i] += dt_s
+            self._variance[i] += growth
+            if self._unseen_s[i] > self._settings.hold_s:
+                self._points_cm[i], self._variance[i] = math.nan, math.inf
         if travel_cm != 0.0:
             turn_rad = travel_cm * math.tan(steering_rad) / self._wheelbase_cm
             self._points_cm = move_points(self._points_cm, travel_cm, turn_rad, self._wheelbase_cm)
 
 
 def move_points(
-    points_cm: Float[np.ndarray, "6"], travel_cm: float, turn_rad: float, wheelbase_cm: float
-) -> Float[np.ndarray, "6"]:
+    points_cm: Sequence[float], travel_cm: float, turn_rad: float, wheelbase_cm: float
+) -> list[float]:
     """Tell where the lane lies after the car has moved.
 
     The rear axle goes ``travel_cm`` along a chord while the heading turns; three points of each parabola move
@@ -126,16 +128,24 @@ def move_points(
     front_x = -travel_cm * math.sin(0.5 * turn_rad) - wheelbase_cm * math.sin(turn_rad)
     front_y = travel_cm * math.cos(0.5 * turn_rad) + wheelbase_cm * (math.cos(turn_rad) - 1.0)
     sine, cosine = math.sin(turn_rad), math.cos(turn_rad)
-    moved = np.full(N_POINTS, np.nan)
-    for side, (a, b, c) in enumerate(parabolas_from_points(points_cm)):
-        if not math.isfinite(a):
-            continue
-        y_old = _ROWS + front_y
-        x_old = (a * y_old + b) * y_old + c
-        dx, dy = x_old - front_x, y_old - front_y
-        x_new, y_new = cosine * dx + sine * dy, cosine * dy - sine * dx
-        if not (np.diff(y_new) > 1.0).all():
-            continue
-        parabola = np.linalg.solve(np.stack([y_new * y_new, y_new, np.ones(3)], axis=1), x_new)
-        moved[3 * side : 3 * side + 3] = (parabola[0] * _ROWS + parabola[1]) * _ROWS + parabola[2]
+    moved: list[float] = []
+    for line in (points_cm[:3], points_cm[3:]):
+        a, b, c = parabola_through(*line)
+        new = []
+        for row in ROWS_CM:
+            y_old = row + front_y
+            dx, dy = (a * y_old + b) * y_old + c - front_x, row
+            new.append((cosine * dx + sine * dy, cosine * dy - sine * dx))
+        moved += _read_at_rows(new)
     return moved
+
+
+def _read_at_rows(points: list[tuple[float, float]]) -> list[float]:
+    """x at the label rows of the parabola through three points; NaN where they do not recede."""
+    (x_0, y_0), (x_1, y_1), (x_2, y_2) = points
+    # Written so that NaN fails as well.
+    if not (y_1 - y_0 > _MIN_STEP_CM and y_2 - y_1 > _MIN_STEP_CM):
+        return [math.nan] * len(ROWS_CM)
+    near, far = (x_1 - x_0) / (y_1 - y_0), (x_2 - x_1) / (y_2 - y_1)
+    bend = (far - near) / (y_2 - y_0)
+    return [x_0 + (row - y_0) * (near + bend * (row - y_1)) for row in ROWS_CM]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
+from lanenet.geometry.lane import parabola_through
 from lanenet.perception.estimate import LaneEstimate
 
 
@@ -47,13 +47,14 @@ def lane_curvature_per_cm(estimate: LaneEstimate, y_cm: float) -> float:
     Returns:
         |x''| / (1 + x'^2)^1.5 of the mean of the known parabolas; NaN when none is known.
     """
-    parabolas = estimate.parabolas
-    known = np.isfinite(parabolas).all(axis=1)
-    if not known.any():
-        return float("nan")
-    a, b, _ = (float(v) for v in parabolas[known].mean(axis=0))
+    points = estimate.points_cm.tolist()
+    lines = [parabola_through(*points[:3]), parabola_through(*points[3:])]
+    known = [(a, b) for a, b, c in lines if math.isfinite(a + b + c)]
+    if not known:
+        return math.nan
+    a, b = (sum(values) / len(known) for values in zip(*known, strict=True))
     slope = 2.0 * a * y_cm + b
-    return float(abs(2.0 * a) / (1.0 + slope * slope) ** 1.5)
+    return abs(2.0 * a) / (1.0 + slope * slope) ** 1.5
 
 
 def curve_speed_cm_s(curvature_per_cm: float, settings: SpeedSettings) -> float:

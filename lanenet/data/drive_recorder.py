@@ -167,11 +167,13 @@ class DriveRecorder:
             self.dropped += 1
 
     def close(self) -> None:
-        """Force what waits onto the card; gives up on a card that hangs."""
+        """Force what waits onto the card; gives up on a card that hangs. A drive without a frame goes."""
         self._ending.set()
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
             self._stop(f"the card did not answer for {_CLOSE_S:.0f} s")
+        elif self.recorded == 0:
+            shutil.rmtree(self.path, ignore_errors=True)
 
     def _write(self) -> None:
         due_s = time.monotonic()

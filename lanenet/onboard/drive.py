@@ -12,7 +12,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.data.drive_recorder import DriveRecorder, new_drive_folder
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.actuator_json import FACTORY
+from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.drive_report import Step
@@ -92,9 +92,10 @@ def build_sink(settings: DriveSettings) -> CommandSink:
     """Return the car's actuator behind its guard, not open yet; one that does nothing where there is none."""
     if settings.actuator is None:
         return NoActuator()
+    actuator, safety = settings.actuator, settings.safety
     # What was left out has to stay so: there a Donkeycar's myconfig.py may have a say.
-    text = settings.actuator.model_dump_json(exclude_unset=True)
-    return GuardedActuator(FACTORY, text, settings.safety.watchdog_s, settings.safety.end_after_s)
+    text = actuator.model_dump_json(exclude_unset=True)
+    return GuardedActuator(text, lambda: make_actuator(actuator), safety.watchdog_s, safety.end_after_s)
 
 
 def _recorder(settings: DriveSettings, camera: Camera | None) -> DriveRecorder | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +32,10 @@ class LatencyHistogram:
 
     def __len__(self) -> int:
         return int(self._counts.sum())
+
+    def above(self, duration_s: float) -> int:
+        """Return how many durations were longer, to the width of a bin."""
+        return int(self._counts[math.ceil(1e3 * duration_s / _BIN_MS) :].sum())
 
     def percentile_ms(self, percent: float) -> float:
         """Return the upper edge of the bin with this percentile, [ms]; NaN when nothing was counted."""

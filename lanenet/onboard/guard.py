@@ -9,7 +9,6 @@ guard itself die, the loop opens the actuator once more and puts it into neutral
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import os
 import select
@@ -18,7 +17,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from lanenet.errors import HardwareError
@@ -26,6 +25,8 @@ from lanenet.onboard.hardware import Actuator
 
 log = logging.getLogger(__name__)
 
+#: What runs in the guard's process.
+PROGRAM = (sys.executable, "-m", "lanenet.onboard.guard_process")
 #: Kind of message, its number, steering, throttle, and the time at which it runs out.
 MESSAGE = struct.Struct("<cxxxIddd")
 DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
@@ -76,26 +77,27 @@ class NoActuator:
         """Do nothing."""
 
 
-def build_actuator(factory: str, settings_json: str) -> Actuator:
-    """Call ``module:function`` with an actuator's settings as JSON."""
-    module, _, name = factory.partition(":")
-    make: Callable[[str], Actuator] = getattr(importlib.import_module(module), name)
-    return make(settings_json)
-
-
 class GuardedActuator:
     """The loop's end: starts the guard, hands commands to it and hears what became of them."""
 
-    def __init__(self, factory: str, settings_json: str, watchdog_s: float, give_up_s: float) -> None:
+    def __init__(
+        self,
+        settings_json: str,
+        make_actuator: Callable[[], Actuator],
+        watchdog_s: float,
+        give_up_s: float,
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
         """Prepare; nothing is started.
 
         Args:
-            factory: ``module:function`` that makes the actuator of its settings as JSON.
-            settings_json: These settings.
+            settings_json: Settings of the actuator, for the guard.
+            make_actuator: Makes the same actuator in this process, should the guard die.
             watchdog_s: The longest time that a command is good.
             give_up_s: The guard takes no more commands after a silence this long.
+            program: Starts the guard; the line and these values follow as arguments.
         """
-        self._factory, self._settings_json = factory, settings_json
+        self._settings_json, self._make_actuator, self._program = settings_json, make_actuator, program
         self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
         self._process: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
@@ -117,15 +119,14 @@ class GuardedActuator:
         """
         ours, theirs = socket.socketpair()
         try:
-            arguments = (str(theirs.fileno()), self._factory, self._settings_json)
+            values = (theirs.fileno(), self._settings_json, self._watchdog_s, self._give_up_s)
             # A session of its own: Ctrl-C at the terminal is for the loop, which then says goodbye.
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "lanenet.onboard.guard_process", *arguments,
-                 repr(self._watchdog_s), repr(self._give_up_s)],
+                [*self._program, *(str(value) for value in values)],
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
-            )  # fmt: skip
+            )
         finally:
             theirs.close()
         self._line = ours
@@ -241,7 +242,7 @@ class GuardedActuator:
         if not self._ready:
             return
         try:
-            actuator = build_actuator(self._factory, self._settings_json)
+            actuator = self._make_actuator()
             actuator.open()
             actuator.close()
         except Exception as error:

@@ -1,9 +1,9 @@
 """What runs in the guard's process, which :mod:`lanenet.onboard.guard` starts with these arguments.
 
-    LINE FACTORY SETTINGS WATCHDOG_S GIVE_UP_S
+    LINE SETTINGS WATCHDOG_S GIVE_UP_S
 
-LINE is the number of an open socket. Down it come messages of fixed size; up go lines of text: ``ready``,
-``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``, ``closed``.
+SETTINGS is JSON. LINE is the number of an open socket. Down it come messages of fixed size; up go lines of
+text: ``ready``, ``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``, ``closed``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,14 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from types import FrameType
 
+from pydantic import TypeAdapter
+
 from lanenet.errors import LanenetError
-from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT, build_actuator, raise_priority
+from lanenet.onboard.actuators import ActuatorSettings, make_actuator
+from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT, raise_priority
 from lanenet.onboard.hardware import Actuator
 
 log = logging.getLogger("lanenet.onboard.guard")
@@ -119,9 +123,27 @@ class Guard:
             self._line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
 
 
-def main(arguments: list[str]) -> int:
-    """Open the actuator, serve, close it; returns the exit code."""
-    line_number, factory, settings_json, watchdog_s, give_up_s = arguments
+def actuator_from_json(text: str) -> Actuator:
+    """Build an actuator of its settings as JSON; the device is not touched.
+
+    Raises:
+        ConfigError: If the settings name a file that cannot be used.
+    """
+    adapter: TypeAdapter[ActuatorSettings] = TypeAdapter(ActuatorSettings)
+    return make_actuator(adapter.validate_json(text))
+
+
+def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_json) -> int:
+    """Open the actuator, serve, close it.
+
+    Args:
+        arguments: As above.
+        build: Makes the actuator of its settings.
+
+    Returns:
+        The exit code.
+    """
+    line_number, settings_json, watchdog_s, give_up_s = arguments
     line = socket.socket(fileno=int(line_number))
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -133,7 +155,7 @@ def main(arguments: list[str]) -> int:
 
     actuator: Actuator | None = None
     try:
-        actuator = build_actuator(factory, settings_json)
+        actuator = build(settings_json)
         guard = Guard(line, actuator, float(watchdog_s), float(give_up_s))
 
         def end(_number: int, _frame: FrameType | None) -> None:

@@ -16,7 +16,8 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
     """Call ``stop`` with the signal's name instead of dying; a second signal raises KeyboardInterrupt.
 
-    Elsewhere than in the main thread, where Python allows no handlers, nothing is changed.
+    A hang-up that is ignored, as under ``nohup``, stays ignored. Elsewhere than in the main thread, where
+    Python allows no handlers, nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -30,7 +31,8 @@ def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
         asked = True
         stop(signal.Signals(number).name)
 
-    before: dict[signal.Signals, Any] = {number: signal.signal(number, handle) for number in ENDING}
+    wanted = [n for n in ENDING if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+    before: dict[signal.Signals, Any] = {number: signal.signal(number, handle) for number in wanted}
     try:
         yield
     finally:

@@ -10,12 +10,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from wire_log import note, settings_of
+from wire_log import guarded_wire, note, settings_of
 
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
-from lanenet.onboard.guard import GuardedActuator
 from lanenet.onboard.hardware import Frame
 from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
@@ -95,7 +94,7 @@ class Eye:
 logging.basicConfig(level=logging.INFO)
 control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
 faults = {"fail_at": FAULT_AT} if fault == "actuator raises" else {}
-sink = GuardedActuator("wire_log:WireLog", settings_of(wire, **faults), 0.1, 1.0)
+sink = guarded_wire(settings_of(wire, **faults), 0.1)
 loop = DriveLoop(
     Camera(),
     Eye(),

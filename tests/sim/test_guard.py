@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from wire_log import Line, read_wire, settings_of
+from wire_log import Line, guarded_wire, read_wire, settings_of
 
 from lanenet.errors import HardwareError
 from lanenet.onboard.guard import GuardedActuator
@@ -18,14 +19,12 @@ LATE_S = 0.15
 
 
 @pytest.fixture
-def wire(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    here = str(Path(__file__).parent)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([here, os.environ.get("PYTHONPATH", "")]))
-    yield tmp_path / "wire.txt"
+def wire(tmp_path: Path) -> Path:
+    return tmp_path / "wire.txt"
 
 
 def guarded(wire: Path, **faults: object) -> GuardedActuator:
-    return GuardedActuator("wire_log:WireLog", settings_of(wire, **faults), WATCHDOG_S, 1.0)
+    return guarded_wire(settings_of(wire, **faults), WATCHDOG_S)
 
 
 def drive(sink: GuardedActuator, count: int = 5, throttle: float = 0.3) -> float:
@@ -154,3 +153,13 @@ def test_a_guard_that_is_ended_goes_to_neutral_itself(wire: Path) -> None:
         drive(sink, 40)
     assert wait_for(wire, "close", ended_s).process != os.getpid()
     sink.close()
+
+
+def test_the_guard_loads_little() -> None:
+    # It starts quickly, takes little memory, and nothing of the perception can hold it.
+    code = (
+        "import sys, lanenet.onboard.guard_process; print(*sorted(m.partition('.')[0] for m in sys.modules))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"lanenet", "pydantic"} <= set(result.stdout.split())
+    assert not {"cv2", "onnxruntime", "serial", "smbus2"} & set(result.stdout.split())

@@ -1,14 +1,20 @@
-"""An actuator whose wire is a file: each command with its time, to be read when all processes are gone."""
+"""An actuator whose wire is a file: each command with its time, to be read when all processes are gone.
+
+Run as a program it is a guard that owns such an actuator.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from lanenet.errors import HardwareError
+from lanenet.onboard.guard import GuardedActuator
+from lanenet.onboard.guard_process import main
 
 
 class WireLog:
@@ -72,3 +78,13 @@ def read_wire(path: Path) -> list[Line]:
 
 def settings_of(path: Path, **more: object) -> str:
     return json.dumps({"path": str(path), **more})
+
+
+def guarded_wire(settings_json: str, watchdog_s: float) -> GuardedActuator:
+    """The loop's end of a guard that owns a wire."""
+    program = (sys.executable, str(Path(__file__)))
+    return GuardedActuator(settings_json, lambda: WireLog(settings_json), watchdog_s, 1.0, program)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:], WireLog))

@@ -20,7 +20,7 @@ def lane(centre_cm: float = 0.0, slope: float = 0.0) -> np.ndarray:
 
 def test_straight_ahead_shifts_a_line_along_itself() -> None:
     # x = 3 + 0.2 y; 10 cm further on the same line is at 3 + 0.2 (y + 10).
-    moved = move_points(lane(3.0, 0.2), 10.0, 0.0, WHEELBASE_CM)
+    moved = move_points(lane(3.0, 0.2).tolist(), 10.0, 0.0, WHEELBASE_CM)
     np.testing.assert_allclose(moved, lane(5.0, 0.2), atol=1e-9)
 
 
@@ -28,9 +28,9 @@ def test_a_turn_without_travel_turns_about_the_rear_axle() -> None:
     # A line through the rear axle (0, -26), at angle 0.1 rad left of ahead, is dead ahead after that turn.
     angle = 0.1
     line = -math.tan(angle) * (ROWS + WHEELBASE_CM)
-    moved = move_points(np.concatenate([line, np.full(3, np.nan)]), 0.0, angle, WHEELBASE_CM)
+    moved = move_points([*line.tolist(), *[math.nan] * 3], 0.0, angle, WHEELBASE_CM)
     np.testing.assert_allclose(moved[:3], 0.0, atol=1e-9)
-    assert np.isnan(moved[3:]).all()
+    assert np.isnan(moved[3:]).all() and len(moved) == 6
 
 
 def test_driving_along_a_circle_leaves_its_lane_where_it_is() -> None:
@@ -41,16 +41,18 @@ def test_driving_along_a_circle_leaves_its_lane_where_it_is() -> None:
     )
     travel = 4.0
     turn = 2.0 * math.asin(0.5 * travel / radius)  # a chord of 4 cm
-    moved = move_points(points, travel, turn, WHEELBASE_CM)
+    moved = move_points(points.tolist(), travel, turn, WHEELBASE_CM)
     # A parabola through three points of a circle is not the circle: 0.2 mm.
     np.testing.assert_allclose(moved, points, atol=0.1)
     np.testing.assert_allclose(
-        move_points(mirror_points(points), travel, -turn, WHEELBASE_CM), mirror_points(moved), atol=1e-9
+        move_points(mirror_points(points).tolist(), travel, -turn, WHEELBASE_CM),
+        mirror_points(np.array(moved)),
+        atol=1e-9,
     )
 
 
 def test_a_line_across_the_way_has_no_place_ahead() -> None:
-    assert np.isnan(move_points(lane(0.0, 0.0), 0.0, 1.55, WHEELBASE_CM)).all()
+    assert np.isnan(move_points(lane(0.0, 0.0).tolist(), 0.0, 1.55, WHEELBASE_CM)).all()
 
 
 def test_noise_shrinks_and_a_standing_lane_keeps_its_place() -> None:

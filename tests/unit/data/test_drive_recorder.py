@@ -205,3 +205,8 @@ def test_times_go_on_without_commands(tmp_path: Path) -> None:
         recorder.add(picture(k), 7.0 + 0.1 * k)
     recorder.close()
     np.testing.assert_allclose(open_drive(tmp_path / "pushed").t_s, [0.0, 0.1, 0.2], atol=1e-6)
+
+
+def test_a_drive_without_a_frame_leaves_no_folder(tmp_path: Path) -> None:
+    DriveRecorder(tmp_path / "nothing", settings()).close()
+    assert list(tmp_path.iterdir()) == []

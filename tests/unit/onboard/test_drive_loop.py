@@ -279,5 +279,6 @@ def test_latencies_are_those_of_the_numbers() -> None:
     for percent in (50.0, 99.0):
         exact = np.percentile(values_ms, percent, method="inverted_cdf")
         assert exact <= histogram.percentile_ms(percent) <= exact + 0.05 + 1e-9
+    assert histogram.above(0.01) == pytest.approx((values_ms > 10.0).sum(), abs=10)
     histogram.add(10.0)
     assert histogram.longest_ms == pytest.approx(10_000.0) and len(histogram) == 5001
