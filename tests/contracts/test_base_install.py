@@ -41,7 +41,14 @@ def test_wheels_for_a_raspberry_pi(tmp_path, version):
     """Python of Raspberry Pi OS Bookworm (3.11) and Trixie (3.13), 64 bit: nothing has to be compiled."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["car"]]
-    words = ["install", "--dry-run", "--ignore-installed", "--target", tmp_path / "none", "--only-binary=:all:"]
+    words = [
+        "install",
+        "--dry-run",
+        "--ignore-installed",
+        "--target",
+        tmp_path / "none",
+        "--only-binary=:all:",
+    ]
     words += ["--implementation", "cp", "--python-version", version]
     for platform in ("manylinux2014_aarch64", "manylinux_2_28_aarch64"):
         words += ["--platform", platform]
