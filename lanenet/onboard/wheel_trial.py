@@ -166,7 +166,7 @@ def _try_motor(
             result.changes["actuator.throttle_forward_us"] = pulses.throttle_reverse_us
             result.changes["actuator.throttle_reverse_us"] = pulses.throttle_forward_us
             result.lines.append("motor: it turned backward, its two pulses are exchanged")
-        result.lines.append(f"motor: it turns from a throttle of {throttle:.2f} on")
+        result.lines.append(f"motor: it turns from a throttle of {throttle:.2f} on, in the air")
         return
     holder.hold(0.0, 0.0)
     result.lines.append(

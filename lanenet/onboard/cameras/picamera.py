@@ -127,3 +127,9 @@ def _require_picamera2() -> ModuleType:
             "it with: sudo apt install python3-picamera2, and make the environment with python3 -m "
             "venv --system-site-packages; or use kind: rpicam"
         ) from None
+    except ValueError as error:
+        # Raspberry Pi OS Bookworm's modules are compiled for NumPy 1 (raspberrypi/picamera2#1088).
+        raise MissingExtraError(
+            f"picamera2 cannot be imported ({error}): this NumPy does not fit Raspberry Pi OS's own modules; "
+            "install an older one with: pip install 'numpy<2'"
+        ) from None

@@ -241,6 +241,14 @@ def test_no_camera_and_no_package(pi, monkeypatch):
         open_source(PiCameraSettings(**SMALL)).open()
 
 
+def test_numpy_that_does_not_fit_the_systems_modules(monkeypatch, tmp_path):
+    (tmp_path / "picamera2.py").write_text("raise ValueError('numpy.dtype size changed')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "picamera2", raising=False)
+    with pytest.raises(MissingExtraError, match=r"numpy\.dtype size changed.*pip install 'numpy<2'"):
+        open_source(PiCameraSettings(**SMALL)).open()
+
+
 # --- rpicam-vid
 
 PROGRAM = """#!{python}
