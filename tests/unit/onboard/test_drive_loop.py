@@ -80,6 +80,9 @@ class Wire:
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
         self.log.append((self._clock(), "send", steering_rad, throttle, until_s))
 
+    def idle(self) -> None:
+        self.neutral()
+
     def neutral(self) -> None:
         self.log.append((self._clock(), "neutral", 0.0, 0.0, 0.0))
 
