@@ -15,7 +15,7 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, judge_cli, onboard_cli, reality_cli, val_cli, world_cli
+from lanenet import calibrate_cli, console, drive_cli, judge_cli, onboard_cli, reality_cli, val_cli, world_cli
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption, check_ending
@@ -69,6 +69,7 @@ app = typer.Typer(
 
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
+app.add_typer(drive_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)
 app.add_typer(judge_cli.app)

@@ -20,7 +20,7 @@ from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.estimate import Detector
 from lanenet.perception.network import NetworkDetector
 
-_WARM_UP = 20
+_WARM_UP = 10
 #: Each path is timed in turns of this many frames: alone as on a car, and all over the same stretch of time.
 _TURN = 50
 _PERIOD_S = 1.0 / 30.0

@@ -52,8 +52,12 @@ class CommandSink(Protocol):
         """Hand over a command that is good until a time of the monotonic clock."""
         ...
 
+    def idle(self) -> None:
+        """Stay in neutral; raises HardwareError if whoever holds the actuator has failed."""
+        ...
+
     def neutral(self) -> None:
-        """Go to neutral; never raises."""
+        """Go to neutral at once, from a signal handler as well; never raises."""
         ...
 
     def close(self) -> None:
@@ -68,6 +72,9 @@ class NoActuator:
         """Do nothing."""
 
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
+        """Do nothing."""
+
+    def idle(self) -> None:
         """Do nothing."""
 
     def neutral(self) -> None:
@@ -150,14 +157,25 @@ class GuardedActuator:
             HardwareError: If the actuator failed, takes no more commands, or the guard is gone; in the last
                 case the actuator has been put into neutral from here.
         """
+        self._order(DRIVE, steering_rad, throttle, until_s)
+
+    def idle(self) -> None:
+        """Stay in neutral; see :class:`CommandSink`.
+
+        Raises:
+            HardwareError: As :meth:`send`.
+        """
+        self._order(NEUTRAL, 0.0, 0.0, 0.0)
+
+    def _order(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         self._listen()
-        self._post(DRIVE, steering_rad, throttle, until_s)
+        self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:
             raise HardwareError(f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs")
 
     def neutral(self) -> None:
-        """Go to neutral; never raises."""
+        """Go to neutral at once; never raises."""
         with contextlib.suppress(HardwareError):
             self._post(NEUTRAL, 0.0, 0.0, 0.0)
 

@@ -196,7 +196,7 @@ class DriveLoop:
         if self._moves and not self._asked:
             self._sink.send(steering_rad, throttle, until_s)
         else:
-            self._sink.neutral()
+            self._sink.idle()
 
     def _speed_cm_s(self) -> float:
         """Speed that the throttle stands for: nothing on the car measures it."""

@@ -13,7 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lanenet.config import Settings
 from lanenet.onboard.hardware import Frame
@@ -65,6 +65,15 @@ class SafetySettings(Settings):
     slow_for_s: float = Field(default=3.0, gt=0.0)
     end_after_s: float = Field(default=1.0, ge=0.2)
     allow_repeated_frames: bool = False
+
+    @model_validator(mode="after")
+    def _check_order(self) -> SafetySettings:
+        if self.stop_below > self.slow_below:
+            raise ValueError(
+                f"expected stop_below at or below slow_below, found {self.stop_below:g} above "
+                f"{self.slow_below:g}"
+            )
+        return self
 
 
 class State(StrEnum):

@@ -155,6 +155,21 @@ def test_a_guard_that_is_ended_goes_to_neutral_itself(wire: Path) -> None:
     sink.close()
 
 
+def test_an_idle_loop_notices_that_its_guard_died(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    for _ in range(5):
+        sink.idle()
+        time.sleep(0.02)
+    os.kill(sink.pid, signal.SIGKILL)
+    with pytest.raises(HardwareError, match="died; neutral was set without it"):
+        for _ in range(20):
+            sink.idle()
+            time.sleep(0.02)
+    assert not [line for line in read_wire(wire) if line.kind == "send"]
+    sink.close()
+
+
 def test_the_guard_loads_little() -> None:
     # It starts quickly, takes little memory, and nothing of the perception can hold it.
     code = (

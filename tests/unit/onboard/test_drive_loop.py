@@ -80,6 +80,9 @@ class Wire:
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
         self.log.append((self._clock(), "send", steering_rad, throttle, until_s))
 
+    def idle(self) -> None:
+        self.neutral()
+
     def neutral(self) -> None:
         self.log.append((self._clock(), "neutral", 0.0, 0.0, 0.0))
 
@@ -209,7 +212,7 @@ def test_a_short_gap_goes_on_with_the_throttle_rising_again() -> None:
     assert after[0] < 0.1 and after[-1] == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize("where", ["camera", "detector", "actuator", "watch"])
+@pytest.mark.parametrize("where", ["camera", "detector", "controller", "actuator", "watch"])
 def test_an_exception_is_neutral_first_and_goes_on_up(where: str, caplog: pytest.LogCaptureFixture) -> None:
     def fail(*_: object) -> LaneEstimate:
         raise RuntimeError("struck by lightning")
@@ -227,6 +230,12 @@ def test_an_exception_is_neutral_first_and_goes_on_up(where: str, caplog: pytest
         car.camera._faults = {30: fail}  # type: ignore[dict-item]
     elif where == "detector":
         car.loop._detector = Eye(lambda k: LANE if k < 30 else fail())
+    elif where == "controller":
+        calls = iter(range(31))
+        whole = car.loop._controller.wish
+        car.loop._controller.wish = lambda *words: (  # type: ignore[method-assign]
+            whole(*words) if next(calls) < 30 else fail()
+        )
     elif where == "actuator":
         car.wire.send = send  # type: ignore[method-assign]
     else:

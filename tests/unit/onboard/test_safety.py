@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError
 from lanenet.onboard.hardware import Frame
 from lanenet.onboard.safety import (
     CommandLimiter,
@@ -71,6 +73,11 @@ def test_an_armed_car_waits_for_its_first_lane() -> None:
     armed = judge()
     assert [armed.judge(float(t), "no lane", NAN).state for t in range(10)] == [State.STOPPED] * 10
     assert armed.judge(10.0, "", 1.0).state is State.DRIVING
+
+
+def test_stopping_before_slowing_is_refused() -> None:
+    with pytest.raises(ConfigError, match="stop_below at or below slow_below"):
+        check_settings(SafetySettings, {"slow_below": 0.1, "stop_below": 0.3}, "test")
 
 
 def frame(t_s: float, number: int = 0, level: int = 0) -> Frame:
