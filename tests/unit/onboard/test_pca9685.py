@@ -157,3 +157,33 @@ def test_command_that_hangs_cannot_undo_neutral(bus, actuator):
     hang.set()
     command.join(5.0)
     assert bus.chip.counts(0) == 370
+
+
+def test_messages_of_the_real_package(monkeypatch):
+    """smbus2's own messages, as it would hand them to the kernel, make the same chip move."""
+    smbus2 = pytest.importorskip("smbus2", reason="smbus2 is not installed")
+    chip = i2c_emulator.Chip()
+
+    class Kernel:
+        def __init__(self, number):
+            assert number == 1
+
+        def i2c_rdwr(self, *messages):
+            for message in messages:
+                assert message.addr == 0x40
+                if message.flags & 1:
+                    for i, byte in enumerate(chip.read(message.len)):
+                        message.buf[i] = byte
+                else:
+                    chip.write(bytes(message))
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(smbus2, "SMBus", Kernel)
+    actuator = make_actuator(SETTINGS)
+    actuator.open()
+    actuator.send(0.4, 0.5)
+    assert chip.counts(1) == 460 and chip.counts(0) == 435
+    actuator.close()
+    assert chip.counts(0) == 370
