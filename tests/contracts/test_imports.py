@@ -12,7 +12,10 @@ import pytest
 REPO = Path(__file__).resolve().parents[2]
 LINT_IMPORTS = Path(sys.executable).parent / "lint-imports"
 #: Modules that start on the car, and the packages that the base installation does not have.
-ONBOARD_MODULES = ("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network")
+ONBOARD_MODULES = (
+    *("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network"),
+    *("lanenet.onboard.drive", "lanenet.onboard.guard_process"),
+)
 HEAVY = (
     *("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow"),
     *("onnx", "onnxscript", "safetensors", "tensorboard"),
