@@ -11,13 +11,14 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c c
 # Shapes and types of arguments are checked at run time in tests, and only there.
 PYTEST := $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype
 
-.PHONY: help train env test test-slow test-base-install check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install arm check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take longer than about ten seconds each"
 	@echo "make test-base-install  detection in an environment with the base installation only"
+	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
 	@echo "make bench        time the stages that run on the car, on this machine"
@@ -38,6 +39,10 @@ test-slow: $(VENV)/.stamp-dev
 # What the car installs, in an empty environment; fetches packages.
 test-base-install: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow tests/contracts/test_base_install.py
+
+# Needs debootstrap and qemu-user-static, and root.
+arm: $(VENV)/.stamp-train
+	PYTHON=$(abspath $(BIN)/python) contrib/arm/prove
 
 check: format-check lint types imports test
 

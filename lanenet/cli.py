@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 from lanenet import (
     calibrate_cli,
     console,
+    drive_cli,
     export_cli,
     judge_cli,
     onboard_cli,
@@ -79,6 +80,7 @@ app = typer.Typer(
 
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
+app.add_typer(drive_cli.app)
 app.add_typer(export_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
+import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +69,55 @@ def training_bar() -> Iterator[ProgressCall]:
             )
 
         yield report
+
+
+class _LiveLog(logging.Handler):
+    """Log lines above the line that is written over."""
+
+    def __init__(self, clear: str) -> None:
+        super().__init__()
+        self._clear = clear
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        _write_stderr(f"{self._clear}{self.format(record)}\n")
+
+
+@contextmanager
+def live_line() -> Iterator[Callable[[Callable[[], str]], None]]:
+    """Show one line on stderr that is written over, and log lines above it, while the body runs.
+
+    Yields:
+        A function that takes a function of no arguments; it is asked for its text only when the line is due,
+        five times a second on a terminal, else every five seconds. A terminal that is gone does not matter.
+    """
+    terminal = sys.stderr.isatty()
+    clear, end, every_s = ("\r\033[K", "", 0.2) if terminal else ("", "\n", 5.0)
+    handler = _LiveLog(clear)
+    log = logging.getLogger("lanenet")
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    due_s = time.monotonic()
+
+    def show(text: Callable[[], str]) -> None:
+        nonlocal due_s
+        if time.monotonic() >= due_s:
+            due_s = time.monotonic() + every_s
+            _write_stderr(f"{clear}{text()}{end}")
+
+    try:
+        yield show
+    finally:
+        _write_stderr(clear)
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+def _write_stderr(text: str) -> None:
+    with suppress(OSError, ValueError):
+        sys.stderr.write(text)
+        sys.stderr.flush()
 
 
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

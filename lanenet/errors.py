@@ -10,6 +10,7 @@
     |- TrackingLostError     the drive cannot be mapped
     |- ModelMismatchError    a model that does not fit this camera or window
     |- MissingExtraError     a package of an extra that is not installed
+    |- HardwareError         a camera or an actuator that does not answer
 
 A message says what was found, what was expected and where (file, key, frame).
 """
@@ -53,3 +54,7 @@ class ModelMismatchError(LanenetError):
 
 class MissingExtraError(LanenetError):
     """A command needs a package that this installation left out."""
+
+
+class HardwareError(LanenetError):
+    """A camera or an actuator is not there, or does not answer."""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import UInt8
 
+    from lanenet.onboard.drive_settings import DriveSettings
     from lanenet.onboard.sources import Source
 
 app = typer.Typer()
@@ -138,6 +139,9 @@ def detect(
 @app.command(epilog="Example: lanenet bench --model checkpoints/small/model.onnx --out bench.json")
 def bench(
     model: Annotated[Path | None, typer.Option(help="ONNX model to time as well.")] = None,
+    also: Annotated[
+        list[Path] | None, typer.Option(help="More models, for their time from frame to steering.")
+    ] = None,
     camera: _CameraOption = None,
     rounds: Annotated[int, typer.Option(min=10, help="Frames to time.")] = 300,
     threads: Annotated[int, typer.Option(min=1, help="Threads of OpenCV and onnxruntime.")] = 1,
@@ -147,10 +151,14 @@ def bench(
     from lanenet.data.camera_file import read_camera
     from lanenet.data.files import write_json
     from lanenet.onboard.bench import example_camera, time_stages
+    from lanenet.onboard.bench_paths import time_paths
 
     used_camera = example_camera() if camera is None else read_camera(camera)
+    models = [path for path in (model, *(also or [])) if path is not None]
     with console.progress_bar("bench") as progress:
         report = time_stages(used_camera, model, rounds, threads, progress)
+    with console.progress_bar("frame to steering") as progress:
+        report["paths"] = time_paths(used_camera, models, rounds, threads, progress)
     rows = [
         [stage, *(f"{v[key]:.3f}" for key in ("median_ms", "p99_ms")), f"{v['ratio_to_canny']:.2f}"]
         for stage, v in report["stages"].items()
@@ -158,6 +166,14 @@ def bench(
     machine = report["machine"]
     title = f"{machine['processor']}, {threads} thread(s), {report['image']} px, {rounds} frames"
     console.show_table(title, ("stage", "median ms", "p99 ms", "x canny"), rows)
+    keys = ("median_ms", "p99_ms", "cpu_median_ms", "cpu_p99_ms")
+    rows = [
+        [f"{size} {path}", *(f"{values[key]:.3f}" for key in keys)]
+        for size, paths in report["paths"].items()
+        for path, values in paths.items()
+    ]
+    columns = ("path", "median ms", "p99 ms", "of it CPU, median", "of it CPU, p99")
+    console.show_table("frame to steering", columns, rows)
     if out is not None:
         write_json(out, report)
         console.wrote(out)
@@ -187,18 +203,69 @@ def analyse(
     console.next_command("doctor", "--camera", camera)
 
 
-@app.command(epilog="Example: lanenet doctor --camera camera.yaml")
-def doctor(camera: _CameraOption = None) -> None:
-    """Check the installation, and a camera file if one is given."""
+@app.command(epilog="Example: lanenet doctor --config configs/car/picamera_pca9685.yaml")
+def doctor(
+    camera: _CameraOption = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML of a car, whose devices are tried.", show_default=False)
+    ] = None,
+    wheels_off_ground: Annotated[
+        bool,
+        typer.Option(
+            "--wheels-off-ground",
+            help="Turn wheels and motor, ask what they did, and write it into --config.",
+        ),
+    ] = False,
+) -> None:
+    """Check the installation, a camera file if one is given, and a whole car with --config."""
     from lanenet.onboard.doctor import run_checks
+    from lanenet.onboard.drive_settings import load_drive_settings
 
+    settings = None if config is None else load_drive_settings(config)
+    if wheels_off_ground:
+        if config is None or settings is None:
+            raise ConfigError("--wheels-off-ground: expected the car's file as well (--config car.yaml)")
+        _try_wheels(config, settings)
+        return
     checks = run_checks(camera)
+    if settings is not None:
+        from lanenet.onboard.doctor_car import check_car
+
+        checks += check_car(settings)
     for check in checks:
         typer.echo(f"{check.state:8s}{check.name}: {check.text}")
     problems = sum(check.state == "problem" for check in checks)
     if problems:
         raise LanenetError(f"{problems} problem(s) found, see above")
-    console.next_command("train", "configs/small.yaml")
+    if settings is None or config is None:
+        console.next_command("train", "configs/small.yaml")
+    elif settings.actuator is None:
+        console.next_command("drive", config, "--dry-run")
+    else:
+        console.next_command("doctor", "--config", config, "--wheels-off-ground")
+
+
+def _try_wheels(config: Path, settings: DriveSettings) -> None:
+    """Ask about the wheels on the terminal, and write what was found into the car's file."""
+    from lanenet.data.files import write_text
+    from lanenet.onboard.drive import build_sink
+    from lanenet.onboard.wheel_trial import pulses_of, try_wheels
+    from lanenet.onboard.yaml_edit import set_values
+
+    def ask(question: str, letters: str) -> str:
+        while True:
+            answer = typer.prompt(f"{question} [{'/'.join(letters)}]", type=str).strip().lower()[:1]
+            if answer and answer in letters:
+                return str(answer)
+
+    pulses_of(settings)
+    result = try_wheels(settings, build_sink(settings), ask)
+    console.show_lines(result.lines)
+    if result.changes:
+        text = config.read_text(encoding="utf-8")
+        write_text(config, set_values(text, result.changes, str(config)))
+        console.wrote(config)
+    console.next_command("drive", config, "--steering-only")
 
 
 def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:

@@ -8,10 +8,10 @@ from jaxtyping import Float, UInt8
 
 from lanenet.calibration.pose import moved_points
 from lanenet.geometry.camera import Camera
+from lanenet.perception.views import View, undistorting_view
 
 #: BGR of the grid's lines, of its axes, of measured and of projected points.
 GRID_BGR, AXIS_BGR, MEASURED_BGR, PROJECTED_BGR = (200, 160, 60), (60, 60, 230), (60, 220, 60), (40, 60, 240)
-_MAX_HALF_FIELD_RAD = float(np.deg2rad(60.0))
 _MAX_SIDE_PX = 1200
 #: Spacing of grid lines, [cm]: the finest that leaves this many pixels between them.
 _SPACINGS_CM, _MIN_SPACING_PX = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0), 28.0
@@ -27,16 +27,7 @@ def undistorted_picture(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -
     Returns:
         A picture of the same size and direction, with the field of the frame up to 120 degrees across.
     """
-    height, width = frame_bgr.shape[:2]
-    rim = np.array([[0.0, camera.K[1, 2]], [width - 1.0, camera.K[1, 2]]])
-    rays = camera.unproject(rim)
-    angles = np.arctan2(np.abs(rays[:, 0]), rays[:, 2])
-    # Where the lens does not see the image's rim, as much as a flat picture can show.
-    half = min(float(np.nan_to_num(angles, nan=np.pi).max()), _MAX_HALF_FIELD_RAD)
-    focal = 0.5 * width / np.tan(half)
-    v, u = np.mgrid[:height, :width].astype(np.float64)
-    x, y = (u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal
-    return _sampled(frame_bgr, camera, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1), x.shape)
+    return undistorting_view(camera).of(frame_bgr)
 
 
 def plane_picture(
@@ -65,7 +56,7 @@ def plane_picture(
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
     x, y = left + (u + 0.5) / scale, far - (v + 0.5) / scale
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    picture = _sampled(frame_bgr, camera, moved_points(pose, plane)[0], x.shape)
+    picture = View.of_rays(camera, moved_points(pose, plane)[0], rows, columns).of(frame_bgr)
     _draw_grid(picture, area_cm, scale)
     return picture
 
@@ -95,18 +86,6 @@ def grid_spacing_cm(px_per_cm: float) -> float:
         if spacing * px_per_cm >= _MIN_SPACING_PX:
             return spacing
     return _SPACINGS_CM[-1]
-
-
-def _sampled(
-    frame_bgr: UInt8[np.ndarray, "h w 3"],
-    camera: Camera,
-    rays: Float[np.ndarray, "n 3"],
-    shape: tuple[int, ...],
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    # Far outside the frame for rays that the lens does not see: remap paints them black.
-    pixels = np.nan_to_num(camera.project_rays(rays), nan=-1e4).clip(-1e4, 1e5).astype(np.float32)
-    maps = pixels.reshape(*shape, 2)
-    return np.asarray(cv2.remap(frame_bgr, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR))
 
 
 def _draw_grid(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
+from lanenet.geometry.lane import ROWS_CM, parabola_through
 from lanenet.geometry.steering import proportional_angle_rad, pure_pursuit_angle_rad
 from lanenet.perception.estimate import LaneEstimate
 
@@ -34,17 +34,22 @@ class SteeringSettings(Settings):
     lane_width_cm: float | None = Field(default=None, gt=0.0)
 
 
-def steering_target_rad(estimate: LaneEstimate, settings: SteeringSettings) -> float:
+def steering_target_rad(
+    estimate: LaneEstimate, settings: SteeringSettings, seen_width_cm: float | None = None
+) -> float:
     """Return the front-wheel angle that leads to the lane's centre.
 
     Args:
         estimate: The lane of one frame.
         settings: Law, look-ahead, wheelbase and limit.
+        seen_width_cm: Width that the frames before showed, for a frame with one line; goes before that of
+            the settings.
 
     Returns:
         Steering angle, [rad], positive left, within the limit; NaN when the lane is unknown there.
     """
-    centre_cm = lane_centre_cm(estimate, settings.look_ahead_cm, settings.lane_width_cm)
+    width_cm = settings.lane_width_cm if seen_width_cm is None else seen_width_cm
+    centre_cm = lane_centre_cm(estimate, settings.look_ahead_cm, width_cm)
     if not math.isfinite(centre_cm):
         return float("nan")
     if settings.law == "proportional":
@@ -87,14 +92,14 @@ def _line_at(x_rows_cm: Float[np.ndarray, "3"], y_cm: float) -> tuple[float, flo
 
     Two known rows are not extended beyond themselves, one not beyond itself: NaN there.
     """
-    known = np.isfinite(x_rows_cm)
-    if known.all():
-        a, b, c = (float(v) for v in PARABOLA_FROM_POINTS @ x_rows_cm)
+    known = [(row, x) for row, x in zip(ROWS_CM, x_rows_cm.tolist(), strict=True) if math.isfinite(x)]
+    if len(known) == len(ROWS_CM):
+        a, b, c = parabola_through(*(x for _, x in known))
         return (a * y_cm + b) * y_cm + c, 2.0 * a * y_cm + b
-    rows, x = np.array(ROWS_CM)[known], x_rows_cm[known]
-    if rows.size == 0 or not rows[0] <= y_cm <= rows[-1]:
-        return float("nan"), float("nan")
-    if rows.size == 1:
-        return float(x[0]), 0.0
-    slope = float((x[1] - x[0]) / (rows[1] - rows[0]))
-    return float(x[0]) + slope * (y_cm - float(rows[0])), slope
+    if not known or not known[0][0] <= y_cm <= known[-1][0]:
+        return math.nan, math.nan
+    (row, x), (last_row, last_x) = known[0], known[-1]
+    if row == last_row:
+        return x, 0.0
+    slope = (last_x - x) / (last_row - row)
+    return x + slope * (y_cm - row), slope

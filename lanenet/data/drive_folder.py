@@ -21,7 +21,7 @@ from lanenet.data.recording import (
     find_breaks,
     first_size,
 )
-from lanenet.data.tables import ColumnSpec, read_csv
+from lanenet.data.tables import ColumnSpec, is_torn, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES
@@ -95,6 +95,8 @@ def check_camera_size(camera: Camera | None, width: int, height: int, where: Pat
 def read_times(path: Path, with_files: bool) -> tuple[dict[str, np.ndarray], Commands]:
     """Read ``frames.csv``, or the CSV beside a video, which has no ``file``.
 
+    A last line that was cut off while it was written is left out.
+
     Returns:
         The columns, and the commands among them.
 
@@ -109,7 +111,7 @@ def read_times(path: Path, with_files: bool) -> tuple[dict[str, np.ndarray], Com
     }
     if with_files:
         specs["file"] = ColumnSpec("text")
-    columns = read_csv(path, specs)
+    columns = read_csv(path, specs, skip_torn=True)
     if len(columns["frame"]) == 0:
         raise DriveFormatError(f"{path}: the drive has no frames")
     return columns, Commands(**{name: columns.get(name) for name in COMMAND_NAMES})
@@ -184,6 +186,8 @@ def open_folder(path: Path) -> Drive:
     images = ImageFiles([path / name for name in columns["file"].tolist()])
     missing = [i for i, image in enumerate(images.paths) if not image.is_file()]
     problems: list[str] = []
+    if is_torn(path / FRAMES_FILE):
+        problems.append(f"{path / FRAMES_FILE}: its last line is cut off and left out")
     if missing:
         problems.append(
             f"{path / FRAMES_FILE}: {len(missing)} of {len(frames)} images are missing (first: frame "

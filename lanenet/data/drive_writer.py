@@ -144,7 +144,7 @@ class DriveWriter:
         ok, data = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])
         if not ok:
             raise DriveFormatError(f"{where}: the image cannot be encoded as JPEG")
-        (self.folder / _image_name(number)).write_bytes(data.tobytes())
+        (self.folder / image_name(number)).write_bytes(data.tobytes())
         self._size = size
         self._rows.append(row)
 
@@ -167,7 +167,7 @@ class DriveWriter:
         if not self._rows:
             raise DriveFormatError(f"{self.path}: no frame was added, nothing is written")
         frame = np.arange(len(self._rows))
-        names = {"frame": frame, "file": [_image_name(int(k)) for k in frame]}
+        names = {"frame": frame, "file": [image_name(int(k)) for k in frame]}
         numbers = {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
         write_csv(self.folder / FRAMES_FILE, {**names, **numbers})
         if self._truth:
@@ -179,7 +179,8 @@ class DriveWriter:
         write_text(self.folder / DRIVE_FILE, yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
 
 
-def _image_name(number: int) -> str:
+def image_name(number: int) -> str:
+    """Return the name of a frame's image, relative to the drive's folder."""
     return f"images/{number:06d}.jpg"
 
 

@@ -70,9 +70,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         try:
-            _sync(temporary)
+            sync_path(temporary)
             temporary.replace(path)
-            _sync(path.parent)
+            sync_path(path.parent)
         except OSError as error:
             raise LanenetError(f"{path}: cannot be written ({error})") from None
     finally:
@@ -109,7 +109,7 @@ def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
         yield temporary
         for file in temporary.rglob("*"):
             if file.is_file():
-                _sync(file)
+                sync_path(file)
         # The destination may have changed while the block ran.
         _check_replaceable(path, kind)
         _move_folder(temporary, path)
@@ -149,6 +149,17 @@ def write_json(path: Path, obj: Any) -> None:
     write_text(path, json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def sync_path(path: Path) -> None:
+    """Have the disk hold what was written, so that a power cut after the move finds the whole file."""
+    if path.is_dir() and os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def _plain(obj: Any) -> Any:
     if isinstance(obj, np.ndarray):
         return _plain(obj.tolist())
@@ -170,17 +181,6 @@ def _make_parent(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LanenetError(f"{path.parent}: the folder cannot be made ({error})") from None
-
-
-def _sync(path: Path) -> None:
-    """Have the disk hold what was written, so that a power cut after the move finds the whole file."""
-    if path.is_dir() and os.name == "nt":
-        return
-    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _check_replaceable(path: Path, kind: str | None) -> None:
@@ -219,7 +219,7 @@ def _move_folder(temporary: Path, path: Path) -> None:
             if old is not None:
                 old.rename(path)
             raise
-        _sync(path.parent)
+        sync_path(path.parent)
     except OSError as error:
         raise LanenetError(f"{path}: cannot be written ({error})") from None
     if old is not None:

@@ -44,7 +44,11 @@ class ColumnSpec:
 
 
 def read_csv(
-    path: Path, columns: dict[str, ColumnSpec], error: type[LanenetError] = DriveFormatError
+    path: Path,
+    columns: dict[str, ColumnSpec],
+    error: type[LanenetError] = DriveFormatError,
+    *,
+    skip_torn: bool = False,
 ) -> dict[str, np.ndarray]:
     """Read the named columns of a CSV file with a header.
 
@@ -54,6 +58,7 @@ def read_csv(
         path: The file, UTF-8, separated by commas.
         columns: What to read.
         error: The error to raise.
+        skip_torn: Leave out a last line of which :func:`is_torn` tells that its writer was stopped in it.
 
     Returns:
         An array per column that the file has: float64, int64 or text. Row i is line i + 2 of a file without
@@ -73,6 +78,8 @@ def read_csv(
         raise error(f"{path}: cannot be read as CSV ({problem})") from None
     if not lines:
         raise error(f"{path}: empty, expected a header with {', '.join(columns)}")
+    if skip_torn and is_torn(path):
+        lines.pop()
     header = lines[0][1]
     _check_header(path, header, columns, error)
     for number, cells in lines[1:]:
@@ -96,6 +103,17 @@ def read_csv(
             values, dtype={"float": np.float64, "int": np.int64, "text": np.str_}[spec.kind]
         )
     return result
+
+
+def is_torn(path: Path) -> bool:
+    """Tell whether the last line of a table was cut off while it was written, as by a power cut.
+
+    Such a line has no end, and lacks fields of the header or the text of its last one. A complete last line
+    without an end, as some editors leave it, is not torn.
+    """
+    head, _, rest = Path(path).read_bytes().partition(b"\n")
+    last = rest.rpartition(b"\n")[2]
+    return bool(last.strip()) and (last.count(b",") < head.count(b",") or last.endswith(b","))
 
 
 def write_csv(

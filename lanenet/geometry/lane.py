@@ -27,6 +27,14 @@ def parabolas_from_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndar
     return points.reshape(*points.shape[:-1], 2, 3) @ PARABOLA_FROM_POINTS.T
 
 
+def parabola_through(x_0: float, x_15: float, x_30: float) -> tuple[float, float, float]:
+    """Return (a, b, c) of one line of plain numbers, for loops in which an array costs more than its sums."""
+    far = (x_30 - x_0) / ROWS_CM[2]
+    near = (x_15 - x_0) / ROWS_CM[1]
+    a = (far - near) / (ROWS_CM[2] - ROWS_CM[1])
+    return a, near - a * ROWS_CM[1], x_0
+
+
 def points_from_parabolas(parabolas: Float[np.ndarray, "*n 2 3"]) -> Float[np.ndarray, "*n 6"]:
     """Return the six points of two parabolas; inverse of :func:`parabolas_from_points`."""
     points = np.asarray(parabolas, dtype=np.float64) @ POINTS_FROM_PARABOLA.T

@@ -18,8 +18,9 @@ from lanenet.geometry.lane import mirror_points
 from lanenet.learn.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
 from lanenet.learn.config import AugmentSettings, Balance
 from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.network import ANY_CAMERA
 
-#: Stands for the hashes of cameras that are too many to be named.
+#: From more cameras than this on, what was learned holds for any.
 _MANY_CAMERAS = 8
 
 

@@ -1,7 +1,9 @@
-"""What the car installs: detection works, and there is no torch."""
+"""What the car installs: detection works, there is no torch, it is small, and Arm has wheels for it."""
 
+import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,38 @@ def test_detect_in_an_empty_environment(tmp_path):
     subprocess.run([environment / "bin" / "lanenet", *words], check=True, timeout=60, cwd=tmp_path)
     header, row = out.read_text().splitlines()
     assert header.split(",")[2] == "left_0_cm" and float(row.split(",")[2]) < 0.0
+    # Only what lanenet brings: every environment has pip, and some setuptools.
+    packages = next((environment / "lib").glob("python*")) / "site-packages"
+    others = ("pip", "setuptools", "pkg_resources", "_distutils_hack")
+    files = [p for p in packages.rglob("*") if p.is_file() and p.relative_to(packages).parts[0] not in others]
+    size_mb = sum(p.stat().st_size for p in files) / 2**20
+    assert 100.0 < size_mb <= 350.0, f"the base installation takes {size_mb:.0f} MB"
     for package in ("torch", "numba", "scipy", "matplotlib"):
         found = subprocess.run([python, "-c", f"import {package}"], capture_output=True, cwd=tmp_path)
         assert found.returncode != 0, f"{package} is part of the base installation"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["3.11", "3.13"])
+def test_wheels_for_a_raspberry_pi(tmp_path, version):
+    """Python of Raspberry Pi OS Bookworm (3.11) and Trixie (3.13), 64 bit: nothing has to be compiled."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["car"]]
+    words = [
+        "install",
+        "--dry-run",
+        "--ignore-installed",
+        "--target",
+        tmp_path / "none",
+        "--only-binary=:all:",
+    ]
+    words += ["--implementation", "cp", "--python-version", version]
+    for platform in ("manylinux2014_aarch64", "manylinux_2_28_aarch64"):
+        words += ["--platform", platform]
+    words += ["--report", tmp_path / "report.json", "-q", *wanted]
+    subprocess.run([sys.executable, "-m", "pip", *words], check=True, timeout=300)
+    report = json.loads((tmp_path / "report.json").read_text())
+    wheels = {i["metadata"]["name"].lower(): i["download_info"]["url"] for i in report["install"]}
+    assert {"numpy", "onnxruntime", "opencv-python-headless", "smbus2", "pyserial"} <= set(wheels)
+    assert all(url.endswith(("_aarch64.whl", "-none-any.whl")) for url in wheels.values())
+    assert "torch" not in wheels and "scipy" not in wheels

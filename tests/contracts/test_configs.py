@@ -44,13 +44,27 @@ def read_detector_settings(path: Path) -> Any:
     return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
 
 
+def read_donkeycar_pilot(path: Path) -> Any:
+    from lanenet.onboard.donkey import LanePilot
+
+    return LanePilot.from_file(path)
+
+
+def read_car(path: Path) -> Any:
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    return load_drive_settings(path)
+
+
 #: What reads the YAML files of each folder below configs/.
 READERS = {
     ".": read_training_run,
+    "car": read_car,
     "drives": read_simulation,
     "tracks": read_track,
     "cameras": read_camera_file,
     "detectors": read_detector_settings,
+    "donkeycar": read_donkeycar_pilot,
 }
 
 

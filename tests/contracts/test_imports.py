@@ -12,14 +12,22 @@ import pytest
 REPO = Path(__file__).resolve().parents[2]
 LINT_IMPORTS = Path(sys.executable).parent / "lint-imports"
 #: Modules that start on the car, and the packages that the base installation does not have.
-ONBOARD_MODULES = ("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network")
+ONBOARD_MODULES = (
+    *("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network"),
+    *("lanenet.onboard.drive", "lanenet.onboard.guard_process"),
+)
 HEAVY = (
     *("torch", "torchvision", "matplotlib", "scipy", "numba", "pyarrow"),
     *("onnx", "onnxscript", "safetensors", "tensorboard"),
 )
 #: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
-#: written only if the extra is there.
-NAMED_IMPORTS = {"lanenet/data/": {"pyarrow"}, "lanenet/learn/sweep.py": {"optuna"}}
+#: written, and a device of the car opened, only if its package is there.
+NAMED_IMPORTS = {
+    "lanenet/data/": {"pyarrow"},
+    "lanenet/learn/sweep.py": {"optuna"},
+    "lanenet/onboard/actuators/": {"serial", "smbus2"},
+    "lanenet/onboard/cameras/": {"picamera2"},
+}
 #: The one function that does it.
 IMPORTER = "lanenet/data/files.py"
 
@@ -122,7 +130,7 @@ def test_no_import_goes_past_the_rules_by_its_name() -> None:
         allowed = {p for place, packages in NAMED_IMPORTS.items() if name.startswith(place) for p in packages}
         assert found <= allowed, f"{name}: imports {found - allowed} past the import rules"
         seen |= found
-    assert seen == {"pyarrow", "optuna"}
+    assert seen == {package for packages in NAMED_IMPORTS.values() for package in packages}
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from lanenet.cli import app
 
 REPO = Path(__file__).resolve().parents[2]
 VERBS = (
-    *("train", "simulate", "judge", "map", "label", "val", "export", "detect", "bench", "doctor"),
-    *("track", "sheets", "reality"),
+    *("train", "simulate", "judge", "map", "label", "val", "export", "detect", "drive"),
+    *("track", "sheets", "reality", "bench", "doctor"),
 )
 #: Wide enough that help texts are not wrapped inside an option's name.
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}

@@ -13,6 +13,7 @@ from lanenet.geometry.lane import (
     ROWS_CM,
     SIDES,
     mirror_points,
+    parabola_through,
     parabola_x_cm,
     parabolas_from_points,
     points_from_parabolas,
@@ -114,3 +115,10 @@ def test_mirroring_twice_changes_nothing_and_flips_the_parabolas(points: np.ndar
     np.testing.assert_array_equal(mirror_points(mirror_points(points)), points)
     mirrored = parabolas_from_points(mirror_points(points))
     np.testing.assert_allclose(mirrored, -parabolas_from_points(points)[:, ::-1], atol=1e-9)
+
+
+def test_plain_numbers_give_the_same_parabola() -> None:
+    points = np.random.default_rng(2).normal(0.0, 30.0, (50, 3))
+    for line in points:
+        np.testing.assert_allclose(parabola_through(*line.tolist()), PARABOLA_FROM_POINTS @ line, atol=1e-10)
+    assert not np.isfinite(parabola_through(1.0, float("nan"), 2.0)[0])

@@ -1,0 +1,60 @@
+// Steering servo and motor controller of a 1:10 car on an Arduino Uno or Nano (ATmega328P, 16 MHz).
+//
+//   pin 9    signal of the steering servo
+//   pin 10   signal of the electronic speed controller
+//   GND      joined with the ground of both; the servo gets its supply from the speed controller, not from here
+//
+// The computer sends lines over USB (protocol.h). 100 ms without a valid command put the motor into neutral,
+// whatever became of the computer.
+//
+// Both pulses come from timer 1 itself, so they do not tremble while bytes arrive; no library is needed.
+
+#include "protocol.h"
+
+namespace {
+
+// Timer 1 counts half microseconds (16 MHz / 8) and starts again after 20 ms: 50 pulses per second.
+const uint16_t kCountsPerUs = 2;
+const uint16_t kPeriodCounts = 20000 * kCountsPerUs;
+
+lanenet::Board board;
+char reply[lanenet::kMaxLine + 6];
+
+void SetPulses() {
+  // Both registers take effect together at the end of the period; an interrupt must not come between the
+  // two bytes of either. The output falls one count after the match.
+  const uint16_t steering = board.steering_us() * kCountsPerUs - 1;
+  const uint16_t throttle = board.throttle_us() * kCountsPerUs - 1;
+  noInterrupts();
+  if (OCR1A != steering) OCR1A = steering;
+  if (OCR1B != throttle) OCR1B = throttle;
+  interrupts();
+}
+
+}  // namespace
+
+void setup() {
+  // Fast PWM up to ICR1 (mode 14), both outputs high from the start of the period to the match.
+  TCCR1A = _BV(COM1A1) | _BV(COM1B1) | _BV(WGM11);
+  TCCR1B = _BV(WGM13) | _BV(WGM12);
+  ICR1 = kPeriodCounts - 1;
+  TCNT1 = 0;
+  SetPulses();
+  pinMode(9, OUTPUT);
+  pinMode(10, OUTPUT);
+  TCCR1B |= _BV(CS11);
+  Serial.begin(115200);
+  board.Greet(reply);
+  Serial.print(reply);
+}
+
+void loop() {
+  while (Serial.available() > 0) {
+    if (board.TakeByte(static_cast<char>(Serial.read()), millis(), reply)) Serial.print(reply);
+  }
+  // A full output buffer would stop the loop, and with it the watchdog: the report is left out then.
+  if (board.Tick(millis(), reply) && Serial.availableForWrite() >= static_cast<int>(sizeof(reply))) {
+    Serial.print(reply);
+  }
+  SetPulses();
+}

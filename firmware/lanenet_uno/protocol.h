@@ -1,0 +1,138 @@
+// What the board does with the lines it gets: the protocol of lanenet/onboard/actuators/line_protocol.py,
+// version 1, and the watchdog. No Arduino header is needed, so that it is tested on a computer, too.
+
+#ifndef LANENET_PROTOCOL_H
+#define LANENET_PROTOCOL_H
+
+#include <stdint.h>
+#include <stdio.h>
+
+namespace lanenet {
+
+const uint8_t kVersion = 1;
+const uint16_t kWatchdogMs = 100;
+const uint16_t kReportMs = 50;
+// The longest line, its end left out.
+const uint8_t kMaxLine = 39;
+// Whatever a line says, no servo gets a pulse outside these.
+const uint16_t kShortestUs = 500, kLongestUs = 2500;
+
+// CRC-8: polynomial 0x07, start 0, not reflected.
+inline uint8_t Crc8(const char* text, uint8_t length) {
+  uint8_t crc = 0;
+  for (uint8_t i = 0; i < length; ++i) {
+    crc ^= static_cast<uint8_t>(text[i]);
+    for (uint8_t bit = 0; bit < 8; ++bit) crc = (crc & 0x80) ? (crc << 1) ^ 0x07 : crc << 1;
+  }
+  return crc;
+}
+
+// Ends `text` with the checksum and a line feed; it needs room for five more characters.
+inline void Seal(char* text) {
+  uint8_t length = 0;
+  while (text[length]) ++length;
+  snprintf(text + length, 5, "*%02X\n", Crc8(text, length));
+}
+
+class Board {
+ public:
+  // Takes one byte. Returns true when `reply` holds a line to send (kMaxLine + 2 characters at most).
+  bool TakeByte(char byte, uint32_t now_ms, char* reply) {
+    if (byte != '\n') {
+      if (byte == '\r') return false;
+      // A line that is too long is dropped as a whole at its end.
+      if (length_ <= kMaxLine) line_[length_++] = byte;
+      return false;
+    }
+    const uint8_t length = length_;
+    length_ = 0;
+    if (length == 0) return false;
+    char letter = 0;
+    uint16_t first = 0, second = 0;
+    if (length > kMaxLine || !Parse(length, &letter, &first, &second)) {
+      ++rejected_;
+      return false;
+    }
+    ++accepted_;
+    if (letter == 'V') return Greet(reply);
+    if (letter == 'N') {
+      neutral_steering_us_ = first;
+      neutral_throttle_us_ = second;
+      has_neutral_ = true;
+      driving_ = false;
+    } else if (has_neutral_) {
+      steering_us_ = first;
+      throttle_us_ = second;
+      driving_ = true;
+      last_command_ms_ = now_ms;
+    }
+    return false;
+  }
+
+  // Fills `reply` with the greeting; sent once at the start, too.
+  bool Greet(char* reply) const {
+    snprintf(reply, kMaxLine, "V%u", static_cast<unsigned>(kVersion));
+    Seal(reply);
+    return true;
+  }
+
+  // To be called in every turn of the loop. Returns true when `reply` holds a report to send.
+  bool Tick(uint32_t now_ms, char* reply) {
+    // The difference of unsigned times is right when the clock starts again at 0 after 49 days.
+    if (driving_ && now_ms - last_command_ms_ >= kWatchdogMs) driving_ = false;
+    if (now_ms - last_report_ms_ < kReportMs) return false;
+    last_report_ms_ = now_ms;
+    snprintf(reply, kMaxLine, "A%u,%u,%u,%u,%u", static_cast<unsigned>(accepted_),
+             static_cast<unsigned>(rejected_), driving_ ? 1u : 0u, static_cast<unsigned>(steering_us()),
+             static_cast<unsigned>(throttle_us()));
+    Seal(reply);
+    return true;
+  }
+
+  bool driving() const { return driving_; }
+  uint16_t steering_us() const { return driving_ ? steering_us_ : neutral_steering_us_; }
+  uint16_t throttle_us() const { return driving_ ? throttle_us_ : neutral_throttle_us_; }
+
+ private:
+  static int8_t HexDigit(char c) {
+    if (c >= '0' && c <= '9') return c - '0';
+    if (c >= 'A' && c <= 'F') return c - 'A' + 10;
+    return -1;
+  }
+
+  // Reads digits up to `end` or a comma; false if there are none, too many, or the pulse is out of range.
+  bool Number(uint8_t* at, uint8_t end, uint16_t* value) const {
+    uint32_t sum = 0;
+    const uint8_t start = *at;
+    while (*at < end && line_[*at] >= '0' && line_[*at] <= '9' && *at - start < 5)
+      sum = sum * 10 + (line_[(*at)++] - '0');
+    *value = static_cast<uint16_t>(sum);
+    return *at > start && sum >= kShortestUs && sum <= kLongestUs;
+  }
+
+  bool Parse(uint8_t length, char* letter, uint16_t* first, uint16_t* second) const {
+    if (length < 4 || line_[length - 3] != '*') return false;
+    const int8_t high = HexDigit(line_[length - 2]), low = HexDigit(line_[length - 1]);
+    const uint8_t end = length - 3;
+    if (high < 0 || low < 0 || Crc8(line_, end) != high * 16 + low) return false;
+    *letter = line_[0];
+    if (*letter == 'V') return end == 1;
+    if (*letter != 'S' && *letter != 'N') return false;
+    uint8_t at = 1;
+    if (!Number(&at, end, first)) return false;
+    if (at >= end || line_[at++] != ',') return false;
+    return Number(&at, end, second) && at == end;
+  }
+
+  char line_[kMaxLine + 1] = {0};
+  uint8_t length_ = 0;
+  uint16_t accepted_ = 0, rejected_ = 0;
+  bool has_neutral_ = false, driving_ = false;
+  uint16_t neutral_steering_us_ = 1500, neutral_throttle_us_ = 1500;
+  uint16_t steering_us_ = 1500, throttle_us_ = 1500;
+  uint32_t last_command_ms_ = 0, last_report_ms_ = 0;
+};
+
+}  // namespace lanenet
+
+#endif  // LANENET_PROTOCOL_H

@@ -1,0 +1,171 @@
+"""A Donkeycar's ``myconfig.py`` as settings of its PCA9685: the file is parsed, and never run.
+
+Source: donkeycar 5.3, ``templates/complete.py`` (``add_drivetrain``), ``parts/pins.py`` and
+``templates/cfg_complete.py``; the older names stand in ``DRIVE_TRAIN_TYPE = "I2C_SERVO"``.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError
+from lanenet.onboard.actuators.pca9685 import OSCILLATOR_HZ, PCA9685Settings, prescale_of
+
+#: Donkeycar counts pulses in 4096ths of a period at this nominal rate.
+_FREQUENCY_HZ = 60.0
+#: As in ``PCA9685.1:40.7``: bus, address in hexadecimal, channel.
+_PIN = re.compile(r"PCA9685\.(\d+):([0-9a-fA-F]+)\.(\d+)")
+_PULSES = {
+    "STEERING_LEFT_PWM": "steering_left_us",
+    "STEERING_RIGHT_PWM": "steering_right_us",
+    "THROTTLE_FORWARD_PWM": "throttle_forward_us",
+    "THROTTLE_STOPPED_PWM": "throttle_stopped_us",
+    "THROTTLE_REVERSE_PWM": "throttle_reverse_us",
+}
+_OLD_PLACES = {
+    "STEERING_CHANNEL": "steering_channel",
+    "THROTTLE_CHANNEL": "throttle_channel",
+    "PCA9685_I2C_ADDR": "address",
+    "PCA9685_I2C_BUSNUM": "bus",
+}
+
+
+def read_assignments(path: Path) -> dict[str, Any]:
+    """Read the plain ``NAME = value`` lines of a Python file without running it.
+
+    Values that are not literals (calls, arithmetic, other names) are left out: Donkeycar's own file joins
+    paths, for example. A later line replaces an earlier one.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ConfigError: If the file is missing or is not Python.
+    """
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file, expected a Donkeycar's myconfig.py") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
+    except (SyntaxError, ValueError) as error:
+        raise ConfigError(f"{path}: not Python: {error}") from None
+    values: dict[str, Any] = {}
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            targets, value = node.targets, node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            targets, value = [node.target], node.value
+        else:
+            continue
+        for target in targets:
+            if isinstance(target, ast.Name):
+                try:
+                    values[target.id] = ast.literal_eval(value)
+                except ValueError:
+                    values.pop(target.id, None)
+    return values
+
+
+def settings_from_myconfig(path: Path) -> dict[str, Any]:
+    """Return what a Donkeycar's files tell about its PCA9685, as keys of :class:`PCA9685Settings`.
+
+    Donkeycar's ``config.py`` beside ``myconfig.py`` holds the values that the latter does not change, so it
+    is read first, as Donkeycar does.
+
+    Args:
+        path: ``myconfig.py``.
+
+    Returns:
+        Only what the files say.
+
+    Raises:
+        ConfigError: If a file is not Python, the car is driven by something else than a PCA9685, or a value
+            is of another kind than Donkeycar's.
+    """
+    values: dict[str, Any] = {}
+    base = path.with_name("config.py")
+    if base.is_file() and base != path:
+        values |= read_assignments(base)
+    values |= read_assignments(path)
+    train = values.get("DRIVE_TRAIN_TYPE", "PWM_STEERING_THROTTLE")
+    if train == "PWM_STEERING_THROTTLE":
+        section = values.get(train, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"{path}: {train}: expected a dictionary, found {section!r}")
+        # Before Donkeycar 4.4 the same names stood at the top level.
+        merged = {**{name: values[name] for name in _PULSES if name in values}, **section}
+        return {**_pulses(merged, path), **_pins(merged, path)}
+    if train == "I2C_SERVO":
+        places = {
+            key: _whole(values, name, path)
+            for name, key in _OLD_PLACES.items()
+            if values.get(name) is not None
+        }
+        return {**_pulses(values, path), **places}
+    raise ConfigError(
+        f"{path}: DRIVE_TRAIN_TYPE {train!r}, expected 'PWM_STEERING_THROTTLE' or 'I2C_SERVO': only a servo "
+        "and a speed controller on a PCA9685 can be taken over"
+    )
+
+
+def with_myconfig(settings: PCA9685Settings) -> PCA9685Settings:
+    """Fill in from ``settings.myconfig`` what the settings do not say themselves.
+
+    Raises:
+        ConfigError: If the file cannot be used, or its values are out of range.
+    """
+    if settings.myconfig is None:
+        return settings
+    said = settings.model_dump(exclude_unset=True)
+    found = settings_from_myconfig(settings.myconfig.expanduser())
+    return check_settings(PCA9685Settings, {**found, **said}, str(settings.myconfig))
+
+
+def _pulses(values: dict[str, Any], path: Path) -> dict[str, float]:
+    """Turn counts into the times that the chip makes of them at its real rate."""
+    count_us = 1e6 * (prescale_of(_FREQUENCY_HZ) + 1) / OSCILLATOR_HZ
+    pulses = {}
+    for name, key in _PULSES.items():
+        if name not in values:
+            continue
+        scale = values.get("PWM_STEERING_SCALE" if name.startswith("STEERING") else "PWM_THROTTLE_SCALE", 1.0)
+        count = values[name]
+        for what, value in ((name, count), (f"scale of {name}", scale)):
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ConfigError(f"{path}: {what}: expected a number, found {value!r}")
+        pulses[key] = round(int(count * scale) * count_us, 3)
+    return pulses
+
+
+def _pins(values: dict[str, Any], path: Path) -> dict[str, int]:
+    places: dict[str, int] = {}
+    for side in ("STEERING", "THROTTLE"):
+        if values.get(f"PWM_{side}_INVERTED", False):
+            raise ConfigError(
+                f"{path}: PWM_{side}_INVERTED: found True, expected False: signals that are inverted by the "
+                "wiring are not supported"
+            )
+        name = f"PWM_{side}_PIN"
+        if name not in values:
+            continue
+        match = _PIN.fullmatch(str(values[name]))
+        if match is None:
+            raise ConfigError(f"{path}: {name}: found {values[name]!r}, expected one as 'PCA9685.1:40.0'")
+        place = {"bus": int(match[1]), "address": int(match[2], 16)}
+        for key, value in place.items():
+            if places.setdefault(key, value) != value:
+                raise ConfigError(f"{path}: steering and throttle lie on two chips, expected one ({name})")
+        places[f"{side.lower()}_channel"] = int(match[3])
+    return places
+
+
+def _whole(values: dict[str, Any], name: str, path: Path) -> int:
+    value = values[name]
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ConfigError(f"{path}: {name}: expected a whole number, found {value!r}")
+    return value

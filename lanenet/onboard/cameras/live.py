@@ -1,0 +1,241 @@
+"""A running camera as a source: a thread keeps its newest frame, and looks for the camera when it is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import Field
+
+from lanenet.config import Settings
+from lanenet.errors import HardwareError, MissingExtraError
+from lanenet.onboard.hardware import Frame
+
+_log = logging.getLogger(__name__)
+
+#: The longest that one call of a device waits, so that ``close`` is not held up.
+_GRAB_S = 0.1
+#: First and longest pause between two attempts to find a lost camera; each is twice the one before.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
+#: A camera driver may hang; nothing waits for it longer than this.
+_JOIN_S = 3.0
+#: An exposure that is said to be older than this was measured on another clock.
+_OLDEST_S = 1.0
+
+
+class CameraSettings(Settings):
+    """What all cameras have in common.
+
+    Attributes:
+        width: Of the image, [px]; the camera file's.
+        height: Of the image, [px].
+        rate_hz: Frames per second.
+        rotate_180: Turn the image, for a camera that hangs upside down; the camera file then belongs to the
+            turned image.
+        start_s: How long the first frame may take.
+        silence_s: A camera without a frame for so long counts as lost.
+        give_up_s: A lost camera is looked for during this time.
+    """
+
+    width: int = Field(default=320, ge=16, le=4096)
+    height: int = Field(default=240, ge=16, le=4096)
+    rate_hz: float = Field(default=30.0, gt=0.0, le=240.0)
+    rotate_180: bool = False
+    start_s: float = Field(default=5.0, gt=0.0)
+    silence_s: float = Field(default=1.0, gt=0.0)
+    give_up_s: float = Field(default=60.0, ge=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One image from a device.
+
+    Attributes:
+        image_bgr: The image; the device does not touch it any more.
+        t_s: When it was exposed, on the clock of :func:`time.monotonic`; None where the device does not know.
+        skipped: Images that the device dropped since the last one, because this one is newer.
+    """
+
+    image_bgr: UInt8[np.ndarray, "h w 3"] = field(repr=False)
+    t_s: float | None = None
+    skipped: int = 0
+
+
+@runtime_checkable
+class Device(Protocol):
+    """A camera driver: started, asked for images and stopped by one thread at a time.
+
+    Attributes:
+        name: As people know it, for messages.
+    """
+
+    name: str
+
+    def start(self) -> None:
+        """Start the camera; raises HardwareError or MissingExtraError."""
+        ...
+
+    def grab(self, timeout_s: float) -> Capture | None:
+        """Return the next image, or None if there is none in time; raises HardwareError when it is lost."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the camera; harmless when it does not run, never raises."""
+        ...
+
+
+class LiveSource:
+    """Newest frame of a device; a ``FrameSource``."""
+
+    def __init__(self, device: Device, settings: CameraSettings) -> None:
+        self._device = device
+        self._settings = settings
+        self._fresh = threading.Condition()
+        self._newest: Frame | None = None
+        self._returned = -1
+        self._count = 0
+        self._failure: HardwareError | None = None
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def open(self) -> None:
+        """Start the camera and wait for its first frame; see :class:`lanenet.onboard.hardware.FrameSource`.
+
+        Raises:
+            HardwareError: If the camera is not there, sends nothing, or sends images of another size.
+            MissingExtraError: If its driver is not installed.
+        """
+        if self._thread is not None:
+            return
+        self._closing.clear()
+        self._failure = None
+        try:
+            self._device.start()
+            end_s = time.monotonic() + self._settings.start_s
+            while self._newest is None:
+                if time.monotonic() > end_s:
+                    raise HardwareError(
+                        f"{self._device.name}: no frame within {self._settings.start_s:g} s; is its cable "
+                        "seated, and does another program use it?"
+                    )
+                self._take(self._device.grab(_GRAB_S))
+        except Exception:
+            self._device.stop()
+            raise
+        self._thread = threading.Thread(target=self._run, name=f"camera {self._device.name}", daemon=True)
+        self._thread.start()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the newest frame that was not returned before; see ``FrameSource``.
+
+        Raises:
+            HardwareError: If the camera was lost and not found again in time, or it is not open.
+        """
+        if self._thread is None:
+            raise HardwareError(f"{self._device.name}: not open")
+        with self._fresh:
+            self._fresh.wait_for(self._has_news, timeout_s)
+            if self._failure is not None:
+                raise self._failure
+            frame = self._newest
+            if frame is None or frame.number == self._returned:
+                return None
+            self._returned = frame.number
+            return frame
+
+    def close(self) -> None:
+        """Stop the camera and its thread."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._closing.set()
+        thread.join(_JOIN_S)
+        if thread.is_alive():
+            _log.warning("%s: its driver hangs and is left behind", self._device.name)
+        self._newest = None
+
+    def _has_news(self) -> bool:
+        news = self._newest is not None and self._newest.number != self._returned
+        return news or self._failure is not None
+
+    def _run(self) -> None:
+        """Grab until closed; the thread is the only one that touches the device meanwhile."""
+        heard_s = time.monotonic()
+        while not self._closing.is_set():
+            try:
+                if self._take(self._device.grab(_GRAB_S)):
+                    heard_s = time.monotonic()
+                elif time.monotonic() - heard_s > self._settings.silence_s:
+                    raise HardwareError(f"{self._device.name}: no frame for {self._settings.silence_s:g} s")
+            except Exception as error:
+                # A driver may raise anything when its device is pulled out.
+                if not self._find_again(error):
+                    break
+                heard_s = time.monotonic()
+        self._device.stop()
+
+    def _find_again(self, error: Exception) -> bool:
+        """Start the device anew until it works; False if it is closed or given up."""
+        _log.error("camera lost: %s; looking for it", error)
+        lost_s = time.monotonic()
+        pause_s = _FIRST_PAUSE_S
+        while not self._closing.is_set():
+            self._device.stop()
+            left_s = lost_s + self._settings.give_up_s - time.monotonic()
+            if left_s <= 0.0:
+                self._fail(
+                    HardwareError(f"{self._device.name}: lost for {self._settings.give_up_s:g} s ({error})")
+                )
+                return False
+            self._closing.wait(min(pause_s, left_s))
+            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+            try:
+                self._device.start()
+            except (HardwareError, MissingExtraError, OSError) as again:
+                _log.warning("camera not found yet: %s", again)
+                continue
+            _log.warning("%s: found again after %.1f s", self._device.name, time.monotonic() - lost_s)
+            return True
+        return False
+
+    def _fail(self, failure: HardwareError) -> None:
+        with self._fresh:
+            self._failure = failure
+            self._fresh.notify_all()
+
+    def _take(self, capture: Capture | None) -> bool:
+        if capture is None:
+            return False
+        arrived_s = time.monotonic()
+        image = capture.image_bgr
+        expected = (self._settings.height, self._settings.width, 3)
+        if image.shape != expected:
+            raise HardwareError(
+                f"{self._device.name}: sends images of {'x'.join(map(str, image.shape[1::-1]))} px, expected "
+                f"{expected[1]}x{expected[0]} as in the settings"
+            )
+        if self._settings.rotate_180:
+            image = np.asarray(cv2.flip(image, -1))
+        exposed_s = capture.t_s
+        if exposed_s is None or not arrived_s - _OLDEST_S < exposed_s <= arrived_s:
+            exposed_s = arrived_s
+        with self._fresh:
+            self._count += 1 + capture.skipped
+            self._newest = Frame(image, exposed_s, self._count - 1)
+            self._fresh.notify_all()
+        return True
+
+
+def stop_quietly(*actions: Callable[[], object]) -> None:
+    """Call each action and forget what it raises: a device that is gone cannot be stopped in good order."""
+    for action in actions:
+        with contextlib.suppress(Exception):
+            action()

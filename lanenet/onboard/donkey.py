@@ -1,0 +1,262 @@
+"""Parts for a Donkeycar: a pilot, a controller for its ``cv_control`` template, and image transformers.
+
+Donkeycar's images are red, green, blue; its angle runs from -1 (left) to 1 (right); its throttle from -1 to
+1. Donkeycar itself is not imported: a part is any object with ``run``.
+
+A pilot in ``manage.py``, in place of a trained model::
+
+    from lanenet.onboard.donkey import LanePilot
+    V.add(LanePilot.from_file("lanenet.yaml"), inputs=["cam/image_array"],
+          outputs=["pilot/angle", "pilot/throttle"], run_condition="run_pilot")
+
+The ``cv_control`` template needs lines in ``myconfig.py`` only::
+
+    CV_CONTROLLER_MODULE = "lanenet.onboard.donkey"
+    CV_CONTROLLER_CLASS = "CvLaneController"
+    LANENET_CONFIG = "/home/pi/mycar/lanenet.yaml"
+
+A transformer for training and driving, here the bird's-eye view::
+
+    POST_TRANSFORMATIONS = ["CUSTOM_BIRDSEYE"]
+    CUSTOM_BIRDSEYE_MODULE = lanenet.onboard.donkey.__file__   # after: import lanenet.onboard.donkey
+    CUSTOM_BIRDSEYE_CLASS = "BirdseyeTransformer"
+    LANENET_CAMERA = "/home/pi/mycar/camera.yaml"
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import Field
+
+from lanenet.config import Settings, check_settings, load_settings
+from lanenet.control.controller import ControlSettings, LaneController
+from lanenet.control.speed import throttle_of
+from lanenet.data.camera_file import read_camera
+from lanenet.errors import ConfigError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera
+from lanenet.onboard.detectors import build_detector
+from lanenet.onboard.drive_settings import DriveDetectorSettings
+from lanenet.onboard.masks import read_mask
+from lanenet.onboard.safety import CommandLimiter, LimitSettings
+from lanenet.perception.draw import draw_estimate
+from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.views import birdseye_view, undistorting_view
+
+
+class DonkeySettings(Settings):
+    """Settings of the pilot; files are relative to the settings' own.
+
+    Attributes:
+        camera: Camera file; ``hough`` and ``painter`` do without.
+        detector: What finds the lane.
+        control: Steering and speed.
+        limits: What no command exceeds; Donkeycar's angle of 1 is ``max_steering_rad``.
+        min_confidence: A frame of less confidence counts as one without a lane.
+        hold_s: Without a lane the car goes on as before for this long, then it stops.
+    """
+
+    camera: Path | None = None
+    detector: DriveDetectorSettings = DriveDetectorSettings()
+    control: ControlSettings
+    limits: LimitSettings = Field(default_factory=LimitSettings)
+    min_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
+    hold_s: float = Field(default=0.2, ge=0.0)
+
+
+class LanePilot:
+    """Image in, angle and throttle out: a Donkeycar pilot.
+
+    Attributes:
+        estimate: The lane of the last image.
+        camera: The camera; None where the detector does without.
+    """
+
+    def __init__(
+        self, settings: DonkeySettings, folder: Path = Path(), clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Build detector and controller.
+
+        Args:
+            settings: Of the pilot.
+            folder: Where the settings' relative paths start.
+            clock: Time, [s].
+
+        Raises:
+            LanenetError: If the model does not fit the camera, or something that is needed is missing.
+        """
+
+        def found(path: Path | None) -> Path | None:
+            return None if path is None else folder / path.expanduser()
+
+        camera, mask = found(settings.camera), found(settings.detector.mask)
+        self.camera = None if camera is None else read_camera(camera)
+        self.estimate = LaneEstimate()
+        self._settings = settings
+        self._detector: Detector = build_detector(
+            settings.detector.kind,
+            self.camera,
+            model=found(settings.detector.model),
+            lane_width_cm=settings.detector.lane_width_cm,
+            any_camera=settings.detector.any_camera,
+            config=found(settings.detector.config),
+            mask=None if mask is None else read_mask(mask),
+        )
+        self._controller = LaneController(settings.control)
+        self._limiter = CommandLimiter(settings.limits)
+        self._clock = clock
+        self._seen_s = -math.inf
+        self._wish = (0.0, 0.0)
+
+    @staticmethod
+    def from_file(path: str | Path) -> LanePilot:
+        """Build the pilot of a YAML file.
+
+        Raises:
+            LanenetError: If the file or what it names cannot be used.
+        """
+        path = Path(path).expanduser()
+        return LanePilot(load_settings(DonkeySettings, path), path.parent)
+
+    def run(self, image_rgb: UInt8[np.ndarray, "h w 3"] | None) -> tuple[float, float]:
+        """Answer to an image.
+
+        Args:
+            image_rgb: Donkeycar's image; None until its camera has one.
+
+        Returns:
+            Angle, -1 (left) to 1 (right), and throttle; a throttle of 0 when the lane is lost.
+        """
+        now_s = self._clock()
+        self.estimate = LaneEstimate()
+        if image_rgb is not None:
+            # Donkeycar hands out views that OpenCV does not take.
+            bgr = np.ascontiguousarray(image_rgb[:, :, ::-1])
+            self.estimate = self._detector.detect(bgr)
+            self._follow(now_s)
+        if now_s - self._seen_s > self._settings.hold_s:
+            self._wish = (self._wish[0], 0.0)
+        steering_rad, speed_cm_s = self._wish
+        throttle = throttle_of(speed_cm_s, self._settings.control.speed)
+        steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
+        return -steering_rad / self._settings.limits.max_steering_rad, throttle
+
+    def _follow(self, now_s: float) -> None:
+        wish = self._controller.wish(self.estimate, now_s, self._wish[1], self._limiter.steering_rad)
+        if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(wish.steering_rad):
+            self._seen_s = now_s
+            self._wish = (wish.steering_rad, wish.speed_cm_s)
+
+    def run_threaded(self, image_rgb: UInt8[np.ndarray, "h w 3"] | None) -> tuple[float, float]:
+        """Do the same as :meth:`run`: the pilot is faster than a camera and needs no thread."""
+        return self.run(image_rgb)
+
+    def shutdown(self) -> None:
+        """Forget the lane; Donkeycar calls it at the end."""
+        self._detector.reset()
+        self._controller.reset()
+
+
+class CvLaneController:
+    """The pilot as a controller of the ``cv_control`` template, which gives it a PID controller and ``cfg``.
+
+    The PID controller is not used: steering follows from the geometry of the lane.
+    """
+
+    def __init__(self, pid: Any, cfg: Any) -> None:
+        """Build the pilot that ``cfg.LANENET_CONFIG`` names.
+
+        Raises:
+            LanenetError: If it is missing or cannot be used.
+        """
+        path = getattr(cfg, "LANENET_CONFIG", None)
+        if path is None:
+            raise ConfigError("myconfig.py: LANENET_CONFIG is missing, expected the path of a pilot's YAML")
+        self.pilot = LanePilot.from_file(path)
+        self._overlay = bool(getattr(cfg, "OVERLAY_IMAGE", False))
+
+    def run(
+        self, cam_img: UInt8[np.ndarray, "h w 3"] | None
+    ) -> tuple[float, float, UInt8[np.ndarray, "h w 3"] | None]:
+        """Return angle, throttle, and the image with what was found drawn into it."""
+        angle, throttle = self.pilot.run(cam_img)
+        if cam_img is None or not self._overlay:
+            return angle, throttle, cam_img
+        bgr = cv2.cvtColor(np.ascontiguousarray(cam_img), cv2.COLOR_RGB2BGR)
+        drawn = draw_estimate(np.asarray(bgr), self.pilot.estimate, self.pilot.camera)
+        return angle, throttle, np.ascontiguousarray(drawn[:, :, ::-1])
+
+    def shutdown(self) -> None:
+        """End the pilot."""
+        self.pilot.shutdown()
+
+
+class BirdseyeTransformer:
+    """The road from above, for Donkeycar's image transformations.
+
+    ``cfg.LANENET_CAMERA`` is the camera file; ``cfg.LANENET_WINDOW`` may be a dictionary with some of
+    ``left_cm, near_cm, cell_cm, rows, columns``.
+    """
+
+    def __init__(self, cfg: Any) -> None:
+        """Read the camera.
+
+        Raises:
+            LanenetError: If the camera file or the window cannot be used.
+        """
+        window = check_settings(_WindowSettings, dict(getattr(cfg, "LANENET_WINDOW", {})), "LANENET_WINDOW")
+        self._view = birdseye_view(_camera_of(cfg), BirdseyeWindow(**window.model_dump()))
+
+    def run(self, image: UInt8[np.ndarray, "h w *c"] | None) -> UInt8[np.ndarray, "rows columns *c"] | None:
+        """Return the view of an image."""
+        return None if image is None else self._view.of(np.ascontiguousarray(image))
+
+    def shutdown(self) -> None:
+        """Do nothing."""
+
+
+class UndistortTransformer:
+    """The image of a lens without distortion, for Donkeycar's image transformations.
+
+    ``cfg.LANENET_CAMERA`` is the camera file.
+    """
+
+    def __init__(self, cfg: Any) -> None:
+        """Read the camera.
+
+        Raises:
+            LanenetError: If the camera file cannot be used.
+        """
+        self._view = undistorting_view(_camera_of(cfg))
+
+    def run(self, image: UInt8[np.ndarray, "h w *c"] | None) -> UInt8[np.ndarray, "rows columns *c"] | None:
+        """Return the view of an image."""
+        return None if image is None else self._view.of(np.ascontiguousarray(image))
+
+    def shutdown(self) -> None:
+        """Do nothing."""
+
+
+class _WindowSettings(Settings):
+    """The default window of :class:`BirdseyeWindow`, with checks."""
+
+    left_cm: float = BirdseyeWindow.left_cm
+    near_cm: float = BirdseyeWindow.near_cm
+    cell_cm: float = Field(default=BirdseyeWindow.cell_cm, gt=0.0)
+    rows: int = Field(default=BirdseyeWindow.rows, ge=1, le=2000)
+    columns: int = Field(default=BirdseyeWindow.columns, ge=1, le=2000)
+
+
+def _camera_of(cfg: Any) -> Camera:
+    path = getattr(cfg, "LANENET_CAMERA", None)
+    if path is None:
+        raise ConfigError("myconfig.py: LANENET_CAMERA is missing, expected the path of a camera file")
+    return read_camera(Path(path).expanduser())

@@ -1,0 +1,273 @@
+"""The watchdog: a process of its own that owns the actuator, and the loop's end of the line to it.
+
+The loop sends commands that carry the time at which they run out. The guard goes to neutral when the last
+one has run out, when the loop's process is gone, and when the actuator fails. It is a process and not a
+thread, so that it outlives whatever holds the loop: a hung driver, a hung network, SIGKILL. And should the
+guard itself die, the loop opens the actuator once more and puts it into neutral.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+from lanenet.errors import HardwareError
+from lanenet.onboard.hardware import Actuator
+
+log = logging.getLogger(__name__)
+
+#: What runs in the guard's process.
+PROGRAM = (sys.executable, "-m", "lanenet.onboard.guard_process")
+#: Kind of message, its number, steering, throttle, and the time at which it runs out.
+MESSAGE = struct.Struct("<cxxxIddd")
+DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
+#: Time for the interpreter, the driver and the device; an Arduino restarts when its port is opened.
+_START_S = 30.0
+#: Commands without an answer for this long: the guard hangs in the actuator's driver.
+_STUCK_S = 0.5
+#: Closing takes no longer than this.
+_CLOSE_S = 2.0
+#: Lines that the guard may leave behind, each of which may be an error.
+_LAST_WORDS = 8
+
+
+@runtime_checkable
+class CommandSink(Protocol):
+    """Where the loop's commands go."""
+
+    def open(self) -> None:
+        """Get ready, in neutral."""
+        ...
+
+    def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
+        """Hand over a command that is good until a time of the monotonic clock."""
+        ...
+
+    def idle(self) -> None:
+        """Stay in neutral; raises HardwareError if whoever holds the actuator has failed."""
+        ...
+
+    def neutral(self) -> None:
+        """Go to neutral at once, from a signal handler as well; never raises."""
+        ...
+
+    def close(self) -> None:
+        """Go to neutral and let go; never raises."""
+        ...
+
+
+class NoActuator:
+    """Takes commands and does nothing with them: a dry run."""
+
+    def open(self) -> None:
+        """Do nothing."""
+
+    def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
+        """Do nothing."""
+
+    def idle(self) -> None:
+        """Do nothing."""
+
+    def neutral(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class GuardedActuator:
+    """The loop's end: starts the guard, hands commands to it and hears what became of them."""
+
+    def __init__(
+        self,
+        settings_json: str,
+        make_actuator: Callable[[], Actuator],
+        watchdog_s: float,
+        give_up_s: float,
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
+        """Prepare; nothing is started.
+
+        Args:
+            settings_json: Settings of the actuator, for the guard.
+            make_actuator: Makes the same actuator in this process, should the guard die.
+            watchdog_s: The longest time that a command is good.
+            give_up_s: The guard takes no more commands after a silence this long.
+            program: Starts the guard; the line and these values follow as arguments.
+        """
+        self._settings_json, self._make_actuator, self._program = settings_json, make_actuator, program
+        self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
+        self._process: subprocess.Popen[bytes] | None = None
+        self._line: socket.socket | None = None
+        self._heard = b""
+        self._sent = self._answered = 0
+        self._waiting_since_s = 0.0
+        self._ready = self._closed = False
+
+    @property
+    def pid(self) -> int:
+        """Process number of the guard; 0 before it is started."""
+        return 0 if self._process is None else self._process.pid
+
+    def open(self) -> None:
+        """Start the guard and wait until it holds the actuator, in neutral.
+
+        Raises:
+            HardwareError: If the actuator does not answer; the guard's own words.
+        """
+        ours, theirs = socket.socketpair()
+        try:
+            values = (theirs.fileno(), self._settings_json, self._watchdog_s, self._give_up_s)
+            # A session of its own: Ctrl-C at the terminal is for the loop, which then says goodbye.
+            self._process = subprocess.Popen(
+                [*self._program, *(str(value) for value in values)],
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+                stdin=subprocess.DEVNULL,
+            )
+        finally:
+            theirs.close()
+        self._line = ours
+        ours.setblocking(False)
+        end_s = time.monotonic() + _START_S
+        try:
+            while not self._ready:
+                left_s = end_s - time.monotonic()
+                if left_s <= 0.0:
+                    raise HardwareError(f"the actuator was not ready within {_START_S:.0f} s")
+                select.select([ours], [], [], left_s)
+                self._listen()
+        except BaseException:
+            self.close()
+            raise
+
+    def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
+        """Hand over a command; see :class:`CommandSink`.
+
+        Raises:
+            HardwareError: If the actuator failed, takes no more commands, or the guard is gone; in the last
+                case the actuator has been put into neutral from here.
+        """
+        self._order(DRIVE, steering_rad, throttle, until_s)
+
+    def idle(self) -> None:
+        """Stay in neutral; see :class:`CommandSink`.
+
+        Raises:
+            HardwareError: As :meth:`send`.
+        """
+        self._order(NEUTRAL, 0.0, 0.0, 0.0)
+
+    def _order(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
+        self._listen()
+        self._post(kind, steering_rad, throttle, until_s)
+        waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
+        if waits:
+            raise HardwareError(f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs")
+
+    def neutral(self) -> None:
+        """Go to neutral at once; never raises."""
+        with contextlib.suppress(HardwareError):
+            self._post(NEUTRAL, 0.0, 0.0, 0.0)
+
+    def close(self) -> None:
+        """Go to neutral, end the guard and wait for it; never raises."""
+        if self._process is None:
+            return
+        with contextlib.suppress(HardwareError):
+            self._post(QUIT, 0.0, 0.0, 0.0)
+        try:
+            self._process.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            log.error("the guard does not end, its driver hangs: it is killed")
+            self._process.kill()
+            self._process.wait()
+        # What it had to say at the end decides whether it left the actuator in order.
+        for _ in range(_LAST_WORDS):
+            with contextlib.suppress(HardwareError):
+                self._listen()
+        if self._line is not None:
+            self._line.close()
+        self._process = self._line = None
+
+    def _post(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
+        if self._line is None:
+            return
+        if self._sent == self._answered:
+            self._waiting_since_s = time.monotonic()
+        self._sent = (self._sent + 1) & 0xFFFFFFFF
+        try:
+            self._line.send(MESSAGE.pack(kind, self._sent, steering_rad, throttle, until_s))
+        except BlockingIOError:
+            raise HardwareError("the actuator takes no more commands: its driver hangs") from None
+        except OSError:
+            self._lost()
+
+    def _listen(self) -> None:
+        """Take in what the guard has to say."""
+        if self._line is None:
+            return
+        while True:
+            try:
+                data = self._line.recv(4096)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self._lost()
+            self._heard += data
+            while b"\n" in self._heard:
+                line, _, self._heard = self._heard.partition(b"\n")
+                self._take(line.decode("utf-8", errors="replace"))
+
+    def _take(self, line: str) -> None:
+        word, _, text = line.partition(" ")
+        if word == "ok":
+            self._answered = int(text)
+            self._waiting_since_s = time.monotonic()
+        elif word == "ready":
+            self._ready = True
+        elif word == "neutral":
+            log.debug("the guard went to neutral: %s", text)
+        elif word == "closed":
+            self._closed = True
+        else:
+            raise HardwareError(text)
+
+    def _lost(self) -> None:
+        """The guard is gone: if it did not say goodbye, do its work from here."""
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+        if self._closed:
+            raise HardwareError("the guard of the actuator was ended from outside; it went to neutral")
+        self._rescue()
+        raise HardwareError(
+            f"the guard of the actuator (process {self.pid}) died; neutral was set without it"
+        )
+
+    def _rescue(self) -> None:
+        if not self._ready:
+            return
+        try:
+            actuator = self._make_actuator()
+            actuator.open()
+            actuator.close()
+        except Exception as error:
+            log.critical("the actuator could not be put into neutral: %s; take the battery out", error)
+
+
+def raise_priority() -> None:
+    """Run before others where the system allows it: the guard has little to do, but that in time."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, -10)

@@ -1,0 +1,190 @@
+"""What runs in the guard's process, which :mod:`lanenet.onboard.guard` starts with these arguments.
+
+    LINE SETTINGS WATCHDOG_S GIVE_UP_S
+
+SETTINGS is JSON. LINE is the number of an open socket. Down it come messages of fixed size; up go lines of
+text: ``ready``, ``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``, ``closed``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import math
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from types import FrameType
+
+from pydantic import TypeAdapter
+
+from lanenet.errors import LanenetError
+from lanenet.onboard.actuators import ActuatorSettings, make_actuator
+from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT, raise_priority
+from lanenet.onboard.hardware import Actuator
+
+log = logging.getLogger("lanenet.onboard.guard")
+
+#: Neutral is written again and again: a write that was lost on the wire is made good.
+_REFRESH_S = 0.05
+
+
+class Guard:
+    """Owns the actuator; nothing but neutral unless a command that still holds says otherwise."""
+
+    def __init__(self, line: socket.socket, actuator: Actuator, watchdog_s: float, give_up_s: float) -> None:
+        self._line, self._actuator = line, actuator
+        self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
+        self._until_s = -math.inf
+        self._heard_s = time.monotonic()
+        self._logged_s = -math.inf
+        self._driving = False
+        #: Once set, no command is taken any more.
+        self._over = ""
+        self.asked_to_end = False
+
+    def run(self) -> str:
+        """Serve until the loop is gone or says goodbye; returns why it ended."""
+        buffer = b""
+        while True:
+            now_s = time.monotonic()
+            wait_s = min(_REFRESH_S, max(0.0, self._until_s - now_s)) if self._driving else _REFRESH_S
+            readable, _, _ = select.select([self._line], [], [], wait_s)
+            if self.asked_to_end:
+                return "asked to end"
+            if readable:
+                try:
+                    data = self._line.recv(65536)
+                except OSError:
+                    data = b""
+                if not data:
+                    return "the drive loop is gone"
+                buffer += data
+                whole = len(buffer) - len(buffer) % MESSAGE.size
+                messages = list(MESSAGE.iter_unpack(buffer[:whole]))
+                buffer = buffer[whole:]
+                if any(kind == QUIT for kind, *_ in messages):
+                    return "the drive loop has ended"
+                if messages:
+                    # Of several that waited, only the newest says what is wanted now.
+                    self._obey(*messages[-1])
+            self._expire(readable=bool(readable))
+
+    def _obey(self, kind: bytes, number: int, steering_rad: float, throttle: float, until_s: float) -> None:
+        now_s = time.monotonic()
+        self._heard_s = now_s
+        # No command is good for longer than the watchdog, whatever it says.
+        until_s = min(until_s, now_s + self._watchdog_s)
+        sane = math.isfinite(steering_rad) and math.isfinite(throttle) and abs(throttle) <= 1.0
+        if kind == DRIVE and sane and until_s > now_s and not self._over:
+            try:
+                self._actuator.send(steering_rad, throttle)
+            except Exception as error:
+                self._neutral()
+                self._over = f"the actuator failed: {error}"
+                self._say(f"failed {self._over}")
+                return
+            self._driving, self._until_s = True, until_s
+        else:
+            self._neutral()
+            if kind == DRIVE and not sane:
+                self._say(f"neutral the command is no number: steering {steering_rad}, throttle {throttle}")
+            if self._over:
+                self._say(f"failed {self._over}")
+                return
+        self._say(f"ok {number}")
+
+    def _expire(self, readable: bool) -> None:
+        now_s = time.monotonic()
+        if self._driving and now_s >= self._until_s:
+            self._neutral()
+            reason = f"no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms"
+            self._say(f"neutral {reason}")
+            # A loop that hangs cannot tell it. Each second once: a slow camera lets every command run out.
+            if now_s - self._logged_s > 1.0:
+                self._logged_s = now_s
+                log.warning("neutral: %s", reason)
+        elif not self._driving and not readable:
+            self._actuator.neutral()
+        if not self._over and now_s - self._heard_s > self._give_up_s and math.isfinite(self._until_s):
+            self._over = f"the drive loop was silent for {self._give_up_s:g} s"
+
+    def _neutral(self) -> None:
+        self._actuator.neutral()
+        self._driving = False
+
+    def _say(self, text: str) -> None:
+        # A loop that does not listen must not hold the guard.
+        with contextlib.suppress(OSError):
+            self._line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
+
+
+def actuator_from_json(text: str) -> Actuator:
+    """Build an actuator of its settings as JSON; the device is not touched.
+
+    Raises:
+        ConfigError: If the settings name a file that cannot be used.
+    """
+    adapter: TypeAdapter[ActuatorSettings] = TypeAdapter(ActuatorSettings)
+    return make_actuator(adapter.validate_json(text))
+
+
+def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_json) -> int:
+    """Open the actuator, serve, close it.
+
+    Args:
+        arguments: As above.
+        build: Makes the actuator of its settings.
+
+    Returns:
+        The exit code.
+    """
+    line_number, settings_json, watchdog_s, give_up_s = arguments
+    line = socket.socket(fileno=int(line_number))
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    logging.basicConfig(format="lanenet guard: %(message)s", level=logging.INFO)
+
+    def say(text: str) -> None:
+        with contextlib.suppress(OSError):
+            line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
+
+    actuator: Actuator | None = None
+    try:
+        actuator = build(settings_json)
+        guard = Guard(line, actuator, float(watchdog_s), float(give_up_s))
+
+        def end(_number: int, _frame: FrameType | None) -> None:
+            guard.asked_to_end = True
+
+        signal.signal(signal.SIGTERM, end)
+        actuator.open()
+        actuator.neutral()
+        raise_priority()
+        # What exists now stays; a collection would be a pause.
+        gc.collect()
+        gc.disable()
+        say("ready")
+        reason = guard.run()
+    except LanenetError as error:
+        say(f"failed {error}")
+        return 1
+    except Exception as error:
+        say(f"failed the guard of the actuator failed: {type(error).__name__}: {error}")
+        raise
+    finally:
+        if actuator is not None:
+            actuator.neutral()
+            actuator.close()
+        say("closed")
+    # Said after the motor stands: a terminal that is gone may hold a writer for ever.
+    log.info("neutral: %s", reason)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

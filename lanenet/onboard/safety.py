@@ -1,0 +1,236 @@
+"""When the car may drive: arming, faults, slowing down, and the limits of every command.
+
+A command is good until its frame is ``max_age_s`` old. Whatever goes wrong, no new command appears, the last
+one runs out, and the guard (:mod:`lanenet.onboard.guard`) puts the motor into neutral; nothing has to notice
+the fault for that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import Field, model_validator
+
+from lanenet.config import Settings
+from lanenet.onboard.hardware import Frame
+
+#: A frame that is this far ahead of the clock is not timed by that clock.
+_MAX_AHEAD_S = 0.05
+#: Every how many-th pixel tells most frames apart.
+_SAMPLE = 16
+
+
+class LimitSettings(Settings):
+    """What no command exceeds.
+
+    Attributes:
+        max_steering_rad: Steering stays within plus and minus this.
+        steering_rate_rad_s: Fastest change of the steering.
+        max_throttle: Throttle stays between 0 and this; the car does not reverse.
+        throttle_rate_s: Fastest rise of the throttle, per second; it may fall at once.
+    """
+
+    max_steering_rad: float = Field(default=0.45, gt=0.0, lt=0.5 * math.pi)
+    steering_rate_rad_s: float = Field(default=8.0, gt=0.0)
+    max_throttle: float = Field(default=0.4, gt=0.0, le=1.0)
+    throttle_rate_s: float = Field(default=1.0, gt=0.0)
+
+
+class SafetySettings(Settings):
+    """When the car slows down, stops and gives up.
+
+    Attributes:
+        watchdog_s: Without a new command for this long the motor goes to neutral.
+        max_age_s: A command is good until its frame is this old.
+        countdown_s: An armed car starts after it has seen the lane this long without a break.
+        slow_below: Below this confidence the car slows down.
+        slow_share: Share of the speed that is left at ``stop_below``.
+        stop_below: Below this confidence it stops.
+        slow_for_s: A car that has been slow for this long stops.
+        end_after_s: An armed car that had to stop for this long does not start again: the drive ends.
+        allow_repeated_frames: Accept frames that equal the one before, pixel for pixel. A camera gives them
+            only when it hangs; a simulator without noise always, while the car stands.
+    """
+
+    watchdog_s: float = Field(default=0.1, gt=0.0, le=0.5)
+    max_age_s: float = Field(default=0.1, gt=0.0, le=0.5)
+    countdown_s: float = Field(default=3.0, ge=0.0)
+    slow_below: float = Field(default=0.5, ge=0.0, le=1.0)
+    slow_share: float = Field(default=0.5, gt=0.0, le=1.0)
+    stop_below: float = Field(default=0.2, ge=0.0, le=1.0)
+    slow_for_s: float = Field(default=3.0, gt=0.0)
+    end_after_s: float = Field(default=1.0, ge=0.2)
+    allow_repeated_frames: bool = False
+
+    @model_validator(mode="after")
+    def _check_order(self) -> SafetySettings:
+        if self.stop_below > self.slow_below:
+            raise ValueError(
+                f"expected stop_below at or below slow_below, found {self.stop_below:g} above "
+                f"{self.slow_below:g}"
+            )
+        return self
+
+
+class State(StrEnum):
+    """What the car may do just now."""
+
+    DISARMED = "disarmed"
+    COUNTDOWN = "countdown"
+    DRIVING = "driving"
+    SLOW = "slow"
+    STOPPED = "stopped"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of one step of the loop.
+
+    Attributes:
+        state: What the car may do.
+        speed_share: Share of the wished speed that is allowed; 0 is neutral.
+        steers: Whether the wish of this frame is fit to steer by.
+        reason: Why the car is slow or stands; empty when it drives.
+    """
+
+    state: State
+    speed_share: float
+    steers: bool
+    reason: str = ""
+
+
+class SafetyJudge:
+    """Decides, step by step, whether the car drives, slows down, stands or gives up."""
+
+    def __init__(self, settings: SafetySettings, armed: bool) -> None:
+        """Start disarmed; ``armed`` lets the countdown begin once the lane is seen."""
+        self._settings, self._armed = settings, armed
+        self._counting_since_s = math.nan
+        self._slow_since_s = math.nan
+        self._fault_since_s = math.nan
+        self._started = False
+        self._ended = ""
+
+    def judge(self, now_s: float, fault: str, confidence: float = math.nan) -> Verdict:
+        """Judge one step.
+
+        Args:
+            now_s: Time on the monotonic clock.
+            fault: What keeps this step from giving a command; empty if nothing does.
+            confidence: Of the estimate; NaN counts as 0.
+
+        Returns:
+            The verdict; once the state is ``ended`` it stays so.
+        """
+        s = self._settings
+        confidence = confidence if math.isfinite(confidence) else 0.0
+        if not fault and confidence < s.stop_below:
+            fault = f"confidence {confidence:.2f}, below {s.stop_below:g}"
+        if not fault and confidence < s.slow_below:
+            self._slow_since_s = now_s if math.isnan(self._slow_since_s) else self._slow_since_s
+            if now_s - self._slow_since_s >= s.slow_for_s:
+                fault = f"confidence below {s.slow_below:g} for {s.slow_for_s:g} s"
+        elif not fault:
+            self._slow_since_s = math.nan
+        if self._ended:
+            return Verdict(State.ENDED, 0.0, False, self._ended)
+        if fault:
+            return self._faulty(now_s, fault)
+        self._fault_since_s = math.nan
+        if not self._armed:
+            return Verdict(State.DISARMED, 0.0, True)
+        if not self._started:
+            self._counting_since_s = now_s if math.isnan(self._counting_since_s) else self._counting_since_s
+            left_s = self._counting_since_s + s.countdown_s - now_s
+            if left_s > 0.0:
+                return Verdict(State.COUNTDOWN, 0.0, True, f"starts in {math.ceil(left_s)} s")
+            self._started = True
+        if confidence < s.slow_below:
+            part = (confidence - s.stop_below) / (s.slow_below - s.stop_below)
+            share = s.slow_share + (1.0 - s.slow_share) * part
+            return Verdict(State.SLOW, share, True, f"confidence {confidence:.2f}, below {s.slow_below:g}")
+        return Verdict(State.DRIVING, 1.0, True)
+
+    def _faulty(self, now_s: float, fault: str) -> Verdict:
+        self._counting_since_s = math.nan
+        if math.isnan(self._fault_since_s):
+            self._fault_since_s = now_s
+        if self._started and now_s - self._fault_since_s >= self._settings.end_after_s:
+            self._ended = f"{fault}; stopped for {self._settings.end_after_s:g} s"
+            return Verdict(State.ENDED, 0.0, False, self._ended)
+        state = State.STOPPED if self._armed else State.DISARMED
+        return Verdict(state, 0.0, False, fault)
+
+
+class FrameCheck:
+    """Finds frames that may not steer: missing, late, from another clock, or the same as before."""
+
+    def __init__(self, settings: SafetySettings) -> None:
+        """Take the limits; no frame has been seen."""
+        self._settings = settings
+        self._before: UInt8[np.ndarray, "h w 3"] | None = None
+
+    def fault_of(self, frame: Frame | None, now_s: float) -> str:
+        """Return what is wrong with a frame, in words; empty if nothing is."""
+        if frame is None:
+            return "no frame from the camera"
+        before, self._before = self._before, frame.image_bgr
+        age_s = now_s - frame.t_s
+        if not math.isfinite(age_s) or age_s < -_MAX_AHEAD_S:
+            return f"frame {frame.number} is timed {-age_s:.2f} s ahead of the clock"
+        if age_s > self._settings.max_age_s:
+            return f"frame {frame.number} is {1e3 * age_s:.0f} ms old"
+        if not self._settings.allow_repeated_frames and before is not None and _same(before, frame.image_bgr):
+            return f"frame {frame.number} is the one before once more: the camera hangs"
+        return ""
+
+
+class CommandLimiter:
+    """Keeps steering and throttle, and how fast they change, within limits."""
+
+    def __init__(self, settings: LimitSettings) -> None:
+        """Start straight ahead and in neutral."""
+        self._settings = settings
+        self._steered_s = self._throttled_s = math.nan
+        self.steering_rad = 0.0
+        self.throttle = 0.0
+
+    def limit(self, steering_rad: float, throttle: float, now_s: float) -> tuple[float, float]:
+        """Return the nearest command that is allowed now.
+
+        Args:
+            steering_rad: Wished steering, positive left; NaN keeps what is.
+            throttle: Wished throttle; NaN is neutral.
+            now_s: Time of the command on the monotonic clock.
+        """
+        s = self._settings
+        if math.isfinite(steering_rad):
+            step = s.steering_rate_rad_s * _since(self._steered_s, now_s)
+            aim = min(max(steering_rad, -s.max_steering_rad), s.max_steering_rad)
+            self.steering_rad = min(max(aim, self.steering_rad - step), self.steering_rad + step)
+        aim = min(max(throttle, 0.0), s.max_throttle) if math.isfinite(throttle) else 0.0
+        self.throttle = min(aim, self.throttle + s.throttle_rate_s * _since(self._throttled_s, now_s))
+        self._steered_s = self._throttled_s = now_s
+        return self.steering_rad, self.throttle
+
+    def neutral(self, now_s: float) -> None:
+        """Note that the motor is in neutral: from now the throttle rises from 0 again."""
+        self.throttle, self._throttled_s = 0.0, now_s
+
+
+def _since(before_s: float, now_s: float) -> float:
+    return max(0.0, now_s - before_s) if math.isfinite(before_s) else 0.0
+
+
+def _same(before: UInt8[np.ndarray, "h w 3"], now: UInt8[np.ndarray, "h w 3"]) -> bool:
+    if before.shape != now.shape:
+        return False
+    # Noise tells frames apart in a few pixels; only frames that may be the same are compared in full.
+    if not np.array_equal(before[::_SAMPLE, ::_SAMPLE], now[::_SAMPLE, ::_SAMPLE]):
+        return False
+    return bool(np.array_equal(before, now))

@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from wire_log import Line, guarded_wire, read_wire, settings_of
+
+from lanenet.errors import HardwareError
+from lanenet.onboard.guard import GuardedActuator
+
+WATCHDOG_S = 0.1
+#: The system may wake a process late, and a busy test machine does.
+LATE_S = 0.15
+
+
+@pytest.fixture
+def wire(tmp_path: Path) -> Path:
+    return tmp_path / "wire.txt"
+
+
+def guarded(wire: Path, **faults: object) -> GuardedActuator:
+    return guarded_wire(settings_of(wire, **faults), WATCHDOG_S)
+
+
+def drive(sink: GuardedActuator, count: int = 5, throttle: float = 0.3) -> float:
+    """Send commands at 50 Hz; returns the time of the last."""
+    for _ in range(count):
+        last_s = time.monotonic()
+        sink.send(0.1, throttle, last_s + WATCHDOG_S)
+        time.sleep(0.02)
+    return last_s
+
+
+def wait_for(wire: Path, kind: str, after_s: float, timeout_s: float = 5.0) -> Line:
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        for line in read_wire(wire) if wire.exists() else []:
+            if line.kind == kind and line.t_s >= after_s:
+                return line
+        time.sleep(0.01)
+    raise AssertionError(f"no {kind} on the wire within {timeout_s} s")
+
+
+def test_neutral_first_commands_then_neutral_at_the_end(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    drive(sink)
+    sink.close()
+    lines = read_wire(wire)
+    assert [line.kind for line in lines[:2]] == ["open", "neutral"]
+    assert lines[-1].kind == "close" and lines[-2].kind == "neutral"
+    sent = [line for line in lines if line.kind == "send"]
+    assert sent and {(line.steering_rad, line.throttle) for line in sent} == {(0.1, 0.3)}
+    # Another process owns the wire, and it is gone afterwards.
+    assert {line.process for line in lines} != {os.getpid()}
+    assert not Path(f"/proc/{lines[0].process}").exists()
+
+
+def test_a_silent_loop_runs_out(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    last_s = drive(sink)
+    neutral = wait_for(wire, "neutral", last_s)
+    assert WATCHDOG_S - 0.01 <= neutral.t_s - last_s <= WATCHDOG_S + LATE_S
+    # A short hiccup is forgiven ...
+    again_s = drive(sink)
+    assert wait_for(wire, "send", again_s)
+    # ... a long silence is not.
+    time.sleep(1.3)
+    with pytest.raises(HardwareError, match="silent for 1 s"):
+        for _ in range(20):
+            drive(sink, 1)
+    assert not [line for line in read_wire(wire) if line.kind == "send" and line.t_s > again_s + 0.5]
+    sink.close()
+
+
+def test_no_command_is_good_for_longer_than_the_watchdog(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    sent_s = time.monotonic()
+    sink.send(0.0, 0.2, sent_s + 60.0)
+    assert wait_for(wire, "neutral", wait_for(wire, "send", sent_s).t_s).t_s - sent_s <= WATCHDOG_S + LATE_S
+    sink.send(0.0, 0.2, time.monotonic() - 0.01)
+    time.sleep(0.1)
+    assert len([line for line in read_wire(wire) if line.kind == "send"]) == 1
+    sink.close()
+
+
+@pytest.mark.parametrize("command", [(float("nan"), 0.2), (0.0, float("nan")), (0.0, 1.5)])
+def test_what_is_no_command_is_neutral(wire: Path, command: tuple[float, float]) -> None:
+    sink = guarded(wire)
+    sink.open()
+    last_s = drive(sink)
+    sink.send(*command, time.monotonic() + WATCHDOG_S)
+    assert wait_for(wire, "neutral", last_s).t_s - last_s <= WATCHDOG_S
+    assert not [line for line in read_wire(wire) if line.kind == "send" and line.t_s > last_s + 0.02]
+    sink.close()
+
+
+def test_a_failing_actuator_is_told_and_stays_neutral(wire: Path) -> None:
+    sink = guarded(wire, fail_at=3)
+    sink.open()
+    with pytest.raises(HardwareError, match="actuator failed: Remote I/O error"):
+        drive(sink, 20)
+    fault = next(line for line in read_wire(wire) if line.kind == "fault")
+    assert wait_for(wire, "neutral", fault.t_s).t_s - fault.t_s <= 0.05
+    sink.close()
+    assert not [line for line in read_wire(wire) if line.kind == "send" and line.t_s > fault.t_s]
+
+
+def test_a_hung_actuator_is_told_and_set_neutral_without_its_guard(wire: Path) -> None:
+    sink = guarded(wire, hang_at=3)
+    sink.open()
+    with pytest.raises(HardwareError, match="driver hangs"):
+        drive(sink, 200)
+    sink.close()
+    assert [line.kind for line in read_wire(wire)][-2:] == ["open", "close"]
+    assert read_wire(wire)[-1].process == os.getpid()
+
+
+def test_an_actuator_that_is_not_there_is_named(wire: Path) -> None:
+    sink = guarded(wire, refuse="no PCA9685 at address 0x40")
+    with pytest.raises(HardwareError, match="no PCA9685 at address 0x40"):
+        sink.open()
+    assert sink.pid == 0
+
+
+def test_when_the_guard_is_killed_the_loop_sets_neutral(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    drive(sink)
+    killed_s = time.monotonic()
+    os.kill(sink.pid, signal.SIGKILL)
+    with pytest.raises(HardwareError, match="died; neutral was set without it"):
+        drive(sink, 20)
+    rescue = [line for line in read_wire(wire) if line.process == os.getpid()]
+    assert [line.kind for line in rescue] == ["open", "close"]
+    assert rescue[-1].t_s - killed_s <= WATCHDOG_S + LATE_S
+    sink.close()
+
+
+def test_a_guard_that_is_ended_goes_to_neutral_itself(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    ended_s = drive(sink)
+    os.kill(sink.pid, signal.SIGTERM)
+    with pytest.raises(HardwareError, match="ended from outside"):
+        drive(sink, 40)
+    assert wait_for(wire, "close", ended_s).process != os.getpid()
+    sink.close()
+
+
+def test_an_idle_loop_notices_that_its_guard_died(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    for _ in range(5):
+        sink.idle()
+        time.sleep(0.02)
+    os.kill(sink.pid, signal.SIGKILL)
+    with pytest.raises(HardwareError, match="died; neutral was set without it"):
+        for _ in range(20):
+            sink.idle()
+            time.sleep(0.02)
+    assert not [line for line in read_wire(wire) if line.kind == "send"]
+    sink.close()
+
+
+def test_the_guard_loads_little() -> None:
+    # It starts quickly, takes little memory, and nothing of the perception can hold it.
+    code = (
+        "import sys, lanenet.onboard.guard_process; print(*sorted(m.partition('.')[0] for m in sys.modules))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"lanenet", "pydantic"} <= set(result.stdout.split())
+    assert not {"cv2", "onnxruntime", "serial", "smbus2"} & set(result.stdout.split())

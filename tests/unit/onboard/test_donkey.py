@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from lanenet.config import check_settings, load_settings
+from lanenet.control.controller import ControlSettings
+from lanenet.control.steering import SteeringSettings
+from lanenet.errors import CalibrationError, ConfigError, ModelMismatchError
+from lanenet.onboard.donkey import (
+    BirdseyeTransformer,
+    CvLaneController,
+    DonkeySettings,
+    LanePilot,
+    UndistortTransformer,
+)
+from lanenet.perception.estimate import LaneEstimate
+
+ROOT = Path(__file__).resolve().parents[3]
+CHECKPOINT = ROOT / "checkpoints" / "small"
+CONFIG = ROOT / "configs" / "donkeycar" / "pilot.yaml"
+
+
+@pytest.fixture
+def example_rgb() -> np.ndarray:
+    """Donkeycar hands out red, green, blue."""
+    return cv2.cvtColor(cv2.imread(str(CHECKPOINT / "example.jpg")), cv2.COLOR_BGR2RGB)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        self.now_s += 0.05
+        return self.now_s
+
+
+class Answers:
+    """A detector that gives the lane it was told to and keeps the image it saw."""
+
+    def __init__(self) -> None:
+        self.estimate = LaneEstimate()
+        self.seen = None
+
+    def detect(self, frame_bgr):
+        self.seen = frame_bgr
+        return self.estimate
+
+    def reset(self):
+        pass
+
+
+@pytest.fixture
+def pilot():
+    settings = DonkeySettings(
+        detector={"kind": "hough"},
+        control=ControlSettings(
+            steering=SteeringSettings(wheelbase_cm=20.0, max_steering_rad=0.4), smoothing={"enabled": False}
+        ),
+        limits={
+            "max_steering_rad": 0.4,
+            "max_throttle": 0.25,
+            "steering_rate_rad_s": 50,
+            "throttle_rate_s": 50,
+        },
+        hold_s=0.12,
+    )
+    pilot = LanePilot(settings, clock=Clock())
+    pilot._detector = Answers()
+    # Before its first image the car stands straight; from there it may turn as fast as its limits allow.
+    assert pilot.run(None) == (0.0, 0.0)
+    return pilot
+
+
+def lane(shift_cm: float, confidence: float = 1.0) -> LaneEstimate:
+    points = np.array([-20.0, -20, -20, 20, 20, 20]) + shift_cm
+    return LaneEstimate(points_cm=points, confidence=confidence)
+
+
+IMAGE = np.zeros((24, 32, 3), np.uint8)
+
+
+def test_angle_has_donkeycars_sign(pilot):
+    pilot._detector.estimate = lane(-10.0)
+    angle, throttle = pilot.run(IMAGE)
+    assert angle < -0.2 and 0.1 < throttle <= 0.25, "the lane lies to the left, so the angle is negative"
+    pilot._detector.estimate = lane(10.0)
+    assert pilot.run(IMAGE)[0] == pytest.approx(-angle)
+    pilot._detector.estimate = lane(35.0)
+    assert pilot.run(IMAGE)[0] == 1.0
+
+
+def test_detector_sees_blue_first(pilot):
+    image = np.zeros((24, 32, 3), np.uint8)
+    image[..., 0] = 200
+    pilot.run(image[:, ::-1])
+    assert pilot._detector.seen[0, 0].tolist() == [0, 0, 200] and pilot._detector.seen.flags.c_contiguous
+
+
+def test_lost_lane_stops_the_car_after_its_time(pilot):
+    pilot._detector.estimate = lane(-5.0)
+    angle, throttle = pilot.run(IMAGE)
+    pilot._detector.estimate = LaneEstimate()
+    answers = [pilot.run(IMAGE) for _ in range(5)]
+    assert [a for a, _ in answers] == [angle] * 5
+    assert [t > 0.0 for _, t in answers] == [True, True, False, False, False], "0.12 s at 20 frames/s"
+    assert throttle > 0.0 and answers[-1][1] == 0.0
+    pilot._detector.estimate = lane(-5.0)
+    assert pilot.run(IMAGE)[1] > 0.0
+
+
+def test_doubtful_frame_counts_as_none(pilot):
+    pilot._detector.estimate = lane(0.0, confidence=0.2)
+    assert [pilot.run(IMAGE)[1] for _ in range(3)] == [0.0, 0.0, 0.0]
+
+
+def test_shipped_settings_drive_on_the_example(example_rgb):
+    pilot = LanePilot(load_settings(DonkeySettings, CONFIG), CONFIG.parent, clock=Clock())
+    throttles = [pilot.run(example_rgb)[1] for _ in range(20)]
+    assert np.diff(throttles).max() <= 0.0501, "the throttle rises by 1 per second at most"
+    angle, throttle = pilot.run(example_rgb)
+    # Steering is pure pursuit of the lane's centre, 15 cm ahead, to the left in this picture.
+    assert pilot.estimate.mask.all() and -0.9 < angle < -0.05 and throttle > 0.1
+    assert pilot.run_threaded(example_rgb) == (
+        pytest.approx(angle, abs=0.05),
+        pytest.approx(throttle, abs=0.05),
+    )
+    pilot.shutdown()
+
+
+def test_cv_controller(example_rgb):
+    cfg = SimpleNamespace(LANENET_CONFIG=str(CONFIG), OVERLAY_IMAGE=True)
+    controller = CvLaneController(pid=None, cfg=cfg)
+    before = example_rgb.copy()
+    controller.run(None)
+    time.sleep(0.01)
+    angle, throttle, image = controller.run(example_rgb)
+    assert angle < 0.0 < throttle and image.shape == example_rgb.shape
+    assert (example_rgb == before).all() and (image != before).any(), "drawn into a copy"
+    # The left line is drawn in green in either order of colours, the right one in orange: more red than blue.
+    changed = image[(image != before).any(axis=2)].astype(int)
+    assert (changed[:, 0] - changed[:, 2]).max() > 100
+    assert controller.run(None)[2] is None
+    cfg.OVERLAY_IMAGE = False
+    assert CvLaneController(None, cfg).run(example_rgb)[2] is example_rgb
+    controller.shutdown()
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="LANENET_CONFIG is missing"):
+        CvLaneController(None, SimpleNamespace())
+    with pytest.raises(ConfigError, match="LANENET_CAMERA is missing"):
+        BirdseyeTransformer(SimpleNamespace())
+    with pytest.raises(ConfigError, match="no such file"):
+        LanePilot.from_file(tmp_path / "lanenet.yaml")
+    control = {"steering": {"wheelbase_cm": 20}}
+    with pytest.raises(ConfigError, match="did you mean 'min_confidence'"):
+        check_settings(DonkeySettings, {"control": control, "min_confidenc": 1}, "lanenet.yaml")
+
+
+def test_model_of_another_camera_is_refused(tmp_path):
+    settings = load_settings(DonkeySettings, CONFIG)
+    text = (CHECKPOINT / "camera.yaml").read_text().replace("height_cm: ", "height_cm: 1")
+    (tmp_path / "camera.yaml").write_text(text)
+    other = settings.model_copy(update={"camera": tmp_path / "camera.yaml"})
+    with pytest.raises(ModelMismatchError, match="trained with camera"):
+        LanePilot(other, CONFIG.parent)
+
+
+def test_transformers(example_rgb):
+    cfg = SimpleNamespace(LANENET_CAMERA=str(CHECKPOINT / "camera.yaml"), LANENET_WINDOW={"cell_cm": 1.5})
+    birdseye = BirdseyeTransformer(cfg)
+    assert birdseye.run(example_rgb).shape == (96, 128, 3)
+    assert birdseye.run(None) is None
+    assert UndistortTransformer(cfg).run(example_rgb[:, ::-1]).shape == example_rgb.shape
+    with pytest.raises(CalibrationError, match="px, expected"):
+        birdseye.run(example_rgb[:50, :60])
+    cfg.LANENET_WINDOW = {"cells_cm": 1}
+    with pytest.raises(ConfigError, match="did you mean 'cell_cm'"):
+        BirdseyeTransformer(cfg)

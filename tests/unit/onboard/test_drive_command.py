@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from lanenet.cli import app
+from lanenet.data.drive import open_drive
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.errors import CalibrationError, ConfigError
+from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
+from lanenet.onboard.drive import build_loop
+from lanenet.onboard.drive_settings import load_drive_settings
+from lanenet.onboard.safety import State
+
+
+@pytest.fixture
+def car(tmp_path: Path) -> Path:
+    """A config that replays a painted drive at full speed, with the lane filter."""
+    camera = example_camera()
+    with DriveWriter(tmp_path / "drive", camera, LANE_WIDTH_CM) as writer:
+        for k, frame in enumerate(example_frames(camera, 8, np.random.default_rng(0)) * 3):
+            writer.add(frame, 0.05 * k, throttle=0.2)
+    config = {
+        "source": {"kind": "replay", "path": str(tmp_path / "drive"), "pace": "fast"},
+        "camera": str(tmp_path / "drive" / "camera.yaml"),
+        "detector": {"kind": "lane-filter", "lane_width_cm": LANE_WIDTH_CM},
+        "control": {"steering": {"look_ahead_cm": 20.0}},
+        # On a busy machine a frame may be old before it is answered.
+        "safety": {"countdown_s": 0.0, "max_age_s": 0.5},
+    }
+    path = tmp_path / "car.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def drive(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, ["drive", *(str(word) for word in words)])
+
+
+def test_the_wheelbase_is_the_cameras_unless_the_settings_say(car: Path) -> None:
+    assert load_drive_settings(car).control.steering.wheelbase_cm == example_camera().wheelbase_cm == 26.0
+    given = load_drive_settings(car, ["control.steering.wheelbase_cm=17.5"])
+    assert given.control.steering.wheelbase_cm == 17.5
+    with pytest.raises(ConfigError, match=r"'control\.steering\.wheelbase_cm' is missing"):
+        load_drive_settings(car, ["camera=null"])
+    with pytest.raises(CalibrationError, match=r"nowhere\.yaml"):
+        load_drive_settings(car, ["camera=nowhere.yaml"])
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("safety.watchdog_s=5", "safety.watchdog_s"),
+        ("limits.max_throttle=1.5", "limits.max_throttle"),
+        ("source.kind=webcam", "source"),
+        ("saftey.countdown_s=1", "did you mean 'safety'"),
+        ("control=3", "control"),
+    ],
+)
+def test_a_wrong_setting_is_named(car: Path, override: str, told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_drive_settings(car, [override])
+    assert told in str(caught.value) and "car.yaml" in str(caught.value)
+
+
+def test_options_that_contradict_each_other_are_refused(car: Path) -> None:
+    settings = load_drive_settings(car)
+    with pytest.raises(ConfigError, match="expected one of"):
+        build_loop(settings, arm=True, dry_run=True)
+    with pytest.raises(ConfigError, match="'actuator' is missing"):
+        build_loop(settings, arm=True)
+
+
+def test_a_dry_run_shows_what_would_be_sent(car: Path) -> None:
+    result = drive(car, "--dry-run")
+    assert result.exit_code == 0, result.output
+    assert "24 frames" in result.output and "driving 100 %" in result.output
+    assert "ended: the recording is over" in result.output
+    assert "next: lanenet bench" in result.output
+
+
+def test_the_log_and_the_live_line_go_to_stderr_and_leave_nothing_behind(car: Path) -> None:
+    log = logging.getLogger("lanenet")
+    before = (log.level, list(log.handlers))
+    result = drive(car, "--dry-run", "--frames", "5")
+    assert "INFO driving" in result.stderr and "steering" in result.stderr
+    assert "INFO driving" not in result.stdout and "5 frames, as asked" in result.stdout
+    assert (log.level, list(log.handlers)) == before
+
+
+def test_a_car_without_an_actuator_says_what_to_do(car: Path) -> None:
+    result = drive(car)
+    assert result.exit_code == 1 and "or --dry-run" in result.stderr
+
+
+def test_an_armed_car_drives_through_its_guard(car: Path) -> None:
+    settings = load_drive_settings(car, ["actuator={kind: recorder}"])
+    steps = []
+    report = build_loop(settings, arm=True, watch=steps.append).run()
+    assert report.frames == 24 and not report.by_fault
+    assert {step.state for step in steps} == {State.DRIVING}
+    assert steps[-1].throttle > 0.0
+    unarmed = drive(car, "actuator={kind: recorder}")
+    assert unarmed.exit_code == 0 and "disarmed 100 %" in unarmed.output
+    assert "--steering-only" in unarmed.output
+
+
+def test_an_armed_car_whose_camera_falls_silent_ends_with_an_error(car: Path) -> None:
+    silent = ("source.pace=real", "source.rate_hz=1", "safety.end_after_s=0.3")
+    result = drive(car, "actuator={kind: recorder}", *silent, "--arm")
+    assert result.exit_code == 1
+    assert "the car had to stop: no frame from the camera" in result.stderr
+
+
+def test_a_recorded_drive_holds_the_frames_and_what_was_told(car: Path, tmp_path: Path) -> None:
+    recording = f"recording={{folder: {tmp_path / 'drives'}, min_free_mb: 0, queue_frames: 100}}"
+    result = drive(car, recording, "actuator={kind: recorder}", "--arm")
+    assert result.exit_code == 0, result.output
+    assert "recorded 24 frames, left out 0" in result.output and "next: lanenet map" in result.output
+    (path,) = (tmp_path / "drives").iterdir()
+    recorded = open_drive(path)
+    assert len(recorded) == 24 and recorded.problems == ()
+    assert recorded.commands.throttle is not None and recorded.commands.throttle.max() > 0.0
+    assert recorded.commands.steering_rad is not None and np.ptp(recorded.commands.steering_rad) > 0.0
+    assert recorded.camera is not None and recorded.camera.hash == example_camera().hash
+
+
+def test_a_dry_run_records_no_commands(car: Path, tmp_path: Path) -> None:
+    recording = f"recording={{folder: {tmp_path / 'drives'}, min_free_mb: 0, queue_frames: 100}}"
+    assert drive(car, recording, "--dry-run").exit_code == 0
+    (path,) = (tmp_path / "drives").iterdir()
+    commands = open_drive(path).commands
+    assert commands.throttle is None and commands.steering_rad is None

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import pytest
+
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError
+from lanenet.onboard.actuators.myconfig import read_assignments, settings_from_myconfig, with_myconfig
+from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
+
+NEW = """
+import os
+raise SystemExit("this file was run")
+CAR_PATH = os.path.join("a", "b")
+DRIVE_TRAIN_TYPE = "PWM_STEERING_THROTTLE"
+PWM_STEERING_THROTTLE = {
+    "PWM_STEERING_PIN": "PCA9685.1:41.3",   # Pin for steering servo
+    "PWM_STEERING_SCALE": 1.0,
+    "PWM_STEERING_INVERTED": False,
+    "PWM_THROTTLE_PIN": "PCA9685.1:41.2",
+    "PWM_THROTTLE_SCALE": 0.5,
+    "PWM_THROTTLE_INVERTED": False,
+    "STEERING_LEFT_PWM": 440,
+    "STEERING_RIGHT_PWM": 310,
+    "THROTTLE_FORWARD_PWM": 900,
+    "THROTTLE_STOPPED_PWM": 740,
+    "THROTTLE_REVERSE_PWM": 600,
+}
+"""
+OLD = """
+# DRIVE_TRAIN_TYPE = "MOCK"
+DRIVE_TRAIN_TYPE = "I2C_SERVO"
+PCA9685_I2C_ADDR = 0x60
+PCA9685_I2C_BUSNUM = None
+STEERING_CHANNEL = 5
+STEERING_LEFT_PWM: int = 300
+STEERING_RIGHT_PWM = 450
+THROTTLE_FORWARD_PWM = 400
+THROTTLE_STOPPED_PWM = 360
+THROTTLE_REVERSE_PWM = 310
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="myconfig.py"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_dictionary_of_donkeycar_5(write):
+    found = settings_from_myconfig(write(NEW))
+    assert (found["bus"], found["address"], found["steering_channel"], found["throttle_channel"]) == (
+        1,
+        0x41,
+        3,
+        2,
+    )
+    prescale = prescale_of(60.0)
+    pulses = ("steering_left_us", "steering_right_us", "throttle_forward_us", "throttle_stopped_us")
+    assert [counts_of(found[key], prescale) for key in pulses] == [440, 310, 450, 370]
+
+
+def test_old_names_at_the_top_level(write):
+    found = settings_from_myconfig(write(OLD))
+    assert found["address"] == 0x60 and found["steering_channel"] == 5
+    assert "bus" not in found and "throttle_channel" not in found
+    assert counts_of(found["steering_left_us"], prescale_of(60.0)) == 300
+
+
+def test_every_count_survives(write):
+    prescale = prescale_of(60.0)
+    for count in range(130, 500):
+        text = f"STEERING_LEFT_PWM = {count}"
+        assert counts_of(settings_from_myconfig(write(text))["steering_left_us"], prescale) == count
+
+
+def test_config_beside_it_holds_what_it_leaves_out(write):
+    write(OLD, "config.py")
+    found = settings_from_myconfig(write("STEERING_LEFT_PWM = 310"))
+    assert found["address"] == 0x60
+    assert counts_of(found["steering_left_us"], prescale_of(60.0)) == 310
+
+
+def test_settings_in_the_yaml_win(write):
+    data = {"kind": "pca9685", "myconfig": str(write(NEW)), "throttle_channel": 9, "steering_trim_rad": 0.02}
+    settings = with_myconfig(check_settings(PCA9685Settings, data, "car.yaml"))
+    assert (settings.throttle_channel, settings.steering_channel, settings.address) == (9, 3, 0x41)
+    assert settings.steering_trim_rad == 0.02
+
+
+def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
+    mark = tmp_path / "mark"
+    path = write(f"A = 1\nB = open({str(mark)!r}, 'w')\nA = A + 1\nC = D = -2.5\nif True:\n    E = 3\n")
+    assert read_assignments(path) == {"C": -2.5, "D": -2.5}
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('DRIVE_TRAIN_TYPE = "VESC"', "DRIVE_TRAIN_TYPE 'VESC', expected"),
+        ('PWM_STEERING_THROTTLE = "x"', "expected a dictionary"),
+        (
+            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "RPI_GPIO.BOARD.33"}',
+            "expected one as 'PCA9685.1:40",
+        ),
+        ('PWM_STEERING_THROTTLE = {"PWM_THROTTLE_INVERTED": True}', "PWM_THROTTLE_INVERTED: found True"),
+        ('STEERING_LEFT_PWM = "460"', "STEERING_LEFT_PWM: expected a number, found '460'"),
+        (
+            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "PCA9685.1:40.1", '
+            '"PWM_THROTTLE_PIN": "PCA9685.1:41.0"}',
+            "two chips",
+        ),
+        (
+            'DRIVE_TRAIN_TYPE = "I2C_SERVO"\nSTEERING_CHANNEL = "1"',
+            "STEERING_CHANNEL: expected a whole number",
+        ),
+        ("THIS IS NOT PYTHON", "not Python"),
+    ],
+)
+def test_what_cannot_be_taken_over_is_named(write, text, message):
+    with pytest.raises(ConfigError, match=message):
+        settings_from_myconfig(write(text))
+
+
+def test_values_out_of_range_name_the_file(write):
+    path = write("STEERING_LEFT_PWM = 4000")
+    with pytest.raises(ConfigError, match=r"myconfig\.py: key 'steering_left_us'.*2500"):
+        with_myconfig(PCA9685Settings(myconfig=path))
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        settings_from_myconfig(tmp_path / "myconfig.py")

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+import i2c_emulator
+import pytest
+
+from lanenet.errors import HardwareError, MissingExtraError
+from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
+from lanenet.onboard.hardware import Actuator
+
+SETTINGS = PCA9685Settings(max_steering_rad=0.4)
+
+
+@pytest.fixture
+def bus(monkeypatch):
+    bus = i2c_emulator.Bus(i2c_emulator.Chip())
+    i2c_emulator.install(monkeypatch, bus)
+    return bus
+
+
+@pytest.fixture
+def actuator(bus):
+    actuator = make_actuator(SETTINGS)
+    actuator.open()
+    yield actuator
+    actuator.close()
+
+
+@pytest.mark.parametrize(("frequency_hz", "prescale"), [(200.0, 30), (60.0, 101), (50.0, 121)])
+def test_prescale_of_the_data_sheet(frequency_hz, prescale):
+    # 200 Hz gives 30 (1Eh), data sheet 7.3.5; 60 Hz gives 101, as Adafruit's driver has it.
+    assert prescale_of(frequency_hz) == prescale
+
+
+def test_default_pulses_are_donkeycars_counts():
+    counts = [
+        counts_of(us, 101)
+        for us in (
+            SETTINGS.steering_left_us,
+            SETTINGS.steering_right_us,
+            SETTINGS.throttle_forward_us,
+            SETTINGS.throttle_stopped_us,
+            SETTINGS.throttle_reverse_us,
+        )
+    ]
+    assert counts == [460, 290, 500, 370, 220]
+
+
+def test_wire_bytes_of_the_start(bus, actuator):
+    assert isinstance(actuator, Actuator)
+    assert bus.wire == [
+        bytes([0x00, 0x30]),  # asleep, with auto-increment
+        bytes([0x01, 0x04]),  # totem pole
+        bytes([0xFE, 101]),  # 59.8 Hz
+        bytes([0x06, 0, 0, 370 & 0xFF, 370 >> 8]),  # motor in neutral
+        bytes([0x0A, 0, 0, 375 & 0xFF, 375 >> 8]),  # wheels straight
+        bytes([0x00, 0x20]),  # awake
+        bytes([0x00, 0xA0]),  # restart
+        bytes([0xFE]),  # read back
+    ]
+    assert bus.chip.refused_prescale == 0 and not bus.chip.asleep
+    assert 1 / bus.chip.period_s == pytest.approx(60.0, abs=0.3)
+    assert bus.chip.pulses == [(0, 370), (1, 375)]
+
+
+def test_emulator_keeps_the_rules_of_sleep():
+    chip = i2c_emulator.Chip()
+    chip.write(bytes([0x00, 0x20]))
+    chip.write(bytes([0xFE, 101]))
+    assert chip.refused_prescale == 1 and chip.registers[0xFE] == 30
+    chip.write(bytes([0x00, 0x10]))
+    chip.write(bytes([0x06, 1, 2, 3, 4]))
+    assert bytes(chip.registers[6:10]) == bytes([4, 0, 0, 0x10]), "without auto-increment one register is hit"
+
+
+def test_pulses_of_commands(bus, actuator):
+    actuator.send(0.4, 0.5)
+    assert bus.chip.pulse_us(1) == pytest.approx(SETTINGS.steering_left_us, abs=2.1)
+    middle_us = 0.5 * (SETTINGS.throttle_forward_us + SETTINGS.throttle_stopped_us)
+    assert bus.chip.pulse_us(0) == pytest.approx(middle_us, abs=2.1)
+    actuator.send(-0.4, -1.0)
+    assert (bus.chip.counts(1), bus.chip.counts(0)) == (290, 220)
+    actuator.neutral()
+    assert (bus.chip.counts(1), bus.chip.counts(0)) == (375, 370)
+
+
+def test_neutral_stops_the_motor_first(bus, actuator):
+    actuator.send(0.1, 0.5)
+    del bus.wire[:]
+    actuator.neutral()
+    assert [data[0] for data in bus.wire] == [0x06, 0x0A]
+
+
+def test_close_leaves_neutral_pulses(bus, actuator):
+    actuator.send(0.4, 1.0)
+    actuator.close()
+    assert bus.closed and bus.chip.counts(0) == 370 and not bus.chip.asleep
+    actuator.close()
+    actuator.neutral()
+    with pytest.raises(HardwareError, match="not open"):
+        actuator.send(0.0, 0.0)
+
+
+def test_glitch_is_tried_again(bus, actuator):
+    bus.glitches = 2
+    actuator.send(0.4, 1.0)
+    assert (bus.chip.counts(1), bus.chip.counts(0)) == (460, 500)
+
+
+def test_lost_bus_is_an_error_and_neutral_only_logs(bus, actuator, caplog):
+    bus.broken = True
+    with pytest.raises(HardwareError, match=r"/dev/i2c-1: the PCA9685 at 0x40 stopped answering"):
+        actuator.send(0.0, 0.1)
+    with caplog.at_level(logging.ERROR):
+        actuator.neutral()
+    assert "neutral could not be sent" in caplog.text
+
+
+def test_no_bus_no_chip_no_package(bus, monkeypatch):
+    with pytest.raises(HardwareError, match=r"/dev/i2c-7: cannot be opened.*raspi-config"):
+        make_actuator(PCA9685Settings(bus=7)).open()
+    with pytest.raises(HardwareError, match=r"no PCA9685 answers at address 0x41.*i2cdetect -y 1"):
+        make_actuator(PCA9685Settings(address=0x41)).open()
+    assert bus.closed
+    monkeypatch.setitem(__import__("sys").modules, "smbus2", None)
+    with pytest.raises(MissingExtraError, match=r"smbus2.*lanenet\[car\]"):
+        make_actuator(SETTINGS).open()
+
+
+def test_another_chip_is_refused(bus):
+    bus.chip.write = lambda data: setattr(bus.chip, "pointer", data[0])
+    with pytest.raises(HardwareError, match=r"register PRE_SCALE.*holds 30, expected 101"):
+        make_actuator(SETTINGS).open()
+
+
+def test_command_that_hangs_cannot_undo_neutral(bus, actuator):
+    """Another thread says neutral while a command hangs between its two outputs."""
+    hang, hung = threading.Event(), threading.Event()
+
+    def before(message):
+        if message.length is None and message.data[0] == 0x0A and message.data[3:] == bytes([460 & 0xFF, 1]):
+            hung.set()
+            hang.wait(5.0)
+
+    bus.before_transfer = before
+    command = threading.Thread(target=actuator.send, args=(0.4, 1.0))
+    command.start()
+    assert hung.wait(5.0)
+    start_s = time.monotonic()
+    actuator.neutral()
+    assert time.monotonic() - start_s < 0.2
+    assert bus.chip.counts(0) == 370
+    hang.set()
+    command.join(5.0)
+    assert bus.chip.counts(0) == 370
+
+
+def test_messages_of_the_real_package(monkeypatch):
+    """smbus2's own messages, as it would hand them to the kernel, make the same chip move."""
+    smbus2 = pytest.importorskip("smbus2", reason="smbus2 is not installed")
+    chip = i2c_emulator.Chip()
+
+    class Kernel:
+        def __init__(self, number):
+            assert number == 1
+
+        def i2c_rdwr(self, *messages):
+            for message in messages:
+                assert message.addr == 0x40
+                if message.flags & 1:
+                    for i, byte in enumerate(chip.read(message.len)):
+                        message.buf[i] = byte
+                else:
+                    chip.write(bytes(message))
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(smbus2, "SMBus", Kernel)
+    actuator = make_actuator(SETTINGS)
+    actuator.open()
+    actuator.send(0.4, 0.5)
+    assert chip.counts(1) == 460 and chip.counts(0) == 435
+    actuator.close()
+    assert chip.counts(0) == 370
