@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lane_scale import fitted_width_cm
@@ -97,7 +98,7 @@ def _map_drive(
     refine_camera: bool,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
-    recorded = open_drive(drive_path)
+    recorded = keep_images(open_drive(drive_path))
     check_moving(recorded)
     notes: list[str] = list(recorded.problems)
     drive = following_frames(recorded, notes)

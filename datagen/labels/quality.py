@@ -36,8 +36,12 @@ def frame_residual_cm(
         known = line[np.isfinite(line[:, 0])]
         if len(known) < 2 or not len(near):
             continue
-        offset = np.abs(_distance_to_polyline(near, known))
-        distances.append(offset[offset < 1.5 * tape_cm + 1.0])
+        limit = 1.5 * tape_cm + 1.0
+        # Most points are far from the line, and need no distance to be left out.
+        low, high = known.min(axis=0) - limit, known.max(axis=0) + limit
+        beside = near[np.all((near >= low) & (near <= high), axis=1)]
+        offset = _distance_to_polyline(beside, known) if len(beside) else np.empty(0)
+        distances.append(offset[offset < limit])
     found = np.concatenate(distances) if distances else np.empty(0)
     return float(np.median(np.abs(found - 0.5 * tape_cm))) if found.size >= 10 else float("nan")
 
@@ -46,10 +50,12 @@ def _distance_to_polyline(
     points: Float[np.ndarray, "m 2"], line: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "m"]:
     start, step = line[:-1], np.diff(line, axis=0)
-    length2 = np.maximum(np.sum(step**2, axis=1), 1e-12)
-    to_point = points[:, None, :] - start[None]
-    t = np.clip(np.sum(to_point * step[None], axis=2) / length2, 0.0, 1.0)
-    return np.linalg.norm(to_point - t[..., None] * step[None], axis=2).min(axis=1)
+    step_x, step_y = step.T
+    length2 = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
+    to_x, to_y = points[:, :1] - start[:, 0], points[:, 1:] - start[:, 1]
+    t = np.clip((to_x * step_x + to_y * step_y) / length2, 0.0, 1.0)
+    off_x, off_y = to_x - t * step_x, to_y - t * step_y
+    return np.sqrt((off_x * off_x + off_y * off_y).min(axis=1))
 
 
 def label_report(
