@@ -36,12 +36,8 @@ def frame_residual_cm(
         known = line[np.isfinite(line[:, 0])]
         if len(known) < 2 or not len(near):
             continue
-        limit = 1.5 * tape_cm + 1.0
-        # Most points are far from the line, and need no distance to be left out.
-        low, high = known.min(axis=0) - limit, known.max(axis=0) + limit
-        beside = near[np.all((near >= low) & (near <= high), axis=1)]
-        offset = _distance_to_polyline(beside, known) if len(beside) else np.empty(0)
-        distances.append(offset[offset < limit])
+        offset = np.abs(_distance_to_polyline(near, known))
+        distances.append(offset[offset < 1.5 * tape_cm + 1.0])
     found = np.concatenate(distances) if distances else np.empty(0)
     return float(np.median(np.abs(found - 0.5 * tape_cm))) if found.size >= 10 else float("nan")
 
