@@ -3,6 +3,9 @@
 Held speeds are compared by the dozen, for every camera that is tried; what tells lineages apart, and keeps
 the trajectory, is not needed for that. The map is that of ``filter.maps=mean``: every frame is entered once,
 at the particles' mean pose.
+
+The loop calls into other files, whose changes numba's cache does not notice (see
+:mod:`datagen.slam.lens_kernels`).
 """
 
 from __future__ import annotations
