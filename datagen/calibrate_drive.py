@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.kept_images import keep_images
 from datagen.lane_scale import LaneScale, measure_lane
 from datagen.map_settings import MapSettings
 from datagen.pictures import straight_frames
@@ -147,7 +148,7 @@ def calibrate_drive(
         raise CalibrationError(
             "pictures do not tell lengths: expected the lane's width or the camera's height, found neither"
         )
-    drive, notes = _moving_part(open_drive(drive_path), start)
+    drive, notes = _moving_part(keep_images(open_drive(drive_path)), start)
     settings = hide_bumper(drive, settings, notes)
     if start is not None:
         guess = settings.guess.model_copy(update={"wheelbase_cm": start.wheelbase_cm})

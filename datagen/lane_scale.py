@@ -9,15 +9,18 @@ from jaxtyping import Float
 
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.line import LaneLine
-from datagen.lanes.path import edges_along_path, path_of_poses
+from datagen.lanes.path import Path, PathEdges, edges_along_path, path_of_poses
 from datagen.lanes.trace import TracedLane, trace_lane
 from datagen.map_settings import MapSettings
 from datagen.slam.calibrate import nudged
+from datagen.slam.scans import Scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 
-_STEP_HEIGHTS, _AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
+#: Step of the path along which lines are looked for, how far it goes on ahead of the last frame, and how far
+#: from each frame its edges count, in camera heights.
+STEP_HEIGHTS, _AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
 #: Way along which the width of the lane is one measurement: what one frame shows of it.
 _ALIKE_HEIGHTS = 3.0
 #: Where a lane is looked at for what a wrong camera does to its width, ahead of the lens.
@@ -50,6 +53,24 @@ def fitted_width_cm(lines: list[LaneLine], lane: TracedLane, s_cm: Float[np.ndar
     return float(np.median(apart)) if apart.size else lane.lane_cm
 
 
+def edges_beside(
+    solved: SolvedSegment, scans: Scans, path: Path | None = None, least_reach_cm: float = 0.0
+) -> tuple[Path, PathEdges]:
+    """Lay the edges of a segment out along the way that was driven, in the scale of its camera.
+
+    Args:
+        solved: The segment.
+        scans: Its edge points, or those of some of its frames.
+        path: The way, where it is not simply that of the poses.
+        least_reach_cm: Edges up to this far from a frame count in any case.
+    """
+    height = solved.camera.mounting.height_cm
+    if path is None:
+        path = path_of_poses(solved.poses, STEP_HEIGHTS * height, _AHEAD_HEIGHTS * height)
+    reach_cm = max(_REACH_HEIGHTS * height, least_reach_cm)
+    return path, edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach_cm)
+
+
 def measure_lane(solved: SolvedSegment, settings: MapSettings, sigma: dict[str, float]) -> LaneScale:
     """Find the driven lane of a segment and measure how wide it is.
 
@@ -62,15 +83,14 @@ def measure_lane(solved: SolvedSegment, settings: MapSettings, sigma: dict[str, 
     Raises:
         TrackingLostError: If no two lines run along the drive.
     """
-    height, wheelbase = solved.camera.mounting.height_cm, solved.camera.wheelbase_cm
-    path = path_of_poses(solved.poses, _STEP_HEIGHTS * height, _AHEAD_HEIGHTS * height)
-    edges = edges_along_path(path, solved.scans, solved.poses, wheelbase, _REACH_HEIGHTS * height)
+    height = solved.camera.mounting.height_cm
+    path, edges = edges_beside(solved, solved.scans)
     lane = trace_lane(path, edges, height, None, settings.trace)
     lines = fit_lines(path, edges, lane, height, settings.fit)
     width_cm = fitted_width_cm(lines, lane, path.s_frames_cm)
     both = spacing_cm(lines, path.s_cm)
     spread = 1.4826 * float(np.median(np.abs(both - width_cm))) if both.size else 0.1 * width_cm
-    count = max(1.0, both.size * _STEP_HEIGHTS / _ALIKE_HEIGHTS)
+    count = max(1.0, both.size * STEP_HEIGHTS / _ALIKE_HEIGHTS)
     by_camera = width_sigma(solved.camera, sigma, width_cm)
     return LaneScale(width_cm, float(np.hypot(spread / width_cm / np.sqrt(count), by_camera)))
 

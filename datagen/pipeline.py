@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
-from datagen.lane_scale import fitted_width_cm
+from datagen.lane_scale import STEP_HEIGHTS, edges_beside, fitted_width_cm
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
-from datagen.lanes.path import edges_along_path, path_of_poses
 from datagen.lanes.trace import trace_lane
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
@@ -23,7 +23,6 @@ from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.held_out import held_out_frames, without_frames
 from datagen.report.mappable import (
-    DRIVE_INSTEAD,
     check_edges,
     check_lane,
     check_lines_seen,
@@ -34,7 +33,7 @@ from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
 from datagen.report.residuals import ResidualSettings
 from datagen.report.verdict import judge
-from datagen.self_calibration import find_camera
+from datagen.self_calibration import DRIVE_INSTEAD, find_camera
 from datagen.slam.calibrate import with_known_scale
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
@@ -97,7 +96,7 @@ def _map_drive(
     refine_camera: bool,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
-    recorded = open_drive(drive_path)
+    recorded = keep_images(open_drive(drive_path))
     check_moving(recorded)
     notes: list[str] = list(recorded.problems)
     drive = following_frames(recorded, notes)
@@ -223,15 +222,11 @@ def _find_lane(
 ) -> MappedSegment:
     """Find a solved segment's lane lines, in the scale of its camera, without the frames held out."""
     height = solved.camera.mounting.height_cm
-    step, ahead = 0.12 * height, 5.0 * height
     revisits = [(revisit.earlier, revisit.later) for revisit in solved.revisits]
-    path = lap_path(solved.poses, revisits, step, height)
-    if path is None:
-        path = path_of_poses(solved.poses, step, ahead)
+    lap = lap_path(solved.poses, revisits, STEP_HEIGHTS * height, height)
     # In a wide lane the further line only comes into view a lane's width ahead.
-    reach = max(3.5 * height, 1.2 * (lane_width_cm or 0.0))
-    scans = without_frames(solved.scans, held_out)
-    edges = edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach)
+    least_reach_cm = 1.2 * (lane_width_cm or 0.0)
+    path, edges = edges_beside(solved, without_frames(solved.scans, held_out), lap, least_reach_cm)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, settings.trace)

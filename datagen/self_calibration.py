@@ -22,9 +22,10 @@ from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 
-#: What to drive where a recording does not determine the camera.
+#: What to drive where a recording gives no map, or does not determine the camera.
 DRIVE_INSTEAD = (
-    "drive two laps of a closed track, or of a figure of eight, between two lines, without a pause"
+    "drive two laps of a closed track, or of a figure of eight, without a pause, between two lines that the "
+    "camera sees"
 )
 #: Moving frames that the adjustment needs, at least.
 MIN_FRAMES = 200

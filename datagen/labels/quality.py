@@ -46,10 +46,12 @@ def _distance_to_polyline(
     points: Float[np.ndarray, "m 2"], line: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "m"]:
     start, step = line[:-1], np.diff(line, axis=0)
-    length2 = np.maximum(np.sum(step**2, axis=1), 1e-12)
-    to_point = points[:, None, :] - start[None]
-    t = np.clip(np.sum(to_point * step[None], axis=2) / length2, 0.0, 1.0)
-    return np.linalg.norm(to_point - t[..., None] * step[None], axis=2).min(axis=1)
+    step_x, step_y = step.T
+    length2 = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
+    to_x, to_y = points[:, :1] - start[:, 0], points[:, 1:] - start[:, 1]
+    t = np.clip((to_x * step_x + to_y * step_y) / length2, 0.0, 1.0)
+    off_x, off_y = to_x - t * step_x, to_y - t * step_y
+    return np.sqrt((off_x * off_x + off_y * off_y).min(axis=1))
 
 
 def label_report(

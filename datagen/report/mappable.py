@@ -16,9 +16,6 @@ from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.lane import SIDES
 from lanenet.perception.edges import EdgeSettings, find_edges
 
-#: What to do about a drive that cannot be mapped.
-DRIVE_INSTEAD = "record one or two laps without a pause, with the car between two lines that the camera sees"
-
 _LOOKS = 40
 #: Pictures from all over a drive that differ by less than this [gray levels, means of blocks] are the same.
 _SAME = 1.0

@@ -44,6 +44,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
+    seen_x, seen_y = np.empty(particles), np.empty(particles)
     scores[:] = 0.0
     for i in range(len(points)):
         right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
@@ -102,10 +103,15 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                                 x += fade_of[node] * vector[page, e, 0]
                                 y += fade_of[node] * vector[page, e, 1]
                         page = following[page]
-            if occupied > 0.0:
-                scores[p] += weight * (x >= occupied)
-            else:
-                nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
-                ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
-                # Saturate: an edge that was seen often counts once.
-                scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))
+            seen_x[p], seen_y[p] = x, y
+        if occupied > 0.0:
+            for p in range(particles):
+                scores[p] += weight * (seen_x[p] >= occupied)
+            continue
+        # A loop of its own, which the processor takes several particles at a time through.
+        for p in range(particles):
+            x, y = seen_x[p], seen_y[p]
+            nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
+            ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
+            # Saturate: an edge that was seen often counts once.
+            scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))

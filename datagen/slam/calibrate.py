@@ -46,7 +46,7 @@ class GuessSettings(Settings):
 _AROUND = np.array([0.75, 1.0, 1.33])
 #: A coarse answer is enough: the adjustment starts from it. With 60 points the best focal length is a fifth
 #: too long, or more.
-_SEARCH = FilterSettings(particles=80, max_points=100, maps="mean", stray_every=0)
+_SEARCH = FilterSettings(particles=80, max_points=100)
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 

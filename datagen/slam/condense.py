@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 _SECTORS = 4  # directions that are kept apart, so that both edges of a tape are
 
@@ -31,19 +34,51 @@ def condense(
         Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
         that normals that disagree weigh less.
     """
-    column, row = np.floor(points_cm / patch_cm).astype(np.int64).T
-    sector = np.rint(np.arctan2(normals[:, 1], normals[:, 0]) * (_SECTORS / (2.0 * np.pi))).astype(np.int64)
-    key = ((column << 24) + row) * _SECTORS + sector % _SECTORS
-    _, patch = np.unique(key, return_inverse=True)
-
-    def total(values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n"]:
-        return np.bincount(patch, values).astype(np.float64)
-
-    weight = total(weights)
-    normal = np.column_stack([total(weights * normals[:, 0]), total(weights * normals[:, 1])])
-    length = np.hypot(normal[:, 0], normal[:, 1])
+    # At most half of the slots are taken, so that a search for a free one is short.
+    slots = np.full(2 << max(len(weights), 1).bit_length(), -1, np.int64)
+    sums, keys = np.zeros((len(weights), 5)), np.empty((len(weights), 2), np.int64)
+    count = _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums)
+    weight, length = sums[:count, 0], np.hypot(sums[:count, 3], sums[:count, 4])
     kept = np.flatnonzero(length > 1e-9 * weight)
     if len(kept) > most:
         kept = np.sort(kept[np.argpartition(-length[kept], most)[:most]])
-    point = np.column_stack([total(weights * points_cm[:, 0]), total(weights * points_cm[:, 1])])
-    return point[kept] / weight[kept, None], normal[kept] / length[kept, None], length[kept]
+    mean, length = sums[kept], length[kept]
+    return mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums):
+    """Sum weight, weighted point and weighted normal of each patch and sector.
+
+    Args:
+        points_cm: Edge points.
+        normals: Their normals.
+        weights: Their weights.
+        patch_cm: Side of a patch.
+        slots: Which patch stands in each slot of a hash table, -1 for none; a power of two.
+        keys: Filled: column, and row with sector, of each patch.
+        sums: Filled.
+
+    Returns:
+        Number of patches.
+    """
+    count, mask = 0, len(slots) - 1
+    for i in range(len(weights)):
+        x, y, nx, ny, weight = points_cm[i, 0], points_cm[i, 1], normals[i, 0], normals[i, 1], weights[i]
+        sector = int(np.rint(np.arctan2(ny, nx) * (_SECTORS / (2.0 * np.pi)))) % _SECTORS
+        column, row = int(np.floor(x / patch_cm)), int(np.floor(y / patch_cm)) * _SECTORS + sector
+        slot = (column * 40503 + row * 30011) & mask
+        while slots[slot] >= 0 and (keys[slots[slot], 0] != column or keys[slots[slot], 1] != row):
+            slot = (slot + 1) & mask
+        patch = slots[slot]
+        if patch < 0:
+            patch = slots[slot] = count
+            keys[count, 0], keys[count, 1] = column, row
+            count += 1
+        sums[patch, 0] += weight
+        sums[patch, 1] += weight * x
+        sums[patch, 2] += weight * y
+        sums[patch, 3] += weight * nx
+        sums[patch, 4] += weight * ny
+    return count

@@ -143,7 +143,9 @@ def _score(vectors, owner, seen, cell_cm, memory, poses, wheelbase, points, norm
                 for jx in range(2):
                     a, b = (iy + jy) & mask, (ix + jx) & mask
                     if seen[a, b] >= 0 and owner[a, b, 0] == ix + jx and owner[a, b, 1] == iy + jy:
-                        w = wy * (tx if jx else 1.0 - tx) * np.exp((seen[a, b] - frame) / memory)
+                        w = wy * (tx if jx else 1.0 - tx)
+                        if seen[a, b] != frame:
+                            w *= np.exp((seen[a, b] - frame) / memory)
                         vx += w * vectors[a, b, 0]
                         vy += w * vectors[a, b, 1]
             # Saturate: an edge that was seen often counts once.

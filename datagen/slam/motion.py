@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 #: Columns of a particle: x, y, heading of the rear axle, distance factor, curvature offset.
 X, Y, HEADING, FACTOR, OFFSET = range(5)
@@ -39,6 +41,23 @@ class MotionModel:
     curvature_noise_per_cm: float
     max_curvature_per_cm: float
 
+    @property
+    def numbers(self) -> Float[np.ndarray, "8"]:
+        """The numbers that hold for every frame, as :func:`advance` takes them."""
+        mean, _ = self.factor_start
+        return np.array(
+            [
+                mean,
+                self.factor_pull,
+                self.factor_walk,
+                self.offset_decay,
+                self.offset_walk_per_cm,
+                self.distance_noise,
+                self.curvature_noise_per_cm,
+                self.max_curvature_per_cm,
+            ]
+        )
+
     def start(self, particles: int, rng: np.random.Generator) -> Float[np.ndarray, "p 5"]:
         """Draw particles at the origin of the map, heading along +x."""
         states = np.zeros((particles, 5))
@@ -47,24 +66,41 @@ class MotionModel:
         return states
 
     def predict(self, states: Float[np.ndarray, "p 5"], k: int, rng: np.random.Generator) -> None:
-        """Move particles in place from frame k - 1 to frame k.
-
-        Source:
-            Kozlowski et al. 2024, eq. 4-6, integrated exactly along an arc's chord (heading at mid-step),
-            with normal noise on distance and curvature (V and tan(beta) / L there).
-        """
+        """Move particles in place from frame k - 1 to frame k."""
         noise = rng.standard_normal((4, len(states)))
-        pull = self.factor_pull * (self.factor_start[0] - states[:, FACTOR])
-        states[:, FACTOR] = np.abs(states[:, FACTOR] + pull + self.factor_walk * noise[0])
-        states[:, OFFSET] += -self.offset_decay * states[:, OFFSET] + self.offset_walk_per_cm * noise[1]
-        distance = self.distance_cm[k] * states[:, FACTOR] * (1.0 + self.distance_noise * noise[2])
-        curvature = self.curvature_per_cm[k] + states[:, OFFSET] + self.curvature_noise_per_cm * noise[3]
-        limit = self.max_curvature_per_cm
-        turn = distance * np.clip(curvature, -limit, limit)
-        middle = states[:, HEADING] + 0.5 * turn
-        states[:, X] += distance * np.cos(middle)
-        states[:, Y] += distance * np.sin(middle)
-        states[:, HEADING] += turn
+        advance(states, noise, self.distance_cm[k], self.curvature_per_cm[k], self.numbers)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def advance(states, noise, distance_cm, curvature_per_cm, numbers):
+    """Move particles in place by one frame.
+
+    Args:
+        states: Particles.
+        noise: Four normal numbers for each particle.
+        distance_cm: Predicted distance.
+        curvature_per_cm: Predicted curvature.
+        numbers: See :attr:`MotionModel.numbers`.
+
+    Source:
+        Kozlowski et al. 2024, eq. 4-6, integrated exactly along an arc's chord (heading at mid-step), with
+        normal noise on distance and curvature (V and tan(beta) / L there).
+    """
+    mean, pull, walk, decay, offset_walk, distance_noise, curvature_noise, limit = numbers
+    for p in range(states.shape[0]):
+        factor = states[p, FACTOR]
+        factor = abs(factor + (pull * (mean - factor) + walk * noise[0, p]))
+        offset = states[p, OFFSET]
+        offset += -decay * offset + offset_walk * noise[1, p]
+        states[p, FACTOR], states[p, OFFSET] = factor, offset
+        distance = distance_cm * factor * (1.0 + distance_noise * noise[2, p])
+        curvature = curvature_per_cm + offset + curvature_noise * noise[3, p]
+        turn = distance * min(max(curvature, -limit), limit)
+        middle = states[p, HEADING] + 0.5 * turn
+        states[p, X] += distance * np.cos(middle)
+        states[p, Y] += distance * np.sin(middle)
+        states[p, HEADING] += turn
 
 
 def widen_steps(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float, Int
+from numba import njit
 
 
 def reweigh(
@@ -14,20 +17,43 @@ def reweigh(
     Edge points of one line are not independent, so that the plain likelihood would leave one particle. The
     scores are tempered until the effective number of particles is at least ``effective_share`` of them.
     """
-    relative = scores - scores.max()
-    temperature = 1.0
+    new = np.empty(len(weights))
+    temper(weights, scores, effective_share, new)
+    return new
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def temper(weights, scores, effective_share, new):
+    """Fill ``new`` with the weights of :func:`reweigh`."""
+    highest, temperature = scores[0], 1.0
+    for p in range(len(weights)):
+        highest = max(highest, scores[p])
     for _ in range(20):
-        new = weights * np.exp(relative / temperature)
-        new /= new.sum()
-        if effective_number(new) >= effective_share * len(new):
+        total = 0.0
+        for p in range(len(weights)):
+            new[p] = weights[p] * np.exp((scores[p] - highest) / temperature)
+            total += new[p]
+        for p in range(len(weights)):
+            new[p] /= total
+        if count_effective(new) >= effective_share * len(new):
             break
         temperature *= 1.4
-    return new
 
 
 def effective_number(weights: Float[np.ndarray, "p"]) -> float:
     """How many equally weighted particles would be as good."""
-    return 1.0 / float(weights @ weights)
+    return float(count_effective(weights))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def count_effective(weights):
+    """See :func:`effective_number`."""
+    total = 0.0
+    for p in range(len(weights)):
+        total += weights[p] * weights[p]
+    return 1.0 / total
 
 
 def systematic_resample(weights: Float[np.ndarray, "p"], rng: np.random.Generator) -> Int[np.ndarray, "p"]:
@@ -39,8 +65,20 @@ def systematic_resample(weights: Float[np.ndarray, "p"], rng: np.random.Generato
     Source:
         Kitagawa 1996; copies of each particle differ from N * weight by less than one.
     """
+    chosen = np.empty(len(weights), np.int64)
+    draw_evenly(weights, rng.random(), chosen)
+    return chosen
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def draw_evenly(weights, uniform, chosen):
+    """Fill ``chosen`` as :func:`systematic_resample` returns it; ``uniform`` is its random number."""
     n = len(weights)
-    positions = (np.arange(n) + rng.random()) / n
-    cumulative = np.cumsum(weights)
-    cumulative[-1] = 1.0
-    return np.searchsorted(cumulative, positions, side="right").clip(0, n - 1)
+    at, cumulative = 0, weights[0]
+    for k in range(n):
+        position = (k + uniform) / n
+        while at < n - 1 and cumulative <= position:
+            at += 1
+            cumulative += weights[at]
+        chosen[k] = at

@@ -181,14 +181,15 @@ def _close(
     height = opened.camera.mounting.height_cm
     for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
         poses, missed = close_loops(opened.poses, revisits, height)
+        along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
+        if not (along < _MAX_MISSED[0] and across < _MAX_MISSED[1]):
+            continue
         loops = _loops(revisits, len(poses))
         closed = adjust(
             edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
             expected=expected, believed=believed,
         )  # fmt: skip
-        along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
-        fits = along < _MAX_MISSED[0] and across < _MAX_MISSED[1]
-        fits &= closed.misfit < _MAX_MISFIT * opened.misfit
+        fits = closed.misfit < _MAX_MISFIT * opened.misfit
         if fits and (best is None or closed.misfit < best.bundle.misfit):
             best = _Closure(revisits, missed, drift, closed)
     return best

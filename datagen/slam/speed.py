@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.slam.filter import FilterSettings, run_filter
+from datagen.slam.filter import FilterSettings
+from datagen.slam.held import HeldStretch
 from datagen.slam.motion import MotionModel
 from datagen.slam.scans import Progress, Scans
 
 #: Steps to try, in camera heights per frame: 1 cm of the paper's crawl up to a fast car at 10 Hz.
 STEPS_HEIGHTS = tuple(0.05 * 1.25**k for k in range(13))
 _FRAMES = 300
-# Held speeds are compared, not driven: one map serves all particles, and none strays.
-_SETTINGS = FilterSettings(particles=150, max_points=80, maps="mean", stray_every=0)
+_SETTINGS = FilterSettings(particles=150, max_points=80)
 
 
 @dataclass(frozen=True)
@@ -84,12 +84,14 @@ def profile_speed(
         progress: Called with (done, total).
     """
     stretch = middle_stretch(scans, _FRAMES)
-    part, relative = scans.cut(stretch), relative_cm[stretch]
+    held, relative = (
+        HeldStretch.of(scans.cut(stretch), settings, height_cm, wheelbase_cm),
+        relative_cm[stretch],
+    )
     match = np.zeros(len(steps_cm))
     for i, step_cm in enumerate(steps_cm):
         motion = held_motion(float(step_cm), relative, height_cm)
-        rng = np.random.default_rng(seed)
-        match[i] = np.nanmean(run_filter(part, motion, settings, height_cm, wheelbase_cm, rng).match)
+        match[i] = np.nanmean(held.match(motion, seed))
         if progress is not None:
             progress(i + 1, len(steps_cm))
     # A spell of lost tracking spoils one step's match; the median of three neighbours does not fall for it.

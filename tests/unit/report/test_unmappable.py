@@ -21,7 +21,7 @@ from lanenet.perception.edges import EdgeSettings
 
 CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
 SETTINGS = MapSettings(find_bumper=False)
-INSTEAD = "record one or two laps"
+INSTEAD = "drive two laps of a closed track"
 
 
 def simulated(folder: Path, frames: int, **lines: str) -> Path:

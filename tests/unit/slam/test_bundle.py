@@ -7,8 +7,9 @@ import pytest
 from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixels
 from tape_road import tape_road
 
-from datagen.slam import bundle
-from datagen.slam.bundle import BundleSettings, _Problem, adjust, point_trust
+from datagen.slam import bundle_problem
+from datagen.slam.bundle import BundleSettings, adjust
+from datagen.slam.bundle_problem import BundleProblem, point_trust
 from datagen.slam.places import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
@@ -62,7 +63,7 @@ def test_a_break_is_not_bridged(seed):
     edges = pixels(road, camera)
     breaks = np.zeros(80, dtype=bool)
     breaks[40] = True
-    problem = _Problem(edges, camera, SMALL, _rng(seed), (), (), breaks)
+    problem = BundleProblem(edges, camera, SMALL, _rng(seed), breaks=breaks)
     first = problem.pairs.min(axis=1)
     assert not ((first < 40) & (problem.pairs.max(axis=1) >= 40)).any()
     assert len(problem.pairs) == 2 * sum(40 - lag for lag in SMALL.lags)
@@ -108,7 +109,7 @@ def test_noise_that_stays_in_the_picture_does_not_hold_the_car_back(monkeypatch,
 
     trusting_some = error()
     assert trusting_some < 3e-3
-    monkeypatch.setattr(bundle, "point_trust", lambda in_view, matched: np.ones(len(in_view)))
+    monkeypatch.setattr(bundle_problem, "point_trust", lambda in_view, matched: np.ones(len(in_view)))
     assert error() > 1.5 * trusting_some
 
 

@@ -9,8 +9,10 @@ import pytest
 from pixel_road import HEIGHT, WIDTH, fisheye, pinhole, pixels
 from tape_road import HEIGHT_CM, tape_road
 
-from datagen.slam.bundle import _STEPS, CAMERA_NAMES, BundleSettings, _Problem
-from datagen.slam.bundle_kernels import _lift_pixel, _project_point
+from datagen.slam.bundle import CAMERA_NAMES, BundleSettings
+from datagen.slam.bundle_problem import BundleProblem
+from datagen.slam.bundle_state import start_state
+from datagen.slam.lens_kernels import N_VIEW, lift_pixel, project_point, project_with_slopes, set_view
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges import EdgePixels
 
@@ -18,15 +20,19 @@ CAMERAS = {"fisheye": fisheye(), "pinhole": pinhole()}
 SMALL = BundleSettings(lags=(1, 4), points=40)
 
 
-def _problem(camera: Camera, frames: int = 2, free: tuple[str, ...] = CAMERA_NAMES) -> _Problem:
-    return _Problem(
-        pixels(tape_road(frames), camera), camera, SMALL, np.random.default_rng(0), free, (), None
-    )
+#: Differences of the camera's numbers.
+STEPS = np.array([1e-4, 1e-2, 1e-2, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4])
+
+
+def _problem(camera: Camera, frames: int = 2) -> BundleProblem:
+    return BundleProblem(pixels(tape_road(frames), camera), camera, SMALL, np.random.default_rng(0))
 
 
 def _vectors(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    state = _problem(camera).start(np.zeros((2, 3)), None)
-    return state.lens, state.mount
+    """Lens and view."""
+    state, view = start_state(np.zeros((1, 3)), None, camera), np.empty(N_VIEW)
+    set_view(state.mount, 0.0, 0.0, view)
+    return state.lens, view
 
 
 def _ground(camera: Camera, uv: np.ndarray) -> np.ndarray:
@@ -46,23 +52,23 @@ def test_lifting_and_projecting_agree_with_the_camera(model, seed):
         ahead_of_front_axle_cm=float(rng.uniform(-15.0, 10.0)),
         right_of_centre_cm=float(rng.uniform(-6.0, 6.0)),
     )
-    lens, mount = _vectors(camera)
+    lens, view = _vectors(camera)
     is_fisheye = model == "fisheye"
     uv = rng.uniform(0.0, [WIDTH - 1.0, HEIGHT - 1.0], (300, 2))
     expected = _ground(camera, uv)
-    lifted = np.array([_lift_pixel(is_fisheye, lens, mount, u, v, -1, 0.0) for u, v in uv])
+    lifted = np.array([lift_pixel(is_fisheye, lens, view, u, v) for u, v in uv])
     near = np.isfinite(expected).all(axis=1) & (np.abs(expected).max(axis=1) < 30.0)
     assert near.sum() > 100
     np.testing.assert_allclose(lifted[near], expected[near], atol=1e-5, rtol=1e-5)
     # A pixel above the horizon has no road.
     assert np.isnan(lifted[~np.isfinite(expected).all(axis=1)]).all()
-    back = np.array([_project_point(is_fisheye, lens, mount, a, b, -1, 0.0) for a, b in expected[near]])
+    back = np.array([project_point(is_fisheye, lens, view, a, b) for a, b in expected[near]])
     np.testing.assert_allclose(back, uv[near], atol=1e-6)
 
 
 def test_a_pinhole_does_not_see_behind_itself():
-    lens, mount = _vectors(CAMERAS["pinhole"])
-    assert np.isnan(_project_point(False, lens, mount, -3.0, 0.0, -1, 0.0)).all()
+    lens, view = _vectors(CAMERAS["pinhole"])
+    assert np.isnan(project_point(False, lens, view, -3.0, 0.0)).all()
 
 
 def _changed(camera: Camera, name: str, amount: float) -> Camera:
@@ -84,30 +90,52 @@ def _changed(camera: Camera, name: str, amount: float) -> Camera:
 
 
 @pytest.mark.parametrize("model", ["fisheye", "pinhole"])
+@pytest.mark.parametrize("seed", range(2))
+def test_slopes_of_projecting_by_the_point_and_by_the_camera(model, seed):
+    rng = np.random.default_rng(seed)
+    camera, by = CAMERAS[model], np.empty((2, 2 + len(CAMERA_NAMES)))
+    lens, view = _vectors(camera)
+
+    def seen(point: np.ndarray, which: Camera = camera) -> np.ndarray:
+        car = HEIGHT_CM * np.array([[-point[1], point[0]]]) - [0.0, camera.wheelbase_cm]
+        return which.project_ground(car)[0]
+
+    for point in rng.uniform([1.5, -2.0], [6.0, 2.0], (20, 2)):
+        np.testing.assert_allclose(
+            project_with_slopes(model == "fisheye", lens, view, *point, by), seen(point), atol=1e-6
+        )
+        slopes = [(seen(point + d) - seen(point - d)) / 2e-4 for d in 1e-4 * np.eye(2)]
+        for name, step in zip(CAMERA_NAMES, STEPS, strict=True):
+            ends = [seen(point, _changed(camera, name, sign * step)) for sign in (1.0, -1.0)]
+            slopes.append((ends[0] - ends[1]) / (2.0 * step))
+        np.testing.assert_allclose(by, np.stack(slopes, axis=1), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("model", ["fisheye", "pinhole"])
 def test_derivatives_of_lifting_by_the_camera(model):
     camera = CAMERAS[model]
     problem = _problem(camera)
-    lifted, by, half = problem._lift(problem.start(np.zeros((2, 3)), None))
+    lifted, by, half = problem.lift(start_state(np.zeros((2, 3)), None, camera))
     np.testing.assert_allclose(lifted, _ground(camera, problem.uv), atol=1e-6)
     np.testing.assert_allclose(half, _ground(camera, problem.uv + 0.5 * problem.normals), atol=1e-5)
     near = lifted[:, 0] < 6.0
     for k, name in enumerate(CAMERA_NAMES):
-        h = 0.5 * _STEPS[k]
+        h = 0.5 * STEPS[k]
         ends = [_ground(_changed(camera, name, sign * h), problem.uv) for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1])[near] / (2.0 * h)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(by[near, k], expected, atol=0.01 * scale, err_msg=name)
+        np.testing.assert_allclose(by[near, k], expected, atol=1e-4 * scale, err_msg=name)
 
 
 def test_a_frame_that_nods_is_a_camera_that_is_mounted_so():
     camera = fisheye()
     problem = _problem(camera)
     tilt = np.array([[0.0, 0.0], [0.02, -0.015]])
-    lifted, _, _ = problem._lift(problem.start(np.zeros((2, 3)), tilt))
+    lifted, _, _ = problem.lift(start_state(np.zeros((2, 3)), tilt, camera))
     m = camera.mounting
     nodded = camera.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.02, roll_rad=m.roll_rad - 0.015)
     for frame, seen in enumerate((camera, nodded)):
-        mine = problem.frame == frame
+        mine = slice(problem.point_starts[frame], problem.point_starts[frame + 1])
         np.testing.assert_allclose(lifted[mine], _ground(seen, problem.uv[mine]), atol=1e-5)
 
 
@@ -119,25 +147,25 @@ def test_the_normal_equations_hold_the_slope_of_the_cost(model, seed):
     camera, frames = CAMERAS[model], 12
     road = tape_road(frames)
     problem = _problem(camera, frames)
-    poses = road.poses / [HEIGHT_CM, HEIGHT_CM, 1.0] + rng.normal(size=(frames, 3)) * [0.01, 0.01, 0.004]
-    state = problem.start(poses, 0.003 * rng.normal(size=(frames, 2)))
+    poses_cm = road.poses + rng.normal(size=(frames, 3)) * [0.01 * HEIGHT_CM, 0.01 * HEIGHT_CM, 0.004]
+    state = start_state(poses_cm, 0.003 * rng.normal(size=(frames, 2)), camera)
     away = np.concatenate([np.zeros(5 * frames), [0.02, 0.3, -0.4, 0.004, 0.003, 0.002, -0.004, 0.05]])
-    state = problem.moved(state, away)
+    state = state.moved(away, problem.free)
     links = problem.associate(state, 4.0)
     assert len(links.point) > 300
-    _, normal, rhs, _ = problem.equations(state, links)
-    assert abs(normal - normal.T).max() < 1e-9 * abs(normal).max()
-    size = np.concatenate([np.full(5 * frames, 1e-5), 0.1 * _STEPS])
+    now = problem.equations(state, links)
+    rhs, curvature = now.rhs, np.concatenate([now.frames.diagonal(), np.diag(now.camera)])
+    assert abs(now.frames - now.frames.T).max() < 1e-9 * abs(now.frames).max()
+    size = np.concatenate([np.full(5 * frames, 1e-5), 0.1 * STEPS])
     # The first pose is held by a prior that drowns every other slope.
     for k in [*rng.choice(np.arange(3, 5 * frames), 12, replace=False), *range(5 * frames, 5 * frames + 8)]:
         ends = []
         for sign in (1.0, -1.0):
             step = np.zeros(len(rhs))
             step[k] = sign * size[k]
-            ends.append(problem.equations(problem.moved(state, step), links)[0])
+            ends.append(problem.equations(state.moved(step, problem.free), links).cost)
         slope = (ends[0] - ends[1]) / (2.0 * size[k])
-        # One-sided differences in the kernels, against the curvature of the cost.
-        tolerance = 0.01 * abs(slope) + 0.01 * np.sqrt(normal[k, k])
+        tolerance = 1e-4 * abs(slope) + 1e-4 * np.sqrt(curvature[k])
         assert -rhs[k] == pytest.approx(slope, abs=tolerance), k
 
 
@@ -147,7 +175,7 @@ def test_uncertainty_of_a_link_grows_with_the_stretch(model):
     camera, frames = CAMERAS[model], 6
     road = tape_road(frames)
     problem = _problem(camera, frames)
-    state = problem.start(road.poses / [HEIGHT_CM, HEIGHT_CM, 1.0], None)
+    state = start_state(road.poses, None, camera)
     links = problem.associate(state, 2.0)
     pair = np.searchsorted(links.pair_starts, np.arange(len(links.point)), side="right") - 1
     i, j = problem.pairs[pair].T
@@ -172,9 +200,9 @@ def test_an_edge_that_brightens_the_other_way_is_not_met():
     camera = fisheye()
     edges = pixels(tape_road(2), camera)
     turned = EdgePixels(edges[1].uv_px, -edges[1].normals)
-    poses = tape_road(2).poses / [HEIGHT_CM, HEIGHT_CM, 1.0]
+    state = start_state(tape_road(2).poses, None, camera)
     met = []
     for second in (edges[1], turned):
-        problem = _Problem([edges[0], second], camera, SMALL, np.random.default_rng(0), (), (), None)
-        met.append(len(problem.associate(problem.start(poses, None), 0.3).point))
+        problem = BundleProblem([edges[0], second], camera, SMALL, np.random.default_rng(0))
+        met.append(len(problem.associate(state, 0.3).point))
     assert met[0] > 20 and met[1] == 0

@@ -63,7 +63,7 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     true = fisheye(pitch_down_rad=np.deg2rad(24.0), roll_rad=0.0, yaw_rad=0.0)
     true.K[:2, :2] = np.diag([60.0, 60.0])
     drive, _ = loop_drive(true, 60, 100, 400.0, seed)
-    guess = GuessSettings(focal_px=(60.0, 80.0), pitch_deg=(16.0, 24.0), frames=50)
+    guess = GuessSettings(focal_px=(60.0, 80.0), pitch_deg=(16.0, 24.0), frames=100)
     seen: list[tuple[int, int]] = []
     camera, tried = coarse_camera(
         drive, PerceptionSettings(), guess, np.random.default_rng(seed), lambda *done: seen.append(done)

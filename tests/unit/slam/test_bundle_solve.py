@@ -1,0 +1,59 @@
+"""The bordered sparse system of the bundle adjustment, against the same in full."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datagen.slam.bundle_kernels import N_FRAME
+from datagen.slam.bundle_solve import Equations, FramePattern
+
+FRAMES = 9
+
+
+def _pairs(rng: np.random.Generator) -> np.ndarray:
+    """Neighbours both ways round, one pair twice, a loop; the last frame in no pair."""
+    near = [(k + 1, k) if rng.random() < 0.5 else (k, k + 1) for k in range(FRAMES - 2)]
+    return np.array([*near, (0, 4), (0, 4), (7, 1)])
+
+
+def _dense(pairs: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    full = np.zeros((N_FRAME * FRAMES, N_FRAME * FRAMES))
+    for (i, j), block in zip(pairs, blocks, strict=True):
+        at = np.concatenate([N_FRAME * i + np.arange(N_FRAME), N_FRAME * j + np.arange(N_FRAME)])
+        full[np.ix_(at, at)] += block
+    return full
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_of_pairs_add_up_where_they_belong(seed):
+    rng = np.random.default_rng(seed)
+    pairs = _pairs(rng)
+    pattern = FramePattern(pairs, FRAMES)
+    # Twice: the pattern stays as it is, and blocks of zeros keep their place.
+    for blocks in (np.zeros((len(pairs), 10, 10)), rng.normal(size=(len(pairs), 10, 10))):
+        np.testing.assert_allclose(pattern.matrix(blocks).toarray(), _dense(pairs, blocks), atol=1e-12)
+
+
+def test_without_a_pair_the_matrix_is_empty():
+    pattern = FramePattern(np.empty((0, 2), np.int64), 3)
+    assert not pattern.matrix(np.empty((0, 10, 10))).toarray().any()
+
+
+@pytest.mark.parametrize("free", [0, 3])
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_a_step_and_the_uncertainty_are_those_of_the_full_system(free, damping):
+    rng = np.random.default_rng(free)
+    pairs, size = _pairs(rng), N_FRAME * FRAMES
+    half = rng.normal(size=(len(pairs), 12, 10))
+    frames = FramePattern(pairs, FRAMES).matrix(np.einsum("pki,pkj->pij", half, half))
+    frames = frames + 0.5 * FramePattern(pairs, FRAMES).matrix(np.tile(np.eye(10), (len(pairs), 1, 1)))
+    frames.setdiag(frames.diagonal() + 1.0)
+    border, rhs = 0.1 * rng.normal(size=(size, free)), rng.normal(size=size + free)
+    camera = 5.0 * np.eye(free) + 0.3
+    full = np.block([[frames.toarray(), border], [border.T, camera]])
+    now = Equations(1.0, frames.tocsc(), border, camera, rhs, np.zeros(0))
+    damped = full + damping * np.diag(np.diag(full))
+    np.testing.assert_allclose(now.step(damping), np.linalg.solve(damped, rhs), rtol=1e-8, atol=1e-10)
+    sigma = np.sqrt(np.diag(np.linalg.inv(full))[size:])
+    np.testing.assert_allclose(now.camera_sigma(), sigma, rtol=1e-8)
