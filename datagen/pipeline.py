@@ -13,6 +13,7 @@ from jaxtyping import Bool
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lane_scale import fitted_width_cm
+from datagen.lanes.crossing import without_crossings
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
 from datagen.lanes.path import edges_along_path, path_of_poses
@@ -232,6 +233,7 @@ def _find_lane(
     reach = max(3.5 * height, 1.2 * (lane_width_cm or 0.0))
     scans = without_frames(solved.scans, held_out)
     edges = edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach)
+    edges = without_crossings(path, edges, height, settings.trace.side_heights * height)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, settings.trace)

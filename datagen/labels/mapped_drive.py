@@ -21,7 +21,7 @@ from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
 #: Uncertainty of a line's position from which it gives no label, in lane widths.
-_MAX_SIGMA_LANES = 0.05
+_MAX_SIGMA_LANES = 0.03
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 

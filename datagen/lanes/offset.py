@@ -23,9 +23,12 @@ _ROUNDS = 5
 _FRAMES_TOGETHER = 10
 _CHUNK = 256
 #: What is left however often a line is seen, in camera heights: paint and lens are not perfect.
-_FLOOR = 0.003
+_FLOOR = 0.005
 #: Precision of the edge points that tell a marking's width.
 _NEAR = 0.2
+#: How far from both borders of a marking one alone is believed, in camera heights: next to a gap it may be
+#: the border of something else.
+_ALONE = 1.0
 #: Gaps at whose ends paint is not trusted, and how much of it, in camera heights.
 _LONG_GAP, _TURNS_OFF = 2.0, 0.4
 
@@ -132,7 +135,7 @@ def fit_offset(
         robust = 1.0 / (1.0 + points.precision * (residual / (2.0 * scale)) ** 2)
         found = points.weight * robust
         seen = seen_samples(
-            path, points.s_cm, points.border, found, 0.1 * prior.height_cm, 2.0 * prior.height_cm
+            path, points.s_cm, points.border, found, 0.1 * prior.height_cm, _ALONE * prior.height_cm
         )
         kept = _at(path, seen & _before_ends(path, seen, prior.height_cm), points.s_cm)
         trust = np.where(kept, points.precision * robust, 0.0)
