@@ -133,6 +133,7 @@ def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[
         p95_px=both["p95_px_at_160"],
         coverage=both["coverage"],
         labelled_share=figures["labelled"]["share"],
+        contradicted_share=0.0 if drive_map.contradicted is None else float(drive_map.contradicted.mean()),
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm

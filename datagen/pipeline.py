@@ -22,6 +22,7 @@ from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
+from datagen.report.agreement import contradicted_frames
 from datagen.report.held_out import held_out_frames, without_frames
 from datagen.report.mappable import (
     DRIVE_INSTEAD,
@@ -135,6 +136,8 @@ def _map_drive(
     notes += map_notes(drive_map, figures, known is not None)
     rows_of_map = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in parts])
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
+    drive_map = replace(drive_map, contradicted=contradicted_frames(mapped))
+    mapped = replace(mapped, drive_map=drive_map)
     quality = measure_map(mapped, ResidualSettings())
     check_lines_seen(quality, drive)
     figures |= quality_figures(quality, drive.width, ResidualSettings())

@@ -6,7 +6,6 @@ line has none, or, where it is double or runs beside a crossing, on one side onl
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Literal
 
 import numpy as np
@@ -52,9 +51,9 @@ def without_crossings(path: Path, edges: PathEdges, camera_height_cm: float, sid
     striped = _opened(striped, rows, path.closed)
     row = np.rint(edges.s_cm / path.step_cm).astype(np.intp) % len(striped)
     column = np.rint(edges.d_cm / cell).astype(np.intp) + half
-    inside = (column >= 0) & (column < striped.shape[1])
+    inside = (column >= 0) & (column <= 2 * half)
     kept = ~(inside & striped[row, np.where(inside, column, 0)])
-    return PathEdges(*(getattr(edges, part.name)[kept] for part in fields(edges)))
+    return edges.part(kept)
 
 
 def _within(density: Float[np.ndarray, "m c"], low: int, high: int) -> Float[np.ndarray, "m c"]:
