@@ -81,14 +81,13 @@ def _join(
     """Carry a stretch over; None where it shows no place of the base, or does not fit."""
     camera, s = base.solved.camera, settings.revisits
     height, first = camera.mounting.height_cm, len(base.rows)
-    rows = np.concatenate([base.rows, other.rows])
-    both = drive.subset(rows)
+    drives = [drive.subset(stretch.rows) for stretch in (base, other)]
     breaks = np.concatenate([base.solved.breaks_or_none(), other.solved.breaks_or_none()])
     breaks[first] = True
     apart = np.concatenate([base.solved.poses, other.solved.poses])
     scans = _together(base.solved.scans, other.solved.scans)
     found = []
-    for pair in _shared_places(thumbnails(both), first, s.min_similarity, s.max_pairs):
+    for pair in _shared_places(*(thumbnails(part) for part in drives), s.min_similarity, s.max_pairs):
         match = match_places(scans, apart, pair, height, camera.wheelbase_cm, s, rng)
         if match is not None:
             found.append(match)
@@ -104,11 +103,13 @@ def _join(
     if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
         return None
     limits = mapping_range(height, settings.perception.range)
-    edges = edges_of_drive(both, settings.perception.edges, RoadTable(camera, limits))
+    table = RoadTable(camera, limits)
+    edges = [pixels for part in drives for pixels in edges_of_drive(part, settings.perception.edges, table)]
+    expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     bundle = adjust(
         edges, poses, camera, settings.bundle, rng, (), loop_pairs(revisits, breaks), tilt, breaks,
-        expected=relative_ways(commands_of(both, camera.wheelbase_cm)),
+        expected=expected,
     )  # fmt: skip
     before = np.average(
         [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
@@ -116,32 +117,39 @@ def _join(
     if bundle.misfit > MAX_MISFIT * before:
         return None
     opened = _carried(other.solved.open_poses, other.solved.poses[0], bundle.poses[first])
+    # From here on in the order of the drive: the base may be the later one, or lie on both sides of the other.
+    rows = np.concatenate([base.rows, other.rows])
+    order = np.argsort(rows)
+    place = np.argsort(order)
+    breaks[0] = True
+    breaks = breaks[order] & (np.arange(len(rows)) > 0)
+    bundle = replace(bundle, poses=bundle.poses[order], tilt=bundle.tilt[order])
     solved = replace(
         base.solved,
-        scans=scans_of(edges, camera, limits, bundle.tilt),
-        trajectory=_one_after_another(base.solved.trajectory, other.solved.trajectory),
-        open_poses=np.concatenate([base.solved.open_poses, opened]),
+        scans=scans_of([edges[i] for i in order], camera, limits, bundle.tilt),
+        trajectory=_one_of_both(base.solved.trajectory, other.solved.trajectory, order),
+        open_poses=np.concatenate([base.solved.open_poses, opened])[order],
         poses=bundle.poses,
-        revisits=revisits,
+        revisits=[replace(r, earlier=int(place[r.earlier]), later=int(place[r.later])) for r in revisits],
         residuals=missed,
         bundle=bundle,
         breaks=breaks,
     )
-    return Stretch(rows, solved)
+    return Stretch(rows[order], solved)
 
 
 def _shared_places(
-    thumbs: Float[np.ndarray, "n d"], first: int, min_similarity: float, max_pairs: int
+    base: Float[np.ndarray, "n d"], other: Float[np.ndarray, "m d"], min_similarity: float, max_pairs: int
 ) -> list[tuple[int, int]]:
     """Pairs of frames, one of either stretch, that look alike, each the other's most similar one.
 
     Args:
-        thumbs: A picture per frame, see :func:`datagen.slam.places.thumbnails`.
-        first: First frame of the second stretch.
+        base: A picture per frame of the first stretch, see :func:`datagen.slam.places.thumbnails`.
+        other: Likewise of the second, whose frames count on from those of the first.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
         max_pairs: Pairs at most, spread over the second stretch.
     """
-    base, other = thumbs[:first], thumbs[first:]
+    first = len(base)
     similarity = cv2.filter2D(
         alike(base, other), -1, np.eye(9, dtype=np.float32) / 9.0, borderType=cv2.BORDER_REPLICATE
     )
@@ -219,7 +227,6 @@ def _together(a: Scans, b: Scans) -> Scans:
     return Scans(points, normals, weights, starts)
 
 
-def _one_after_another(a: Trajectory, b: Trajectory) -> Trajectory:
-    return Trajectory(
-        **{part.name: np.concatenate([getattr(a, part.name), getattr(b, part.name)]) for part in fields(a)}
-    )
+def _one_of_both(a: Trajectory, b: Trajectory, order: Int[np.ndarray, "n"]) -> Trajectory:
+    columns = {x.name: np.concatenate([getattr(a, x.name), getattr(b, x.name)]) for x in fields(a)}
+    return Trajectory(**{name: column[order] for name, column in columns.items()})

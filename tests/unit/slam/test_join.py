@@ -84,6 +84,29 @@ def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
     assert solved.path_cm[-1] == pytest.approx((len(true) - 2) * LAP_CM / LAP_FRAMES, rel=0.03)
 
 
+def test_the_stretch_that_carries_may_be_the_later_one(same_road):
+    drive, true, stretches = same_road
+    # The short stretch was driven first.
+    n = len(true)
+    order = np.concatenate([np.arange(FIRST, n), np.arange(FIRST)])
+    turned = replace(
+        drive,
+        images=Pictures([drive.image(int(k)) for k in order]),
+        breaks=np.arange(n) == n - FIRST,
+    )
+    swapped = [
+        Stretch(np.arange(n - FIRST), stretches[1].solved),
+        Stretch(np.arange(n - FIRST, n), stretches[0].solved),
+    ]
+    (joined,) = join_stretches(swapped, turned, SMALL, np.random.default_rng(1))
+    np.testing.assert_array_equal(joined.rows, np.arange(n))
+    np.testing.assert_array_equal(np.flatnonzero(joined.solved.breaks_or_none()), [n - FIRST])
+    error = _errors_cm(joined.solved.poses, true[order], slice(n - FIRST, n))
+    assert error.max() < 2.0
+    for r in joined.solved.uninterrupted_revisits():
+        assert abs(r.later - r.earlier - LAP_FRAMES) <= 2
+
+
 def test_a_stretch_of_another_road_stays_apart(same_road):
     drive, _, stretches = same_road
     # A road that bends the other way, between other walls.
