@@ -86,8 +86,9 @@ def _join(
     breaks[first] = True
     apart = np.concatenate([base.solved.poses, other.solved.poses])
     scans = _together(base.solved.scans, other.solved.scans)
+    pictures = thumbnails(drives[0]), thumbnails(drives[1])
     found = []
-    for pair in _shared_places(*(thumbnails(part) for part in drives), s.min_similarity, s.max_pairs):
+    for pair in _shared_places(*pictures, s.min_similarity, s.max_pairs):
         match = match_places(scans, apart, pair, height, camera.wheelbase_cm, s, rng)
         if match is not None:
             found.append(match)
@@ -117,7 +118,7 @@ def _join(
     if bundle.misfit > MAX_MISFIT * before:
         return None
     opened = _carried(other.solved.open_poses, other.solved.poses[0], bundle.poses[first])
-    # From here on in the order of the drive: the base may be the later one, or lie on both sides of the other.
+    # From here on in the order of the drive: the base may be the later one, or lie on both sides.
     rows = np.concatenate([base.rows, other.rows])
     order = np.argsort(rows)
     place = np.argsort(order)
