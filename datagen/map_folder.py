@@ -72,6 +72,8 @@ class DriveMap:
         lines: Left and right line of the driven lane of each segment, then those of the lanes beside it.
         tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for level.
         held_out: Frames whose edge points had no say in the lines; None where there were none.
+        contradicted: Frames around which the pictures disagree with the lines, see
+            :mod:`datagen.report.agreement`; None where nobody looked.
     """
 
     meta: MapMeta
@@ -86,6 +88,7 @@ class DriveMap:
     lines: dict[int, list[LaneLine]]
     tilt_rad: Float[np.ndarray, "n 2"] | None = None
     held_out: Bool[np.ndarray, "n"] | None = None
+    contradicted: Bool[np.ndarray, "n"] | None = None
 
     def camera_at(self, k: int) -> Camera:
         """Return the camera as it nodded in the k-th frame."""
@@ -131,6 +134,8 @@ def write_map(
         columns |= {"pitch_rad": m.tilt_rad[:, 0], "roll_rad": m.tilt_rad[:, 1]}
     if m.held_out is not None:
         columns["held_out"] = m.held_out
+    if m.contradicted is not None:
+        columns["contradicted"] = m.contradicted
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -193,6 +198,7 @@ def read_map(folder: Path) -> DriveMap:
             "pitch_rad": ColumnSpec(required=False),
             "roll_rad": ColumnSpec(required=False),
             "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
+            "contradicted": ColumnSpec("int", required=False, low=0.0, high=1.0),
         },
         error=MapFormatError,
     )
@@ -211,6 +217,7 @@ def read_map(folder: Path) -> DriveMap:
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
         tilt_rad=np.stack(tilt, axis=1),
         held_out=table.get("held_out", np.zeros(n)) > 0,
+        contradicted=table.get("contradicted", np.zeros(n)) > 0,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
@@ -30,7 +30,7 @@ class MappedSegment:
     """A segment with its lane, in the scale of its camera.
 
     Attributes:
-        rows: Frames of the drive that it covers.
+        rows: Frames of the drive that it covers, as positions in it.
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
@@ -39,7 +39,7 @@ class MappedSegment:
             the user's number was not used in the first place.
     """
 
-    rows: slice
+    rows: Int[np.ndarray, "n"]
     solved: SolvedSegment
     s_frames_cm: Float[np.ndarray, "n"]
     lane: TracedLane
@@ -53,12 +53,12 @@ def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict
     for i, part in enumerate(parts):
         solved = part.solved
         for k in range(len(solved.poses)):
-            rows = solved.scans.frame(k)
+            points_of = solved.scans.frame(k)
             pose = solved.poses[k] * [factor, factor, 1.0]
-            points.append(map_from_car(factor * solved.scans.points_cm[rows], pose, camera.wheelbase_cm))
-            normals.append(map_from_car_directions(solved.scans.normals[rows], pose[2]))
-            frames.append(np.full(rows.stop - rows.start, part.rows.start + k))
-            segments.append(np.full(rows.stop - rows.start, i))
+            points.append(map_from_car(factor * solved.scans.points_cm[points_of], pose, camera.wheelbase_cm))
+            normals.append(map_from_car_directions(solved.scans.normals[points_of], pose[2]))
+            frames.append(np.full(points_of.stop - points_of.start, part.rows[k]))
+            segments.append(np.full(points_of.stop - points_of.start, i))
     xy, normal = np.concatenate(points).astype(np.float32), np.concatenate(normals).astype(np.float32)
     return {
         "frame_index": np.concatenate(frames),
@@ -79,7 +79,7 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
         residual = np.abs(solved.residuals)
         segments.append(
             {
-                "first_frame": part.rows.start,
+                "first_frame": int(part.rows[0]),
                 "frames": len(solved.poses),
                 "path_cm": factor * float(solved.path_cm[-1]),
                 "median_match": float(np.nanmedian(solved.trajectory.match)),
@@ -133,6 +133,7 @@ def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[
         p95_px=both["p95_px_at_160"],
         coverage=both["coverage"],
         labelled_share=figures["labelled"]["share"],
+        contradicted_share=0.0 if drive_map.contradicted is None else float(drive_map.contradicted.mean()),
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lane_scale import STEP_HEIGHTS, edges_beside, fitted_width_cm
+from datagen.lanes.crossing import without_crossings
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
 from datagen.lanes.trace import trace_lane
@@ -21,6 +22,7 @@ from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
+from datagen.report.agreement import contradicted_frames
 from datagen.report.held_out import held_out_frames, without_frames
 from datagen.report.mappable import (
     check_edges,
@@ -35,8 +37,9 @@ from datagen.report.residuals import ResidualSettings
 from datagen.report.verdict import judge
 from datagen.self_calibration import DRIVE_INSTEAD, find_camera
 from datagen.slam.calibrate import with_known_scale
+from datagen.slam.join import Stretch, join_stretches
 from datagen.slam.scans import Progress
-from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.segment import solve_segment
 from datagen.slam.stillness import following_frames
 from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
@@ -117,22 +120,28 @@ def _map_drive(
         figures["calibration"] = found.figures
         notes.append(found.note)
     width = lane_width_cm if known is not None else None
-    parts = []
+    stretches = []
     for rows in segments:
         if rows != longest_rows:
             solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
-        parts.append(_find_lane(rows, solved, width, settings, held_out[rows]))
+        stretches.append(Stretch(np.arange(rows.start, rows.stop), solved))
+    parts = [
+        _find_lane(stretch, width, settings, held_out[stretch.rows])
+        for stretch in join_stretches(stretches, drive, settings, rng)
+    ]
     check_lane(parts, drive)
     factor = 1.0
     if known is None:
         factor = lane_width_cm / _mapped_lane_cm(parts)
         camera = with_known_scale(camera, factor, settings.guess)
     drive_map = _assemble(drive, drive_path, lane_width_cm, camera, parts, factor, known is None)
-    drive_map = replace(drive_map, held_out=np.concatenate([held_out[part.rows] for part in parts]))
+    rows_of_map = _rows_of_map(parts)
+    drive_map = replace(drive_map, held_out=held_out[rows_of_map])
     figures |= map_figures(drive_map, parts, factor)
     notes += map_notes(drive_map, figures, known is not None)
-    rows_of_map = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in parts])
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
+    drive_map = replace(drive_map, contradicted=contradicted_frames(mapped))
+    mapped = replace(mapped, drive_map=drive_map)
     quality = measure_map(mapped, ResidualSettings())
     check_lines_seen(quality, drive)
     figures |= quality_figures(quality, drive.width, ResidualSettings())
@@ -146,7 +155,7 @@ def _map_drive(
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
-        opened = np.concatenate([part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
+        opened = _in_order(parts, [part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
         scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
         draw_map(folder / "map.png", drive_map, scaled)
@@ -214,26 +223,27 @@ def _check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
 
 
 def _find_lane(
-    rows: slice,
-    solved: SolvedSegment,
+    stretch: Stretch,
     lane_width_cm: float | None,
     settings: MapSettings,
     held_out: Bool[np.ndarray, "n"],
 ) -> MappedSegment:
     """Find a solved segment's lane lines, in the scale of its camera, without the frames held out."""
+    solved = stretch.solved
     height = solved.camera.mounting.height_cm
-    revisits = [(revisit.earlier, revisit.later) for revisit in solved.revisits]
+    revisits = [(revisit.earlier, revisit.later) for revisit in solved.uninterrupted_revisits()]
     lap = lap_path(solved.poses, revisits, STEP_HEIGHTS * height, height)
     # In a wide lane the further line only comes into view a lane's width ahead.
     least_reach_cm = 1.2 * (lane_width_cm or 0.0)
     path, edges = edges_beside(solved, without_frames(solved.scans, held_out), lap, least_reach_cm)
+    edges = without_crossings(path, edges, height, settings.trace.side_heights * height)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, settings.trace)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, settings.trace)
     lines = fit_lines(path, edges, lane, height, settings.fit)
-    return MappedSegment(rows, solved, path.s_frames_cm, lane, lines, free_cm)
+    return MappedSegment(stretch.rows, solved, path.s_frames_cm, lane, lines, free_cm)
 
 
 def _mapped_lane_cm(parts: list[MappedSegment]) -> float:
@@ -249,8 +259,7 @@ def _assemble(
     factor: float,
     scale_from_lane: bool,
 ) -> DriveMap:
-    """Join the segments, in centimetres."""
-    laps = np.concatenate([part.solved.laps for part in parts])
+    """Join the segments, in centimetres, in the order of the drive."""
     meta = MapMeta(
         format=FORMAT,
         drive=str(drive_path),
@@ -258,18 +267,29 @@ def _assemble(
         mapped_lane_cm=factor * _mapped_lane_cm(parts),
         tape_cm=factor * float(np.median([line.marking_cm for part in parts for line in part.lines[:2]])),
         scale_from="lane width" if scale_from_lane else "camera",
-        laps=int(laps.max()) if any(part.solved.revisits for part in parts) else 0,
+        laps=max(int(part.solved.laps.max()) for part in parts),
     )
+    rows = _rows_of_map(parts)
     return DriveMap(
         meta=meta,
         camera=camera,
-        frames=np.concatenate([drive.frames[part.rows] for part in parts]),
-        t_s=np.concatenate([drive.t_s[part.rows] for part in parts]),
-        poses=np.concatenate([part.solved.poses for part in parts]) * [factor, factor, 1.0],
-        lap=laps,
-        segment=np.concatenate([np.full(len(part.solved.poses), i) for i, part in enumerate(parts)]),
-        s_cm=np.concatenate([part.s_frames_cm for part in parts]) * factor,
-        match=np.concatenate([part.solved.trajectory.match for part in parts]),
+        frames=drive.frames[rows],
+        t_s=drive.t_s[rows],
+        poses=_in_order(parts, [part.solved.poses for part in parts]) * [factor, factor, 1.0],
+        lap=_in_order(parts, [part.solved.laps for part in parts]),
+        segment=_in_order(parts, [np.full(len(part.rows), i) for i, part in enumerate(parts)]),
+        s_cm=_in_order(parts, [part.s_frames_cm for part in parts]) * factor,
+        match=_in_order(parts, [part.solved.trajectory.match for part in parts]),
         lines={i: [line.scaled(factor) for line in part.lines] for i, part in enumerate(parts)},
-        tilt_rad=np.concatenate([part.solved.bundle.tilt for part in parts]),
+        tilt_rad=_in_order(parts, [part.solved.bundle.tilt for part in parts]),
     )
+
+
+def _rows_of_map(parts: list[MappedSegment]) -> Int[np.ndarray, "n"]:
+    """Positions in the drive of all mapped frames."""
+    return np.sort(np.concatenate([part.rows for part in parts]))
+
+
+def _in_order(parts: list[MappedSegment], values: list[np.ndarray]) -> np.ndarray:
+    """Values per frame of each segment, in the order of the drive: a segment may lie within another one."""
+    return np.concatenate(values)[np.argsort(np.concatenate([part.rows for part in parts]))]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.labels.mapped_drive import (
+    CONTRADICTED,
     DELETED,
     NO_LINE,
     UNCERTAIN,
@@ -58,7 +59,7 @@ def label_map(
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
     rows: list[int] = []
     edges, lines, points, residuals = [], [], [], []
-    skipped = {DELETED: 0, UNCERTAIN: 0, NO_LINE: 0}
+    skipped = {DELETED: 0, UNCERTAIN: 0, CONTRADICTED: 0, NO_LINE: 0}
     for k in range(len(drive_map.frames)):
         if progress is not None:
             progress(k + 1, len(drive_map.frames))
@@ -72,9 +73,7 @@ def label_map(
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
         lines.append((seen.left_cm, seen.right_cm))
         points.append(visible)
-        residuals.append(
-            frame_residual_cm(road.points_cm, (seen.left_cm, seen.right_cm), drive_map.meta.tape_cm)
-        )
+        residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
     if not rows:
         raise TrackingLostError(f"{map_folder}: no frame can be labelled ({skipped})")
     residual = np.array(residuals)

@@ -21,9 +21,10 @@ from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
 #: Uncertainty of a line's position from which it gives no label, in lane widths.
-_MAX_SIGMA_LANES = 0.05
+_MAX_SIGMA_LANES = 0.03
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
+CONTRADICTED = "the pictures disagree with the map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +93,17 @@ def label_frame(
 ) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:
     """Return the lane of the map's k-th frame and its six labels, or why it gets none.
 
-    A frame gets no labels where its pose is uncertain (few edges match the map) or the driver has deleted
-    it; a point is masked where the map does not support the line, or where it lies beside the window.
+    A frame gets no labels where its pose is uncertain (few edges match the map), where the pictures disagree
+    with the map's lines, or where the driver has deleted it; a point is masked where the map does not support
+    the line, or where it lies beside the window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED
     # The first frame of a segment has no map to match yet, so that its match is NaN.
     if mapped.drive_map.match[k] < _MIN_MATCH:
         return UNCERTAIN
+    if mapped.drive_map.contradicted is not None and mapped.drive_map.contradicted[k]:
+        return CONTRADICTED
     seen = lines_at(mapped.drive_map, k)
     visible = window.labelled(seen.points_cm)
     return (seen, visible) if np.isfinite(visible).any() else NO_LINE

@@ -26,11 +26,18 @@ class FrameLines:
         left_cm: Left line in the direction of travel, frame car; NaN where unsupported.
         right_cm: Right line likewise.
         points_cm: The six labels; NaN where masked.
+        markings_cm: Width of the left and of the right marking; NaN where it is not known.
     """
 
     left_cm: Float[np.ndarray, "m 2"]
     right_cm: Float[np.ndarray, "m 2"]
     points_cm: Float[np.ndarray, "6"]
+    markings_cm: tuple[float, float] = (float("nan"), float("nan"))
+
+    def marking_cm(self, side: int, usual_cm: float) -> float:
+        """Width of the left (0) or right (1) marking; the usual one where it is not known."""
+        own = self.markings_cm[side]
+        return own if np.isfinite(own) else usual_cm
 
 
 def lines_of_frame(
@@ -60,7 +67,7 @@ def lines_of_frame(
     left, right = (_polyline(by_index[i], s, pose, wheelbase_cm, max_sigma_cm) for i in pair)
     points = np.concatenate([label_rows(left), label_rows(right)])
     assert points.shape == (N_POINTS,)
-    return FrameLines(left, right, points)
+    return FrameLines(left, right, points, (by_index[pair[0]].marking_cm, by_index[pair[1]].marking_cm))
 
 
 def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:

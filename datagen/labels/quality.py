@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from datagen.labels.project import FrameLines
 from lanenet.data.label_set import LabelSet
 from lanenet.geometry.lane import POINT_NAMES
 
@@ -15,31 +16,28 @@ REPORT_FORMAT = "lanenet-label-report/1"
 _REACH_CM = 60.0
 
 
-def frame_residual_cm(
-    points_cm: Float[np.ndarray, "m 2"],
-    lines_cm: tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]],
-    tape_cm: float,
-) -> float:
+def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, tape_cm: float) -> float:
     """Median distance between the marking's borders and where the projected line says they are.
 
     Args:
         points_cm: Edge points of the frame, frame car.
-        lines_cm: Left and right line, frame car; NaN where unsupported.
-        tape_cm: Width of the marking.
+        lines: The frame's lane.
+        tape_cm: Width of a marking whose own one is not known.
 
     Returns:
         [cm]; NaN where the frame shows fewer than ten edge points near the lines.
     """
     near = points_cm[points_cm[:, 1] <= _REACH_CM]
     distances = []
-    for line in lines_cm:
+    for side, line in enumerate((lines.left_cm, lines.right_cm)):
         known = line[np.isfinite(line[:, 0])]
         if len(known) < 2 or not len(near):
             continue
         offset = np.abs(_distance_to_polyline(near, known))
-        distances.append(offset[offset < 1.5 * tape_cm + 1.0])
+        marking_cm = lines.marking_cm(side, tape_cm)
+        distances.append(np.abs(offset[offset < 1.5 * marking_cm + 1.0] - 0.5 * marking_cm))
     found = np.concatenate(distances) if distances else np.empty(0)
-    return float(np.median(np.abs(found - 0.5 * tape_cm))) if found.size >= 10 else float("nan")
+    return float(np.median(found)) if found.size >= 10 else float("nan")
 
 
 def _distance_to_polyline(

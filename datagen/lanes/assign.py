@@ -11,6 +11,8 @@ from datagen.lanes.line import LaneLine
 
 #: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
 _BEYOND = 0.1
+#: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
+_ENTERED = 0.3
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
 _WIDTHS = (0.6, 1.5)
 
@@ -35,7 +37,8 @@ def assign_lanes(
     """Find the lane of each frame of a segment, in the order in which they were driven.
 
     The lane is the one in which the middle of the front axle is; it changes when that is clearly beyond a
-    line that has a lane behind it. Beside the road the car keeps the lane that it left.
+    line that has a lane behind it. Beside the road the car keeps the lane that it left, and so it does where
+    it comes back before it is well inside the other one.
 
     Args:
         lines: Lines of the segment.
@@ -71,7 +74,21 @@ def assign_lanes(
         elif current + 1 in exists and left_of[current + 1][k] < -margin and exists[current + 1][k]:
             current += 1
         lane[k] = current
-    return FrameLanes(lane, forward)
+    return FrameLanes(_without_swerves(lane, left_of, _ENTERED * usual), forward)
+
+
+def _without_swerves(
+    lane: Int[np.ndarray, "n"], left_of: dict[int, Float[np.ndarray, "n"]], entered_cm: float
+) -> Int[np.ndarray, "n"]:
+    """Give frames back to the lane before and after them where the car hardly got into the other one."""
+    lane = lane.copy()
+    runs = np.split(np.arange(len(lane)), np.flatnonzero(np.diff(lane)) + 1)
+    for before, run, after in zip(runs[:-2], runs[1:-1], runs[2:], strict=True):
+        home, away = lane[before[-1]], lane[run[0]]
+        inside = left_of[home][run] if away < home else -left_of[away][run]
+        if home == lane[after[0]] and inside.max() < entered_cm:
+            lane[run] = home
+    return lane
 
 
 def _left_of(

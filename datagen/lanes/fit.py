@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from datagen.lanes.line import LaneLine, Side
 from datagen.lanes.offset import Borders, FittedOffset, Prior, fit_offset
+from datagen.lanes.parallel import distance_across, parallel_offset
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.spline import CubicBasis, adapted_breaks
 from datagen.lanes.support import stretches
@@ -20,6 +21,7 @@ from lanenet.config import Settings
 __all__ = ["FitSettings", "LaneLine", "Side", "fit_lines"]
 
 _SIGN: dict[Side, float] = {"left": 1.0, "right": -1.0}
+_OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
 
 
 class FitSettings(Settings):
@@ -33,7 +35,8 @@ class FitSettings(Settings):
         extend_heights: What is believed beyond the end of the paint.
         reach_heights: How far from the traced line its edges are looked for, beyond half the marking.
         bend_heights: Typical bend of a line against the path: its inverse radius times the height.
-        guide_lanes: How well a line keeps its distance from the one beside it, in lane widths.
+        guide_lanes: How well a line keeps its distance from the one beside it at best, in lane widths; by how
+            much the two vary where both are seen counts where that is more.
         loose_lanes: How well the lane is known where neither of its lines is seen, in lane widths.
         precise_heights: Distance at which an edge point counts half. One pixel spans road in proportion to
             the squared distance, and what a frame's tilt is off by moves its points likewise.
@@ -58,7 +61,8 @@ def fit_lines(
 ) -> list[LaneLine]:
     """Fit the lines of the driven lane, then those beside it.
 
-    Where a line has a gap, the one beside it, a lane's width away, guides the cubic through it.
+    Each line is fitted alone first. Where it then has a gap and the line beside it has none, that one guides
+    the cubic through it, at the distance that the two keep where both are seen, and bends it likewise.
 
     Args:
         path: The path.
@@ -73,54 +77,110 @@ def fit_lines(
     widest = settings.knot_heights * camera_height_cm
     narrowest = settings.corner_heights * camera_height_cm
     basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
-
-    def fit(
-        known_cm: Float[np.ndarray, "m"],
-        guess_cm: Float[np.ndarray, "m"],
-        held: Bool[np.ndarray, "m"],
-        tape_cm: float,
-    ) -> FittedOffset:
-        start = np.where(np.isfinite(known_cm), known_cm, guess_cm)
-        guess = _smoothed(path, start, 0.25 * lane.lane_cm)
-        points = _borders(path, edges, start, guess, tape_cm, camera_height_cm, settings)
-        prior = Prior(
-            guess_cm=guess_cm,
-            sigma_cm=np.where(held, settings.guide_lanes, settings.loose_lanes) * lane.lane_cm,
-            lane_cm=lane.lane_cm,
-            bend_per_cm=settings.bend_heights / camera_height_cm,
-            knot_cm=widest,
-            height_cm=camera_height_cm,
-        )
-        return fit_offset(path, basis, points, tape_cm, prior)
-
-    known: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
+    fitter = _Fitter(path, edges, basis, lane.lane_cm, camera_height_cm, settings)
+    traced: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
         ("left", 0): lane.left_cm,
         ("right", 0): lane.right_cm,
         **lane.beside_cm,
     }
-    # The line of which more is seen first: it guides the other one.
-    first: Side = "left" if np.isfinite(lane.left_cm).sum() >= np.isfinite(lane.right_cm).sum() else "right"
-    second: Side = "right" if first == "left" else "left"
-    width = _apart(path, lane.left_cm - lane.right_cm, lane.lane_cm)
-    by_centre = lane.centre_cm + 0.5 * _SIGN[first] * width
-    by_other = known[second, 0] + _SIGN[first] * width
-    held = np.isfinite(by_other)
-    fitted = {(first, 0): fit(known[first, 0], np.where(held, by_other, by_centre), held, lane.tape_cm)}
-    beside = fitted[first, 0]
     # A line that is only seen from afar does not show how wide it is; most are as wide as the best seen one.
-    tape = beside.marking_cm
-    fitted[second, 0] = fit(known[second, 0], beside.d_cm + _SIGN[second] * width, beside.seen, tape)
+    first: Side = "left" if np.isfinite(lane.left_cm).sum() >= np.isfinite(lane.right_cm).sum() else "right"
+    alone: dict[Side, FittedOffset] = {}
+    tape = lane.tape_cm
+    for side in (first, _OTHER[first]):
+        by_centre = lane.centre_cm + 0.5 * _SIGN[side] * lane.lane_cm
+        alone[side] = fitter.alone(traced[side, 0], by_centre, tape)
+        tape = alone[first].marking_cm
+    apart = fitter.apart(alone["right"].d_cm, alone["left"].d_cm, alone["right"].seen & alone["left"].seen)
+    fitted: dict[tuple[Side, int], FittedOffset] = {}
+    for side, own in alone.items():
+        start = np.where(own.seen, own.d_cm, np.nan)
+        fitted[side, 0] = fitter.beside(start, alone[_OTHER[side]], _SIGN[side], apart, own.marking_cm)
     for side, rank in sorted(lane.beside_cm, key=lambda name: name[1]):
-        beside = fitted[side, rank - 1]
-        apart = _apart(path, np.abs(known[side, rank] - beside.d_cm), lane.lane_cm)
-        fitted[side, rank] = fit(known[side, rank], beside.d_cm + _SIGN[side] * apart, beside.seen, tape)
+        inner, known = fitted[side, rank - 1], np.isfinite(traced[side, rank])
+        apart = fitter.apart(inner.d_cm, np.where(known, traced[side, rank], inner.d_cm), known)
+        fitted[side, rank] = fitter.beside(traced[side, rank], inner, _SIGN[side], apart, tape)
     lines = []
     for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
-        inner: tuple[Side, int] = (side, rank - 1) if rank else (second if side == first else first, 0)
-        parallel = fitted[inner].seen
+        parallel = fitted[(side, rank - 1) if rank else (_OTHER[side], 0)].seen
         offset = fitted[side, rank]
         lines.append(_line(path, basis, side, rank, offset, parallel, camera_height_cm, settings))
     return lines
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """What the fits of all lines have in common."""
+
+    path: Path
+    edges: PathEdges
+    basis: CubicBasis
+    lane_cm: float
+    height_cm: float
+    settings: FitSettings
+
+    def alone(
+        self, traced_cm: Float[np.ndarray, "m"], guess_cm: Float[np.ndarray, "m"], tape_cm: float
+    ) -> FittedOffset:
+        """Fit a line of which nothing but the trace is known; NaN where that has lost it."""
+        start = np.where(np.isfinite(traced_cm), traced_cm, guess_cm)
+        loose = np.full(len(start), self.settings.loose_lanes * self.lane_cm)
+        return self._fit(start, self._smoothed(start), np.zeros(len(start)), loose, tape_cm)
+
+    def beside(
+        self,
+        known_cm: Float[np.ndarray, "m"],
+        other: FittedOffset,
+        sign: float,
+        apart: tuple[Float[np.ndarray, "m"], float],
+        tape_cm: float,
+    ) -> FittedOffset:
+        """Fit a line that runs on the left (sign 1) or on the right (-1) of a fitted one."""
+        guess = parallel_offset(self.path, self._smoothed(other.d_cm), sign * apart[0])
+        sigma = np.where(
+            other.seen, np.hypot(apart[1], other.sigma_cm), self.settings.loose_lanes * self.lane_cm
+        )
+        start = np.where(np.isfinite(known_cm), known_cm, guess)
+        return self._fit(start, guess, guess, sigma, tape_cm)
+
+    def apart(
+        self, inner_cm: Float[np.ndarray, "m"], outer_cm: Float[np.ndarray, "m"], known: Bool[np.ndarray, "m"]
+    ) -> tuple[Float[np.ndarray, "m"], float]:
+        """Distance of two lines, smoothed over a lane's width and interpolated in gaps; what it varies by."""
+        path, lane_cm = self.path, self.lane_cm
+        least = self.settings.guide_lanes * lane_cm
+        inner, outer = self._smoothed(inner_cm), self._smoothed(outer_cm)
+        found = distance_across(path, inner, outer, known)
+        good = known & (np.abs(found - lane_cm) < 0.35 * lane_cm)
+        if not good.any():
+            return np.full(len(found), lane_cm), self.settings.loose_lanes * lane_cm
+        filled = np.interp(path.s_cm, path.s_cm[good], found[good], period=path.period_cm)
+        varies = 1.4826 * float(np.median(np.abs(found[good] - np.median(found[good]))))
+        return _smoothed(path, filled, 0.5 * lane_cm), max(varies, least)
+
+    def _smoothed(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        return _smoothed(self.path, d_cm, 0.25 * self.lane_cm)
+
+    def _fit(
+        self,
+        start_cm: Float[np.ndarray, "m"],
+        guess_cm: Float[np.ndarray, "m"],
+        shape_cm: Float[np.ndarray, "m"],
+        sigma_cm: Float[np.ndarray, "m"],
+        tape_cm: float,
+    ) -> FittedOffset:
+        smooth = self._smoothed(start_cm)
+        points = _borders(self.path, self.edges, start_cm, smooth, tape_cm, self.height_cm, self.settings)
+        prior = Prior(
+            guess_cm=guess_cm,
+            shape_cm=shape_cm,
+            sigma_cm=sigma_cm,
+            lane_cm=self.lane_cm,
+            bend_per_cm=self.settings.bend_heights / self.height_cm,
+            knot_cm=self.settings.knot_heights * self.height_cm,
+            height_cm=self.height_cm,
+        )
+        return fit_offset(self.path, self.basis, points, smooth, tape_cm, prior)
 
 
 def _curvature(path: Path) -> Float[np.ndarray, "m"]:
@@ -129,15 +189,6 @@ def _curvature(path: Path) -> Float[np.ndarray, "m"]:
         turn = np.unwrap(np.concatenate([heading[-1:], heading, heading[:1]]))
         return gaussian_filter1d(0.5 * (turn[2:] - turn[:-2]) / path.step_cm, 2.0, mode="wrap")
     return gaussian_filter1d(np.gradient(np.unwrap(heading)) / path.step_cm, 2.0, mode="nearest")
-
-
-def _apart(path: Path, apart_cm: Float[np.ndarray, "m"], lane_cm: float) -> Float[np.ndarray, "m"]:
-    """Distance between two neighbouring lines, smoothed over a lane's width and interpolated in gaps."""
-    known = np.isfinite(apart_cm) & (np.abs(apart_cm - lane_cm) < 0.35 * lane_cm)
-    if not known.any():
-        return np.full(len(apart_cm), lane_cm)
-    filled = np.interp(path.s_cm, path.s_cm[known], apart_cm[known], period=path.period_cm)
-    return _smoothed(path, filled, 0.5 * lane_cm)
 
 
 def _smoothed(path: Path, values: Float[np.ndarray, "m"], over_cm: float) -> Float[np.ndarray, "m"]:
@@ -187,9 +238,7 @@ def _line(
     settings: FitSettings,
 ) -> LaneLine:
     """Turn an offset from the path into a cubic on the map."""
-    design = basis.design(path.s_cm)
-    factor = splu(csc_array(design.T @ design))
-    control = factor.solve(np.asarray(design.T @ path.points(offset.d_cm)))
+    control = basis.fitted(path.s_cm, path.points(offset.d_cm))
     bridge, extend = settings.bridge_heights * camera_height_cm, settings.extend_heights * camera_height_cm
     return LaneLine(
         side,

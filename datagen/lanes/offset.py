@@ -23,9 +23,12 @@ _ROUNDS = 5
 _FRAMES_TOGETHER = 10
 _CHUNK = 256
 #: What is left however often a line is seen, in camera heights: paint and lens are not perfect.
-_FLOOR = 0.003
+_FLOOR = 0.005
 #: Precision of the edge points that tell a marking's width.
 _NEAR = 0.2
+#: How far from both borders of a marking one alone is believed, in camera heights: next to a gap it may be
+#: the border of something else.
+_ALONE = 1.0
 #: Gaps at whose ends paint is not trusted, and how much of it, in camera heights.
 _LONG_GAP, _TURNS_OFF = 2.0, 0.4
 
@@ -57,14 +60,16 @@ class Prior:
 
     Attributes:
         guess_cm: Where it should be at each path sample, by the line beside it.
+        shape_cm: Offset whose bends it shares; zeros for those of the path.
         sigma_cm: How well it keeps to that at each sample, independently once per lane width.
         lane_cm: Lane width.
-        bend_per_cm: Typical second derivative of the offset.
+        bend_per_cm: Typical second derivative of the offset, beyond that of the shape.
         knot_cm: Length over which that hangs together.
         height_cm: Height of the camera, which sets the scale of errors.
     """
 
     guess_cm: Float[np.ndarray, "m"]
+    shape_cm: Float[np.ndarray, "m"]
     sigma_cm: Float[np.ndarray, "m"]
     lane_cm: float
     bend_per_cm: float
@@ -91,20 +96,28 @@ class FittedOffset:
     residual_cm: float
 
 
-def fit_offset(path: Path, basis: CubicBasis, points: Borders, tape_cm: float, prior: Prior) -> FittedOffset:
+def fit_offset(
+    path: Path,
+    basis: CubicBasis,
+    points: Borders,
+    start_cm: Float[np.ndarray, "m"],
+    tape_cm: float,
+    prior: Prior,
+) -> FittedOffset:
     """Fit a cubic spline to the borders of one marking, robustly.
 
     Args:
         path: The path.
         basis: Splines over its length.
         points: Edge points near the marking.
+        start_cm: Where the marking is, about, at each path sample.
         tape_cm: Width of the marking, about.
         prior: What carries the line where it is not seen.
 
     Source:
         Penalised splines (Eilers and Marx 1996) with iterative reweighting (Cauchy). The uncertainty is
         inflated by what neighbouring frames err in common (design effect, Kish 1965);
-        ``tests/unit/lanes/test_offset.py`` checks it.
+        ``tests/unit/lanes/test_fit.py`` checks it.
     """
     at_samples, at_points = basis.design(path.s_cm), basis.design(points.s_cm)
     stiff = basis.design(path.s_cm, 2)
@@ -112,7 +125,8 @@ def fit_offset(path: Path, basis: CubicBasis, points: Borders, tape_cm: float, p
     marking, scale = tape_cm, 0.02 * prior.height_cm
     seen = np.zeros(len(path.xy_cm), dtype=bool)
     trust = points.precision
-    solution = _solve(at_samples, stiffness, at_points, 0.0 * trust, points.d_cm, prior, seen, path)[0]
+    solution = basis.fitted(path.s_cm, start_cm)
+    shape = basis.fitted(path.s_cm, prior.shape_cm)
     residual = points.d_cm
     for _ in range(_ROUNDS):
         off = points.d_cm - at_points @ solution
@@ -121,32 +135,51 @@ def fit_offset(path: Path, basis: CubicBasis, points: Borders, tape_cm: float, p
         robust = 1.0 / (1.0 + points.precision * (residual / (2.0 * scale)) ** 2)
         found = points.weight * robust
         seen = seen_samples(
-            path, points.s_cm, points.border, found, 0.1 * prior.height_cm, 2.0 * prior.height_cm
+            path, points.s_cm, points.border, found, 0.1 * prior.height_cm, _ALONE * prior.height_cm
         )
-        # Where paint ends for long, it may turn off into a side road before it does.
-        ends = stretches(path, seen, _LONG_GAP * prior.height_cm, -_TURNS_OFF * prior.height_cm)
-        trust = np.where(_at(path, seen & within(path, ends), points.s_cm), points.precision * robust, 0.0)
+        kept = _at(path, seen & _before_ends(path, seen, prior.height_cm), points.s_cm)
+        trust = np.where(kept, points.precision * robust, 0.0)
         if not trust.any():
             break
         spread = (np.sqrt(points.precision) * np.abs(residual))[trust > 0.0]
         low, high = 1e-3 * prior.height_cm, 0.05 * prior.height_cm
         scale = float(np.clip(1.4826 * np.median(spread), low, high))
         middle = points.d_cm - 0.5 * points.border * marking
-        solution, _, _ = _solve(at_samples, stiffness, at_points, trust / scale**2, middle, prior, seen, path)
+        solution, _, _ = _solve(
+            at_samples, stiffness, shape, at_points, trust / scale**2, middle, prior, seen, path
+        )
     middle = points.d_cm - 0.5 * points.border * marking
     weight = trust / scale**2
-    solution, factor, data = _solve(at_samples, stiffness, at_points, weight, middle, prior, seen, path)
+    solution, factor, data = _solve(
+        at_samples, stiffness, shape, at_points, weight, middle, prior, seen, path
+    )
     excess = _in_common(factor, data, at_points, weight * (middle - at_points @ solution), points.frame)
-    solution, factor, _ = _solve(at_samples, stiffness, at_points, weight / excess, middle, prior, seen, path)
+    solution, factor, _ = _solve(
+        at_samples, stiffness, shape, at_points, weight / excess, middle, prior, seen, path
+    )
     near = trust > 0.5 * points.precision
     robust_sd = 1.4826 * float(np.median(np.abs(residual[near]))) if near.any() else float("nan")
     sigma = np.sqrt(_variance(factor, at_samples) + (_FLOOR * prior.height_cm) ** 2)
     return FittedOffset(np.asarray(at_samples @ solution), sigma, seen, marking, robust_sd)
 
 
+def _before_ends(path: Path, seen: Bool[np.ndarray, "m"], height_cm: float) -> Bool[np.ndarray, "m"]:
+    """Leave out the ends of paint before long gaps: it may turn off into a side road before it ends.
+
+    Where an open path ends, paint does not.
+    """
+    trim = _TURNS_OFF * height_cm
+    ends = stretches(path, seen, _LONG_GAP * height_cm, -trim)
+    if not path.closed:
+        ends[:, 0] = np.where(ends[:, 0] < 2.0 * trim, 0.0, ends[:, 0])
+        ends[:, 1] = np.where(ends[:, 1] > path.s_cm[-1] - 2.0 * trim, path.s_cm[-1], ends[:, 1])
+    return within(path, ends)
+
+
 def _solve(
     at_samples: csr_array,
     stiffness: csc_array,
+    shape: Float[np.ndarray, "c"],
     at_points: csr_array,
     weight: Float[np.ndarray, "n"],
     middle_cm: Float[np.ndarray, "n"],
@@ -160,8 +193,7 @@ def _solve(
     data = csc_array(at_points.T @ diags_array(weight) @ at_points)
     normal = data + stiffness + csc_array(at_samples.T @ diags_array(guide) @ at_samples)
     factor = splu(csc_array(normal))
-    right = at_points.T @ (weight * middle_cm) + at_samples.T @ (guide * prior.guess_cm)
-    # The guide's own bends are none that the prior forbids.
+    right = at_points.T @ (weight * middle_cm) + at_samples.T @ (guide * prior.guess_cm) + stiffness @ shape
     return factor.solve(np.asarray(right)), factor, data
 
 

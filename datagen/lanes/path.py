@@ -118,6 +118,18 @@ class PathEdges:
     distance_cm: Float[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
 
+    def part(self, rows: Bool[np.ndarray, "m"]) -> PathEdges:
+        """Return some of the points."""
+        return PathEdges(
+            self.s_cm[rows],
+            self.d_cm[rows],
+            self.side[rows],
+            self.along[rows],
+            self.weight[rows],
+            self.distance_cm[rows],
+            self.frame[rows],
+        )
+
 
 def edges_along_path(
     path: Path, scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float

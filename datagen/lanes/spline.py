@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import BSpline
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.linalg import splu
 
 _DEGREE = 3
 
@@ -56,6 +57,13 @@ class CubicBasis:
             slope = degree / np.maximum(t[degree + 1 : degree + count] - t[1:count], 1e-12)
             matrix = matrix @ diags_array([-slope, slope], offsets=[0, 1], shape=(count - 1, count))
         return csr_array(matrix @ self._unfold()) if self.periodic else csr_array(matrix)
+
+    def fitted(
+        self, s_cm: Float[np.ndarray, "m"], values: Float[np.ndarray, "m *d"]
+    ) -> Float[np.ndarray, "c *d"]:
+        """Coefficients that come closest to values at given places, of which every interval holds some."""
+        design = self.design(s_cm)
+        return np.asarray(splu(csc_array(design.T @ design)).solve(np.asarray(design.T @ values)))
 
     def unfolded(self, coefficients: Float[np.ndarray, "c *d"]) -> Float[np.ndarray, "c2 *d"]:
         """Coefficients for the full list of knots."""

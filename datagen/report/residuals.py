@@ -8,9 +8,11 @@ how much of the border in view met an edge at all, and how much of a line moved 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from numba import njit
 from pydantic import Field
 
 from datagen.labels.project import FrameLines
@@ -87,7 +89,7 @@ def border_samples(
     Args:
         edges: Edge pixels of the frame.
         lines: Its lane, frame car.
-        tape_cm: Width of the markings.
+        tape_cm: Width of a marking whose own one is not known.
         camera: Camera of the frame, with the tilt that it had in it.
         keep: Nonzero where the image shows road.
         settings: Gate and sampling.
@@ -97,9 +99,10 @@ def border_samples(
     for i, line in enumerate((lines.left_cm, lines.right_cm)):
         at, across = _along(line, settings)
         at = at + aside_cm * across
+        marking_cm = lines.marking_cm(i, tape_cm)
         for border in (-0.5, 0.5):
             # ``across`` points to the right, so that the left border lies against it.
-            place = at + border * tape_cm * across
+            place = at + border * marking_cm * across
             uv, gradient = _in_image(place, -np.sign(border) * across, camera)
             seen = _in_view(uv, gradient, keep)
             residual = _nearest(edges, uv[seen], gradient[seen], camera.width / REFERENCE_WIDTH, settings)
@@ -163,18 +166,25 @@ def _nearest(
     settings: ResidualSettings,
 ) -> Float[np.ndarray, "m"]:
     """Signed distance along the gradient to the edge that lies closest across the border; NaN without one."""
-    if not len(edges.uv_px) or not len(uv):
-        return np.full(len(uv), np.nan)
-    off = edges.uv_px[None] - uv[:, None]
-    across = np.einsum("mek,mk->me", off, gradient)
-    beside = np.abs(off[..., 0] * gradient[:, None, 1] - off[..., 1] * gradient[:, None, 0])
-    agrees = gradient @ edges.normals.T >= settings.min_agreement
-    # Edges are about a pixel apart along their line, whatever the size of the image.
-    good = agrees & (beside <= 0.75) & (np.abs(across) <= settings.gate_px * scale)
-    distance = np.where(good, np.abs(across), np.inf)
-    best = np.argmin(distance, axis=1)
-    rows = np.arange(len(uv))
-    return np.where(np.isfinite(distance[rows, best]), across[rows, best], np.nan)
+    found = np.full(len(uv), np.nan)
+    _meet(edges.uv_px, edges.normals, uv, gradient, settings.min_agreement, settings.gate_px * scale, found)
+    return found
+
+
+@njit(cache=True)
+@no_type_check
+def _meet(edge_uv, edge_normal, uv, gradient, least, gate, found):
+    for i in range(uv.shape[0]):
+        best = gate
+        gx, gy = gradient[i, 0], gradient[i, 1]
+        for j in range(edge_uv.shape[0]):
+            dx, dy = edge_uv[j, 0] - uv[i, 0], edge_uv[j, 1] - uv[i, 1]
+            across = dx * gx + dy * gy
+            # Edges are about a pixel apart along their line, whatever the size of the image.
+            if abs(across) > best or abs(dx * gy - dy * gx) > 0.75:
+                continue
+            if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= least:
+                found[i], best = across, abs(across)
 
 
 @dataclass(frozen=True)

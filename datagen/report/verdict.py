@@ -26,6 +26,8 @@ class VerdictSettings(Settings):
             map may leave out ``usable`` times as many.
         min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; a map
             below it may be right, but the frames do not show that it is.
+        max_contradicted: Share of the frames around which the pictures disagree with the map. A map that is
+            bent in one place is not to be trusted in others.
         max_focal_sigma: Relative uncertainty of the focal length, where the drive had to tell it.
         max_pitch_sigma_rad: Uncertainty of the camera's pitch, likewise.
         max_closure_heights: What a revisit misses across the road, in camera heights, as median.
@@ -39,6 +41,7 @@ class VerdictSettings(Settings):
     max_p95_px: float = Field(default=1.5, gt=0.0)
     min_labelled: float = Field(default=0.85, gt=0.0, lt=1.0)
     min_coverage: float = Field(default=0.3, gt=0.0, lt=1.0)
+    max_contradicted: float = Field(default=0.06, gt=0.0, lt=1.0)
     max_focal_sigma: float = Field(default=0.05, gt=0.0)
     max_pitch_sigma_rad: float = Field(default=0.02, gt=0.0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)
@@ -56,6 +59,7 @@ class MapEvidence:
         p95_px: Likewise.
         coverage: Share of the borders in view that met an edge; NaN where nothing was held out.
         labelled_share: Of the frames that the driver did not delete.
+        contradicted_share: Of all frames: those around which the pictures disagree with the map.
         not_labelled: Why the others have none, and how many.
         revisits: Places seen twice.
         closure_across_heights: What the revisits miss across the road, as median; None without any.
@@ -76,6 +80,7 @@ class MapEvidence:
     sigma: dict[str, float]
     given_lane_cm: float
     found_lane_cm: float | None
+    contradicted_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +103,7 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     found: list[tuple[Grade, str]] = [
         *_residuals(evidence, settings),
         *_labelled(evidence, settings),
+        *_contradicted(evidence, settings),
         *_camera(evidence, settings),
         *_lane_width(evidence, settings),
     ]
@@ -155,6 +161,19 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
             grade,
             f"{100.0 * e.labelled_share:.0f} % of the frames have labels, expected "
             f"{100.0 * s.min_labelled:.0f} % ({causes})",
+        )
+    ]
+
+
+def _contradicted(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+    grade = _bounded(e.contradicted_share, s.max_contradicted, s)
+    if grade == "good":
+        return []
+    return [
+        (
+            grade,
+            f"around {100.0 * e.contradicted_share:.0f} % of the frames the pictures disagree with the map, "
+            f"expected {100.0 * s.max_contradicted:.0f} % at most",
         )
     ]
 

@@ -97,11 +97,7 @@ def propose_revisits(
         settings: Bounds.
     """
     n = len(thumbs)
-    picture = thumbs.reshape(n, SMALL_HEIGHT, SMALL_WIDTH)
-    similarity = np.full((n, n), -1.0, np.float32)
-    for shift in (-2, -1, 0, 1, 2):
-        shifted = np.roll(picture, shift, axis=2).reshape(n, -1)
-        np.maximum(similarity, thumbs @ shifted.T, out=similarity)
+    similarity = alike(thumbs, thumbs)
     kernel = np.eye(9, dtype=np.float32) / 9.0
     similarity = cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     path = path_lengths(poses)
@@ -123,6 +119,16 @@ def propose_revisits(
         if key not in best or pair > best[key]:
             best[key] = pair
     return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda p: p[2])]
+
+
+def alike(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
+    """Correlation of each small picture with each other one, at the sideways shift at which it is highest."""
+    picture = b.reshape(len(b), SMALL_HEIGHT, SMALL_WIDTH)
+    similarity = np.full((len(a), len(b)), -1.0, np.float32)
+    for shift in (-2, -1, 0, 1, 2):
+        shifted = np.roll(picture, shift, axis=2).reshape(len(b), -1)
+        np.maximum(similarity, a @ shifted.T, out=similarity)
+    return similarity
 
 
 def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
@@ -13,10 +13,15 @@ from datagen.slam.places import Revisit, relative_pose
 from lanenet.geometry.frames import wrap_angle
 
 _ITERATIONS = 12
+#: Weight of the motion across a break, which is known from nothing; not zero, so that all stays determined.
+_ACROSS_BREAK = 1e-4
 
 
 def close_loops(
-    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
+    poses: Float[np.ndarray, "n 3"],
+    revisits: list[Revisit],
+    camera_height_cm: float,
+    breaks: Bool[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "r 3"]]:
     """Bend a trajectory so that revisits meet.
 
@@ -28,6 +33,7 @@ def close_loops(
         poses: Open-loop trajectory, heading unwrapped.
         revisits: Verified revisits.
         camera_height_cm: Sets the scale of the tolerances.
+        breaks: Frames that do not follow the one before them.
 
     Returns:
         The closed trajectory, and each revisit's residual (ahead, left, heading) in it.
@@ -35,16 +41,20 @@ def close_loops(
     if not revisits:
         return poses, np.empty((0, 3))
     odometry = np.array([relative_pose(a, b) for a, b in pairwise(poses)])
-    closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits))
+    # How far the motion to each frame can be trusted, 1 for what the drive has seen.
+    trust = np.ones(len(odometry)) if breaks is None else np.where(breaks[1:], _ACROSS_BREAK, 1.0)
+    closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits, trust))
     for robust in (False, True):
         for _ in range(_ITERATIONS):
-            closed, step = _gauss_newton(closed, odometry, revisits, camera_height_cm, robust)
+            closed, step = _gauss_newton(closed, odometry, trust, revisits, camera_height_cm, robust)
             if step < 1e-4 * camera_height_cm:
                 break
     return closed, _residuals(closed, revisits)
 
 
-def _solve_headings(heading: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Float[np.ndarray, "n"]:
+def _solve_headings(
+    heading: Float[np.ndarray, "n"], revisits: list[Revisit], trust: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n"]:
     """Headings that keep the turns between neighbours and meet the revisits with their whole turns."""
     n = len(heading)
     turn_sigma, revisit_sigma = 0.01, 0.05
@@ -52,8 +62,9 @@ def _solve_headings(heading: Float[np.ndarray, "n"], revisits: list[Revisit]) ->
     for k in range(n - 1):
         rows += [k + 1, k + 1]
         columns += [k, k + 1]
-        values += [-1.0 / turn_sigma, 1.0 / turn_sigma]
-        targets.append((heading[k + 1] - heading[k]) / turn_sigma)
+        weight = float(trust[k]) / turn_sigma
+        values += [-weight, weight]
+        targets.append((heading[k + 1] - heading[k]) * weight)
     for i, revisit in enumerate(revisits):
         rows += [n + i, n + i]
         columns += [revisit.earlier, revisit.later]
@@ -85,6 +96,7 @@ def _residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Floa
 def _gauss_newton(
     poses: Float[np.ndarray, "n 3"],
     odometry: Float[np.ndarray, "m 3"],
+    trust: Float[np.ndarray, "m"],
     revisits: list[Revisit],
     camera_height_cm: float,
     robust: bool,
@@ -98,7 +110,7 @@ def _gauss_newton(
     along = 0.1 * np.abs(odometry[:, 0]) + 0.01 * camera_height_cm
     odometry_sigma = np.stack([along, 0.3 * along, np.full(n - 1, 0.015)], axis=1)
     revisit_sigma = np.tile([0.15 * camera_height_cm, 0.05 * camera_height_cm, 0.02], (len(revisits), 1))
-    weight = 1.0 / np.concatenate([odometry_sigma, revisit_sigma])
+    weight = np.concatenate([trust[:, None] / odometry_sigma, 1.0 / revisit_sigma])
     c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
     dx, dy = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
     residual = (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
@@ -36,7 +36,7 @@ _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 _BESIDE_REVISIT = range(-12, 13, 4)
 #: What revisits may miss once closed (medians along and across the road, in camera heights), and how much
 #: worse frames may agree than before: places that only look alike, as on an open road, miss more.
-_MAX_MISSED, _MAX_MISFIT = (0.6, 0.3), 1.1
+MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.1
 #: The camera is adjusted until its focal length moves by less than this share, or so often.
 _SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
 
@@ -56,6 +56,7 @@ class SolvedSegment:
         residuals: What each revisit misses after closing: ahead, left, heading.
         drift_rad_per_cm: Heading that the open loop missed per length; None without a revisit.
         bundle: The adjustment.
+        breaks: Frames that do not follow the one before them; None for an uninterrupted segment.
     """
 
     camera: Camera
@@ -68,16 +69,27 @@ class SolvedSegment:
     residuals: Float[np.ndarray, "r 3"]
     drift_rad_per_cm: float | None
     bundle: BundleResult
+    breaks: Bool[np.ndarray, "n"] | None = None
 
     @property
     def path_cm(self) -> Float[np.ndarray, "n"]:
-        """Length of the path up to each frame."""
-        return path_lengths(self.poses)
+        """Length of the path up to each frame; what lies between two stretches does not count."""
+        steps = np.diff(path_lengths(self.poses), prepend=0.0)
+        return np.cumsum(np.where(self.breaks_or_none(), 0.0, steps))
 
     @property
     def laps(self) -> Int[np.ndarray, "n"]:
         """Lap of each frame, from 0."""
-        return count_laps(self.path_cm, self.revisits)
+        return count_laps(self.path_cm, self.uninterrupted_revisits())
+
+    def breaks_or_none(self) -> Bool[np.ndarray, "n"]:
+        """The breaks, one flag per frame in any case."""
+        return np.zeros(len(self.poses), dtype=bool) if self.breaks is None else self.breaks.copy()
+
+    def uninterrupted_revisits(self) -> list[Revisit]:
+        """Revisits between whose visits the drive was recorded without a break."""
+        stretch = np.cumsum(self.breaks_or_none())
+        return [r for r in self.revisits if stretch[r.earlier] == stretch[r.later]]
 
 
 def solve_segment(
@@ -100,7 +112,7 @@ def solve_segment(
     """
     height = camera.mounting.height_cm
     limits = mapping_range(height, settings.perception.range)
-    edges = _road_edges(drive, camera, limits, settings)
+    edges = road_edges(drive, camera, limits, settings)
     scans = scans_of(edges, camera, limits)
     if len(scans.points_cm) < 20 * len(scans):
         raise TrackingLostError(
@@ -110,7 +122,7 @@ def solve_segment(
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
     free = _OPEN_LOOP if find_camera else ()
-    expected = _relative_ways(commands)
+    expected = relative_ways(commands)
     opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected)
     scans = scans_of(edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
@@ -124,8 +136,9 @@ def solve_segment(
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
-            edges = _road_edges(drive, bundle.camera, limits, settings)
-            before, loops = bundle.camera.K[0, 0], _loops(closure.revisits, len(drive))
+            edges = road_edges(drive, bundle.camera, limits, settings)
+            before, uninterrupted = bundle.camera.K[0, 0], np.zeros(len(drive), dtype=bool)
+            loops = loop_pairs(closure.revisits, uninterrupted)
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,
@@ -148,7 +161,7 @@ def solve_segment(
     )
 
 
-def _road_edges(
+def road_edges(
     drive: Drive, camera: Camera, limits: RangeSettings, settings: MapSettings
 ) -> list[EdgePixels]:
     """Edges of the road in every frame, without those of lamps that are mirrored in it."""
@@ -182,29 +195,34 @@ def _close(
     for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
         poses, missed = close_loops(opened.poses, revisits, height)
         along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
-        if not (along < _MAX_MISSED[0] and across < _MAX_MISSED[1]):
+        if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
             continue
-        loops = _loops(revisits, len(poses))
+        loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
         closed = adjust(
             edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
             expected=expected, believed=believed,
         )  # fmt: skip
-        fits = closed.misfit < _MAX_MISFIT * opened.misfit
+        fits = closed.misfit < MAX_MISFIT * opened.misfit
         if fits and (best is None or closed.misfit < best.bundle.misfit):
             best = _Closure(revisits, missed, drift, closed)
     return best
 
 
-def _relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
+def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
     """Commanded way per frame relative to the usual one; 0 where the car was told to stand."""
     moving = commands.distance_cm[commands.distance_cm > 0.0]
     return commands.distance_cm / (float(np.median(moving)) if moving.size else 1.0)
 
 
-def _loops(revisits: list[Revisit], frames: int) -> list[tuple[int, int]]:
-    """Pairs of frames around each revisit that show the same place."""
-    pairs = [(r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
-    return [(a, b) for a, b in pairs if a >= 0 and b < frames]
+def loop_pairs(revisits: list[Revisit], breaks: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """Pairs of frames around each revisit that show the same place, not beyond a break of the drive."""
+    stretch = np.cumsum(breaks)
+    pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
+    return [
+        (a, b)
+        for r, a, b in pairs
+        if a >= 0 and b < len(breaks) and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
+    ]
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:

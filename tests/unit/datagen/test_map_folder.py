@@ -73,6 +73,7 @@ def _drive_map() -> DriveMap:
         },
         tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
         held_out=np.arange(N) % 10 == 3,
+        contradicted=np.arange(N) // 4 == 2,
     )
 
 
@@ -93,6 +94,7 @@ def test_round_trip(folder):
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
     # Nine digits on paper.
     np.testing.assert_array_equal(found.held_out, written.held_out)
+    np.testing.assert_array_equal(found.contradicted, written.contradicted)
     for name in ("t_s", "poses", "s_cm", "match", "tilt_rad"):
         np.testing.assert_allclose(getattr(found, name), getattr(written, name), rtol=1e-7)
     assert found.lines.keys() == written.lines.keys()
@@ -112,13 +114,14 @@ def test_the_camera_nods_with_the_frame(folder):
 
 
 def test_an_older_map_has_no_tilt_no_held_out_frames_and_no_verdict(tmp_path):
-    older = replace(_drive_map(), tilt_rad=None, held_out=None)
+    older = replace(_drive_map(), tilt_rad=None, held_out=None, contradicted=None)
     write_map(tmp_path, older, {"frame_index": np.arange(2)}, {}, "given")
     assert "pitch_rad" not in (tmp_path / "poses.csv").read_text()
     path = tmp_path / "map.yaml"
     path.write_text(re.sub(r"^verdict:.*\n", "", path.read_text(), flags=re.MULTILINE))
     found = read_map(tmp_path)
-    assert not found.tilt_rad.any() and not found.held_out.any() and found.meta.verdict is None
+    assert not found.tilt_rad.any() and not found.held_out.any()
+    assert not found.contradicted.any() and found.meta.verdict is None
     assert found.camera_at(3).hash == found.camera.hash
 
 

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import DELETED, UNCERTAIN, label_frame, open_mapped_drive, read_map_frames
+from datagen.labels.mapped_drive import (
+    CONTRADICTED,
+    DELETED,
+    UNCERTAIN,
+    label_frame,
+    open_mapped_drive,
+    read_map_frames,
+)
 from datagen.lanes.line import LaneLine, Side
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_settings import SETTINGS_NAME, MapSettings
@@ -129,6 +136,9 @@ def test_why_a_frame_gets_no_labels(folder):
     mapped = open_mapped_drive(folder)
     window = BirdseyeWindow()
     assert label_frame(mapped, 5, window) == UNCERTAIN
+    assert not isinstance(label_frame(mapped, 6, window), str)
+    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED)) == 6)
+    assert label_frame(replace(mapped, drive_map=doubted), 6, window) == CONTRADICTED
     assert not isinstance(label_frame(mapped, 0, window), str)
     assert label_frame(mapped, 3, BirdseyeWindow(left_cm=100.0)) == "no line in the window"
     deleted = replace(mapped.drive, deleted=np.arange(N) == 16)

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from datagen.labels.project import FrameLines
 from datagen.labels.quality import frame_residual_cm, label_report
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -27,13 +28,27 @@ def _borders(x_cm: float, shift_cm: float = 0.0) -> np.ndarray:
     return np.concatenate(sides)
 
 
-LINES = (_line(-20.0), _line(20.0))
+def _lane(left: np.ndarray, right: np.ndarray, *markings_cm: float) -> FrameLines:
+    return FrameLines(left, right, np.full(6, np.nan), markings_cm or (np.nan, np.nan))
+
+
+LINES = _lane(_line(-20.0), _line(20.0))
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3, -0.7])
 def test_residual_is_the_shift_between_marking_and_line(shift):
     points = np.concatenate([_borders(-20.0, shift), _borders(20.0, shift)])
     assert frame_residual_cm(points, LINES, TAPE_CM) == pytest.approx(abs(shift), abs=1e-9)
+
+
+def test_each_line_has_its_own_marking():
+    # A narrow middle line beside a wide outer one.
+    points = np.concatenate([_borders(-20.0), _borders(20.0) + np.tile([[1.5, 0.0]], (80, 1))])
+    points[80:120, 0] -= 3.0
+    lane = _lane(_line(-20.0), _line(20.0), 2.0, 5.0)
+    assert frame_residual_cm(points, lane, TAPE_CM) == pytest.approx(0.0, abs=1e-9)
+    assert frame_residual_cm(points[80:], LINES, 5.0) == pytest.approx(0.0, abs=1e-9)
+    assert frame_residual_cm(points[80:], LINES, TAPE_CM) == pytest.approx(1.5, abs=1e-9)
 
 
 def test_clutter_away_from_the_lines_does_not_count():
@@ -51,7 +66,9 @@ def test_residual_is_measured_across_a_slanting_line():
     normal = np.array([1.0, -0.5]) / np.hypot(1.0, 0.5)
     on_line = line[(y > 5.0) & (y < 50.0)]
     points = np.concatenate([on_line + (1.0 + 0.4) * normal, on_line - (1.0 - 0.4) * normal])
-    assert frame_residual_cm(points, (line, LINES[1] + [60.0, 0.0]), TAPE_CM) == pytest.approx(0.4, abs=1e-9)
+    assert frame_residual_cm(points, _lane(line, LINES.right_cm + [60.0, 0.0]), TAPE_CM) == pytest.approx(
+        0.4, abs=1e-9
+    )
 
 
 def test_too_few_points_give_no_residual():
@@ -59,13 +76,13 @@ def test_too_few_points_give_no_residual():
     assert frame_residual_cm(_borders(-20.0)[:10], LINES, TAPE_CM) == pytest.approx(0.0)
     assert np.isnan(frame_residual_cm(np.empty((0, 2)), LINES, TAPE_CM))
     unknown = np.full((65, 2), np.nan)
-    assert np.isnan(frame_residual_cm(_borders(-20.0), (unknown, unknown), TAPE_CM))
+    assert np.isnan(frame_residual_cm(_borders(-20.0), _lane(unknown, unknown), TAPE_CM))
 
 
 def test_an_unsupported_line_does_not_take_part():
     points = np.concatenate([_borders(-20.0, 0.5), _borders(20.0, 0.0)])
     unknown = np.full((65, 2), np.nan)
-    assert frame_residual_cm(points, (LINES[0], unknown), TAPE_CM) == pytest.approx(0.5, abs=1e-9)
+    assert frame_residual_cm(points, _lane(LINES.left_cm, unknown), TAPE_CM) == pytest.approx(0.5, abs=1e-9)
 
 
 def _labels(points_cm: np.ndarray) -> LabelSet:

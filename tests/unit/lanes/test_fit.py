@@ -268,3 +268,19 @@ def test_moving_the_path_moves_the_lines():
         np.testing.assert_allclose(
             there.points(path.s_cm), here.points(path.s_cm) @ rotation.T + shift, atol=1e-5
         )
+
+
+@pytest.mark.parametrize("slope", [0.35, -0.35])
+def test_a_gap_is_bridged_parallel_to_the_other_line_where_the_path_is_oblique(slope):
+    rng = np.random.default_rng(5)
+    path = arc_path(None)
+    # The car weaves from side to side of a straight lane; seen from its path the lane weaves.
+    centre = slope * 60.0 * np.sin(path.s_cm / 60.0)
+    across = 0.5 * LANE_CM * np.hypot(1.0, np.gradient(centre) / path.step_cm)
+    gap = (path.s_cm > 150.0) & (path.s_cm < 230.0)
+    left = paint(rng, path, centre + across, ~gap)
+    lines = _fit(path, left, paint(rng, path, centre - across, _everywhere(path)))
+    assert lines[0].supported(path.s_cm[gap]).all()
+    right = lines[1].points(path.s_cm)
+    apart = [np.nanmin(np.linalg.norm(right - place, axis=1)) for place in lines[0].points(path.s_cm[gap])]
+    np.testing.assert_allclose(apart, LANE_CM, atol=0.6)

@@ -175,6 +175,20 @@ def test_straddling_a_line_does_not_flicker():
     assert not assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM).lane.any()
 
 
+@pytest.mark.parametrize(("reach", "changes"), [(0.2, False), (0.4, True)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_swerve_across_a_line_is_no_lane_change(reach, changes, side):
+    lines = _straight_lines(TWO_LANES)
+    # From the middle of a lane to a share of the other one's width beyond the line between them, and back.
+    start = 18.0 - 18.0 * side
+    y = start + side * (18.0 + 36.0 * reach) * np.sin(np.linspace(0.0, np.pi, 60))
+    poses, s = _drive(y)
+    home, away = (0, -1) if side > 0.0 else (-1, 0)
+    lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
+    assert lane[0] == home and lane[-1] == home
+    assert (away in lane) == changes
+
+
 def test_beyond_the_outer_line_the_car_keeps_its_lane():
     poses, s = _drive(np.linspace(0.0, -60.0, 50))
     assert not assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM).lane.any()

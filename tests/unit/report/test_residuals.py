@@ -134,3 +134,11 @@ def test_figures_of_known_residuals():
     wide = figures.as_dict(320)
     assert wide["p95_px_at_160"] == pytest.approx(0.5 * figures.p95_px)
     assert np.isnan(summarise(join_samples([])).coverage)
+
+
+def test_a_line_that_knows_its_marking_is_compared_with_that():
+    wide = replace(lane(), markings_cm=(TAPE_CM + 1.5, float("nan")))
+    assert abs(summarise(measure(edges_of(lane()), lane())).median_px) < 0.05
+    found = measure(edges_of(lane()), wide)
+    assert summarise(found.part(~found.right)).median_px > 0.3
+    assert abs(summarise(found.part(found.right)).median_px) < 0.05

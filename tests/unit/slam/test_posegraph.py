@@ -109,3 +109,20 @@ def test_where_the_drive_starts_does_not_matter():
     here, _ = close_loops(drifted, revisits, HEIGHT_CM)
     there, _ = close_loops(move(drifted), revisits, HEIGHT_CM)
     np.testing.assert_allclose(there, move(here), atol=0.05)
+
+
+def test_motion_across_a_break_is_not_believed():
+    true, drifted = _laps(np.deg2rad(5.0))
+    # From the break on the path is laid down elsewhere, by less than a turn.
+    moved = drifted.copy()
+    c, s = np.cos(0.8), np.sin(0.8)
+    moved[150:, :2] = moved[150:, :2] @ np.array([[c, s], [-s, c]]) + [40.0, -25.0]
+    moved[150:, 2] += 0.8
+    breaks = np.arange(len(true)) == 150
+    revisits = _revisits(true, range(0, LAP, 5))
+    closed, residuals = close_loops(moved, revisits, HEIGHT_CM, breaks)
+    assert np.abs(residuals[:, :2]).max() < 0.5
+    assert np.linalg.norm(closed[:, :2] - true[:, :2], axis=1).max() < 3.0
+    # Taken for motion, the jump would bend the road.
+    bent, _ = close_loops(moved, revisits, HEIGHT_CM)
+    assert np.linalg.norm(bent[:, :2] - true[:, :2], axis=1).max() > 5.0

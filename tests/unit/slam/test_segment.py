@@ -15,7 +15,7 @@ from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import CommandedMotion
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.segment import SolvedSegment, _loops, _relative_ways, solve_segment
+from datagen.slam.segment import SolvedSegment, loop_pairs, relative_ways, solve_segment
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.recording import Commands, Drive
@@ -113,14 +113,14 @@ def test_pictures_without_edges_cannot_be_mapped():
 
 def test_pairs_around_a_revisit_stay_within_the_drive():
     revisits = [Revisit(4, 60, np.zeros(3), 0.8), Revisit(30, 95, np.zeros(3), 0.8)]
-    pairs = _loops(revisits, 100)
+    pairs = loop_pairs(revisits, np.zeros(100, dtype=bool))
     assert pairs == [(4 + d, 60 + d) for d in range(-4, 13, 4)] + [(30 + d, 95 + d) for d in range(-12, 5, 4)]
 
 
 def test_ways_are_relative_to_the_usual_one():
-    ways = _relative_ways(CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None))
+    ways = relative_ways(CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None))
     np.testing.assert_allclose(ways, [0.0, 1.0, 1.0, 2.0, 0.0])
-    np.testing.assert_array_equal(_relative_ways(CommandedMotion(np.zeros(3), True, None)), np.zeros(3))
+    np.testing.assert_array_equal(relative_ways(CommandedMotion(np.zeros(3), True, None)), np.zeros(3))
 
 
 @pytest.mark.slow

@@ -1,0 +1,67 @@
+"""Frames that show the lines elsewhere than the map does: where a map is bent or its poses are lost.
+
+A wrong map agrees with itself in most places, so that its figures look well as a whole. Where it is wrong,
+the frames say so: the borders of the lines meet no edge, or edges beside them. Such frames get no labels, nor
+do those next to them on the road, whose near points these frames alone have seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool
+
+from datagen.labels.mapped_drive import MappedDrive, lines_at
+from datagen.report.residuals import REFERENCE_WIDTH, BorderSamples, ResidualSettings, border_samples
+from datagen.slam.calibrate import mapping_range
+from datagen.slam.places import path_lengths
+from lanenet.perception.birdseye import RoadTable
+from lanenet.perception.edges import find_edges
+
+#: One frame in so many is looked at: neighbours show the same.
+_EVERY = 3
+#: A frame disagrees where the edges lie further off than this as median, in pixels of an image 160 px wide,
+#: or where less than this share of the borders in view met any. Both lines are seldom interrupted at once.
+_OFF_PX, _LEAST_MET = 1.0, 0.15
+#: Samples that tell it at least: in view, and met.
+_MIN_VIEW, _MIN_MET = 15, 8
+_REACH_CM = 60.0
+#: Way on either side of a place over which frames are asked, and the share that has to disagree.
+_AROUND_CM, _SHARE = 20.0, 0.3
+
+
+def contradicted_frames(mapped: MappedDrive) -> Bool[np.ndarray, "n"]:
+    """Find the map's frames around which pictures disagree with its lines."""
+    drive_map = mapped.drive_map
+    camera, n = drive_map.camera, len(drive_map.frames)
+    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, mapped.perception.range))
+    asked = np.arange(0, n, _EVERY)
+    disagrees, told = np.zeros(len(asked), dtype=bool), np.zeros(len(asked), dtype=bool)
+    for i, k in enumerate(asked.tolist()):
+        image = mapped.drive.image(int(mapped.rows[k]))
+        edges = find_edges(image, mapped.perception.edges, table.keep, table.scale)
+        samples = border_samples(
+            edges,
+            lines_at(drive_map, k),
+            drive_map.meta.tape_cm,
+            drive_map.camera_at(k),
+            table.keep,
+            ResidualSettings(),
+        )
+        samples = samples.part(samples.ahead_cm < _REACH_CM)
+        told[i] = len(samples.residual_px) >= _MIN_VIEW
+        disagrees[i] = told[i] and _disagrees(samples, camera.width)
+    contradicted = np.zeros(n, dtype=bool)
+    way = path_lengths(drive_map.poses)
+    for k in range(n):
+        near = told & (np.abs(way[asked] - way[k]) < _AROUND_CM)
+        near &= drive_map.segment[asked] == drive_map.segment[k]
+        contradicted[k] = near.any() and disagrees[near].mean() > _SHARE
+    return contradicted
+
+
+def _disagrees(samples: BorderSamples, width: int) -> bool:
+    met = samples.residual_px[samples.found]
+    if met.size < _LEAST_MET * len(samples.residual_px):
+        return True
+    off_px = float(np.median(np.abs(met))) if met.size >= _MIN_MET else 0.0
+    return off_px * REFERENCE_WIDTH / width > _OFF_PX

@@ -1,0 +1,111 @@
+"""Frames that show the lines elsewhere than the map are found, and only those and their neighbours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datagen.labels.mapped_drive import MappedDrive
+from datagen.lanes.line import LaneLine, Side
+from datagen.map_folder import FORMAT, DriveMap, MapMeta
+from datagen.report.agreement import contradicted_frames
+from lanenet.data.recording import Commands, Drive
+from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.frames import car_from_map
+from lanenet.perception.birdseye import PerceptionSettings
+
+N, STEP_CM, TAPE_CM = 72, 3.0, 2.4
+CAMERA = Camera(
+    "fisheye",
+    160,
+    120,
+    np.array([[70.0, 0.0, 79.5], [0.0, 70.0, 59.5], [0.0, 0.0, 1.0]]),
+    np.zeros(4),
+    Mounting(15.0, pitch_down_rad=0.4, ahead_of_front_axle_cm=-3.0),
+    17.0,
+)
+
+
+class _Pictures:
+    def __init__(self, images: list[np.ndarray]) -> None:
+        self.images = images
+
+    def read(self, row: int) -> np.ndarray:
+        return self.images[row]
+
+
+def _poses() -> np.ndarray:
+    return np.column_stack([STEP_CM * np.arange(N), np.zeros(N), np.zeros(N)])
+
+
+def _picture(pose: np.ndarray, aside_cm: float, paint: bool) -> np.ndarray:
+    """Two tapes along the map's x axis, at 18 cm on either side and moved by so much."""
+    image = np.full((120, 160), 60, np.uint8)
+    along = pose[0] + np.arange(10.0, 150.0, 2.0)
+    for y in (18.0, -18.0) if paint else ():
+        borders = []
+        for half in (0.5, -0.5):
+            place = np.column_stack([along, np.full(len(along), y + aside_cm + half * TAPE_CM)])
+            borders.append(CAMERA.project_ground(car_from_map(place, pose, CAMERA.wheelbase_cm)))
+        outline = np.concatenate([borders[0], borders[1][::-1]])
+        outline = outline[np.isfinite(outline).all(axis=1)]
+        cv2.fillPoly(image, [np.rint(outline * 16.0).astype(np.int32)], 220, cv2.LINE_AA, shift=4)
+    return cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 0.7), cv2.COLOR_GRAY2BGR)
+
+
+def _line(side: Side, y_cm: float) -> LaneLine:
+    knots = np.concatenate([np.full(3, -100.0), np.linspace(-100.0, 500.0, 11), np.full(3, 500.0)])
+    s = np.array([knots[i + 1 : i + 4].mean() for i in range(13)])
+    control = np.column_stack([s, np.full(13, y_cm)])
+    return LaneLine(side, knots, control, np.array([[-100.0, 500.0]]), 0.1, marking_cm=TAPE_CM)
+
+
+def _mapped(aside_cm: np.ndarray, painted: np.ndarray) -> MappedDrive:
+    poses, t_s = _poses(), 0.05 * np.arange(N)
+    images = [_picture(*shown) for shown in zip(poses, aside_cm, painted, strict=True)]
+    none = np.zeros(N, dtype=bool)
+    drive = Drive(
+        "made-up", Path("made-up"), np.arange(N), t_s, True, Commands(), none, none, None, 36.0, (),
+        160, 120, _Pictures(images), np.arange(N),
+    )  # fmt: skip
+    drive_map = DriveMap(
+        meta=MapMeta(
+            format=FORMAT, drive="made-up", lane_width_cm=36.0, mapped_lane_cm=36.0, tape_cm=TAPE_CM,
+            scale_from="camera", laps=0,
+        ),
+        camera=CAMERA,
+        frames=np.arange(N),
+        t_s=t_s,
+        poses=poses,
+        lap=np.zeros(N, np.int64),
+        segment=np.zeros(N, np.int64),
+        s_cm=poses[:, 0],
+        match=np.full(N, 0.6),
+        lines={0: [_line("left", 18.0), _line("right", -18.0)]},
+    )  # fmt: skip
+    return MappedDrive(drive_map, drive, np.arange(N), PerceptionSettings())
+
+
+WRONG = (np.arange(N) >= 30) & (np.arange(N) < 45)
+NEAR = (np.arange(N) >= 22) & (np.arange(N) < 53)
+
+
+def test_frames_that_agree_are_left_alone():
+    found = contradicted_frames(_mapped(np.where(WRONG, 0.15, 0.0), np.ones(N, dtype=bool)))
+    assert not found.any()
+
+
+@pytest.mark.parametrize("aside_cm", [2.5, -2.5, 7.0])
+def test_lines_that_lie_elsewhere_are_found(aside_cm):
+    found = contradicted_frames(_mapped(np.where(WRONG, aside_cm, 0.0), np.ones(N, dtype=bool)))
+    assert found[WRONG].all()
+    assert not found[~NEAR].any()
+
+
+def test_lines_that_are_not_there_are_found():
+    found = contradicted_frames(_mapped(np.zeros(N), ~WRONG))
+    assert found[WRONG].all()
+    assert not found[~NEAR].any()

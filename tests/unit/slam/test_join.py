@@ -1,0 +1,145 @@
+"""Stretches of one drive, each in a map of its own, become one where they show the same places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from picture_road import Pictures, loop_drive, made_up_drive
+from pixel_road import fisheye
+
+from datagen.map_settings import MapSettings
+from datagen.slam.bundle import BundleSettings
+from datagen.slam.filter import FilterSettings
+from datagen.slam.join import Stretch, _agreeing, _carried, join_stretches
+from datagen.slam.places import Revisit, RevisitSettings, relative_pose
+from datagen.slam.segment import loop_pairs, solve_segment
+from lanenet.data.recording import Commands, Drive
+from lanenet.geometry.camera import Camera
+
+SMALL = MapSettings(
+    filter=FilterSettings(particles=80, max_points=80),
+    bundle=BundleSettings(points=40),
+    revisits=RevisitSettings(max_pairs=30),
+)
+LAP_FRAMES, LAP_CM = 90, 360.0
+FIRST = 125
+#: The car was lifted, and put down where it had been a lap before.
+SECOND = slice(150, 195)
+
+
+def _camera() -> Camera:
+    camera = fisheye(pitch_down_rad=0.42)
+    return replace(camera, K=camera.K * np.array([[0.75, 0.0, 1.0], [0.0, 0.75, 1.0], [0.0, 0.0, 1.0]]))
+
+
+def _stretches() -> tuple[Drive, np.ndarray, list[Stretch]]:
+    """A drive with a break, its true poses, and its two stretches, each mapped alone."""
+    whole, poses = loop_drive(_camera(), SECOND.stop, LAP_FRAMES, LAP_CM, 0)
+    images = [whole.image(k) for k in [*range(FIRST), *range(SECOND.start, SECOND.stop)]]
+    n = len(images)
+    drive = made_up_drive(
+        images,
+        camera=_camera(),
+        breaks=np.arange(n) == FIRST,
+        commands=Commands(speed_cm_s=np.full(n, LAP_CM / LAP_FRAMES / 0.05)),
+    )
+    rng = np.random.default_rng(0)
+    rows = [np.arange(FIRST), np.arange(FIRST, n)]
+    stretches = [Stretch(r, solve_segment(drive.subset(r), _camera(), SMALL, rng, None)) for r in rows]
+    return drive, np.concatenate([poses[:FIRST], poses[SECOND]]), stretches
+
+
+@pytest.fixture(scope="module")
+def same_road() -> tuple[Drive, np.ndarray, list[Stretch]]:
+    return _stretches()
+
+
+def _errors_cm(poses: np.ndarray, true: np.ndarray, by: slice) -> np.ndarray:
+    """Distance of each frame from the truth, with some of the frames laid over it."""
+    here, there = poses[by, :2].mean(axis=0), true[by, :2].mean(axis=0)
+    u, _, v = np.linalg.svd((poses[by, :2] - here).T @ (true[by, :2] - there))
+    return np.linalg.norm(true[:, :2] - there - (poses[:, :2] - here) @ u @ v, axis=1)
+
+
+def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
+    drive, true, stretches = same_road
+    joined = join_stretches(stretches, drive, SMALL, np.random.default_rng(1))
+    assert len(joined) == 1
+    np.testing.assert_array_equal(joined[0].rows, np.arange(len(true)))
+    solved = joined[0].solved
+    np.testing.assert_array_equal(np.flatnonzero(solved.breaks_or_none()), [FIRST])
+    # Laid over the truth by the first stretch alone, the second one is where it was driven.
+    error = _errors_cm(solved.poses, true, slice(0, FIRST))
+    assert np.sqrt(np.mean(error[FIRST:] ** 2)) < 1.0
+    assert error.max() < 2.0
+    turn = solved.poses[-1, 2] - solved.poses[0, 2] - (true[-1, 2] - true[0, 2])
+    assert abs(np.sin(turn)) < np.deg2rad(2.0) and np.cos(turn) > 0.0
+    cross = [r for r in solved.revisits if r.earlier < FIRST <= r.later]
+    assert len(cross) >= SMALL.revisits.min_revisits
+    assert len(solved.uninterrupted_revisits()) == len(solved.revisits) - len(cross)
+    assert len(solved.scans) == len(true) == len(solved.trajectory.match) == len(solved.open_poses)
+    # What lies between the two stretches was not driven.
+    assert solved.path_cm[-1] == pytest.approx((len(true) - 2) * LAP_CM / LAP_FRAMES, rel=0.03)
+
+
+def test_the_stretch_that_carries_may_be_the_later_one(same_road):
+    drive, true, stretches = same_road
+    # The short stretch was driven first.
+    n = len(true)
+    order = np.concatenate([np.arange(FIRST, n), np.arange(FIRST)])
+    turned = replace(
+        drive,
+        images=Pictures([drive.image(int(k)) for k in order]),
+        breaks=np.arange(n) == n - FIRST,
+    )
+    swapped = [
+        Stretch(np.arange(n - FIRST), stretches[1].solved),
+        Stretch(np.arange(n - FIRST, n), stretches[0].solved),
+    ]
+    (joined,) = join_stretches(swapped, turned, SMALL, np.random.default_rng(1))
+    np.testing.assert_array_equal(joined.rows, np.arange(n))
+    np.testing.assert_array_equal(np.flatnonzero(joined.solved.breaks_or_none()), [n - FIRST])
+    error = _errors_cm(joined.solved.poses, true[order], slice(n - FIRST, n))
+    assert error.max() < 2.0
+    for r in joined.solved.uninterrupted_revisits():
+        assert abs(r.later - r.earlier - LAP_FRAMES) <= 2
+
+
+def test_a_stretch_of_another_road_stays_apart(same_road):
+    drive, _, stretches = same_road
+    # A road that bends the other way, between other walls.
+    images = [drive.image(k) for k in range(FIRST)]
+    images += [np.ascontiguousarray(drive.image(k)[:, ::-1]) for k in range(FIRST, len(drive))]
+    elsewhere = replace(drive, images=Pictures(images))
+    assert join_stretches(stretches, elsewhere, SMALL, np.random.default_rng(1)) == stretches
+
+
+def test_alignments_that_contradict_each_other_do_not_join():
+    rng = np.random.default_rng(2)
+    poses = np.column_stack([np.arange(60.0) * 4.0, np.zeros(60), np.zeros(60)])
+    poses[30:, 0] -= 120.0
+    # The second stretch lies 80 cm further along the road of the first one, turned by half a radian.
+    true = _carried(poses[30:], poses[30], np.array([80.0, 10.0, 0.5]))
+    right = [Revisit(k, 30 + k, relative_pose(poses[k], true[k]), 0.8) for k in range(0, 30, 4)]
+    wrong = [replace(r, relative=r.relative + rng.normal(size=3) * [60.0, 60.0, 1.0]) for r in right[::2]]
+    kept, moved = _agreeing(poses, 30, wrong + right, 15.0)
+    assert {(r.earlier, *r.relative) for r in kept} == {(r.earlier, *r.relative) for r in right}
+    np.testing.assert_allclose(moved, true, atol=1e-9)
+    assert len(_agreeing(poses, 30, wrong, 15.0)[0]) < 3
+
+
+def test_one_stretch_is_all_there_is(same_road):
+    drive, _, stretches = same_road
+    assert join_stretches(stretches[:1], drive, SMALL, np.random.default_rng(1)) == stretches[:1]
+    # Nothing to carry the other one over to: none is closed.
+    opened = [replace(s, solved=replace(s.solved, revisits=[])) for s in stretches]
+    assert join_stretches(opened, drive, SMALL, np.random.default_rng(1)) == opened
+
+
+def test_pairs_beside_a_revisit_keep_to_their_stretches():
+    breaks = np.arange(100) == 50
+    pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], breaks)
+    assert (44, 86) in pairs and (52, 94) not in pairs
+    assert (14, 56) in pairs and (6, 48) not in pairs
