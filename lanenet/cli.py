@@ -15,10 +15,20 @@ import typer
 from pydantic import Field
 from typer.core import TyperGroup
 
-from lanenet import calibrate_cli, console, judge_cli, onboard_cli, reality_cli, val_cli, world_cli
+from lanenet import (
+    calibrate_cli,
+    console,
+    judge_cli,
+    localise_cli,
+    onboard_cli,
+    reality_cli,
+    val_cli,
+    world_cli,
+)
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
-from lanenet.onboard_cli import MarkingOption, check_ending
+from lanenet.onboard_cli import MarkingOption
+from lanenet.outputs import check_ending
 
 _Config = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
@@ -69,6 +79,7 @@ app = typer.Typer(
 
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
+app.add_typer(localise_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)
 app.add_typer(judge_cli.app)

@@ -10,6 +10,7 @@ import typer
 
 from lanenet import console
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
+from lanenet.outputs import check_ending
 
 if TYPE_CHECKING:
     import numpy as np
@@ -225,9 +226,3 @@ def _frame_range(text: str) -> tuple[int, int]:
             f"--frames {text!r}: found a last frame before the first, expected FIRST:LAST, as in 700:999"
         )
     return int(first), int(last)
-
-
-def check_ending(path: Path, *endings: str) -> None:
-    """Refuse an output before the work starts, not after it."""
-    if path.suffix.lower() not in endings:
-        raise ConfigError(f"{path}: expected a name that ends in {' or '.join(endings)}")
