@@ -28,7 +28,7 @@ from lanenet import (
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
 from lanenet.onboard_cli import MarkingOption
-from lanenet.outputs import check_ending
+from lanenet.outputs import check_ending, check_not_source
 
 _Config = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
@@ -253,6 +253,7 @@ def label(
     from datagen.pipeline import label_map
 
     check_ending(out, ".parquet")
+    check_not_source(map_folder, out, out.with_suffix(".json"), out.with_suffix(".png"))
     with console.progress_bar("label") as progress:
         report = label_map(map_folder, out, progress, force=force)
     console.show_lines(report.lines)

@@ -9,7 +9,7 @@ import typer
 
 from lanenet import console
 from lanenet.errors import CalibrationError
-from lanenet.outputs import check_ending
+from lanenet.outputs import check_ending, check_not_source
 
 app = typer.Typer()
 
@@ -55,6 +55,7 @@ def localise(
     from lanenet.data.drive import open_drive
 
     check_ending(out, ".csv")
+    check_not_source(source, out, out.with_suffix(".tum"), out.with_suffix(".png"))
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     drive = open_drive(source)
     known = read_camera(camera) if camera is not None else drive.camera

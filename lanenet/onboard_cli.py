@@ -10,7 +10,7 @@ import typer
 
 from lanenet import console
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
-from lanenet.outputs import check_ending
+from lanenet.outputs import check_ending, check_not_source
 
 if TYPE_CHECKING:
     import numpy as np
@@ -90,6 +90,7 @@ def detect(
     from lanenet.onboard.sources import open_source
 
     check_ending(out, ".parquet", ".csv")
+    check_not_source(source, out, video)
     check_table_path(out)
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))

@@ -42,7 +42,7 @@ def ran(moments, start: StartSettings = KNOWN, settings: MapSettings = SETTINGS)
 
 
 def check_turned(poses: list[LivePose], truth: np.ndarray) -> None:
-    """The road begins in a bend, which takes the filter some frames to find; from there the heading is true."""
+    """The road begins in a bend, which the filter finds within some frames; then the heading is true."""
     found = stacked(poses)[:, 2]
     turned = truth[-1, 2] - truth[20, 2]
     assert found[-1] - found[20] == pytest.approx(turned, abs=0.04 * turned)
