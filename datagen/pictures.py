@@ -70,12 +70,15 @@ def draw_map(
             colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
             _polyline(image, pixels, line.points(np.arange(s.min(), end, 2.0)), colour)
         _polyline(image, pixels, drive_map.poses[drive_map.segment == segment, :2], (255, 255, 255))
-    metre = int(100.0 * scale)
-    cv2.line(image, (20, height - 20), (20 + metre, height - 20), (255, 255, 255), 2)
-    cv2.putText(
-        image, "1 m", (20, height - 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA
-    )
+    draw_metre(image, scale)
     write_png(path, image)
+
+
+def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
+    """Draw a metre of scale into the lower left corner."""
+    y, end = image.shape[0] - 20, 20 + int(100.0 * px_per_cm)
+    cv2.line(image, (20, y), (end, y), (255, 255, 255), 2)
+    cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]

@@ -14,6 +14,7 @@ from lanenet import console
 from lanenet.calibrate_show import ground_pictures, lens_pictures, show_lens, show_mounting
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.outputs import check_not_source
 
 if TYPE_CHECKING:
     from datagen.map_settings import MapSettings
@@ -202,6 +203,7 @@ def drive_(
     from lanenet.data.camera_file import write_camera
 
     _check_yaml(out)
+    check_not_source(drive, out)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start, notes = starting_camera(drive, camera, refine)
     settings, start, note = _with_wheelbase(settings, start, wheelbase)

@@ -21,6 +21,7 @@ from lanenet import (
     drive_cli,
     export_cli,
     judge_cli,
+    localise_cli,
     onboard_cli,
     reality_cli,
     val_cli,
@@ -28,7 +29,8 @@ from lanenet import (
 )
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import LanenetError
-from lanenet.onboard_cli import MarkingOption, check_ending
+from lanenet.onboard_cli import MarkingOption
+from lanenet.outputs import check_ending, check_not_source
 
 _Config = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
@@ -82,6 +84,7 @@ app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
 app.add_typer(drive_cli.app)
 app.add_typer(export_cli.app)
+app.add_typer(localise_cli.app)
 app.add_typer(val_cli.app)
 app.add_typer(world_cli.app)
 app.add_typer(judge_cli.app)
@@ -284,6 +287,7 @@ def label(
     from datagen.pipeline import label_map
 
     check_ending(out, ".parquet")
+    check_not_source(map_folder, out, out.with_suffix(".json"), out.with_suffix(".png"))
     with console.progress_bar("label") as progress:
         report = label_map(map_folder, out, progress, force=force)
     console.show_lines(report.lines)

@@ -10,6 +10,7 @@ import typer
 
 from lanenet import console
 from lanenet.errors import CalibrationError, ConfigError, LanenetError
+from lanenet.outputs import check_ending, check_not_source
 
 if TYPE_CHECKING:
     import numpy as np
@@ -90,6 +91,7 @@ def detect(
     from lanenet.onboard.sources import open_source
 
     check_ending(out, ".parquet", ".csv")
+    check_not_source(source, out, video)
     check_table_path(out)
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))
@@ -292,9 +294,3 @@ def _frame_range(text: str) -> tuple[int, int]:
             f"--frames {text!r}: found a last frame before the first, expected FIRST:LAST, as in 700:999"
         )
     return int(first), int(last)
-
-
-def check_ending(path: Path, *endings: str) -> None:
-    """Refuse an output before the work starts, not after it."""
-    if path.suffix.lower() not in endings:
-        raise ConfigError(f"{path}: expected a name that ends in {' or '.join(endings)}")

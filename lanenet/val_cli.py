@@ -12,6 +12,7 @@ from lanenet import console
 from lanenet.errors import ConfigError
 from lanenet.evaluation import Opened, default_names, evaluate, open_source
 from lanenet.onboard_cli import MarkingOption
+from lanenet.outputs import check_not_source
 
 if TYPE_CHECKING:
     from lanenet.learn.compare import Comparison
@@ -80,6 +81,9 @@ def val(
     from lanenet.perception.network import read_model_meta
 
     model, source_paths = _split_paths(paths)
+    if out is not None:
+        for source in source_paths:
+            check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
     window = BirdseyeWindow() if model is None else read_model_meta(model).window
     sources = [open_source(path, window) for path in source_paths]
     names = _chosen(detectors, no_baselines, model, sources)

@@ -13,7 +13,7 @@ from datagen.slam.motion import MotionModel
 from datagen.slam.scans import Progress, Scans
 from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
 from lanenet.config import Settings
-from lanenet.data.drive import Drive
+from lanenet.data.drive import Commands, Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import left_from_donkey
 
@@ -65,13 +65,29 @@ class SteeringFit:
 
 def commands_of(drive: Drive, wheelbase_cm: float) -> CommandedMotion:
     """Turn a drive's recorded commands into distances and turns."""
-    recorded = drive.commands
+    step_s = np.diff(drive.t_s)
+    return commanded_motion(
+        drive.commands, drive.t_s, float(np.median(step_s)) if len(step_s) else 1.0, wheelbase_cm
+    )
+
+
+def commanded_motion(
+    recorded: Commands, t_s: Float[np.ndarray, "n"], usual_s: float, wheelbase_cm: float
+) -> CommandedMotion:
+    """Turn the commands of frames that follow each other into distances and turns.
+
+    Args:
+        recorded: The commands.
+        t_s: Times of the frames.
+        usual_s: Usual time between frames.
+        wheelbase_cm: Distance between the axles.
+    """
     speed_cm_s, steering_rad, angle, yaw_rate_rad_s = (
         None if values is None else _held(values)
         for values in (recorded.speed_cm_s, recorded.steering_rad, recorded.angle, recorded.yaw_rate_rad_s)
     )
-    step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
-    usual = max(float(np.median(step_s[1:])) if len(step_s) > 1 else 1.0, 1e-6)
+    step_s = np.diff(t_s, prepend=t_s[:1])
+    usual = max(usual_s, 1e-6)
     # A longer step is a stop, whose frames were left out: the car has driven for about one of them.
     step_s = np.where(step_s > _LONGEST_STEP * usual, usual, step_s)
     if speed_cm_s is not None:
@@ -119,34 +135,60 @@ def track(
         report = None if progress is None else lambda k, _: progress(offset + k, 2 * n)
         return run_filter(scans, motion, filter_settings, height, camera.wheelbase_cm, rng, report)
 
-    steps = _GAINS if commands.speed_known else height * np.array(STEPS_HEIGHTS)
-    seed = int(rng.integers(2**31))
-    speed = profile_speed(scans, commands.distance_cm, steps, height, camera.wheelbase_cm, seed)
-
-    def motion(curvature_per_cm: Float[np.ndarray, "n"], predicted: bool) -> MotionModel:
-        step = speed.step_cm
-        noise = (1.0 if predicted else 2.0) * m.curvature_noise_heights / height
-        return MotionModel(
-            distance_cm=commands.distance_cm,
-            curvature_per_cm=curvature_per_cm,
-            factor_start=(step, 0.05 * step),
-            factor_walk=0.005 if commands.speed_known else m.factor_walk_heights * height,
-            factor_pull=m.factor_pull,
-            distance_noise=m.distance_noise,
-            offset_walk_per_cm=(0.004 if predicted else 0.012) / height,
-            offset_decay=0.02 if predicted else 0.0,
-            curvature_noise_per_cm=noise,
-            max_curvature_per_cm=m.max_curvature_heights / height,
-        )
-
-    trajectory = run(motion(np.zeros(n), False), 0)
+    step = usual_factor(scans, commands, camera, rng)
+    trajectory = run(motion_of(commands, None, step, height, m), 0)
     fit = fit_steering(trajectory, commands, height)
     if fit is None or commands.turn is None:
         if progress is not None:
             progress(2 * n, 2 * n)
         return trajectory, None
     predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    return run(motion(predicted, True), n), fit
+    return run(motion_of(commands, predicted, step, height, m), n), fit
+
+
+def usual_factor(scans: Scans, commands: CommandedMotion, camera: Camera, rng: np.random.Generator) -> float:
+    """Find the usual distance factor of a drive (see :class:`MotionModel`).
+
+    Returns:
+        Gain of a recorded speed; the usual way per frame, [cm], where none was recorded.
+    """
+    height = camera.mounting.height_cm
+    factors = _GAINS if commands.speed_known else height * np.array(STEPS_HEIGHTS)
+    seed = int(rng.integers(2**31))
+    return profile_speed(scans, commands.distance_cm, factors, height, camera.wheelbase_cm, seed).step_cm
+
+
+def motion_of(
+    commands: CommandedMotion,
+    curvature_per_cm: Float[np.ndarray, "n"] | None,
+    factor: float,
+    height_cm: float,
+    settings: MotionSettings,
+) -> MotionModel:
+    """Return how a car may move.
+
+    Args:
+        commands: What was commanded.
+        curvature_per_cm: Curvature that the steering predicts; None where it predicts nothing.
+        factor: Usual distance factor.
+        height_cm: Of the camera.
+        settings: How far the car may stray.
+    """
+    predicted = curvature_per_cm is not None
+    return MotionModel(
+        distance_cm=commands.distance_cm,
+        curvature_per_cm=np.zeros(len(commands.distance_cm))
+        if curvature_per_cm is None
+        else curvature_per_cm,
+        factor_start=(factor, 0.05 * factor),
+        factor_walk=0.005 if commands.speed_known else settings.factor_walk_heights * height_cm,
+        factor_pull=settings.factor_pull,
+        distance_noise=settings.distance_noise,
+        offset_walk_per_cm=(0.004 if predicted else 0.012) / height_cm,
+        offset_decay=0.02 if predicted else 0.0,
+        curvature_noise_per_cm=(1.0 if predicted else 2.0) * settings.curvature_noise_heights / height_cm,
+        max_curvature_per_cm=settings.max_curvature_heights / height_cm,
+    )
 
 
 def delayed(values: Float[np.ndarray, "n"], frames: int) -> Float[np.ndarray, "n"]:

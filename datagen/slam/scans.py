@@ -73,11 +73,16 @@ def scans_of(
     table = RoadTable(camera, range_settings)
     frames = []
     for k, pixels in enumerate(edges):
-        nearest = np.rint(pixels.uv_px).astype(np.intp)
-        seen = table.keep[nearest[:, 1], nearest[:, 0]] > 0
-        kept = EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
+        kept = seen_edges(pixels, table)
         frames.append(table.lift(kept) if tilt_rad is None else _lift_tilted(kept, camera, tilt_rad[k]))
     return pack_scans(frames, camera.mounting.height_cm)
+
+
+def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
+    """Return the edge pixels that see the part of the road that counts."""
+    nearest = np.rint(pixels.uv_px).astype(np.intp)
+    seen = table.keep[nearest[:, 1], nearest[:, 0]] > 0
+    return EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
 
 
 def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import cv2
@@ -22,6 +23,8 @@ _ELSEWHERE = 0.35
 #: How much more alike the steps before and after it are.
 _DIP = 0.35
 _EPSILON = 1e-9
+_BACK = 4  # frames that a live car looks back
+_WATCHED = 300  # frames of a live car whose change counts as usual
 
 
 def following_frames(drive: Drive, notes: list[str]) -> Drive:
@@ -52,9 +55,14 @@ def small_pictures(drive: Drive) -> Float32[np.ndarray, "n h w"]:
 
 
 def small_picture(drive: Drive, k: int) -> UInt8[np.ndarray, "h w"]:
-    """Return the drive's k-th frame in gray, averaged over large patches, gray levels."""
+    """Return the drive's k-th frame as :func:`shrink_picture`."""
+    return shrink_picture(drive.image(k))
+
+
+def shrink_picture(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
+    """Return a frame in gray, averaged over large patches, gray levels."""
     size = (SMALL_WIDTH, SMALL_HEIGHT)
-    return np.asarray(cv2.resize(to_gray(drive.image(k)), size, interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(to_gray(image), size, interpolation=cv2.INTER_AREA))
 
 
 def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:
@@ -85,6 +93,33 @@ def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"
     # A picture that was recorded twice: not even the noise differs.
     standing[1:] |= step < _EPSILON
     return standing
+
+
+class StandingWatch:
+    """Tells of each frame as it comes whether the car stands, from what came before alone.
+
+    As :func:`standing_frames`, but nothing is known of the frames to come: the first frames of a stop count
+    as driven, so that they have to be few. What the pictures usually change by is that of the last frames in
+    which the car drove.
+    """
+
+    def __init__(self) -> None:
+        self._last: deque[Float32[np.ndarray, "d"]] = deque(maxlen=_BACK)
+        self._usual: deque[float] = deque(maxlen=_WATCHED)
+
+    def stands(self, small: UInt8[np.ndarray, "h w"]) -> bool:
+        """Take in the next frame's small picture (see :func:`shrink_picture`)."""
+        flat = small.astype(np.float32).ravel()
+        flat -= flat.mean()
+        full = len(self._last) == _BACK
+        step = float(np.abs(flat - self._last[-1]).mean()) if self._last else np.inf
+        far = float(np.abs(flat - self._last[0]).mean()) if full else np.inf
+        self._last.append(flat)
+        limit = max(_NOISE, _STILL_SHARE * float(np.median(self._usual))) if self._usual else _NOISE
+        stands = step < _EPSILON or (far < limit and step < limit)
+        if full and not stands:
+            self._usual.append(far)
+        return stands
 
 
 def put_elsewhere(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:

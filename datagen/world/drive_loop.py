@@ -42,7 +42,9 @@ def scripted_states(world: World) -> Iterator[DriveState]:
         t_s = frame / world.settings.rate_hz
         pose, moving = world.car.pose, (world.car.speed_cm_s, world.car.yaw_rate_rad_s)
         speed_cm_s, steering_rad = obeyed(world, *world.driver.command(pose, t_s))
-        points_cm = world.track.truth(pose, world.settings.car.wheelbase_cm, world.driver.s_cm)
+        points_cm = world.track.truth(
+            pose, world.settings.car.wheelbase_cm, world.driver.s_cm, world.driver.lane_cm(pose)
+        )
         yield DriveState(frame, t_s, pose, *moving, points_cm, speed_cm_s, steering_rad)
         world.car.step(speed_cm_s, steering_rad, 1.0 / world.settings.rate_hz)
 

@@ -42,7 +42,7 @@ class Driver:
         rng: np.random.Generator,
     ) -> None:
         """Set out with the rear axle near a place along the road."""
-        self.track, self.script = track, Script(settings, rate_hz, rng)
+        self.track, self.script = track, Script(settings, rate_hz, rng, track.oncoming_cm)
         self._aim_ahead_cm = settings.aim_ahead_cm
         self._wheelbase_cm, self._max_steering_rad = car.wheelbase_cm, car.max_steering_rad
         # A command holds until the next one: on average it is half a frame old.
@@ -93,6 +93,16 @@ class Driver:
         steering = math.remainder(wanted, 2.0 * math.pi) - self._trim_rad
         self._steered_rad = min(max(steering, -self._max_steering_rad), self._max_steering_rad)
         return self._steered_rad
+
+    def lane_cm(self, pose: Float[np.ndarray, "3"]) -> float:
+        """Return the offset of the lane in which the middle of the front axle is, left positive.
+
+        That is the driver's own lane, 0, unless the driver changes lanes.
+        """
+        other_cm = self.script.other_lane_cm
+        if self.script.settings.change_lanes_every_cm is None:
+            return 0.0
+        return other_cm if self._place(pose)[1] / other_cm > 0.5 else 0.0
 
     def _place(self, pose: Float[np.ndarray, "3"]) -> tuple[float, float]:
         """Way along the road, over all laps, and offset of the front axle at a pose."""

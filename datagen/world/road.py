@@ -178,7 +178,11 @@ class Track:
         return float(self.s_cm[i] + along_cm), float(offset_cm)
 
     def lines_car(
-        self, pose: Float[np.ndarray, "3"], wheelbase_cm: float, near_s_cm: float | None = None
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
     ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
         """Return the left and right line around the car, [cm], frame car, in the direction of travel.
 
@@ -189,21 +193,26 @@ class Track:
             pose: Rear-axle centre x, y and heading, frame map.
             wheelbase_cm: Distance between the axles.
             near_s_cm: Where along the road the car is known to be, when it may have left its lane.
+            lane_cm: Offset of the lane whose lines are asked for, left positive; 0 for the driven one.
         """
         front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
         s_cm, _ = self.nearest(front, near_s_cm)
         index = self._samples(s_cm - _BEHIND_CM, s_cm + _AHEAD_CM)
-        left, right = (self._beside(index, self.line_offset_cm(side)) for side in SIDES)
+        left, right = (self._beside(index, self.line_offset_cm(side) + lane_cm) for side in SIDES)
         return car_from_map(left, pose, wheelbase_cm), car_from_map(right, pose, wheelbase_cm)
 
     def truth(
-        self, pose: Float[np.ndarray, "3"], wheelbase_cm: float, near_s_cm: float | None = None
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
     ) -> Float[np.ndarray, "6"]:
         """Return the six points of the label contract, [cm], frame car; NaN where a line misses a row.
 
-        The points follow the road, also where its paint is interrupted.
+        The points follow the road, also where its paint is interrupted; arguments as :meth:`lines_car`.
         """
-        left, right = self.lines_car(pose, wheelbase_cm, near_s_cm)
+        left, right = self.lines_car(pose, wheelbase_cm, near_s_cm, lane_cm)
         return np.concatenate([rows_of_polyline(left), rows_of_polyline(right)])
 
     def mirrored(self) -> Track:

@@ -35,6 +35,9 @@ class DriverSettings(Settings):
         longest_wander_cm: Longest wave.
         recover_cm: Largest excursion to one side with the style ``recover``; the smallest is half of it.
         recover_every_cm: From one excursion to the next.
+        change_lanes_every_cm: On a road with two lanes, way from one change to the next; the car then
+            drives in the other lane, against its traffic. None: it keeps its lane.
+        lane_change_cm: Way that a change takes.
     """
 
     style: Literal["wander", "recover", "crawl", "fast"] = "wander"
@@ -49,6 +52,8 @@ class DriverSettings(Settings):
     longest_wander_cm: float = Field(default=400.0, gt=0.0)
     recover_cm: float = Field(default=12.0, ge=0.0)
     recover_every_cm: float = Field(default=200.0, gt=0.0)
+    change_lanes_every_cm: float | None = Field(default=None, gt=0.0)
+    lane_change_cm: float = Field(default=150.0, gt=0.0)
 
     @model_validator(mode="after")
     def _waves_in_order(self) -> DriverSettings:
@@ -56,6 +61,15 @@ class DriverSettings(Settings):
             raise ValueError(
                 f"shortest_wander_cm {self.shortest_wander_cm:g} exceeds longest_wander_cm "
                 f"{self.longest_wander_cm:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _changes_end_before_the_next(self) -> DriverSettings:
+        every_cm = self.change_lanes_every_cm
+        if every_cm is not None and self.lane_change_cm > every_cm:
+            raise ValueError(
+                f"lane_change_cm {self.lane_change_cm:g} exceeds change_lanes_every_cm {every_cm:g}"
             )
         return self
 
@@ -69,9 +83,23 @@ class DriverSettings(Settings):
 class Script:
     """Offset and speed along the road, drawn once."""
 
-    def __init__(self, settings: DriverSettings, rate_hz: float, rng: np.random.Generator) -> None:
-        """Draw what the settings leave open."""
+    def __init__(
+        self,
+        settings: DriverSettings,
+        rate_hz: float,
+        rng: np.random.Generator,
+        other_lane_cm: float | None = None,
+    ) -> None:
+        """Draw what the settings leave open.
+
+        Args:
+            settings: The driver.
+            rate_hz: Frames per second.
+            rng: Source of randomness.
+            other_lane_cm: Offset of the other lane's middle, left positive; None on a road with one lane.
+        """
         self.settings = settings
+        self.other_lane_cm = 0.0 if other_lane_cm is None else other_lane_cm
         self._speed_cm_s = settings.chosen_speed_cm_s(rate_hz)
         lengths_cm = rng.uniform(settings.shortest_wander_cm, settings.longest_wander_cm, _WAVES)
         self._waves = 2.0 * np.pi / lengths_cm
@@ -95,7 +123,17 @@ class Script:
             if share < _EXCURSION_SHARE:
                 height_cm = float(self._excursions_cm[int(number) % _EXCURSIONS])
                 offset_cm += height_cm * math.sin(math.pi * share / _EXCURSION_SHARE) ** 2
-        return offset_cm
+        return offset_cm + self._lane_cm(s_cm)
+
+    def _lane_cm(self, s_cm: float) -> float:
+        """Middle of the lane that the driver aims for, and on the way from one to the other between them."""
+        every_cm = self.settings.change_lanes_every_cm
+        if every_cm is None or s_cm < every_cm:
+            return 0.0
+        number, since_cm = divmod(s_cm, every_cm)
+        share = min(since_cm / self.settings.lane_change_cm, 1.0)
+        gone = share * share * (3.0 - 2.0 * share)
+        return self.other_lane_cm * (gone if number % 2.0 else 1.0 - gone)
 
     def slope(self, s_cm: float) -> float:
         """Change of the offset per way along the road."""

@@ -114,6 +114,10 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
     children = np.random.default_rng(settings.seed).spawn(6)
     track_rng, look_rng, scene_rng, driver_rng, car_rng, donkey_rng = children
     track = _drawn_track(settings, track_rng)
+    if settings.driver.change_lanes_every_cm is not None and track.oncoming_cm is None:
+        raise ConfigError(
+            "driver.change_lanes_every_cm: found a road with one lane, expected one with two (track.lanes: 2)"
+        )
     look = settings.look
     if settings.track.floor_bgr is not None and "floor_bgr" not in look.model_fields_set:
         look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})

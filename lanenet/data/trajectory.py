@@ -14,6 +14,7 @@ from jaxtyping import Float
 from lanenet.data.files import write_text
 from lanenet.errors import MapFormatError
 
+TUM_HEADER = "# t_s x_m y_m z_m qx qy qz qw\n"
 _CM_PER_M = 100.0
 _UNIT_TOLERANCE = 1e-3
 
@@ -61,8 +62,13 @@ def write_tum(path: Path, t_s: Float[np.ndarray, "n"], poses_cm: Float[np.ndarra
     bad = ~np.isfinite(rows).all(axis=1)
     if bad.any():
         raise MapFormatError(f"{path}: the pose of row {int(np.flatnonzero(bad)[0])} is not finite")
-    lines = [f"{row[0]:.6f} " + " ".join(f"{value:.9f}" for value in row[1:]) for row in rows.tolist()]
-    write_text(path, "\n".join(["# t_s x_m y_m z_m qx qy qz qw", *lines]) + "\n")
+    write_text(path, "".join([TUM_HEADER, *tum_lines(t_s, poses_cm)]))
+
+
+def tum_lines(t_s: Float[np.ndarray, "n"], poses_cm: Float[np.ndarray, "n 3"]) -> list[str]:
+    """Lines of a TUM file below :data:`TUM_HEADER`; poses as for :func:`tum_from_poses`, all finite."""
+    rows = tum_from_poses(t_s, poses_cm).tolist()
+    return [f"{row[0]:.6f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n" for row in rows]
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:

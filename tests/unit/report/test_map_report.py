@@ -138,8 +138,8 @@ def test_a_rejected_map_is_not_labelled_unless_forced(mapped, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, tmp_path):
-    """Killed early, late in the work, and while the folder is being filled."""
+def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, mapped, tmp_path):
+    """Killed early, at random moments, and while the folder is being filled; then as if undisturbed."""
     out = tmp_path / "maps" / "one"
     config = tmp_path / "map.yaml"
     config.write_text("find_bumper: false\n")
@@ -159,9 +159,10 @@ def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, tmp_path):
         process.communicate()
         assert process.returncode == -signal.SIGKILL
 
-    begin = time.monotonic()
-    kill_when(lambda: time.monotonic() > begin + 2.0)
-    assert not out.exists()
+    for delay_s in (2.0, *np.random.default_rng(0).uniform(0.1, 4.0, 3)):
+        begin = time.monotonic()
+        kill_when(lambda end_s=begin + delay_s: time.monotonic() > end_s)
+        assert not out.exists()
     kill_when(lambda: any(out.parent.glob(".one.*.tmp")))
     assert not out.exists()
     kill_when(lambda: any(out.parent.glob(".one.*.tmp/poses.csv")))
@@ -170,6 +171,8 @@ def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "verdict: good" in done.stdout
     before = (out / "poses.csv").read_bytes()
+    for name in ("poses.csv", "lanes.json", "report.json"):
+        assert (out / name).read_bytes() == (mapped[0] / name).read_bytes(), name
     # What was killed leaves nothing that the next run does not clear away.
     assert [path.name for path in out.parent.iterdir()] == ["one"]
     kill_when(lambda: any(out.parent.glob(".one.*.tmp")))

@@ -110,6 +110,41 @@ def test_a_new_style_leaves_the_wandering_as_it_is():
     assert [plain.offset_cm(s) for s in (0.0, 77.0)] == [varied.offset_cm(s) for s in (0.0, 77.0)]
 
 
+def test_lanes_are_changed_and_changed_back():
+    driver = DriverSettings(wander_cm=0.0, change_lanes_every_cm=300.0, lane_change_cm=100.0)
+    script = Script(driver, 20.0, np.random.default_rng(0), other_lane_cm=40.0)
+    places = (0.0, 299.0, 300.0, 350.0, 400.0, 599.0, 600.0, 650.0, 700.0, 899.0, 900.0, 1000.0)
+    aimed = [0.0, 0.0, 0.0, 20.0, 40.0, 40.0, 40.0, 20.0, 0.0, 0.0, 0.0, 40.0]
+    assert [script.offset_cm(s) for s in places] == pytest.approx(aimed)
+    # Halfway it is steepest: half as steep again as the straight way across.
+    assert max(script.slope(s) for s in np.arange(300.0, 401.0)) == pytest.approx(1.5 * 0.4, rel=0.01)
+
+
+def test_truth_is_of_the_lane_that_the_car_is_in():
+    driver = DriverSettings(change_lanes_every_cm=250.0)
+    track = TrackSettings(lanes=2, lane_width_cm=40.0)
+    world = _world(driver, track=track, frames=250)
+    middles, offsets = [], []
+    for state in scripted_states(world):
+        front = map_from_car(np.zeros((1, 2)), state.pose, world.settings.car.wheelbase_cm)[0]
+        offsets.append(place_on_track(world.track, front, world.driver.s_cm)[1])
+        # Where the car is in its lane, by the two lines at its axle.
+        middles.append(0.5 * (state.points_cm[0] + state.points_cm[3]))
+    offsets, middles = np.array(offsets), np.array(middles)
+    other = offsets > 20.0
+    # There, back, and there again.
+    assert np.flatnonzero(np.diff(other.astype(int))).size in (2, 3)
+    np.testing.assert_allclose(middles, offsets - 40.0 * other, atol=4.0)
+    assert np.abs(middles).max() < 26.0 and offsets.max() == pytest.approx(40.0, abs=8.0)
+
+
+def test_lanes_are_not_changed_where_there_is_one():
+    with pytest.raises(ConfigError, match=r"change_lanes_every_cm: found a road with one lane, expected .*2"):
+        _world(DriverSettings(change_lanes_every_cm=300.0))
+    with pytest.raises(ConfigError, match="lane_change_cm 150 exceeds change_lanes_every_cm 100"):
+        check_settings(DriverSettings, {"change_lanes_every_cm": 100.0}, "driver")
+
+
 def test_contradictory_waves_are_refused():
     with pytest.raises(ConfigError, match="shortest_wander_cm 500 exceeds longest_wander_cm 400"):
         check_settings(DriverSettings, {"shortest_wander_cm": 500.0}, "driver")

@@ -1,0 +1,97 @@
+"""Outputs that would replace a file of their own source are refused before anything is read or written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lanenet.cli import app
+from lanenet.data.drive_writer import DriveWriter
+from lanenet.errors import ConfigError
+from lanenet.outputs import check_ending, check_not_source
+
+
+def touched(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name", ["frames.csv", "Frames.csv", "truth.csv", "drive.yaml", "track.json", "images/0001.png"]
+)
+def test_a_drive_keeps_its_files(tmp_path, name):
+    drive = touched(tmp_path / "drive", "frames.csv", "images/0001.png")
+    with pytest.raises(ConfigError, match=r"is, or would be read as, a file of .*drive"):
+        check_not_source(drive, tmp_path / "lanes.csv", drive / name)
+
+
+def test_a_tub_a_video_a_map_and_a_label_set_keep_theirs(tmp_path):
+    tub = touched(tmp_path / "tub", "manifest.json", "catalog_0.catalog")
+    a_map = touched(tmp_path / "map", "map.yaml", "edges.parquet")
+    touched(tmp_path, "a.mp4", "b.parquet", "photo.jpg")
+    refused = [
+        (tub, tub / "manifest.json"),
+        (tub, tub / "catalog_0.catalog"),
+        (a_map, a_map / "edges.parquet"),
+        (tmp_path / "a.mp4", tmp_path / "a.mp4"),
+        # Not there yet, but then the video would have these commands.
+        (tmp_path / "a.mp4", tmp_path / "a.csv"),
+        (tmp_path / "b.parquet", tmp_path / "b.json"),
+        (tmp_path / "photo.jpg", tmp_path / "photo.jpg"),
+    ]
+    for source, out in refused:
+        with pytest.raises(ConfigError, match="choose another name"):
+            check_not_source(source, out)
+
+
+def test_a_link_does_not_hide_what_it_leads_to(tmp_path):
+    drive = touched(tmp_path / "drive", "frames.csv")
+    (tmp_path / "link").symlink_to(drive)
+    (tmp_path / "out.csv").symlink_to(drive / "frames.csv")
+    for source, out in ((tmp_path / "link", drive / "frames.csv"), (drive, tmp_path / "out.csv")):
+        with pytest.raises(ConfigError, match="choose another name"):
+            check_not_source(source, out)
+
+
+def test_other_files_beside_and_within_are_fine(tmp_path):
+    drive = touched(tmp_path / "drive", "frames.csv", "images/0001.png", "lanes.csv")
+    photos = touched(tmp_path / "photos", "a.jpg")
+    touched(tmp_path, "a.mp4")
+    check_not_source(drive, drive / "lanes.csv", drive / "lanes.mp4", drive / "camera.yaml", None)
+    check_not_source(drive, tmp_path / "frames.csv", drive / "lanes" / "frames.csv")
+    check_not_source(photos, photos / "frames.csv", photos / "a.csv")
+    check_not_source(photos / "a.jpg", photos / "a.csv")
+    check_not_source(tmp_path / "a.mp4", tmp_path / "a.parquet", tmp_path / "a_lanes.csv")
+
+
+def test_endings(tmp_path):
+    check_ending(tmp_path / "a.CSV", ".parquet", ".csv")
+    with pytest.raises(ConfigError, match=r"a\.txt: expected a name that ends in \.parquet or \.csv"):
+        check_ending(tmp_path / "a.txt", ".parquet", ".csv")
+
+
+def test_the_commands_ask(tmp_path):
+    """Every command that reads a source and writes files leaves the source's own alone."""
+    drive = tmp_path / "drive"
+    with DriveWriter(drive) as writer:
+        for k in range(3):
+            writer.add(np.full((60, 80, 3), 40 * k, np.uint8), 0.05 * k, speed_cm_s=20.0)
+    a_map = touched(tmp_path / "map", "map.yaml", "edges.parquet", "report.json", "map.png")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for words in (
+        ("detect", drive, "--detector", "hough", "--out", drive / "frames.csv"),
+        ("localise", drive, "--out", drive / "frames.csv"),
+        ("label", a_map, "--out", a_map / "edges.parquet"),
+        ("label", a_map, "--out", a_map / "map.parquet"),
+        ("calibrate", "drive", drive, "--lane-width", "40", "--out", drive / "drive.yaml"),
+        ("val", drive, a_map, "--no-baselines", "--out", a_map / "report"),
+    ):
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert result.exit_code == 1, words
+        assert "choose another name" in result.stderr, (words, result.stderr)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
