@@ -11,7 +11,7 @@ from datagen.slam.bundle import BundleSettings
 from datagen.slam.calibrate import GuessSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import MotionSettings
-from datagen.slam.odometry import OdometrySettings
+from datagen.slam.picture_pairs import OdometrySettings
 from datagen.slam.places import RevisitSettings
 from lanenet.config import Settings
 from lanenet.perception.birdseye import PerceptionSettings

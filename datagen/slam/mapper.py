@@ -11,7 +11,8 @@ from pydantic import Field
 
 from datagen.slam.filter import FilterSettings, Trajectory, run_filter
 from datagen.slam.motion import MotionModel
-from datagen.slam.odometry import Evidence, Odometry, OdometrySettings, Pictures
+from datagen.slam.odometry import Evidence, Odometry
+from datagen.slam.picture_pairs import OdometrySettings, Pictures
 from datagen.slam.scans import Progress, Scans
 from lanenet.config import Settings
 from lanenet.data.drive import Drive

@@ -19,7 +19,8 @@ from datagen.slam.mapper import (
     motion_about,
     track,
 )
-from datagen.slam.odometry import Odometry, OdometrySettings
+from datagen.slam.odometry import Odometry
+from datagen.slam.picture_pairs import OdometrySettings
 from datagen.slam.scans import scans_of
 from lanenet.data.recording import Commands, Drive
 from lanenet.perception.birdseye import RangeSettings

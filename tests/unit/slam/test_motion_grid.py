@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.slam.motion_grid import MotionGrid, follow_motion
-from datagen.slam.odometry import turns_up_to
+from datagen.slam.picture_pairs import turns_up_to
 
 TURNS = turns_up_to(0.09, 0.006)
 WALK_RAD = 0.008

@@ -7,16 +7,9 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
-from datagen.slam.odometry import (
-    STEPS_HEIGHTS,
-    Evidence,
-    Odometry,
-    OdometrySettings,
-    Pictures,
-    turns_up_to,
-    usual_step,
-)
+from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step
 from datagen.slam.odometry_kernels import SECTORS, index_edges
+from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
 from lanenet.perception.edges import EdgePixels
 
 SETTINGS = OdometrySettings()
