@@ -11,6 +11,7 @@ from datagen.slam.bundle import BundleSettings
 from datagen.slam.calibrate import GuessSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import MotionSettings
+from datagen.slam.picture_pairs import OdometrySettings
 from datagen.slam.places import RevisitSettings
 from lanenet.config import Settings
 from lanenet.perception.birdseye import PerceptionSettings
@@ -28,8 +29,9 @@ class MapSettings(Settings):
             unless ``perception.range.bottom_rows`` says how many they are.
         perception: How edge points are found.
         guess: First guess of an unknown camera.
+        odometry: Motion from picture to picture.
         filter: Particle filter.
-        motion: How the car may move.
+        motion: How far it may stray from the odometry.
         bundle: Adjustment of poses and camera together.
         revisits: What counts as the same place.
         trace: How lane lines are looked for.
@@ -43,6 +45,7 @@ class MapSettings(Settings):
     find_bumper: bool = True
     perception: PerceptionSettings = PerceptionSettings()
     guess: GuessSettings = GuessSettings()
+    odometry: OdometrySettings = OdometrySettings()
     filter: FilterSettings = FilterSettings()
     motion: MotionSettings = MotionSettings()
     bundle: BundleSettings = BundleSettings()

@@ -14,24 +14,25 @@ from jaxtyping import UInt8
 
 from datagen.map_settings import MapSettings
 from datagen.slam.calibrate import mapping_range
-from datagen.slam.filter import Estimate, ParticleFilter, Survivors, Trajectory, smooth_lineages
+from datagen.slam.filter import Estimate, ParticleFilter, Survivors, smooth_lineages
+from datagen.slam.live_motion import live_motion
 from datagen.slam.mapper import (
     CommandedMotion,
     SteeringFit,
     commanded_motion,
     fit_steering,
-    motion_of,
-    usual_factor,
 )
 from datagen.slam.moments import LEAST_START, LivePose, Moment, StartSettings
-from datagen.slam.motion import FACTOR, OFFSET, MotionModel
+from datagen.slam.motion import OFFSET, MotionModel
+from datagen.slam.odometry import usual_way
+from datagen.slam.picture_pairs import Pictures
 from datagen.slam.scans import Scans, pack_scans, seen_edges
 from datagen.slam.stillness import StandingWatch, shrink_picture
 from lanenet.data.recording import COMMAND_NAMES, MAX_PAUSE_S, Commands
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import RoadEdges, RoadTable
-from lanenet.perception.edges import check_frame, find_edges
+from lanenet.perception.edges import EdgePixels, check_frame, find_edges
 
 _TIMES = 100  # steps of time of which the median is the usual one
 
@@ -42,6 +43,7 @@ class _Seen:
 
     frame: int
     t_s: float
+    pixels: EdgePixels
     edges: Scans
     commands: CommandedMotion
 
@@ -155,15 +157,19 @@ class LiveLocaliser:
         return moment.image
 
     def _seen(self, moment: Moment, image: UInt8[np.ndarray, "h w 3"] | None) -> _Seen:
-        road = RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+        pixels, road = (
+            EdgePixels(np.empty((0, 2)), np.empty((0, 2))),
+            RoadEdges(np.empty((0, 2)), np.empty((0, 2))),
+        )
         if image is not None:
-            pixels = find_edges(image, self.settings.perception.edges, self._table.keep, self._table.scale)
-            road = self._table.lift(seen_edges(pixels, self._table))
+            found = find_edges(image, self.settings.perception.edges, self._table.keep, self._table.scale)
+            pixels = seen_edges(found, self._table)
+            road = self._table.lift(pixels)
         edges = pack_scans([road], self.camera.mounting.height_cm)
         before = self._t_filtered_s if np.isfinite(self._t_filtered_s) else moment.t_s
         commands = self._commanded(moment, before)
         self._t_filtered_s = moment.t_s
-        return _Seen(moment.frame, moment.t_s, edges, commands)
+        return _Seen(moment.frame, moment.t_s, pixels, edges, commands)
 
     def _commanded(self, moment: Moment, before_s: float) -> CommandedMotion:
         """What was commanded on the way from the last frame that the filter saw."""
@@ -194,17 +200,10 @@ class LiveLocaliser:
 
     def _set_out(self, waiting: list[_Seen]) -> list[LivePose]:
         """Find the usual speed in the frames so far, and run the filter over them."""
-        parts = [seen.edges for seen in waiting]
-        counts = [int(part.starts[-1]) for part in parts]
-        scans = Scans(
-            np.concatenate([part.points_cm for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.weights for part in parts]),
-            np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        )
+        odometry, height = self.settings.odometry, self.camera.mounting.height_cm
+        pictures = Pictures([seen.pixels for seen in waiting], self.camera, odometry, self._rng)
         ways = np.concatenate([seen.commands.distance_cm for seen in waiting])
-        commands = CommandedMotion(ways, waiting[0].commands.speed_known, None)
-        self.factor = usual_factor(scans, commands, self.camera, self._rng)
+        self.factor = usual_way(pictures, ways, waiting[0].commands.speed_known, height).factor
         return [self._step(seen) for seen in waiting]
 
     def _step(self, seen: _Seen) -> LivePose:
@@ -228,7 +227,7 @@ class LiveLocaliser:
             self._ways.append(float(seen.commands.distance_cm[0]))
         if self.steering is not None and self._turns:
             curvature = np.array([self._predicted()])
-        return motion_of(seen.commands, curvature, self.factor, height, self.settings.motion)
+        return live_motion(seen.commands, curvature, self.factor, height)
 
     def _predicted(self) -> float:
         """Curvature that the steering predicts for the last frame, [1/cm]."""
@@ -246,9 +245,8 @@ class LiveLocaliser:
         final = np.bincount(self._filter.survivor_of, self._filter.weights)
         states = smooth_lineages(list(self._history), final)
         n = len(states)
-        driven = Trajectory(states[:, :3], states[:, FACTOR], np.full(n, np.nan), np.zeros(n))
         commands = CommandedMotion(np.array(self._ways)[-n:], speed_known, np.array(self._turns)[-n:])
-        self.steering = fit_steering(driven, commands, self.camera.mounting.height_cm)
+        self.steering = fit_steering(states[:, :3], commands, self.camera.mounting.height_cm)
         self._history.clear()
         if self.steering is not None:
             # What the steering predicts from now on, the particles need not hold as an offset.

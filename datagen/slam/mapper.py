@@ -1,7 +1,8 @@
-"""From scans and commands to an open-loop trajectory: the usual step, then two passes of the filter."""
+"""From pictures and commands to an open-loop trajectory: odometry, the answer to the steering, the filter."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,30 +11,41 @@ from pydantic import Field
 
 from datagen.slam.filter import FilterSettings, Trajectory, run_filter
 from datagen.slam.motion import MotionModel
+from datagen.slam.odometry import Evidence, Odometry
+from datagen.slam.picture_pairs import OdometrySettings, Pictures
 from datagen.slam.scans import Progress, Scans
-from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
 from lanenet.config import Settings
 from lanenet.data.drive import Commands, Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import left_from_donkey
+from lanenet.perception.edges import EdgePixels
 
 _MAX_LAG = 10  # frames
 _LONGEST_STEP = 3.0  # usual times between frames
-#: Factors to try on a recorded speed, whose gain is not known exactly.
-_GAINS = np.array([0.75, 0.82, 0.9, 1.0, 1.1, 1.21, 1.33])
 
 
 class MotionSettings(Settings):
-    """How far the car may stray from what the commands predict; lengths in camera heights.
+    """How far the car may stray from what the odometry says.
 
-    The defaults come from real drives with a throttle only, where speed is a slow, unknown state about the
-    usual one that :mod:`datagen.slam.speed` finds: a wider walk or a weaker pull lets the filter creep.
+    The filter's map likes slow motion, a little in every frame: it may correct a step, but not make a habit
+    of it.
+
+    Attributes:
+        factor_walk: Change of the filter's factor on the odometry's ways, per frame.
+        factor_pull: Share by which that factor returns to 1 per frame.
+        distance_noise: Standard deviation of a way, relative.
+        curvature_noise_heights: Standard deviation of a curvature times camera height.
+        offset_walk_heights: Change of the curvature's offset per frame, times camera height.
+        offset_decay: Share of the offset that is forgotten per frame.
+        max_curvature_heights: Bound of the curvature times camera height, so that the heading cannot spin.
     """
 
-    factor_walk_heights: float = Field(default=0.006, gt=0.0)
+    factor_walk: float = Field(default=0.001, gt=0.0)
     factor_pull: float = Field(default=0.1, ge=0.0, lt=1.0)
-    distance_noise: float = Field(default=0.02, gt=0.0)
+    distance_noise: float = Field(default=0.005, gt=0.0)
     curvature_noise_heights: float = Field(default=0.01, gt=0.0)
+    offset_walk_heights: float = Field(default=0.001, gt=0.0)
+    offset_decay: float = Field(default=0.1, ge=0.0, le=1.0)
     max_curvature_heights: float = Field(default=0.8, gt=0.0)
 
 
@@ -115,79 +127,61 @@ def _held(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def track(
+    edges: Sequence[EdgePixels],
     scans: Scans,
     commands: CommandedMotion,
     camera: Camera,
     filter_settings: FilterSettings,
     motion_settings: MotionSettings,
+    odometry_settings: OdometrySettings,
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Trajectory, SteeringFit | None]:
     """Estimate all poses without closing loops.
 
-    First the usual step is found, with the speed held. The first pass knows nothing of the steering and gives
-    how curvature answers to the command: gain, trim and delay. The second pass uses that as prediction.
-    """
-    height = camera.mounting.height_cm
-    n, m = len(scans), motion_settings
-
-    def run(motion: MotionModel, offset: int) -> Trajectory:
-        report = None if progress is None else lambda k, _: progress(offset + k, 2 * n)
-        return run_filter(scans, motion, filter_settings, height, camera.wheelbase_cm, rng, report)
-
-    step = usual_factor(scans, commands, camera, rng)
-    trajectory = run(motion_of(commands, None, step, height, m), 0)
-    fit = fit_steering(trajectory, commands, height)
-    if fit is None or commands.turn is None:
-        if progress is not None:
-            progress(2 * n, 2 * n)
-        return trajectory, None
-    predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    return run(motion_of(commands, predicted, step, height, m), n), fit
-
-
-def usual_factor(scans: Scans, commands: CommandedMotion, camera: Camera, rng: np.random.Generator) -> float:
-    """Find the usual distance factor of a drive (see :class:`MotionModel`).
-
-    Returns:
-        Gain of a recorded speed; the usual way per frame, [cm], where none was recorded.
-    """
-    height = camera.mounting.height_cm
-    factors = _GAINS if commands.speed_known else height * np.array(STEPS_HEIGHTS)
-    seed = int(rng.integers(2**31))
-    return profile_speed(scans, commands.distance_cm, factors, height, camera.wheelbase_cm, seed).step_cm
-
-
-def motion_of(
-    commands: CommandedMotion,
-    curvature_per_cm: Float[np.ndarray, "n"] | None,
-    factor: float,
-    height_cm: float,
-    settings: MotionSettings,
-) -> MotionModel:
-    """Return how a car may move.
+    The pictures alone give each frame's motion first, and from it how curvature answers to the steering:
+    gain, trim and delay. That prediction then settles what the pictures leave open, and the filter puts the
+    steps together.
 
     Args:
+        edges: Edge pixels per frame, only such that see the road.
+        scans: The same on the road.
         commands: What was commanded.
-        curvature_per_cm: Curvature that the steering predicts; None where it predicts nothing.
-        factor: Usual distance factor.
-        height_cm: Of the camera.
-        settings: How far the car may stray.
+        camera: The camera.
+        filter_settings: Size of the filter.
+        motion_settings: How far it may stray from the odometry.
+        odometry_settings: How pictures are compared.
+        rng: Source of randomness.
+        progress: Called with (done, total).
     """
-    predicted = curvature_per_cm is not None
+    height, n = camera.mounting.height_cm, len(scans)
+    compared = None if progress is None else lambda k, _: progress(k, 2 * n)
+    pictures = Pictures(edges, camera, odometry_settings, rng)
+    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height, compared)
+    odometry = evidence.motion()
+    fit = fit_steering(odometry.poses, commands, height)
+    if fit is not None and commands.turn is not None:
+        odometry = evidence.motion(fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm)
+    motion = motion_about(odometry, motion_settings, height)
+    filtered = None if progress is None else lambda k, _: progress(n + k, 2 * n)
+    return run_filter(scans, motion, filter_settings, height, camera.wheelbase_cm, rng, filtered), fit
+
+
+def motion_about(odometry: Odometry, settings: MotionSettings, camera_height_cm: float) -> MotionModel:
+    """Return the motion of a car that does about what the odometry says."""
+    m, ways = settings, odometry.ways_cm
+    moving = ways > 0.0
     return MotionModel(
-        distance_cm=commands.distance_cm,
-        curvature_per_cm=np.zeros(len(commands.distance_cm))
-        if curvature_per_cm is None
-        else curvature_per_cm,
-        factor_start=(factor, 0.05 * factor),
-        factor_walk=0.005 if commands.speed_known else settings.factor_walk_heights * height_cm,
-        factor_pull=settings.factor_pull,
-        distance_noise=settings.distance_noise,
-        offset_walk_per_cm=(0.004 if predicted else 0.012) / height_cm,
-        offset_decay=0.02 if predicted else 0.0,
-        curvature_noise_per_cm=(1.0 if predicted else 2.0) * settings.curvature_noise_heights / height_cm,
-        max_curvature_per_cm=settings.max_curvature_heights / height_cm,
+        distance_cm=ways,
+        curvature_per_cm=np.where(moving, odometry.turns_rad / np.where(moving, ways, 1.0), 0.0),
+        factor_start=(1.0, m.factor_walk),
+        factor_walk=m.factor_walk,
+        factor_pull=m.factor_pull,
+        distance_noise=m.distance_noise,
+        offset_walk_per_cm=m.offset_walk_heights / camera_height_cm,
+        offset_decay=m.offset_decay,
+        curvature_noise_per_cm=m.curvature_noise_heights / camera_height_cm,
+        max_curvature_per_cm=m.max_curvature_heights / camera_height_cm,
     )
 
 
@@ -197,7 +191,7 @@ def delayed(values: Float[np.ndarray, "n"], frames: int) -> Float[np.ndarray, "n
 
 
 def fit_steering(
-    trajectory: Trajectory, commands: CommandedMotion, camera_height_cm: float
+    poses: Float[np.ndarray, "n 3"], commands: CommandedMotion, camera_height_cm: float
 ) -> SteeringFit | None:
     """Regress the found curvature on the command, at the delay where they correlate best.
 
@@ -206,7 +200,7 @@ def fit_steering(
     """
     if commands.turn is None or np.std(commands.turn) < 1e-6:
         return None
-    delta = np.diff(trajectory.poses, axis=0)
+    delta = np.diff(poses, axis=0)
     step = np.hypot(delta[:, 0], delta[:, 1])
     moving = step > 0.3 * np.median(step)
     if moving.sum() < 50:

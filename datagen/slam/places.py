@@ -16,6 +16,9 @@ from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
 
+#: Heading per lap that an open loop misses which is good.
+_SMALL_DRIFT_RAD = 0.6
+
 
 class RevisitSettings(Settings):
     """When two frames count as one place. Lengths are in camera heights.
@@ -168,26 +171,33 @@ def consistent_revisits(
     count = int(10.0 * limit * between.max() / settings.drift_tolerance_rad)
     rates = np.linspace(-limit, limit, 2 * count + 1)
     rest = wrap_angle(missed - rates[:, None] * between)
-    best = int(np.argmax(np.sum(np.exp(-0.5 * (rest / (0.5 * tolerance)) ** 2), axis=1)))
-    expected, rest = rates[best] * between, rest[best]
-    for _ in range(2):
-        # The drift may grow or shrink on the way.
-        good = np.abs(rest) <= tolerance
-        terms = np.stack([between, path[later] ** 2 - path[earlier] ** 2], axis=1)
-        scale = np.abs(terms).max(axis=0)
-        fitted = np.linalg.lstsq(terms[good] / scale, (expected + rest)[good], rcond=None)[0]
-        expected = terms / scale @ fitted
-        rest = wrap_angle(missed - expected)
-    turns = np.rint((missed - expected) / (2.0 * np.pi)).astype(int)
-    good = np.abs(rest) <= tolerance
+    explained = np.sum(np.exp(-0.5 * (rest / (0.5 * tolerance)) ** 2), axis=1)
+    # Places that look alike may agree on a large drift by chance: a small one is tried whatever they say.
+    small = np.where(np.abs(rates) * lap <= _SMALL_DRIFT_RAD, explained, -1.0)
     laps = np.maximum(np.rint(between / lap), 1.0).astype(int)
     found: list[tuple[list[Revisit], float]] = []
-    for more in (0, -1, 1):
-        rate = float(np.median(expected / between)) - 2.0 * np.pi * more / lap
-        whole = turns + more * laps
-        kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, whole, good, strict=True) if ok]
-        if abs(rate) <= limit and len(kept) >= settings.min_revisits:
-            found.append((kept, rate))
+    for best in dict.fromkeys((int(np.argmax(explained)), int(np.argmax(small)))):
+        expected, rest_of = rates[best] * between, rest[best]
+        for _ in range(2):
+            # The drift may grow or shrink on the way.
+            good = np.abs(rest_of) <= tolerance
+            if good.sum() < settings.min_revisits:
+                break
+            terms = np.stack([between, path[later] ** 2 - path[earlier] ** 2], axis=1)
+            scale = np.abs(terms).max(axis=0)
+            fitted = np.linalg.lstsq(terms[good] / scale, (expected + rest_of)[good], rcond=None)[0]
+            expected = terms / scale @ fitted
+            rest_of = wrap_angle(missed - expected)
+        turns = np.rint((missed - expected) / (2.0 * np.pi)).astype(int)
+        good = np.abs(rest_of) <= tolerance
+        for more in (0, -1, 1):
+            rate = float(np.median(expected / between)) - 2.0 * np.pi * more / lap
+            whole = turns + more * laps
+            kept = [replace(r, turns=int(t)) for r, t, ok in zip(revisits, whole, good, strict=True) if ok]
+            known = [[(r.earlier, r.later, r.turns) for r in group] for group, _ in found]
+            new = [(r.earlier, r.later, r.turns) for r in kept] not in known
+            if abs(rate) <= limit and len(kept) >= settings.min_revisits and new:
+                found.append((kept, rate))
     return found
 
 

@@ -120,7 +120,9 @@ def solve_segment(
             "road; mapping needs 20"
         )
     commands = commands_of(drive, camera.wheelbase_cm)
-    trajectory, steering = track(scans, commands, camera, settings.filter, settings.motion, rng, progress)
+    trajectory, steering = track(
+        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress
+    )
     free = _OPEN_LOOP if find_camera else ()
     expected = relative_ways(commands)
     opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected)

@@ -1,9 +1,10 @@
-"""The usual step per frame of a drive whose speed nobody recorded.
+"""The usual step per frame of a drive whose camera is only guessed, and how well that camera fits at it.
 
 A filter that is free to choose its speed creeps: whatever stands still in the picture (mirrored lamps, the
 car's shadow, a curve that looks the same from frame to frame) rewards it for moving less, and its score
-grows. With the speed held, the score does peak at the true one. So a few speeds are held in turn over one
-stretch of the drive, and the best wins.
+grows. With the speed held, the score does peak at the true one, roughly, and highest with the true camera.
+So a few speeds are held in turn over one stretch of the drive. Once there is a camera, neighbouring pictures
+tell the step to a few per cent (see :mod:`datagen.slam.odometry`).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ STAGES: list[tuple[ModuleType, str]] = [
     (self_calibration, "solve_segment"),
     (segment, "edges_of_drive"),
     (segment, "scans_of"),
-    (mapper, "profile_speed"),
+    (mapper, "Evidence"),
     (mapper, "run_filter"),
     (segment, "match_places"),
     (segment, "adjust"),

@@ -138,3 +138,15 @@ def test_a_mirrored_drive_turns_the_other_way(drift):
     rivals = sorted((rate, r[0].turns) for r, rate in here)
     mirrored = sorted((-rate, -r[0].turns) for r, rate in there)
     assert np.array(mirrored) == pytest.approx(np.array(rivals), abs=1e-9)
+
+
+def test_a_good_open_loop_is_tried_though_more_false_revisits_agree_on_a_large_drift():
+    poses = _laps(1, 2)
+    true = _visits(LAP, range(0, 70, 10))
+    # Bends that look alike, half a lap apart and heading the same way as far as the pictures tell.
+    false = [Revisit(k, k + LAP // 2, np.zeros(3), 0.9) for k in range(40, 80, 4)]
+    found = consistent_revisits(poses, true + false, BOUNDS)
+    pairs = {(r.earlier, r.later) for r in true}
+    rates = [rate for revisits, rate in found if {(r.earlier, r.later) for r in revisits} == pairs]
+    assert len(rates) == 1 and abs(rates[0]) * LAP_CM < 0.15
+    assert {r.turns for revisits, rate in found if rate == rates[0] for r in revisits} == {1}

@@ -14,7 +14,8 @@ from datagen.map_settings import MapSettings
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import FilterSettings, ParticleFilter, run_filter
 from datagen.slam.live import LiveLocaliser
-from datagen.slam.mapper import commands_of, motion_of
+from datagen.slam.live_motion import live_motion
+from datagen.slam.mapper import commands_of
 from datagen.slam.moments import LivePose, Moment, StartSettings, moments_of
 from datagen.slam.scans import edges_of_drive, scans_of
 from lanenet.data.recording import Commands, Drive
@@ -56,7 +57,7 @@ def scans_and_motion(drive: Drive):
     limits = mapping_range(CAMERA.mounting.height_cm, SETTINGS.perception.range)
     edges = edges_of_drive(drive, SETTINGS.perception.edges, RoadTable(CAMERA, limits))
     commands = commands_of(drive, CAMERA.wheelbase_cm)
-    motion = motion_of(commands, None, 1.0, CAMERA.mounting.height_cm, SETTINGS.motion)
+    motion = live_motion(commands, None, 1.0, CAMERA.mounting.height_cm)
     return scans_of(edges, CAMERA, limits), motion
 
 

@@ -1,4 +1,4 @@
-"""Commands to predictions, the fit of the steering, and both passes of the tracker."""
+"""Commands to predictions, the fit of the steering, and tracking with both."""
 
 from __future__ import annotations
 
@@ -6,29 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, tape_road
+from pixel_road import fisheye, pixels
+from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
-from datagen.slam.filter import FilterSettings, Trajectory
+from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import (
     CommandedMotion,
     MotionSettings,
     commands_of,
     delayed,
     fit_steering,
+    motion_about,
     track,
 )
+from datagen.slam.odometry import Odometry
+from datagen.slam.picture_pairs import OdometrySettings
+from datagen.slam.scans import scans_of
 from lanenet.data.recording import Commands, Drive
-from lanenet.geometry.camera import Camera, Mounting
-
-CAMERA = Camera(
-    "fisheye",
-    160,
-    120,
-    np.array([[80.0, 0.0, 79.5], [0.0, 80.0, 59.5], [0.0, 0.0, 1.0]]),
-    np.zeros(4),
-    Mounting(HEIGHT_CM, pitch_down_rad=0.25),
-    WHEELBASE_CM,
-)
+from lanenet.perception.birdseye import RangeSettings
 
 
 class _NoImages:
@@ -119,22 +114,21 @@ def test_a_drive_without_commands_has_no_turn():
 
 def _answer(
     rng: np.random.Generator, gain: float, trim: float, lag: int, noise_rad: float, n: int = 400
-) -> tuple[Trajectory, CommandedMotion]:
-    """A trajectory whose curvature answers to a slowly changing command."""
+) -> tuple[np.ndarray, CommandedMotion]:
+    """Poses of a path whose curvature answers to a slowly changing command."""
     turn = np.convolve(rng.normal(size=n + 40), np.ones(12) / 3.0, mode="same")[20 : 20 + n]
     curvature = gain * delayed(turn, lag) + trim
     heading = np.cumsum(curvature * STEP_CM) + np.cumsum(noise_rad * rng.normal(size=n))
     middle = heading - 0.5 * curvature * STEP_CM
     xy = np.cumsum(STEP_CM * np.column_stack([np.cos(middle), np.sin(middle)]), axis=0)
-    trajectory = Trajectory(np.column_stack([xy, heading]), np.ones(n), np.ones(n), np.zeros(n))
-    return trajectory, CommandedMotion(np.full(n, STEP_CM), True, turn)
+    return np.column_stack([xy, heading]), CommandedMotion(np.full(n, STEP_CM), True, turn)
 
 
 @pytest.mark.parametrize("lag", [0, 4, 10])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fit_finds_gain_trim_and_lag(seed, lag):
-    trajectory, commands = _answer(np.random.default_rng(seed), 0.009, 0.002, lag, 0.005)
-    fit = fit_steering(trajectory, commands, HEIGHT_CM)
+    poses, commands = _answer(np.random.default_rng(seed), 0.009, 0.002, lag, 0.005)
+    fit = fit_steering(poses, commands, HEIGHT_CM)
     assert fit is not None
     assert fit.lag_frames == lag
     assert fit.gain == pytest.approx(0.009, rel=0.03)
@@ -143,8 +137,7 @@ def test_the_fit_finds_gain_trim_and_lag(seed, lag):
 
 
 def test_frames_at_standstill_do_not_disturb_the_fit():
-    trajectory, commands = _answer(np.random.default_rng(0), 0.009, 0.0, 3, 0.002)
-    poses = trajectory.poses.copy()
+    poses, commands = _answer(np.random.default_rng(0), 0.009, 0.0, 3, 0.002)
     # From frame 200 the car stands for 40 frames; its heading jitters over next to no distance.
     shift = np.zeros_like(poses[240:])
     shift[:, :2] = poses[200, :2] - poses[239, :2]
@@ -152,8 +145,7 @@ def test_frames_at_standstill_do_not_disturb_the_fit():
     poses[200:240] = poses[200]
     poses[200:240, 2] += 0.02 * np.random.default_rng(1).normal(size=40)
     poses[200:240, 0] += np.linspace(0.0, 0.1, 40)
-    stopped = Trajectory(poses, trajectory.factor, trajectory.match, trajectory.spread_cm)
-    fit = fit_steering(stopped, commands, HEIGHT_CM)
+    fit = fit_steering(poses, commands, HEIGHT_CM)
     assert fit is not None
     assert fit.lag_frames == 3
     assert fit.gain == pytest.approx(0.009, rel=0.1)
@@ -161,19 +153,18 @@ def test_frames_at_standstill_do_not_disturb_the_fit():
 
 def test_no_fit_without_a_command_that_explains_the_path():
     rng = np.random.default_rng(0)
-    trajectory, commands = _answer(rng, 0.009, 0.0, 3, 0.002)
-    n = len(trajectory.poses)
+    poses, commands = _answer(rng, 0.009, 0.0, 3, 0.002)
+    n = len(poses)
 
     def fit_of(turn: np.ndarray | None) -> object:
-        return fit_steering(trajectory, CommandedMotion(commands.distance_cm, True, turn), HEIGHT_CM)
+        return fit_steering(poses, CommandedMotion(commands.distance_cm, True, turn), HEIGHT_CM)
 
     assert fit_of(None) is None
     assert fit_of(np.full(n, 0.3)) is None
     assert fit_of(rng.normal(size=n)) is None
     # Too short a drive to tell.
-    short = Trajectory(trajectory.poses[:40], np.ones(40), np.ones(40), np.zeros(40))
     assert commands.turn is not None
-    assert fit_steering(short, CommandedMotion(np.ones(40), True, commands.turn[:40]), HEIGHT_CM) is None
+    assert fit_steering(poses[:40], CommandedMotion(np.ones(40), True, commands.turn[:40]), HEIGHT_CM) is None
 
 
 @pytest.mark.parametrize("speed_known", [True, False])
@@ -185,12 +176,16 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     turn = np.concatenate([curvature[2:], curvature[-1:], curvature[-1:]]) / 0.02
     commands = CommandedMotion(np.full(n, STEP_CM if speed_known else 1.0), speed_known, turn)
     calls: list[tuple[int, int]] = []
+    camera = fisheye()
+    edges = pixels(road, camera)
     trajectory, fit = track(
-        road.scans(),
+        edges,
+        scans_of(edges, camera, RangeSettings()),
         commands,
-        CAMERA,
+        camera,
         FilterSettings(particles=200),
         MotionSettings(),
+        OdometrySettings(),
         np.random.default_rng(0),
         lambda done, total: calls.append((done, total)),
     )
@@ -199,5 +194,18 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     assert abs(fit.lag_frames - 2) <= 1
     assert fit.gain == pytest.approx(0.02, rel=0.1)
     assert abs(fit.trim_per_cm) < 0.001
-    assert np.linalg.norm(trajectory.poses[-1, :2] - road.poses[-1, :2]) < 12.0
+    assert np.linalg.norm(trajectory.poses[-1, :2] - road.poses[-1, :2]) < 9.0
     assert np.abs(trajectory.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(4.0)
+
+
+def test_the_filter_moves_as_the_odometry_says():
+    odometry = Odometry(np.array([0.0, 3.0, 4.0]), np.array([0.0, 0.06, -0.02]))
+    settings = MotionSettings(
+        factor_walk=1e-9, distance_noise=1e-9, curvature_noise_heights=1e-9, offset_walk_heights=1e-9
+    )
+    motion = motion_about(odometry, settings, HEIGHT_CM)
+    rng = np.random.default_rng(0)
+    states = motion.start(20, rng)
+    for k in (1, 2):
+        motion.predict(states, k, rng)
+    np.testing.assert_allclose(states[:, :3], np.tile(odometry.poses[-1], (20, 1)), atol=1e-6)

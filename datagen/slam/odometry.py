@@ -1,0 +1,176 @@
+"""How far the car drove, and turned, from picture to picture, by edges alone.
+
+The filter's map is blurred by about as much as the car moves per frame, and a blurred map likes slow motion:
+the less the car moves, the more edges lie on those before. Neighbouring pictures compared to half a pixel do
+not mind: their edges meet at the true motion, and nowhere else along a line of dashes, corners or stains.
+What one pair of pictures leaves open its neighbours settle (see :mod:`datagen.slam.motion_grid`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from datagen.slam.motion_grid import MotionGrid, follow_motion
+from datagen.slam.picture_pairs import Pictures, turns_up_to
+from datagen.slam.scans import Progress
+
+#: Steps to try where no speed was recorded, in camera heights per frame: a crawl up to a fast car at 10 Hz.
+STEPS_HEIGHTS = tuple(0.025 * 1.1**k for k in range(37))
+#: Factors to try on a recorded speed, whose gain is not known exactly.
+_GAINS = tuple(1.06**k for k in range(-11, 12))
+#: Pairs of pictures that the usual step is found from.
+_PAIRS = 60
+#: A step must fit better than those that are shorter and longer by this factor: what does not move on the
+#: road, such as mirrored lamps, fits slow motion of any size.
+_BESIDE = 1.5
+#: A car that is told to stand may roll on: least commanded way, relative to the usual one.
+LEAST_WAY = 0.1
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Motion from frame to frame; the first frame has none.
+
+    Attributes:
+        ways_cm: Way of the rear axle from the frame before.
+        turns_rad: Turn, positive left.
+    """
+
+    ways_cm: Float[np.ndarray, "n"]
+    turns_rad: Float[np.ndarray, "n"]
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 3"]:
+        """Rear-axle poses when the steps are put together, heading +x at the start, frame map."""
+        heading = np.cumsum(self.turns_rad)
+        middle = heading - 0.5 * self.turns_rad
+        xy = np.cumsum(self.ways_cm[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)
+        return np.column_stack([xy, heading])
+
+
+def usual_step(
+    pictures: Pictures, relative: Float[np.ndarray, "n"], steps: Float[np.ndarray, "w"]
+) -> tuple[float, Float[np.ndarray, "w"]]:
+    """Find the way per frame of usual length that suits pairs from all over the drive.
+
+    Args:
+        pictures: The drive.
+        relative: Way of each frame relative to the usual one.
+        steps: Steps to try, each longer than the one before by the same factor, camera heights.
+
+    Returns:
+        The step, between the tried ones by a parabola, and the mean fit of each tried one.
+    """
+    s, n = pictures.settings, len(pictures)
+    first = min(max(s.lags), n - 1)
+    frames = np.unique(np.linspace(first, n - 1, min(_PAIRS, n - first)).astype(np.int64))
+    fit = np.zeros(len(steps))
+    for k in frames:
+        for i, step in enumerate(steps):
+            turns = turns_up_to(s.max_curvature_heights * step * relative[k], pictures.turn_step_rad)
+            fit[i] += pictures.fit(int(k), steps[i : i + 1], turns, relative).max() / len(frames)
+    log_ratio = float(np.log(steps[1] / steps[0]))
+    beside = round(float(np.log(_BESIDE)) / log_ratio)
+    padded = np.pad(fit, beside, mode="edge")
+    above = fit - 0.5 * (padded[: -2 * beside] + padded[2 * beside :])
+    best = int(np.argmax(above))
+    shift = 0.0
+    if 0 < best < len(steps) - 1:
+        left, middle, right = above[best - 1 : best + 2]
+        bend = left - 2.0 * middle + right
+        shift = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
+    return float(steps[best] * np.exp(shift * log_ratio)), fit
+
+
+@dataclass(frozen=True)
+class UsualWay:
+    """What a drive's commands mean in centimetres.
+
+    Attributes:
+        relative: Way of each frame relative to the usual one.
+        step: Way per frame of usual length, camera heights.
+        factor: Way per unit of the commands: gain of a recorded speed, else the usual way, [cm].
+    """
+
+    relative: Float[np.ndarray, "n"]
+    step: float
+    factor: float
+
+
+def usual_way(
+    pictures: Pictures, distance_cm: Float[np.ndarray, "n"], speed_known: bool, height_cm: float
+) -> UsualWay:
+    """Find how far the car really drives when it is told to.
+
+    Args:
+        pictures: The drive.
+        distance_cm: Commanded way per frame, or the frame's duration.
+        speed_known: Whether that is in centimetres.
+        height_cm: Of the camera.
+    """
+    moving = distance_cm[distance_cm > 0.0]
+    usual = float(np.median(moving)) if moving.size else 1.0
+    relative = np.maximum(distance_cm / usual, LEAST_WAY)
+    steps = np.array(_GAINS) * usual / height_cm if speed_known else np.array(STEPS_HEIGHTS)
+    step, _ = usual_step(pictures, relative, steps)
+    return UsualWay(relative, step, step * height_cm / usual)
+
+
+class Evidence:
+    """What the pictures say of each frame's motion, and the grid that it is said on."""
+
+    def __init__(
+        self,
+        pictures: Pictures,
+        distance_cm: Float[np.ndarray, "n"],
+        speed_known: bool,
+        height_cm: float,
+        progress: Progress | None = None,
+    ) -> None:
+        """Compare all pictures.
+
+        Args:
+            pictures: The drive.
+            distance_cm: Commanded way per frame, or the frame's duration.
+            speed_known: Whether that is in centimetres.
+            height_cm: Of the camera.
+            progress: Called with (done, total).
+        """
+        s, n = pictures.settings, len(pictures)
+        self.settings, self.height_cm = s, height_cm
+        usual = usual_way(pictures, distance_cm, speed_known, height_cm)
+        self.relative, step = usual.relative, usual.step
+        spread, keep = s.unknown_spread, s.unknown_keep
+        if speed_known:
+            spread, keep = s.known_spread, s.known_keep
+        most = 1.3 * s.max_curvature_heights * step
+        self.grid = MotionGrid(step, spread, keep, s.jump, turns_up_to(most, pictures.turn_step_rad))
+        self.log_likelihood: Float32[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float32)
+        for k in range(n):
+            if k > 0:
+                fit = pictures.fit(k, self.grid.steps, self.grid.turns_rad, self.relative)
+                self.log_likelihood[k] = s.temper * (fit - fit.max())
+            if progress is not None:
+                progress(k + 1, n)
+
+    def motion(self, curvature_per_cm: Float[np.ndarray, "n"] | None = None) -> Odometry:
+        """Find the likeliest motion.
+
+        Args:
+            curvature_per_cm: What the steering predicts, positive left; None where it predicts nothing.
+        """
+        s = self.settings
+        if curvature_per_cm is None:
+            # Where nothing is seen the car goes straight on.
+            curvature, sigma = np.zeros(len(self.relative)), s.max_curvature_heights
+        else:
+            curvature, sigma = curvature_per_cm * self.height_cm, s.steering_heights
+        steps, turns = follow_motion(
+            self.grid, self.log_likelihood, self.relative, s.turn_walk_rad, curvature, sigma
+        )
+        ways = steps * self.relative * self.height_cm
+        ways[0] = turns[0] = 0.0
+        return Odometry(ways, turns)

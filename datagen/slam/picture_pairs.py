@@ -1,0 +1,185 @@
+"""The pictures of a drive in pairs: how well a step and a turn carry the edges of one onto the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import Field
+
+from datagen.slam.odometry_kernels import SECTORS, fit_of_motions, index_edges
+from lanenet.config import Settings
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges import EdgePixels
+
+#: Spacing of the grid on the road that is looked up instead of projecting, in camera heights, and its reach.
+_CELL_HEIGHTS, _REACH_HEIGHTS = 0.05, 7.0
+#: Directions on the road of which the points are drawn in equal numbers.
+_KINDS = 4
+#: Pixels that a far edge moves by from one turn of the grid to the next, in standard deviations.
+_TURN_SIGMAS = 1.2
+#: Width up to which an edge's place is known to the same part of a pixel.
+_FINE_WIDTH = 320
+
+
+class OdometrySettings(Settings):
+    """How pictures are compared, and what is believed of the motion between them.
+
+    Attributes:
+        lags: Frames between the pictures of a pair.
+        points: Edge points of the earlier picture that are moved.
+        sigma_px: Standard deviation of an edge's place across itself, for images up to 320 px wide.
+        gain: How much likelier a point of the road falls on an edge of the later picture than off it.
+        unseen_share: Share of a full match that a point counts for which leaves the view.
+        temper: Power of the likelihood: neighbouring points share their errors, and so do the lags.
+        known_spread: Spread of the speed about the recorded one, times its usual gain, as a logarithm.
+        known_keep: Share of that deviation which stays until the next frame.
+        unknown_spread: The same where no speed was recorded.
+        unknown_keep: The same where no speed was recorded.
+        turn_walk_rad: Change of turn from frame to frame.
+        steering_heights: Curvature by which the car may miss the steering's prediction, times camera height.
+        jump: Probability that the motion changes as none of this expects.
+        max_curvature_heights: Tightest curve times camera height.
+    """
+
+    lags: tuple[int, ...] = (1, 2, 4)
+    points: int = Field(default=80, ge=20)
+    sigma_px: float = Field(default=0.5, gt=0.0)
+    gain: float = Field(default=10.0, gt=0.0)
+    unseen_share: float = Field(default=0.4, ge=0.0, le=1.0)
+    temper: float = Field(default=0.02, gt=0.0)
+    known_spread: float = Field(default=0.05, gt=0.0)
+    known_keep: float = Field(default=0.95, gt=0.0, lt=1.0)
+    unknown_spread: float = Field(default=0.2, gt=0.0)
+    unknown_keep: float = Field(default=0.99, gt=0.0, lt=1.0)
+    turn_walk_rad: float = Field(default=0.008, gt=0.0)
+    steering_heights: float = Field(default=0.03, gt=0.0)
+    jump: float = Field(default=0.01, gt=0.0, lt=1.0)
+    max_curvature_heights: float = Field(default=0.6, gt=0.0)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """Edges of a frame, and the points among them that are moved into later ones."""
+
+    points: Float[np.ndarray, "m 2"]
+    sector: Int[np.ndarray, "m"]
+    uv_px: Float[np.ndarray, "e 2"]
+    normals: Float[np.ndarray, "e 2"]
+    edge_sector: Float[np.ndarray, "e"]
+
+
+class Pictures:
+    """The edges of a drive, ready to be compared in pairs; lengths are in camera heights."""
+
+    def __init__(
+        self,
+        edges: Sequence[EdgePixels],
+        camera: Camera,
+        settings: OdometrySettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Draw the points that are moved.
+
+        Args:
+            edges: Edge pixels per frame, only such that see the road.
+            camera: The camera.
+            settings: How pictures are compared.
+            rng: Draws the points.
+        """
+        self.settings, self._camera = settings, camera
+        self._sigma_px = settings.sigma_px * max(1.0, camera.width / _FINE_WIDTH)
+        ahead = np.arange(0.0, _REACH_HEIGHTS, _CELL_HEIGHTS)
+        left = np.arange(-_REACH_HEIGHTS, _REACH_HEIGHTS, _CELL_HEIGHTS)
+        self._origin = np.array([ahead[0], left[0]])
+        grid_cm = camera.mounting.height_cm * np.stack(np.meshgrid(ahead, left, indexing="ij"), -1)
+        car_cm = np.stack([-grid_cm[..., 1], grid_cm[..., 0] - camera.wheelbase_cm], axis=-1)
+        self._pixel_of = camera.project_ground(car_cm.reshape(-1, 2)).reshape(car_cm.shape)
+        self._pictures = [self._picture(pixels, rng) for pixels in edges]
+        shape = (SECTORS, camera.height, camera.width)
+        self._nearest, self._distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    @property
+    def turn_step_rad(self) -> float:
+        """Difference of two turns that the pictures can just tell apart."""
+        return float(_TURN_SIGMAS * self._sigma_px / self._camera.K[0, 0])
+
+    def _picture(self, pixels: EdgePixels, rng: np.random.Generator) -> _Picture:
+        """Draw points of every direction on the road alike.
+
+        Source:
+            Rusinkiewicz and Levoy 2001, "Efficient variants of the ICP algorithm", section 3.1 (normal-space
+            sampling): lines along the road are most of the edges and say nothing of the way along it.
+        """
+        uv, normals = pixels.uv_px.astype(np.float64), pixels.normals.astype(np.float64)
+        sector = np.arctan2(normals[:, 1], normals[:, 0]) * (SECTORS / (2.0 * np.pi)) % SECTORS
+        along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+        road, beside = self._camera.intersect_ground(np.concatenate([uv, uv + 0.5 * along])).reshape(2, -1, 2)
+        tangent = beside - road
+        good = np.isfinite(road).all(axis=1) & np.isfinite(tangent).all(axis=1)
+        angle = np.arctan2(tangent[good, 1], tangent[good, 0])
+        kind = np.full(len(uv), -1)
+        kind[good] = np.rint(angle * (_KINDS / np.pi)).astype(np.int64) % _KINDS
+        each = self.settings.points // _KINDS
+        drawn = []
+        for number in range(_KINDS):
+            candidates = np.flatnonzero(kind == number)
+            drawn.append(rng.choice(candidates, min(each, len(candidates)), replace=False))
+        chosen = np.concatenate(drawn)
+        forward_cm = road[chosen, 1] + self._camera.wheelbase_cm
+        points = np.stack([forward_cm, -road[chosen, 0]], axis=1) / self._camera.mounting.height_cm
+        return _Picture(points, np.rint(sector[chosen]).astype(np.int64) % SECTORS, uv, normals, sector)
+
+    def fit(
+        self,
+        k: int,
+        steps: Float[np.ndarray, "w"],
+        turns_rad: Float[np.ndarray, "t"],
+        relative: Float[np.ndarray, "n"],
+    ) -> Float[np.ndarray, "w t"]:
+        """Compare frame k with those before it, for every step and turn.
+
+        Args:
+            k: Frame.
+            steps: Ways per frame of usual length.
+            turns_rad: Turns per frame; the same for all frames between a pair.
+            relative: Way of each frame relative to the usual one.
+
+        Returns:
+            Log likelihood up to a constant, not tempered.
+        """
+        s, later = self.settings, self._pictures[k]
+        out = np.zeros((len(steps), len(turns_rad)))
+        index_edges(later.uv_px, later.edge_sector, self._nearest, self._distance)
+        for lag in s.lags:
+            if lag > k:
+                continue
+            earlier = self._pictures[k - lag]
+            fit_of_motions(
+                earlier.points,
+                earlier.sector,
+                later.uv_px,
+                later.normals,
+                self._nearest,
+                self._pixel_of,
+                self._origin,
+                _CELL_HEIGHTS,
+                relative[k - lag + 1 : k + 1].sum() * steps,
+                lag * turns_rad,
+                self._sigma_px,
+                s.gain,
+                s.unseen_share * np.log1p(s.gain),
+                out,
+            )
+        return out
+
+
+def turns_up_to(most_rad: float, step_rad: float) -> Float[np.ndarray, "t"]:
+    """Return turns at even spacing, as many to the left as to the right."""
+    half = int(np.ceil(most_rad / step_rad))
+    return step_rad * np.arange(-half, half + 1)

@@ -1,0 +1,142 @@
+"""Motion from picture to picture, on exact edges of a made-up road, with and without what does not move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pixel_road import fisheye, mirrored, pinhole, pixels
+from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
+
+from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step
+from datagen.slam.odometry_kernels import SECTORS, index_edges
+from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
+from lanenet.perception.edges import EdgePixels
+
+SETTINGS = OdometrySettings()
+STEP = STEP_CM / HEIGHT_CM
+
+
+def _pictures(edges: list[EdgePixels], camera=None, seed: int = 0) -> Pictures:
+    camera = fisheye() if camera is None else camera
+    return Pictures(edges, camera, SETTINGS, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def road() -> TapeRoad:
+    return tape_road(60)
+
+
+@pytest.fixture(scope="module")
+def edges(road) -> list[EdgePixels]:
+    return pixels(road, fisheye())
+
+
+def _true_turns(road: TapeRoad) -> np.ndarray:
+    return np.diff(road.poses[:, 2], prepend=0.0)
+
+
+def _with_a_lamp(edges: list[EdgePixels], points: int) -> list[EdgePixels]:
+    """The same with a ring that stays where it is in the picture, as a lamp mirrored in the floor does."""
+    angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
+    normal = np.column_stack([np.cos(angle), np.sin(angle)])
+    ring = [60.0, 90.0] + 14.0 * normal
+    return [EdgePixels(np.concatenate([e.uv_px, ring]), np.concatenate([e.normals, -normal])) for e in edges]
+
+
+def test_the_index_gives_the_nearest_edge_of_a_direction():
+    rng = np.random.default_rng(3)
+    uv, angle = rng.uniform(0.0, 39.0, (60, 2)), rng.uniform(0.0, 2.0 * np.pi, 60)
+    sector = angle * SECTORS / (2.0 * np.pi)
+    nearest = np.empty((SECTORS, 30, 40), np.int32)
+    index_edges(uv, sector, nearest, np.empty(nearest.shape, np.float32))
+    for s in range(SECTORS):
+        off = np.abs((sector - s + 0.5 * SECTORS) % SECTORS - 0.5 * SECTORS)
+        for v in range(0, 30, 3):
+            for u in range(0, 40, 3):
+                far = np.where(off < 1.0, np.hypot(*(uv - [u, v]).T), np.inf)
+                found = nearest[s, v, u]
+                if far.min() < 1.5:
+                    assert far[found] == pytest.approx(far.min(), abs=1e-6)
+                if found >= 0:
+                    assert far[found] < 4.0
+
+
+@pytest.mark.parametrize("camera", [fisheye(), pinhole()], ids=["fisheye", "pinhole"])
+def test_a_pair_fits_best_at_its_true_motion(road, camera):
+    pictures = _pictures(pixels(road, camera), camera)
+    steps, turns = STEP * np.exp(0.06 * np.arange(-10, 11)), turns_up_to(0.12, pictures.turn_step_rad)
+    off_step, off_turn = [], []
+    for k in range(6, 60, 6):
+        i, j = np.unravel_index(pictures.fit(k, steps, turns, np.ones(60)).argmax(), (21, len(turns)))
+        off_step.append(np.log(steps[i] / STEP))
+        off_turn.append(turns[j] - _true_turns(road)[k])
+    # Half a cell of the grid is as well as it can tell; the turn changes between the frames of a pair.
+    assert np.median(np.abs(off_step)) < 0.07
+    assert np.median(np.abs(off_turn)) < 1.2 * pictures.turn_step_rad
+
+
+def test_steps_put_together_give_poses():
+    ways, turns = np.array([0.0, 2.0, 2.0]), np.array([0.0, 0.0, np.pi / 2.0])
+    poses = Odometry(ways, turns).poses
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(poses, [[0, 0, 0], [2, 0, 0], [2 + 2 * half, 2 * half, np.pi / 2]], atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("lamp", [0, 60])
+def test_way_and_turn_of_a_drive_are_found(road, edges, known, lamp):
+    # The recorded speed is a quarter too high.
+    distance_cm = np.full(60, 1.25 * STEP_CM if known else 1.0)
+    pictures = _pictures(_with_a_lamp(edges, lamp))
+    odometry = Evidence(pictures, distance_cm, known, HEIGHT_CM).motion()
+    assert odometry.ways_cm[0] == odometry.turns_rad[0] == 0.0
+    assert odometry.ways_cm[1:].sum() == pytest.approx(59 * STEP_CM, rel=0.02)
+    np.testing.assert_allclose(odometry.ways_cm[5:], STEP_CM, rtol=0.15)
+    assert np.abs(odometry.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(3.0)
+
+
+def test_a_mirrored_drive_turns_the_other_way(road, edges):
+    flipped = pixels(road.mirrored(), mirrored(fisheye()))
+    plain, other = (
+        Evidence(_pictures(e, camera), np.ones(60), False, HEIGHT_CM).motion()
+        for e, camera in ((edges, fisheye()), (flipped, mirrored(fisheye())))
+    )
+    np.testing.assert_allclose(other.poses[-1], plain.poses[-1] * [1.0, -1.0, -1.0], atol=6.0)
+    assert np.sign(plain.turns_rad.sum()) == -np.sign(other.turns_rad.sum())
+
+
+def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
+    steps = np.array(STEPS_HEIGHTS)
+    for lamp in (0, 60):
+        step, fit = usual_step(_pictures(_with_a_lamp(edges, lamp)), np.ones(60), steps)
+        assert step == pytest.approx(STEP, rel=0.03)
+        assert fit.shape == steps.shape
+
+
+def test_a_long_frame_takes_a_long_way(road):
+    kept = np.r_[0:30, 32:60]
+    thinned = pixels(TapeRoad(road.points_cm, road.normals, road.poses[kept]), fisheye())
+    distance = np.ones(58)
+    distance[30] = 3.0
+    odometry = Evidence(_pictures(thinned), distance, False, HEIGHT_CM).motion()
+    assert odometry.ways_cm[30] == pytest.approx(3.0 * STEP_CM, rel=0.1)
+    assert odometry.ways_cm[29] == pytest.approx(STEP_CM, rel=0.1)
+
+
+def test_pictures_without_edges_leave_it_to_the_commands():
+    nothing = [EdgePixels(np.empty((0, 2)), np.empty((0, 2)))] * 30
+    odometry = Evidence(_pictures(nothing), np.full(30, 4.0), True, HEIGHT_CM).motion(np.full(30, 0.01))
+    assert odometry.turns_rad[15] > 0.0
+    np.testing.assert_allclose(odometry.turns_rad[5:25] / odometry.ways_cm[5:25], 0.01, rtol=0.2)
+
+
+def test_points_are_drawn_from_every_direction_alike():
+    # A road of nothing but lines ahead, and one short edge across it.
+    v = np.repeat(np.arange(60.0, 118.0, 0.5), 2)
+    lines = np.column_stack([np.where(np.arange(len(v)) % 2, 40.0, 120.0), v])
+    across = np.column_stack([np.arange(70.0, 82.0, 0.5), np.full(24, 90.0)])
+    uv = np.concatenate([lines, across])
+    normals = np.concatenate([np.tile([1.0, 0.0], (len(lines), 1)), np.tile([0.0, 1.0], (24, 1))])
+    pictures = _pictures([EdgePixels(uv, normals)])
+    sector = pictures._pictures[0].sector
+    assert (sector == SECTORS // 4).sum() >= SETTINGS.points // 4
