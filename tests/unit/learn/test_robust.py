@@ -38,7 +38,7 @@ class ColumnModel(RasterModel):
                     points[i, 3 * side : 3 * side + 3] = half[:, 0].mean()
                 else:
                     points[i, 3 * side : 3 * side + 3] = sign * 20.0
-        return RasterAnswers(points, np.full((n, 6), 5.0), presence)
+        return RasterAnswers(points, np.where(presence.repeat(3, axis=1) > 0.5, 5.0, 20.0), presence)
 
 
 def rows(models=None, sets=(LABELS,)):
@@ -52,6 +52,9 @@ def test_every_change_is_measured_and_only_what_it_says_is_changed():
     # Only the missing line's points count where one is missing.
     assert found["one line missing"].errors.truth_count == 3 * 40
     assert found["none"].errors.truth_count == 6 * 40
+    # The lines of these lanes are 40 cm apart, so that the one tells the other; the model guesses 20.
+    known, unknown = found["same, width known"].errors, found["one line missing"].errors
+    assert known.truth_count == unknown.truth_count and known.rmse_cm < unknown.rmse_cm
     assert found["both lines missing"].errors is None
     assert found["both lines missing"].presence.absent_recall == 1.0
     assert found["both lines missing"].presence.there == 0

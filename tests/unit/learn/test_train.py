@@ -228,10 +228,10 @@ def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
 
 def test_patience_ends_a_run_that_gets_no_better(data, tmp_path):
     # So small a rate that only the first epochs change anything that counts.
-    settings = TINY.model_copy(update={"epochs": 12, "patience": 2, "learning_rate": 3e-2, "ema_decay": 0.0})
+    settings = TINY.model_copy(update={"epochs": 60, "patience": 2, "learning_rate": 3e-2, "ema_decay": 0.0})
     seen = []
     result = run(data, tmp_path / "patient", settings, lambda epoch, *_: seen.append(epoch))
-    assert seen[-1] == result.best_epoch + 2 < 12
+    assert seen[-1] == result.best_epoch + 2 < 60
     assert run(data, tmp_path / "patient", settings) == replace(result, computed=False)
 
 
