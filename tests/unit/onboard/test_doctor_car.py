@@ -176,7 +176,7 @@ def test_answers_are_written_into_the_file(car, monkeypatch):
         def open(self):
             pass
 
-        send = neutral = close = lambda self, *values: None
+        send = idle = neutral = close = lambda self, *values: None
 
     monkeypatch.setattr(drive, "build_sink", lambda settings: Sink())
     # On a box; points right; points left of straight, then straight; does not turn yet, then backward.

@@ -53,6 +53,9 @@ class Car:
         assert until_s > time.monotonic()
         self.sent.append((time.monotonic(), steering_rad, throttle))
 
+    def idle(self):
+        pass
+
     def neutral(self):
         self.sent.append((time.monotonic(), 0.0, 0.0))
 
