@@ -17,11 +17,13 @@ from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
+from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.evaluate import network_predictor, point_errors
 from lanenet.learn.network import new_network
 from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
 from lanenet.learn.quantise import Int8Report, export_int8
-from lanenet.learn.train import train
+from lanenet.learn.run_state import EpochRecord
+from lanenet.learn.train import TrainingRun, train
 from lanenet.perception.network import open_model, read_model_meta
 
 torch.set_num_threads(1)
@@ -226,13 +228,19 @@ def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
     assert {group["lr"] for group in compact.param_groups} == {1e-4}
 
 
-def test_patience_ends_a_run_that_gets_no_better(data, tmp_path):
-    # So small a rate that only the first epochs change anything that counts.
-    settings = TINY.model_copy(update={"epochs": 60, "patience": 2, "learning_rate": 3e-2, "ema_decay": 0.0})
-    seen = []
-    result = run(data, tmp_path / "patient", settings, lambda epoch, *_: seen.append(epoch))
-    assert seen[-1] == result.best_epoch + 2 < 60
-    assert run(data, tmp_path / "patient", settings) == replace(result, computed=False)
+def test_patience_ends_a_run_that_gets_no_better():
+    samples = LaneSamples([make_label_set(20, 0)], ["train.parquet"])
+
+    def ended(errors_cm, patience, epochs=12):
+        settings = TINY.model_copy(update={"epochs": epochs, "patience": patience})
+        run = TrainingRun(settings, samples)
+        run.history = [EpochRecord(i + 1, 1.0, error, 1e-3, 1.0) for i, error in enumerate(errors_cm)]
+        return run.ended
+
+    # The second epoch was the best: two others have brought nothing.
+    assert ended([3.0, 2.0, 2.5, 2.2], 2) and not ended([3.0, 2.0, 2.5], 2)
+    assert not ended([3.0, 2.0, 2.5, 1.9], 2) and not ended([3.0, 2.0, 2.5, 2.2], 0)
+    assert not ended([], 2) and ended([3.0, 2.0], 0, epochs=2)
 
 
 def test_a_gpu_that_is_not_there_is_named(data, tmp_path):
