@@ -11,15 +11,15 @@ from jaxtyping import Float
 from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
 from lanenet.learn.evaluate import ErrorStats, error_stats
 
-#: By condition: the unit of its values, and name and lower limit of each group; the last has no upper one.
+#: By condition: what its groups mean, and name and lower limit of each; the last one has no upper limit.
 GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
     "bend": (
-        "curvature of the lane at y = 15 cm, 1/cm",
-        (("straight, radius over 3 m", 0.0), ("1 to 3 m", 1.0 / 300.0), ("under 1 m", 0.01)),
+        "radius of the lane at y = 15 cm",
+        (("over 3 m", 0.0), ("1 to 3 m", 1.0 / 300.0), ("under 1 m", 0.01)),
     ),
     "light": (
         "mean grey level of the frame, 0 to 255",
-        (("dark, under 60", 0.0), ("60 to 140", 60.0), ("bright, over 140", 140.0)),
+        (("under 60", 0.0), ("60 to 140", 60.0), ("over 140", 140.0)),
     ),
     "place": (
         "way to the nearest pose of the training frames of the same map, cm",

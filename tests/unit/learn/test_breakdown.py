@@ -1,7 +1,10 @@
+import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from lanenet.data.files import write_json
 from lanenet.data.png import png_size
@@ -17,9 +20,10 @@ from lanenet.learn.breakdown import (
 )
 from lanenet.learn.breakdown_picture import breakdown_picture
 from lanenet.learn.compare import SourceAnswers, compare_detectors
-from lanenet.learn.error_tables import as_markdown
+from lanenet.learn.error_tables import as_markdown, lay_out
 
 NAN = float("nan")
+TRUTH = np.zeros((200, 6))
 
 
 def test_curvature_is_that_of_circles():
@@ -44,7 +48,7 @@ def test_groups_take_the_frames_between_their_limits():
     groups = errors_by_group("light", np.array([10.0, 59.9, 60.0, NAN, 200.0]), errors, labelled)
     assert [g.truth_count for g in groups.values()] == [12, 6, 6]
     assert [g.worst_cm for g in groups.values()] == [1.0, 2.0, 4.0]
-    assert groups["bright, over 140"].coverage == 0.5
+    assert groups["over 140"].coverage == 0.5
 
 
 def test_the_interval_is_over_drives_and_not_over_frames():
@@ -141,5 +145,12 @@ def test_a_comparison_tells_where_errors_come_from(tmp_path):
     assert network["presence"]["absent_recall"] == 0.0
     assert network["rmse_95_interval_cm"][0] < network["groups"]["all"]["rmse_cm"]
     assert network["conditions"]["bend"]["under 1 m"]["rmse_cm"] == pytest.approx(2.3, rel=0.1)
+    # Five detectors have room in a terminal of 80 columns.
+    five = dict.fromkeys(("network", "lane-filter", "hough", "hough-value", "painter"), TRUTH)
+    wide = compare_detectors([replace(source, answers_cm=five) for source in sources()])
+    console = Console(width=80, file=io.StringIO(), record=True)
+    for table in lay_out(wide):
+        console.print(table.as_rich())
+    assert "by light" in (text := console.export_text()) and "…" not in text
     size = png_size(breakdown_picture(found))
     assert size is not None and min(size) > 200
