@@ -114,7 +114,17 @@ def write_quick_labels(path: Path, window: Any, source: str, camera: str) -> Non
     write_labels(path, labels)
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+#: 57 million weights are trained, compared and exported in about a minute.
+SLOW = ("alexnet.yaml",)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
+        for path in sorted(CONFIGS.glob("*.y*ml"))
+    ],
+)
 def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of a run but driving and mapping, which would take minutes: their place take straight lanes.
 
