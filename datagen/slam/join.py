@@ -21,11 +21,10 @@ from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import commands_of
 from datagen.slam.places import Revisit, alike, match_places, path_lengths, relative_pose, thumbnails
 from datagen.slam.posegraph import close_loops
-from datagen.slam.scans import Scans, edges_of_drive, scans_of
-from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways
+from datagen.slam.scans import Scans, scans_of
+from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways, road_edges
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
-from lanenet.perception.birdseye import RoadTable
 
 #: What alignments of one stretch may differ by: in camera heights, as a share of the way between them, which
 #: the open loop drifts over, and in heading.
@@ -104,8 +103,7 @@ def _join(
     if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
         return None
     limits = mapping_range(height, settings.perception.range)
-    table = RoadTable(camera, limits)
-    edges = [pixels for part in drives for pixels in edges_of_drive(part, settings.perception.edges, table)]
+    edges = [pixels for part in drives for pixels in road_edges(part, camera, limits, settings)]
     expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     bundle = adjust(

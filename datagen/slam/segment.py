@@ -22,11 +22,12 @@ from datagen.slam.places import (
     thumbnails,
 )
 from datagen.slam.posegraph import close_loops
+from datagen.slam.reflections import without_reflections
 from datagen.slam.scans import Progress, Scans, edges_of_drive, scans_of
 from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import RoadTable
+from lanenet.perception.birdseye import RangeSettings, RoadTable
 from lanenet.perception.edges import EdgePixels
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
@@ -111,7 +112,7 @@ def solve_segment(
     """
     height = camera.mounting.height_cm
     limits = mapping_range(height, settings.perception.range)
-    edges = edges_of_drive(drive, settings.perception.edges, RoadTable(camera, limits))
+    edges = road_edges(drive, camera, limits, settings)
     scans = scans_of(edges, camera, limits)
     if len(scans.points_cm) < 20 * len(scans):
         raise TrackingLostError(
@@ -135,11 +136,9 @@ def solve_segment(
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
-            edges = edges_of_drive(drive, settings.perception.edges, RoadTable(bundle.camera, limits))
-            before, loops = (
-                bundle.camera.K[0, 0],
-                loop_pairs(closure.revisits, np.zeros(len(drive), dtype=bool)),
-            )
+            edges = road_edges(drive, bundle.camera, limits, settings)
+            before = bundle.camera.K[0, 0]
+            loops = loop_pairs(closure.revisits, np.zeros(len(drive), dtype=bool))
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,
@@ -160,6 +159,14 @@ def solve_segment(
         drift_rad_per_cm=None if closure is None else closure.drift_rad_per_cm,
         bundle=bundle,
     )
+
+
+def road_edges(
+    drive: Drive, camera: Camera, limits: RangeSettings, settings: MapSettings
+) -> list[EdgePixels]:
+    """Edges of the road in every frame, without those of lamps that are mirrored in it."""
+    table = RoadTable(camera, limits)
+    return without_reflections(edges_of_drive(drive, settings.perception.edges, table), camera, table)
 
 
 @dataclass(frozen=True)
