@@ -21,7 +21,7 @@ from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
 #: Uncertainty of a line's position from which it gives no label, in lane widths.
-_MAX_SIGMA_LANES = 0.03
+_MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 CONTRADICTED = "the pictures disagree with the map"
@@ -74,8 +74,11 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
     return MappedDrive(drive_map, drive, np.searchsorted(drive.frames, drive_map.frames), perception)
 
 
-def lines_at(drive_map: DriveMap, k: int) -> FrameLines:
-    """Return the lane of the map's k-th frame: the one that it is in, in its direction of travel."""
+def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LANES) -> FrameLines:
+    """Return the lane of the map's k-th frame: the one that it is in, in its direction of travel.
+
+    A line that is known worse than to ``max_sigma_lanes`` lane widths is left out.
+    """
     segment = int(drive_map.segment[k])
     return lines_of_frame(
         drive_map.lines[segment],
@@ -84,7 +87,7 @@ def lines_at(drive_map: DriveMap, k: int) -> FrameLines:
         drive_map.camera.wheelbase_cm,
         int(drive_map.lanes.lane[k]),
         bool(drive_map.lanes.forward[k]),
-        _MAX_SIGMA_LANES * drive_map.meta.mapped_lane_cm,
+        max_sigma_lanes * drive_map.meta.mapped_lane_cm,
     )
 
 

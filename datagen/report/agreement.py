@@ -22,6 +22,8 @@ _EVERY = 3
 #: A frame disagrees where the edges lie further off than this as median, in pixels of an image 160 px wide,
 #: or where less than this share of the borders in view met any. Both lines are seldom interrupted at once.
 _OFF_PX, _LEAST_MET = 1.0, 0.15
+#: Lines that are less certain than this, in lane widths, bridge gaps: no paint is expected there.
+_KNOWN_LANES = 0.02
 #: Samples that tell it at least: in view, and met.
 _MIN_VIEW, _MIN_MET = 15, 8
 _REACH_CM = 60.0
@@ -41,7 +43,7 @@ def contradicted_frames(mapped: MappedDrive) -> Bool[np.ndarray, "n"]:
         edges = find_edges(image, mapped.perception.edges, table.keep, table.scale)
         samples = border_samples(
             edges,
-            lines_at(drive_map, k),
+            lines_at(drive_map, k, _KNOWN_LANES),
             drive_map.meta.tape_cm,
             drive_map.camera_at(k),
             table.keep,
@@ -53,9 +55,13 @@ def contradicted_frames(mapped: MappedDrive) -> Bool[np.ndarray, "n"]:
     contradicted = np.zeros(n, dtype=bool)
     way = path_lengths(drive_map.poses)
     for k in range(n):
-        near = told & (np.abs(way[asked] - way[k]) < _AROUND_CM)
-        near &= drive_map.segment[asked] == drive_map.segment[k]
-        contradicted[k] = near.any() and disagrees[near].mean() > _SHARE
+        telling = np.flatnonzero(told & (drive_map.segment[asked] == drive_map.segment[k]))
+        near = telling[np.abs(way[asked[telling]] - way[k]) < _AROUND_CM]
+        if not near.size:
+            # In a long gap the last frame before it and the first one after it tell.
+            i = int(np.searchsorted(asked[telling], k))
+            near = telling[max(i - 1, 0) : i + 1]
+        contradicted[k] = near.size > 0 and disagrees[near].mean() > _SHARE
     return contradicted
 
 

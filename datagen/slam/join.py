@@ -22,14 +22,7 @@ from datagen.slam.mapper import commands_of
 from datagen.slam.places import Revisit, alike, match_places, path_lengths, relative_pose, thumbnails
 from datagen.slam.posegraph import close_loops
 from datagen.slam.scans import Scans, scans_of
-from datagen.slam.segment import (
-    MAX_MISFIT,
-    MAX_MISSED,
-    SolvedSegment,
-    loop_pairs,
-    relative_ways,
-    road_edges,
-)
+from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways, road_edges
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
 

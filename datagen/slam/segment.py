@@ -139,8 +139,8 @@ def solve_segment(
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
             edges = road_edges(drive, bundle.camera, limits, settings)
-            before, uninterrupted = bundle.camera.K[0, 0], np.zeros(len(drive), dtype=bool)
-            loops = loop_pairs(closure.revisits, uninterrupted)
+            before = bundle.camera.K[0, 0]
+            loops = loop_pairs(closure.revisits, np.zeros(len(drive), dtype=bool))
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,

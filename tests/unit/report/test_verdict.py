@@ -91,3 +91,12 @@ def test_the_worst_reason_comes_first_and_none_is_lost():
     verdict = graded(GOOD, robust_sd_px=0.6, p95_px=9.0, labelled_share=0.8)
     assert verdict.grade == "reject" and len(verdict.reasons) == 3
     assert verdict.reasons[0].startswith("residual on held-out frames: p95 9.00")
+
+
+@pytest.mark.parametrize(
+    ("share", "grade"), [(0.0, "good"), (0.06, "good"), (0.1, "usable"), (0.13, "reject")]
+)
+def test_pictures_that_disagree_with_the_map_count(share, grade):
+    found = judge(replace(GOOD, contradicted_share=share), VerdictSettings())
+    assert found.grade == grade
+    assert any("disagree" in reason for reason in found.reasons) == (grade != "good")
