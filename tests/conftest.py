@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,3 +21,11 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data at {folder}; set LANENET_SHARED_DATA to where it is")
     return folder
+
+
+@pytest.fixture
+def hang_up_ends() -> Iterator[None]:
+    """A hang-up ends programs, as usual, even where the tests themselves were started to outlive one."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)

@@ -68,6 +68,7 @@ def wait_for_neutral(wire: Path, process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.usefixtures("hang_up_ends")
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_fault_ends_in_neutral(
     fault: str, tmp_path: Path, lateness: list[float], record_property: pytest.RecordProperty

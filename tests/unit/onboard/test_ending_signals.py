@@ -9,6 +9,7 @@ import pytest
 from lanenet.onboard.signals import ENDING, ending_signals
 
 
+@pytest.mark.usefixtures("hang_up_ends")
 @pytest.mark.parametrize("number", ENDING)
 def test_the_first_signal_asks_and_the_second_insists(number: signal.Signals) -> None:
     before = [signal.getsignal(n) for n in ENDING]
