@@ -1,7 +1,9 @@
-"""A coarse camera from the drive alone: focal length and pitch by match score at held speed.
+"""A coarse camera from the drive alone: focal length and pitch by how well neighbouring pictures fit.
 
-This is a start for the bundle adjustment. The lens is taken as an equidistant fisheye with its axis in the
-image's middle. Scale is not observable: the camera's height is nominal until the lane width sets it.
+This is a start for the bundle adjustment. Pairs of pictures tell the pitch to a degree or two, but the focal
+length hardly at all before a loop is closed, so that what lenses usually have counts, too. The lens is taken
+as an equidistant fisheye with its axis in the image's middle. Scale is not observable: the camera's height is
+nominal until the lane width sets it.
 """
 
 from __future__ import annotations
@@ -9,16 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field
 
-from datagen.slam.filter import FilterSettings
-from datagen.slam.scans import Progress, scans_of
-from datagen.slam.speed import STEPS_HEIGHTS, profile_speed
+from datagen.slam.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.picture_pairs import OdometrySettings, Pictures
+from datagen.slam.scans import Progress, seen_edges
 from lanenet.config import Settings
 from lanenet.data.drive import Drive
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadTable
 from lanenet.perception.edges import EdgePixels, find_edges
 
 
@@ -42,11 +43,11 @@ class GuessSettings(Settings):
     frames: int = Field(default=250, ge=50)
 
 
-#: Steps tried with each camera, relative to the one that suits the camera in the middle of the grid.
-_AROUND = np.array([0.75, 1.0, 1.33])
-#: A coarse answer is enough: the adjustment starts from it. With 60 points the best focal length is a fifth
-#: too long, or more.
-_SEARCH = FilterSettings(particles=80, max_points=100)
+#: Steps tried with each camera, relative to the one that suits the best camera so far.
+_AROUND = np.exp(np.linspace(-0.4, 0.4, 9))
+#: What a squared logarithm between the focal length and the middle of those to try costs, in log likelihood
+#: per point: the fit alone is flat from the shortest to the longest.
+_FOCAL_PRIOR = 0.5
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 
@@ -74,7 +75,10 @@ def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One camera of the search, with its best step, in camera heights, and mean matched share."""
+    """One camera of the search, with its best step, in camera heights, and how well it does.
+
+    ``match`` is the log likelihood per edge point that pairs of pictures have with it, less its prior's.
+    """
 
     focal_px: float
     pitch_deg: float
@@ -89,7 +93,7 @@ def coarse_camera(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Camera, list[Candidate]]:
-    """Search focal length and pitch for the highest mean match of a short run of the filter at held speed.
+    """Search focal length and pitch for the best fit of pairs of pictures.
 
     Returns:
         The camera, and all candidates for the report.
@@ -104,14 +108,19 @@ def coarse_camera(
     total = len(grid) + 9
     focal, pitch = (float(np.median(values)) for values in zip(*grid, strict=True))
     middle = guessed_camera(drive.width, drive.height, focal, pitch, guess)
-    steps = np.array(STEPS_HEIGHTS)
-    usual, _ = _best_step(pixels, middle, perception, steps, seed)
+    relative = np.ones(count)
+    usual, _ = usual_step(_pictures(pixels, middle, perception, seed), relative, np.array(STEPS_HEIGHTS))
+    usual_focal = float(np.exp(np.mean(np.log(guess.focal_px)))) * scale
     # Two rounds: the given grid, then half its steps around the best.
     for round_index in range(2):
         for focal, pitch in grid:
             if (focal, pitch) not in tried:
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
-                step, match = _best_step(pixels, camera, perception, usual * _AROUND, seed)
+                pictures = _pictures(pixels, camera, perception, seed)
+                _, fit = usual_step(pictures, relative, usual * _AROUND)
+                prior = _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2
+                match = float(fit.max()) / pictures.points_per_frame - float(prior)
+                step = usual * float(_AROUND[np.argmax(fit)])
                 tried[focal, pitch] = Candidate(focal, pitch, step, match)
             if progress is not None:
                 progress(min(len(tried), total), total)
@@ -129,20 +138,13 @@ def _spacing(values: tuple[float, ...]) -> float:
     return float(np.min(np.diff(np.sort(values)))) if len(values) > 1 else 0.1 * values[0]
 
 
-def _best_step(
-    pixels: list[EdgePixels],
-    camera: Camera,
-    perception: PerceptionSettings,
-    steps_heights: Float[np.ndarray, "k"],
-    seed: int,
-) -> tuple[float, float]:
-    """Step per frame, in camera heights, that matches best with this camera, and its match."""
-    height = camera.mounting.height_cm
-    scans = scans_of(pixels, camera, mapping_range(height, perception.range))
-    profile = profile_speed(
-        scans, np.ones(len(scans)), height * steps_heights, height, camera.wheelbase_cm, seed, _SEARCH
-    )
-    return profile.step_cm / height, float(np.max(profile.match))
+def _pictures(
+    pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, seed: int
+) -> Pictures:
+    """The edges that see the road with a camera, the same draw of points for every camera."""
+    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
+    edges = [seen_edges(frame, table) for frame in pixels]
+    return Pictures(edges, camera, OdometrySettings(), np.random.default_rng(seed))
 
 
 def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Camera:

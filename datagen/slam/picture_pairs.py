@@ -105,6 +105,12 @@ class Pictures:
         return len(self._pictures)
 
     @property
+    def points_per_frame(self) -> float:
+        """Mean number of points that a comparison of a frame with those before it moves."""
+        drawn = sum(len(picture.points) for picture in self._pictures)
+        return max(len(self.settings.lags) * drawn / max(len(self), 1), 1.0)
+
+    @property
     def turn_step_rad(self) -> float:
         """Difference of two turns that the pictures can just tell apart."""
         return float(_TURN_SIGMAS * self._sigma_px / self._camera.K[0, 0])

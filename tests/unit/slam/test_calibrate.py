@@ -80,7 +80,7 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     assert {(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {
         (c.focal_px, c.pitch_deg) for c in tried
     }
-    assert all(0.0 < c.match < 1.0 and c.step_heights > 0.0 for c in tried)
+    assert all(0.0 < c.match < np.log1p(10.0) and c.step_heights > 0.0 for c in tried)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
