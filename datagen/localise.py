@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -173,22 +174,18 @@ def localise(
 
 
 class _PoseLog:
-    """A CSV that is complete up to the last pose at any moment."""
+    """A CSV that is complete up to the last pose at any moment; it begins with the first pose."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._file: TextIO | None = None
 
     def __enter__(self) -> _PoseLog:
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("w", encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise LanenetError(f"{self.path}: cannot be written ({error})") from None
-        self._write(HEADER)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def add(self, pose: LivePose) -> None:
         x, y, heading = pose.estimate.pose
@@ -200,6 +197,10 @@ class _PoseLog:
 
     def _write(self, text: str) -> None:
         try:
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self.path.open("w", encoding="utf-8", newline="\n")
+                self._file.write(HEADER)
             self._file.write(text)
             self._file.flush()
         except OSError as error:

@@ -126,7 +126,8 @@ def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[
         if segment["revisits"]
     ]
     revisits = sum(count for _, count in across)
-    known = "calibration" not in figures
+    # A camera that was given stays known when the drive has refined it: no search has guessed its lens.
+    known = not figures.get("calibration", {}).get("candidates")
     free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
     return MapEvidence(
         robust_sd_px=both["robust_sd_px_at_160"],
@@ -143,7 +144,11 @@ def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[
         sigma={} if known else figures["calibration"]["sigma"],
         given_lane_cm=meta.lane_width_cm,
         # Where the free search finds nothing better, the lane that was traced at the given width is it.
-        found_lane_cm=None if not known else float(np.median(free)) if free else meta.mapped_lane_cm,
+        found_lane_cm=None
+        if meta.scale_from == "lane width"
+        else float(np.median(free))
+        if free
+        else meta.mapped_lane_cm,
     )
 
 

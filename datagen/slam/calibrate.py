@@ -27,7 +27,8 @@ class GuessSettings(Settings):
     """First guess of an unknown camera; lengths in camera heights where the name says so.
 
     Attributes:
-        focal_px: Focal lengths to try for images of 160 px width; wider images scale them.
+        focal_px: Focal lengths to try for images of 160 px width; wider images scale them. Their geometric
+            mean is what lenses are expected to have where pictures leave it open.
         pitch_deg: Downward tilts to try.
         k1: First coefficient of the fisheye.
         lever_heights: Camera ahead of the rear axle.
@@ -77,13 +78,13 @@ def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings
 class Candidate:
     """One camera of the search, with its best step, in camera heights, and how well it does.
 
-    ``match`` is the log likelihood per edge point that pairs of pictures have with it, less its prior's.
+    ``fit`` is the log likelihood per edge point that pairs of pictures have with it, less its prior's.
     """
 
     focal_px: float
     pitch_deg: float
     step_heights: float
-    match: float
+    fit: float
 
 
 def coarse_camera(
@@ -117,14 +118,14 @@ def coarse_camera(
             if (focal, pitch) not in tried:
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
                 pictures = _pictures(pixels, camera, perception, seed)
-                _, fit = usual_step(pictures, relative, usual * _AROUND)
+                _, fits = usual_step(pictures, relative, usual * _AROUND)
                 prior = _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2
-                match = float(fit.max()) / pictures.points_per_frame - float(prior)
-                step = usual * float(_AROUND[np.argmax(fit)])
-                tried[focal, pitch] = Candidate(focal, pitch, step, match)
+                fit = float(fits.max()) / pictures.points_per_frame - float(prior)
+                step = usual * float(_AROUND[np.argmax(fits)])
+                tried[focal, pitch] = Candidate(focal, pitch, step, fit)
             if progress is not None:
                 progress(min(len(tried), total), total)
-        best = max(tried.values(), key=lambda candidate: candidate.match)
+        best = max(tried.values(), key=lambda candidate: candidate.fit)
         usual = best.step_heights
         if round_index == 0:
             df = 0.5 * _spacing(guess.focal_px) * scale

@@ -39,12 +39,6 @@ class Scans:
         """Return the slice of frame k's points."""
         return slice(int(self.starts[k]), int(self.starts[k + 1]))
 
-    def cut(self, frames: slice) -> Scans:
-        """Return a stretch of the drive."""
-        starts = self.starts[frames.start : frames.stop + 1]
-        points = slice(int(starts[0]), int(starts[-1]))
-        return Scans(self.points_cm[points], self.normals[points], self.weights[points], starts - starts[0])
-
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:
         """Frame index of every point."""

@@ -1,7 +1,8 @@
 """The paper's likelihood beside the directional one: ``python tests/bench/bench_likelihood.py MAP...``.
 
 Each map is of a drive that goes around more than once. Its camera and settings are taken, and the particle
-filter alone is run with either likelihood: how far the open loop has drifted when the car comes back to a
+filter alone is run with either likelihood, with the gains of speed and steering known and nothing else of the
+odometry: how far the open loop has drifted when the car comes back to a
 place, against the truth of a simulated drive, or against the closed map of a real one. With ``--remap
 FOLDER`` the whole mapping is run as well, with the map's camera as known: does it close, and how well do
 frames agree with it that had no say in its lines. Prints JSON, a line per drive and likelihood.
@@ -22,15 +23,18 @@ from datagen.labels.mapped_drive import MappedDrive, open_mapped_drive
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pipeline import map_drive
 from datagen.slam.calibrate import mapping_range
-from datagen.slam.filter import Trajectory
-from datagen.slam.mapper import commands_of, track
+from datagen.slam.filter import Trajectory, run_filter
+from datagen.slam.live_motion import live_motion
+from datagen.slam.mapper import commands_of, delayed, fit_steering
+from datagen.slam.odometry import Evidence, usual_way
+from datagen.slam.picture_pairs import Pictures
 from datagen.slam.places import path_lengths
-from datagen.slam.scans import edges_of_drive, scans_of
+from datagen.slam.scans import scans_of
+from datagen.slam.segment import road_edges
 from lanenet.config import load_settings
 from lanenet.data.drive import read_truth
 from lanenet.errors import LanenetError
 from lanenet.geometry.frames import wrap_angle
-from lanenet.perception.birdseye import RoadTable
 
 LIKELIHOODS = ("direction", "count")
 #: What counts as the same place: least way between the visits, most distance [camera heights], heading [rad].
@@ -82,12 +86,20 @@ def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tu
     """Run the filter alone over the frames of the map; its trajectory, and processor time per frame, [ms]."""
     drive, camera = mapped.drive.subset(mapped.rows[rows]), mapped.drive_map.camera
     limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
-    edges = edges_of_drive(drive, settings.perception.edges, RoadTable(camera, limits))
+    edges = road_edges(drive, camera, limits, settings)
     scans = scans_of(edges, camera, limits)
-    commands = commands_of(drive, camera.wheelbase_cm)
-    begun = time.process_time()
+    commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)
-    trajectory, _ = track(scans, commands, camera, settings.filter, settings.motion, rng)
+    pictures = Pictures(edges, camera, settings.odometry, rng)
+    ways = commands.distance_cm, commands.speed_known, height
+    evidence, usual = Evidence(pictures, *ways), usual_way(pictures, *ways)
+    fit = fit_steering(evidence.motion().poses, commands, height)
+    predicted = None
+    if fit is not None and commands.turn is not None:
+        predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
+    motion = live_motion(commands, predicted, usual.factor, height)
+    begun = time.process_time()
+    trajectory = run_filter(scans, motion, settings.filter, height, camera.wheelbase_cm, rng)
     return trajectory, 1e3 * (time.process_time() - begun) / len(drive)
 
 

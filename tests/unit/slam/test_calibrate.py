@@ -72,7 +72,7 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     assert abs(np.rad2deg(camera.mounting.pitch_down_rad) - 24.0) <= 4.0 + 1e-9
     assert camera.mounting.height_cm == NOMINAL_HEIGHT_CM and camera.wheelbase_cm == guess.wheelbase_cm
     # The camera is that of the best candidate, and no camera was tried twice.
-    best = max(tried, key=lambda candidate: candidate.match)
+    best = max(tried, key=lambda candidate: candidate.fit)
     assert (best.focal_px, best.pitch_deg) == pytest.approx(
         (camera.K[0, 0], np.rad2deg(camera.mounting.pitch_down_rad))
     )
@@ -80,7 +80,7 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     assert {(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {
         (c.focal_px, c.pitch_deg) for c in tried
     }
-    assert all(0.0 < c.match < np.log1p(10.0) and c.step_heights > 0.0 for c in tried)
+    assert all(0.0 < c.fit < np.log1p(10.0) and c.step_heights > 0.0 for c in tried)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
