@@ -135,7 +135,7 @@ def read_map_frames(
         labelled = label_frame(mapped, k, window)
         if not isinstance(labelled, str):
             points[k] = labelled[1]
-    # Stretches that were too short to map are left out of the map, so that their neighbours do not touch.
+    # Stretches that could not be mapped are left out of the map, so that their neighbours do not touch.
     starts = drive.breaks[rows] | (np.diff(rows, prepend=rows[0] - 2) != 1)
     starts |= np.diff(drive_map.segment, prepend=drive_map.segment[0]) != 0
     return LabelledFrames(
