@@ -111,9 +111,7 @@ def _map_drive(
         figures["calibration"] = found.figures
         notes.append(found.note)
     width = lane_width_cm if known is not None else None
-    parts = map_stretches(
-        drive, segments, camera, solved, width, held_out, settings, rng, notes, progress
-    )
+    parts = map_stretches(drive, segments, camera, solved, width, held_out, settings, rng, notes, progress)
     factor = 1.0
     if known is None:
         factor = lane_width_cm / _mapped_lane_cm(parts)
