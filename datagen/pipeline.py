@@ -140,7 +140,7 @@ def _map_drive(
         opened = _in_order(parts, [part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
         scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
-        draw_map(folder / "map.png", drive_map, scaled)
+        draw_map(folder / "map.png", drive_map, scaled, mapped.starts)
         numbers = [int(drive_map.frames[k]) for k in shown]
         tiles = [
             (drive.image(index[number]), lines_at(drive_map, int(k)), number)
