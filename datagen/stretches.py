@@ -75,8 +75,8 @@ def map_stretches(
             parts.append(part)
     if not parts:
         raise max(refused, key=lambda one: len(one[0]))[1]
-    for rows, error in refused:
-        why = str(error).removeprefix(f"{drive.path}: ")
+    for rows, reason in refused:
+        why = str(reason).removeprefix(f"{drive.path}: ")
         notes.append(f"{frames_text(drive, rows)} left out: {why}")
     return parts
 
