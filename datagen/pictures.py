@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from datagen.labels.project import FrameLines
 from datagen.map_folder import DriveMap
@@ -26,6 +26,7 @@ def draw_map(
     path: Path,
     drive_map: DriveMap,
     parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
+    starts: Bool[np.ndarray, "f"],
     size_px: int = 1600,
 ) -> None:
     """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right), a metre of scale.
@@ -34,6 +35,7 @@ def draw_map(
         path: PNG to write.
         drive_map: The map.
         parts: Scans, poses in map scale and scale factor of the scans, per segment.
+        starts: Frames of the map that do not follow the one before them; the path is not drawn to them.
         size_px: Longer side of the picture.
     """
     clouds = []
@@ -69,7 +71,8 @@ def draw_map(
             end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
             colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
             _polyline(image, pixels, line.points(np.arange(s.min(), end, 2.0)), colour)
-        _polyline(image, pixels, drive_map.poses[drive_map.segment == segment, :2], (255, 255, 255))
+    for stretch in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
+        _polyline(image, pixels, stretch, (255, 255, 255))
     draw_metre(image, scale)
     write_png(path, image)
 

@@ -8,39 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import MappedDrive, lines_at
-from datagen.lane_scale import STEP_HEIGHTS, edges_beside, fitted_width_cm
-from datagen.lanes.crossing import without_crossings
-from datagen.lanes.fit import fit_lines
-from datagen.lanes.lap import lap_path
-from datagen.lanes.trace import trace_lane
+from datagen.lane_scale import fitted_width_cm
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.agreement import contradicted_frames
-from datagen.report.held_out import held_out_frames, without_frames
-from datagen.report.mappable import (
-    check_edges,
-    check_lane,
-    check_lines_seen,
-    check_moving,
-    trace_known_lane,
-)
+from datagen.report.held_out import held_out_frames
+from datagen.report.mappable import check_edges, check_lines_seen, check_moving
 from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
 from datagen.report.residuals import ResidualSettings
 from datagen.report.verdict import judge
 from datagen.self_calibration import DRIVE_INSTEAD, find_camera
 from datagen.slam.calibrate import with_known_scale
-from datagen.slam.join import Stretch, join_stretches
 from datagen.slam.scans import Progress
-from datagen.slam.segment import solve_segment
+from datagen.slam.segment import SolvedSegment
 from datagen.slam.stillness import following_frames
+from datagen.stretches import map_stretches
 from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
@@ -110,26 +100,18 @@ def _map_drive(
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:
         _check_size(known, drive, camera_path)
-    camera, how, longest_rows = known, "given", None
+    camera, how = known, "given"
+    solved: dict[int, SolvedSegment] = {}
     if camera is None or refine_camera:
-        longest_rows = max(segments, key=lambda s: s.stop - s.start)
-        longest = drive.subset(longest_rows)
+        k = max(range(len(segments)), key=lambda i: segments[i].stop - segments[i].start)
+        longest = drive.subset(segments[k])
         check_edges(longest, settings.perception.edges)
         found = find_camera(longest, known, settings, rng, progress, search_progress=progress)
-        solved, camera, how = found.solved, found.camera, found.how
+        solved[k], camera, how = found.solved, found.camera, found.how
         figures["calibration"] = found.figures
         notes.append(found.note)
     width = lane_width_cm if known is not None else None
-    stretches = []
-    for rows in segments:
-        if rows != longest_rows:
-            solved = solve_segment(drive.subset(rows), camera, settings, rng, progress)
-        stretches.append(Stretch(np.arange(rows.start, rows.stop), solved))
-    parts = [
-        _find_lane(stretch, width, settings, held_out[stretch.rows])
-        for stretch in join_stretches(stretches, drive, settings, rng)
-    ]
-    check_lane(parts, drive)
+    parts = map_stretches(drive, segments, camera, solved, width, held_out, settings, rng, notes, progress)
     factor = 1.0
     if known is None:
         factor = lane_width_cm / _mapped_lane_cm(parts)
@@ -158,7 +140,7 @@ def _map_drive(
         opened = _in_order(parts, [part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
         scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
-        draw_map(folder / "map.png", drive_map, scaled)
+        draw_map(folder / "map.png", drive_map, scaled, mapped.starts)
         numbers = [int(drive_map.frames[k]) for k in shown]
         tiles = [
             (drive.image(index[number]), lines_at(drive_map, int(k)), number)
@@ -220,30 +202,6 @@ def _check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
             f"{camera_path or drive.path}: the camera is for {camera.width}x{camera.height} px, "
             f"the images of {drive.path} have {drive.width}x{drive.height}"
         )
-
-
-def _find_lane(
-    stretch: Stretch,
-    lane_width_cm: float | None,
-    settings: MapSettings,
-    held_out: Bool[np.ndarray, "n"],
-) -> MappedSegment:
-    """Find a solved segment's lane lines, in the scale of its camera, without the frames held out."""
-    solved = stretch.solved
-    height = solved.camera.mounting.height_cm
-    revisits = [(revisit.earlier, revisit.later) for revisit in solved.uninterrupted_revisits()]
-    lap = lap_path(solved.poses, revisits, STEP_HEIGHTS * height, height)
-    # In a wide lane the further line only comes into view a lane's width ahead.
-    least_reach_cm = 1.2 * (lane_width_cm or 0.0)
-    path, edges = edges_beside(solved, without_frames(solved.scans, held_out), lap, least_reach_cm)
-    edges = without_crossings(path, edges, height, settings.trace.side_heights * height)
-    free_cm = None
-    if lane_width_cm is None:
-        lane = trace_lane(path, edges, height, None, settings.trace)
-    else:
-        lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, settings.trace)
-    lines = fit_lines(path, edges, lane, height, settings.fit)
-    return MappedSegment(stretch.rows, solved, path.s_frames_cm, lane, lines, free_cm)
 
 
 def _mapped_lane_cm(parts: list[MappedSegment]) -> float:

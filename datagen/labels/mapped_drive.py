@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from datagen.labels.project import FrameLines, lines_of_frame
 from datagen.map_folder import DriveMap, read_map
@@ -42,6 +42,14 @@ class MappedDrive:
     drive: Drive
     rows: Int[np.ndarray, "n"]
     perception: PerceptionSettings
+
+    @property
+    def starts(self) -> Bool[np.ndarray, "n"]:
+        """Frames of the map that do not follow the one before them, though they may lie on the same map."""
+        rows, segment = self.rows, self.drive_map.segment
+        # Stretches that could not be mapped are left out of the map, so that their neighbours do not touch.
+        starts = self.drive.breaks[rows] | (np.diff(rows, prepend=rows[0] - 2) != 1)
+        return np.asarray(starts | (np.diff(segment, prepend=segment[0]) != 0))
 
 
 def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> MappedDrive:
@@ -135,9 +143,6 @@ def read_map_frames(
         labelled = label_frame(mapped, k, window)
         if not isinstance(labelled, str):
             points[k] = labelled[1]
-    # Stretches that were too short to map are left out of the map, so that their neighbours do not touch.
-    starts = drive.breaks[rows] | (np.diff(rows, prepend=rows[0] - 2) != 1)
-    starts |= np.diff(drive_map.segment, prepend=drive_map.segment[0]) != 0
     return LabelledFrames(
         name=str(map_folder),
         reference="map",
@@ -146,7 +151,7 @@ def read_map_frames(
         marking_cm=drive_map.meta.tape_cm,
         perception=mapped.perception,
         frames=drive_map.frames,
-        starts=starts,
+        starts=mapped.starts,
         points_cm=points,
         image=lambda i: drive.image(int(rows[i])),
     )

@@ -98,15 +98,15 @@ def report_page(
         _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
         _section("Path and loops"),
         _table(loop_rows(figures["segments_mapped"])),
-        _picture(plots.trajectory_plot(drive_map, opened_poses)),
+        _picture(plots.trajectory_plot(mapped, opened_poses)),
         _section("Camera and scale"),
         _table(camera_rows(drive_map.camera, figures.get("calibration"))),
         _table(scale_rows(drive_map.meta)),
         _list(verdict.remarks),
         _section("Steering and speed"),
-        _picture(plots.steering_plot(drive, drive_map, mapped.rows, fits))
+        _picture(plots.steering_plot(mapped, fits))
         or _note("The steering command does not explain the path, or there is none."),
-        _picture(plots.speed_plot(drive, drive_map, mapped.rows)),
+        _picture(plots.speed_plot(mapped)),
     ]
     return _PAGE.substitute(
         title=html.escape(f"Map of {drive.name}"),

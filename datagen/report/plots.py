@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from datagen.labels.mapped_drive import DELETED
+from datagen.labels.mapped_drive import DELETED, MappedDrive
 from datagen.map_folder import DriveMap
 from datagen.report.quality import LABELLED, VERDICT_REACH_CM, MapQuality
 from datagen.report.residuals import REFERENCE_WIDTH, join_samples, summarise
@@ -43,20 +43,23 @@ def _png(figure: Any) -> bytes:
     return picture.getvalue()
 
 
-def trajectory_plot(drive_map: DriveMap, opened_poses: Float[np.ndarray, "n 3"]) -> bytes | None:
+def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
+    """Put a row of NaN before each row that does not follow the one before it: no line is drawn across."""
+    return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
+
+
+def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes | None:
     """Driven path before and after the loops were closed."""
     made = _figure(6.5, 5.0)
     if made is None:
         return None
     figure, (axes,) = made
-    for segment in np.unique(drive_map.segment):
-        rows = drive_map.segment == segment
-        first = segment == drive_map.segment[0]
-        for poses, style, name in (
-            (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
-            (drive_map.poses, {"color": "#2060c0", "lw": 1.3}, "closed"),
-        ):
-            axes.plot(*(0.01 * poses[rows, :2].T), label=name if first else None, **style)
+    drive_map = mapped.drive_map
+    for poses, style, name in (
+        (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
+        (drive_map.poses, {"color": "#2060c0", "lw": 1.3}, "closed"),
+    ):
+        axes.plot(*_interrupted(0.01 * poses[:, :2], mapped.starts).T, label=name, **style)
     axes.plot(*(0.01 * drive_map.poses[0, :2]), "ko", ms=4)
     axes.annotate(" start", 0.01 * drive_map.poses[0, :2], fontsize=8)
     axes.set_aspect("equal", adjustable="datalim")
@@ -128,10 +131,9 @@ def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: i
     return _png(figure)
 
 
-def steering_plot(
-    drive: Drive, drive_map: DriveMap, rows: np.ndarray, fits: list[SteeringFit | None]
-) -> bytes | None:
+def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
     """Curvature of the driven path against the steering command, with the line that was fitted."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
     if turn is None or not any(fits):
         return None
@@ -145,7 +147,7 @@ def steering_plot(
             continue
         delta = np.diff(drive_map.poses[part], axis=0)
         step = np.hypot(delta[:, 0], delta[:, 1])
-        moving = step > 0.3 * np.median(step)
+        moving = (step > 0.3 * np.median(step)) & ~mapped.starts[part[1:]]
         command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
         curvature = 100.0 * delta[moving, 2] / step[moving]
         axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
@@ -169,16 +171,17 @@ def steering_plot(
     return _png(figure)
 
 
-def speed_plot(drive: Drive, drive_map: DriveMap, rows: np.ndarray) -> bytes | None:
+def speed_plot(mapped: MappedDrive) -> bytes | None:
     """Way per frame as found, with the commanded speed or throttle beside it."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     made = _figure(6.5, 2.8)
     if made is None:
         return None
     figure, (axes,) = made
-    for segment in np.unique(drive_map.segment):
-        part = np.flatnonzero(drive_map.segment == segment)
-        step = np.hypot(*np.diff(drive_map.poses[part, :2], axis=0).T)
-        axes.plot(drive_map.frames[part[1:]], step, "-", color="#2060c0", lw=0.8)
+    step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
+    # A step across a break was not driven.
+    step[mapped.starts[1:]] = np.nan
+    axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("frame")
     axes.set_ylabel("way per frame, cm", color="#2060c0")

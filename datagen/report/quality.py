@@ -24,7 +24,7 @@ from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.perception.birdseye import RoadTable
 from lanenet.perception.edges import EdgePixels, find_edges
 
-NOT_MAPPED, LABELLED = "stretch too short to map", "labelled"
+NOT_MAPPED, LABELLED = "stretch not mapped", "labelled"
 #: The residuals of the verdict reach this far; beyond, a pixel is more than a centimetre on most cars.
 VERDICT_REACH_CM = 45.0
 #: Fewer samples than this give no median of a frame.

@@ -47,7 +47,7 @@ class Stretch:
 
 
 def join_stretches(
-    stretches: list[Stretch], drive: Drive, settings: MapSettings, rng: np.random.Generator
+    stretches: list[Stretch], drive: Drive, settings: MapSettings, rng: np.random.Generator, notes: list[str]
 ) -> list[Stretch]:
     """Carry stretches over onto the longest one whose loops are closed, where they show the same places.
 
@@ -56,6 +56,7 @@ def join_stretches(
         drive: The drive.
         settings: Settings of all stages.
         rng: Source of randomness.
+        notes: Gets what was joined.
 
     Returns:
         The stretches that are left, in the order of their first frames.
@@ -66,7 +67,7 @@ def join_stretches(
     base = max(closed, key=lambda stretch: len(stretch.rows))
     apart = []
     for other in sorted((x for x in stretches if x is not base), key=lambda x: -len(x.rows)):
-        joined = _join(base, other, drive, settings, rng)
+        joined = _join(base, other, drive, settings, rng, notes)
         if joined is None:
             apart.append(other)
         else:
@@ -74,10 +75,21 @@ def join_stretches(
     return sorted([base, *apart], key=lambda stretch: int(stretch.rows[0]))
 
 
+def frames_text(drive: Drive, rows: Int[np.ndarray, "n"]) -> str:
+    """Name rows of a drive by the frame numbers of their first and last ones, run by run."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return "frames " + ", ".join(f"{drive.frames[run[0]]}-{drive.frames[run[-1]]}" for run in runs)
+
+
 def _join(
-    base: Stretch, other: Stretch, drive: Drive, settings: MapSettings, rng: np.random.Generator
+    base: Stretch,
+    other: Stretch,
+    drive: Drive,
+    settings: MapSettings,
+    rng: np.random.Generator,
+    notes: list[str],
 ) -> Stretch | None:
-    """Carry a stretch over; None where it shows no place of the base, or does not fit."""
+    """Carry a stretch over, and note it; None where it shows no place of the base, or does not fit."""
     camera, s = base.solved.camera, settings.revisits
     height, first = camera.mounting.height_cm, len(base.rows)
     drives = [drive.subset(stretch.rows) for stretch in (base, other)]
@@ -133,6 +145,10 @@ def _join(
         residuals=missed,
         bundle=bundle,
         breaks=breaks,
+    )
+    notes.append(
+        f"{frames_text(drive, other.rows)} lie on the same map as {frames_text(drive, base.rows)}: "
+        f"{len(cross)} places seen in both"
     )
     return Stretch(rows[order], solved)
 

@@ -12,7 +12,7 @@ from pixel_road import fisheye
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
-from datagen.slam.join import Stretch, _agreeing, _carried, join_stretches
+from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
 from datagen.slam.places import Revisit, RevisitSettings, relative_pose
 from datagen.slam.segment import loop_pairs, solve_segment
 from lanenet.data.recording import Commands, Drive
@@ -65,7 +65,8 @@ def _errors_cm(poses: np.ndarray, true: np.ndarray, by: slice) -> np.ndarray:
 
 def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
     drive, true, stretches = same_road
-    joined = join_stretches(stretches, drive, SMALL, np.random.default_rng(1))
+    notes: list[str] = []
+    joined = join_stretches(stretches, drive, SMALL, np.random.default_rng(1), notes)
     assert len(joined) == 1
     np.testing.assert_array_equal(joined[0].rows, np.arange(len(true)))
     solved = joined[0].solved
@@ -78,6 +79,7 @@ def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
     assert abs(np.sin(turn)) < np.deg2rad(2.0) and np.cos(turn) > 0.0
     cross = [r for r in solved.revisits if r.earlier < FIRST <= r.later]
     assert len(cross) >= SMALL.revisits.min_revisits
+    assert notes == [f"frames 125-169 lie on the same map as frames 0-124: {len(cross)} places seen in both"]
     assert len(solved.uninterrupted_revisits()) == len(solved.revisits) - len(cross)
     assert len(solved.scans) == len(true) == len(solved.trajectory.match) == len(solved.open_poses)
     # What lies between the two stretches was not driven.
@@ -98,7 +100,7 @@ def test_the_stretch_that_carries_may_be_the_later_one(same_road):
         Stretch(np.arange(n - FIRST), stretches[1].solved),
         Stretch(np.arange(n - FIRST, n), stretches[0].solved),
     ]
-    (joined,) = join_stretches(swapped, turned, SMALL, np.random.default_rng(1))
+    (joined,) = join_stretches(swapped, turned, SMALL, np.random.default_rng(1), [])
     np.testing.assert_array_equal(joined.rows, np.arange(n))
     np.testing.assert_array_equal(np.flatnonzero(joined.solved.breaks_or_none()), [n - FIRST])
     error = _errors_cm(joined.solved.poses, true[order], slice(n - FIRST, n))
@@ -113,7 +115,9 @@ def test_a_stretch_of_another_road_stays_apart(same_road):
     images = [drive.image(k) for k in range(FIRST)]
     images += [np.ascontiguousarray(drive.image(k)[:, ::-1]) for k in range(FIRST, len(drive))]
     elsewhere = replace(drive, images=Pictures(images))
-    assert join_stretches(stretches, elsewhere, SMALL, np.random.default_rng(1)) == stretches
+    notes: list[str] = []
+    assert join_stretches(stretches, elsewhere, SMALL, np.random.default_rng(1), notes) == stretches
+    assert not notes
 
 
 def test_alignments_that_contradict_each_other_do_not_join():
@@ -132,10 +136,10 @@ def test_alignments_that_contradict_each_other_do_not_join():
 
 def test_one_stretch_is_all_there_is(same_road):
     drive, _, stretches = same_road
-    assert join_stretches(stretches[:1], drive, SMALL, np.random.default_rng(1)) == stretches[:1]
+    assert join_stretches(stretches[:1], drive, SMALL, np.random.default_rng(1), []) == stretches[:1]
     # Nothing to carry the other one over to: none is closed.
     opened = [replace(s, solved=replace(s.solved, revisits=[])) for s in stretches]
-    assert join_stretches(opened, drive, SMALL, np.random.default_rng(1)) == opened
+    assert join_stretches(opened, drive, SMALL, np.random.default_rng(1), []) == opened
 
 
 def test_pairs_beside_a_revisit_keep_to_their_stretches():
@@ -143,3 +147,9 @@ def test_pairs_beside_a_revisit_keep_to_their_stretches():
     pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], breaks)
     assert (44, 86) in pairs and (52, 94) not in pairs
     assert (14, 56) in pairs and (6, 48) not in pairs
+
+
+def test_frames_are_named_run_by_run():
+    drive = made_up_drive([np.zeros((6, 8, 3), np.uint8)] * 9)
+    numbered = replace(drive, frames=np.arange(9) + 100)
+    assert frames_text(numbered, np.array([0, 1, 2, 5, 6])) == "frames 100-102, 105-106"

@@ -1,0 +1,156 @@
+"""Stretches of a drive: each keeps its own poses, and one that cannot be mapped leaves the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from datagen import pipeline, stretches
+from datagen.lanes.line import LaneLine, Side
+from datagen.lanes.trace import TracedLane
+from datagen.map_report import MappedSegment
+from datagen.map_settings import MapSettings
+from datagen.slam.bundle import BundleResult
+from datagen.slam.calibrate import GuessSettings, guessed_camera
+from datagen.slam.filter import Trajectory
+from datagen.slam.join import Stretch
+from datagen.slam.scans import pack_scans
+from datagen.slam.segment import SolvedSegment
+from lanenet.data.recording import Commands, Drive, ImageFiles
+from lanenet.errors import TrackingLostError
+from lanenet.perception.birdseye import RoadEdges
+
+CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
+SETTINGS = MapSettings(find_bumper=False)
+
+
+class _StopError(Exception):
+    """Ends a run once what it hands on has been seen."""
+
+
+def _drive(n: int, breaks: list[int]) -> Drive:
+    flags = np.isin(np.arange(n), breaks)
+    return Drive(
+        name="made-up",
+        path=Path("made-up"),
+        # Recordings do not always count from 0.
+        frames=np.arange(n) + 1000,
+        t_s=0.05 * np.arange(n),
+        times_trusted=True,
+        commands=Commands(),
+        deleted=np.zeros(n, dtype=bool),
+        breaks=flags,
+        camera=None,
+        lane_width_cm=None,
+        problems=(),
+        width=160,
+        height=120,
+        images=ImageFiles([]),
+        rows=np.arange(n),
+    )
+
+
+def _solved(n: int) -> SolvedSegment:
+    poses = np.column_stack([3.0 * np.arange(n), np.zeros(n), np.zeros(n)])
+    nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
+    bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), 1.0, 10)
+    trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
+    return SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, [], np.zeros((0, 3)), None, bundle)
+
+
+@pytest.mark.parametrize("at", [70, 130])
+def test_each_stretch_keeps_its_own_poses_where_the_longest_gave_the_camera(monkeypatch, at):
+    drive = _drive(200, [at])
+    longest = _solved(130)
+    seen: list[Stretch] = []
+
+    def join(found: list[Stretch], *_: object) -> None:
+        seen.extend(found)
+        raise _StopError
+
+    def find(part: Drive, *_: object, **__: object) -> SimpleNamespace:
+        assert len(part) == 130
+        return SimpleNamespace(solved=longest, camera=CAMERA, how="found", figures={}, note="found")
+
+    monkeypatch.setattr(pipeline, "open_drive", lambda path: drive)
+    monkeypatch.setattr(pipeline, "following_frames", lambda drive, notes: drive)
+    monkeypatch.setattr(pipeline, "keep_images", lambda drive: drive)
+    for check in ("check_moving", "check_edges"):
+        monkeypatch.setattr(pipeline, check, lambda *_: None)
+    monkeypatch.setattr(pipeline, "find_camera", find)
+    monkeypatch.setattr(stretches, "solve_segment", lambda part, *_: _solved(len(part)))
+    monkeypatch.setattr(stretches, "join_stretches", join)
+    with pytest.raises(_StopError):
+        pipeline.map_drive(Path("made-up"), 40.0, None, SETTINGS, Path("nowhere"))
+    assert [len(s.rows) for s in seen] == [at, 200 - at]
+    assert [len(s.solved.poses) for s in seen] == [at, 200 - at]
+    assert next(s for s in seen if len(s.rows) == 130).solved is longest
+
+
+def _line(side: Side, until_cm: float) -> LaneLine:
+    knots = np.concatenate([np.zeros(3), np.linspace(0.0, 3000.0, 6), np.full(3, 3000.0)])
+    return LaneLine(side, knots, np.zeros((8, 2)), np.array([[0.0, until_cm]]), 0.1)
+
+
+def _map(
+    monkeypatch: pytest.MonkeyPatch,
+    drive: Drive,
+    notes: list[str],
+    no_edges: tuple[int, ...] = (),
+    no_lane: tuple[int, ...] = (),
+    one_line: tuple[int, ...] = (),
+) -> list[MappedSegment]:
+    """Map a drive whose stretches of some lengths show no edges, no lane, or one line only."""
+
+    def solve(part: Drive, *_: object) -> SolvedSegment:
+        if len(part) in no_edges:
+            raise TrackingLostError(f"{part.path}: {len(part)} frames, 3 edge points per frame")
+        return _solved(len(part))
+
+    def find_lane(stretch: Stretch, *_: object) -> MappedSegment:
+        n = len(stretch.rows)
+        if n in no_lane:
+            raise TrackingLostError(f"no pair of lines in {n} frames")
+        lane = TracedLane(np.zeros(2), np.zeros(2), np.zeros(2), 40.0, 2.0)
+        # The right line ends early where there is one line only.
+        lines = [_line("left", 3.0 * n), _line("right", 0.3 * n if n in one_line else 3.0 * n)]
+        return MappedSegment(stretch.rows, stretch.solved, 3.0 * np.arange(n), lane, lines)
+
+    monkeypatch.setattr(stretches, "solve_segment", solve)
+    monkeypatch.setattr(stretches, "_find_lane", find_lane)
+    segments, held_out = pipeline.split_segments(drive), np.zeros(len(drive), dtype=bool)
+    rng = np.random.default_rng(0)
+    return stretches.map_stretches(drive, segments, CAMERA, {}, 40.0, held_out, SETTINGS, rng, notes, None)
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        ({"no_edges": (70,)}, "70 frames, 3 edge points per frame"),
+        ({"no_lane": (70,)}, "no pair of lines in 70 frames"),
+        ({"one_line": (70,)}, "one line only bounds the driven lane"),
+    ],
+)
+def test_a_stretch_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, why):
+    notes: list[str] = []
+    parts = _map(monkeypatch, _drive(1000, [300, 370]), notes, **bad)
+    assert [(int(p.rows[0]), int(p.rows[-1])) for p in parts] == [(0, 299), (370, 999)]
+    assert len(notes) == 1
+    assert notes[0].startswith(f"frames 1300-1369 left out: {why}")
+
+
+def test_the_longest_stretch_says_why_nothing_could_be_mapped(monkeypatch):
+    notes: list[str] = []
+    with pytest.raises(TrackingLostError, match="no pair of lines in 130 frames"):
+        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(70,), no_lane=(130,))
+    with pytest.raises(TrackingLostError, match="130 frames, 3 edge points"):
+        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(130,), no_lane=(70,))
+
+
+def test_nothing_is_said_where_all_is_mapped(monkeypatch):
+    notes: list[str] = []
+    assert len(_map(monkeypatch, _drive(200, [70]), notes)) == 2
+    assert not notes

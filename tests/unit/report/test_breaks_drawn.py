@@ -1,0 +1,125 @@
+"""Stretches that lie on one map are drawn apart: nobody drove from one to the next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from datagen.labels.mapped_drive import MappedDrive
+from datagen.map_folder import FORMAT, DriveMap, MapMeta
+from datagen.pictures import draw_map
+from datagen.report import plots
+from datagen.slam.calibrate import GuessSettings, guessed_camera
+from datagen.slam.mapper import SteeringFit
+from datagen.slam.scans import pack_scans
+from lanenet.data.recording import Commands, Drive, ImageFiles
+from lanenet.perception.birdseye import PerceptionSettings, RoadEdges
+
+CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
+#: Frames of the drive; of its four stretches the third is not on the map, and the second in one of its own.
+N, BREAKS = 40, [10, 20, 25]
+ROWS = np.delete(np.arange(N), np.arange(20, 25))
+STARTS = [0, 10, 20]
+
+
+@pytest.fixture
+def mapped() -> MappedDrive:
+    """The stretches start 200 cm apart, on parallel ways, 2 cm per frame."""
+    stretch = np.repeat([0, 1, 3], [10, 10, 15])
+    since = np.concatenate([np.arange(10), np.arange(10), np.arange(15)])
+    poses = np.column_stack([2.0 * since, 200.0 * stretch, 0.0 * since])
+    n = len(ROWS)
+    drive_map = DriveMap(
+        meta=MapMeta(
+            format=FORMAT,
+            drive="made-up",
+            lane_width_cm=40.0,
+            mapped_lane_cm=40.0,
+            tape_cm=2.0,
+            scale_from="camera",
+            laps=0,
+        ),
+        camera=CAMERA,
+        frames=ROWS,
+        t_s=0.05 * ROWS,
+        poses=poses,
+        lap=np.zeros(n, np.int64),
+        segment=np.where(stretch == 1, 1, 0),
+        s_cm=2.0 * np.arange(n),
+        match=np.full(n, 0.6),
+        lines={},
+    )
+    drive = Drive(
+        name="made-up",
+        path=Path("made-up"),
+        frames=np.arange(N),
+        t_s=0.05 * np.arange(N),
+        times_trusted=True,
+        commands=Commands(angle=np.sin(0.3 * np.arange(N))),
+        deleted=np.zeros(N, dtype=bool),
+        breaks=np.isin(np.arange(N), BREAKS),
+        camera=None,
+        lane_width_cm=None,
+        problems=(),
+        width=160,
+        height=120,
+        images=ImageFiles([]),
+        rows=np.arange(N),
+    )
+    return MappedDrive(drive_map, drive, ROWS, PerceptionSettings())
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that the plots would write."""
+    pytest.importorskip("matplotlib")
+    figures: list[Any] = []
+
+    def keep(figure: Any) -> bytes:
+        figures.append(figure)
+        return b""
+
+    monkeypatch.setattr(plots, "_png", keep)
+    return figures
+
+
+def test_a_stretch_starts_at_a_break_and_after_one_that_was_left_out(mapped):
+    np.testing.assert_array_equal(np.flatnonzero(mapped.starts), STARTS)
+
+
+def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
+    no_edges = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))], 15.0)
+    parts = [(no_edges, mapped.drive_map.poses[:1], 1.0)]
+    draw_map(tmp_path / "map.png", mapped.drive_map, parts, mapped.starts, size_px=400)
+    image = cv2.imread(str(tmp_path / "map.png"))
+    # Left of the metre of scale in the corner there is nothing else that is white.
+    white = (image > 200).all(axis=2)[: image.shape[0] - 60]
+    scale = 400 / 640.0
+    rows = np.flatnonzero(white.any(axis=1))
+    expected = image.shape[0] - 1 - scale * (20.0 + np.array([200.0, 600.0]))
+    assert np.min(np.abs(rows[:, None] - expected), axis=1).max() <= 2.0
+    assert {int(np.abs(expected - row).argmin()) for row in rows} == {0, 1}
+
+
+def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):
+    plots.trajectory_plot(mapped, mapped.drive_map.poses)
+    (axes,) = drawn[0].axes
+    for line in axes.lines[:2]:
+        x, y = (np.asarray(values, dtype=float) for values in line.get_data())
+        assert len(x) == len(ROWS) + 2
+        np.testing.assert_array_equal(np.flatnonzero(np.isnan(y)), [10, 21])
+        assert np.nanmax(np.abs(np.diff(y))) == 0.0
+
+
+def test_ways_and_curvature_across_a_break_are_left_out(mapped, drawn):
+    plots.speed_plot(mapped)
+    step = np.asarray(drawn[0].axes[0].lines[0].get_ydata(), dtype=float)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(step)) + 1, STARTS[1:])
+    np.testing.assert_allclose(step[np.isfinite(step)], 2.0)
+    plots.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
+    # Of the first segment's 25 frames, two begin a stretch.
+    assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23
