@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -19,7 +18,15 @@ from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import commands_of
-from datagen.slam.places import Revisit, alike, match_places, path_lengths, relative_pose, thumbnails
+from datagen.slam.places import (
+    Revisit,
+    alike,
+    diagonal_mean,
+    match_places,
+    path_lengths,
+    relative_pose,
+    thumbnails,
+)
 from datagen.slam.posegraph import close_loops
 from datagen.slam.scans import Scans, scans_of
 from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways, road_edges
@@ -165,9 +172,7 @@ def _shared_places(
         max_pairs: Pairs at most, spread over the second stretch.
     """
     first = len(base)
-    similarity = cv2.filter2D(
-        alike(base, other), -1, np.eye(9, dtype=np.float32) / 9.0, borderType=cv2.BORDER_REPLICATE
-    )
+    similarity = diagonal_mean(alike(base, other))
     # What surrounds the last frames of one stretch must not be taken from the other one.
     inner = similarity[: max(first - _EDGE, 0)]
     if not inner.size:

@@ -21,11 +21,16 @@ from datagen.slam.scans import Progress
 STEPS_HEIGHTS = tuple(0.025 * 1.1**k for k in range(37))
 #: Factors to try on a recorded speed, whose gain is not known exactly.
 _GAINS = tuple(1.06**k for k in range(-11, 12))
+#: No car turns further per frame than on its tightest curve with this step, in camera heights: a speed in the
+#: wrong unit must not ask for thousands of turns.
+_MOST_STEP_HEIGHTS = 1.3 * STEPS_HEIGHTS[-1]
 #: Pairs of pictures that the usual step is found from.
 _PAIRS = 60
 #: A step must fit better than those that are shorter and longer by this factor: what does not move on the
 #: road, such as mirrored lamps, fits slow motion of any size.
 _BESIDE = 1.5
+#: How much more than the best step near the recorded one a step must stand out to be believed instead.
+_CLEARLY = 2.0
 #: A car that is told to stand may roll on: least commanded way, relative to the usual one.
 LEAST_WAY = 0.1
 
@@ -70,12 +75,10 @@ def usual_step(
     fit = np.zeros(len(steps))
     for k in frames:
         for i, step in enumerate(steps):
-            turns = turns_up_to(s.max_curvature_heights * step * relative[k], pictures.turn_step_rad)
+            turns = _turns_of(pictures, step * relative[k])
             fit[i] += pictures.fit(int(k), steps[i : i + 1], turns, relative).max() / len(frames)
+    above = _standing_out(fit, steps)
     log_ratio = float(np.log(steps[1] / steps[0]))
-    beside = round(float(np.log(_BESIDE)) / log_ratio)
-    padded = np.pad(fit, beside, mode="edge")
-    above = fit - 0.5 * (padded[: -2 * beside] + padded[2 * beside :])
     best = int(np.argmax(above))
     shift = 0.0
     if 0 < best < len(steps) - 1:
@@ -83,6 +86,19 @@ def usual_step(
         bend = left - 2.0 * middle + right
         shift = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
     return float(steps[best] * np.exp(shift * log_ratio)), fit
+
+
+def _standing_out(fit: Float[np.ndarray, "w"], steps: Float[np.ndarray, "w"]) -> Float[np.ndarray, "w"]:
+    """By how much each step fits better than clearly shorter and longer ones."""
+    beside = round(float(np.log(_BESIDE) / np.log(steps[1] / steps[0])))
+    padded = np.pad(fit, beside, mode="edge")
+    return fit - 0.5 * (padded[: -2 * beside] + padded[2 * beside :])
+
+
+def _turns_of(pictures: Pictures, step: float) -> Float[np.ndarray, "t"]:
+    """Turns that a car may make with a step, in camera heights."""
+    most = pictures.settings.max_curvature_heights * min(step, _MOST_STEP_HEIGHTS)
+    return turns_up_to(most, pictures.turn_step_rad)
 
 
 @dataclass(frozen=True)
@@ -105,6 +121,10 @@ def usual_way(
 ) -> UsualWay:
     """Find how far the car really drives when it is told to.
 
+    A recorded speed may be far off: another unit, or a camera much higher than the nominal height. Then it
+    fits best at the rim of the gains to try, or nowhere in particular, and the step that fits best of all is
+    taken. Where that one lies at the rim, too, the pictures say nothing and the recorded speed stands.
+
     Args:
         pictures: The drive.
         distance_cm: Commanded way per frame, or the frame's duration.
@@ -114,9 +134,24 @@ def usual_way(
     moving = distance_cm[distance_cm > 0.0]
     usual = float(np.median(moving)) if moving.size else 1.0
     relative = np.maximum(distance_cm / usual, LEAST_WAY)
-    steps = np.array(_GAINS) * usual / height_cm if speed_known else np.array(STEPS_HEIGHTS)
-    step, _ = usual_step(pictures, relative, steps)
+    any_step = np.array(STEPS_HEIGHTS)
+    step, fit = usual_step(pictures, relative, any_step)
+    if speed_known:
+        recorded = usual / height_cm
+        steps = recorded * np.array(_GAINS)
+        near, near_fit = usual_step(pictures, relative, steps)
+        clearer = _standing_out(fit, any_step).max() > _CLEARLY * _standing_out(near_fit, steps).max()
+        if not (_at_rim(near, steps) or clearer):
+            step = near
+        elif _at_rim(step, any_step):
+            step = recorded
     return UsualWay(relative, step, step * height_cm / usual)
+
+
+def _at_rim(step: float, steps: Float[np.ndarray, "w"]) -> bool:
+    """Whether a step lies within about one of either end of those that were tried."""
+    half = np.sqrt(steps[1] / steps[0])
+    return not steps[1] * half < step < steps[-2] / half
 
 
 class Evidence:
@@ -146,8 +181,7 @@ class Evidence:
         spread, keep = s.unknown_spread, s.unknown_keep
         if speed_known:
             spread, keep = s.known_spread, s.known_keep
-        most = 1.3 * s.max_curvature_heights * step
-        self.grid = MotionGrid(step, spread, keep, s.jump, turns_up_to(most, pictures.turn_step_rad))
+        self.grid = MotionGrid(step, spread, keep, s.jump, _turns_of(pictures, 1.3 * step))
         self.log_likelihood: Float32[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float32)
         for k in range(n):
             if k > 0:

@@ -100,6 +100,7 @@ class Pictures:
         self._pictures = [self._picture(pixels, rng) for pixels in edges]
         shape = (SECTORS, camera.height, camera.width)
         self._nearest, self._distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
+        self._indexed: int | None = None
 
     def __len__(self) -> int:
         return len(self._pictures)
@@ -161,7 +162,10 @@ class Pictures:
         """
         s, later = self.settings, self._pictures[k]
         out = np.zeros((len(steps), len(turns_rad)))
-        index_edges(later.uv_px, later.edge_sector, self._nearest, self._distance)
+        # The usual step asks for one frame again and again, with other turns for every step.
+        if self._indexed != k:
+            index_edges(later.uv_px, later.edge_sector, self._nearest, self._distance)
+            self._indexed = k
         for lag in s.lags:
             if lag > k:
                 continue

@@ -18,6 +18,10 @@ from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_
 
 #: Heading per lap that an open loop misses which is good.
 _SMALL_DRIFT_RAD = 0.6
+#: Frames to either side over which the likeness of a pair is averaged.
+_DIAGONAL = 4
+#: Frames whose likeness to all before them is held at once.
+_BLOCK = 256
 
 
 class RevisitSettings(Settings):
@@ -100,18 +104,27 @@ def propose_revisits(
         settings: Bounds.
     """
     n = len(thumbs)
-    similarity = alike(thumbs, thumbs)
-    kernel = np.eye(9, dtype=np.float32) / 9.0
-    similarity = cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     path = path_lengths(poses)
-    apart = path[None, :] - path[:, None]
-    similarity[apart < settings.min_gap_heights * camera_height_cm] = -1.0
-    pairs: list[tuple[float, int, int]] = []
-    for later in range(n):
-        earlier = int(similarity[:, later].argmax())
-        score = float(similarity[earlier, later])
-        if score >= settings.min_similarity and later == int(similarity[earlier].argmax()):
-            pairs.append((score, earlier, later))
+    before, after = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    score, score_after = np.full(n, -1.0, np.float32), np.full(n, -1.0, np.float32)
+    # All pairs of a long drive at once are more than a small computer holds.
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        # What is averaged reaches beyond the block; what comes after it is no earlier visit.
+        first, last = max(start - _DIAGONAL, 0), min(stop + _DIAGONAL, n)
+        similarity = diagonal_mean(alike(thumbs[:last], thumbs[first:last]))[:stop, start - first :]
+        similarity = similarity[:, : stop - start]
+        apart = path[start:stop] - path[:stop, None]
+        similarity[apart < settings.min_gap_heights * camera_height_cm] = -1.0
+        before[start:stop], score[start:stop] = similarity.argmax(axis=0), similarity.max(axis=0)
+        best_after = similarity.max(axis=1)
+        higher = np.flatnonzero(best_after > score_after[:stop])
+        score_after[higher], after[higher] = best_after[higher], start + similarity[higher].argmax(axis=1)
+    pairs = [
+        (float(score[later]), int(before[later]), later)
+        for later in range(n)
+        if score[later] >= settings.min_similarity and later == after[before[later]]
+    ]
     if not pairs:
         return []
     # The best of each stretch of the drive, so that no corner takes all the pairs.
@@ -132,6 +145,13 @@ def alike(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.
         shifted = np.roll(picture, shift, axis=2).reshape(len(b), -1)
         np.maximum(similarity, a @ shifted.T, out=similarity)
     return similarity
+
+
+def diagonal_mean(similarity: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    """Average over neighbouring frames of both drives: a pair counts when its neighbours agree."""
+    size = 2 * _DIAGONAL + 1
+    kernel = np.eye(size, dtype=np.float32) / size
+    return np.asarray(cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE))
 
 
 def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:

@@ -1,4 +1,4 @@
-"""Frames in which the car stands, and places at which it was put down elsewhere, by small pictures alone."""
+"""Frames in which the car stands or backs up, and breaks that only the pictures tell."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from lanenet.data.drive import Drive
+from lanenet.data.drive import Commands, Drive
+from lanenet.errors import TrackingLostError
 from lanenet.perception.edges import to_gray
 
 SMALL_WIDTH, SMALL_HEIGHT = 24, 18
@@ -22,28 +23,74 @@ _STILL_SHARE = 0.25
 _ELSEWHERE = 0.35
 #: How much more alike the steps before and after it are.
 _DIP = 0.35
+#: Throttle below which Donkeycar's car brakes or drives backwards.
+_BACKWARDS_THROTTLE = -0.05
+#: Frames of one such command in which the car moves: a driver who brakes needs fewer.
+_BACKING = 5
 _EPSILON = 1e-9
 _BACK = 4  # frames that a live car looks back
 _WATCHED = 300  # frames of a live car whose change counts as usual
 
 
 def following_frames(drive: Drive, notes: list[str]) -> Drive:
-    """Leave out frames that show the same as the one before, and mark breaks that only the pictures tell.
+    """Leave out frames in which the car stands or backs up, and mark breaks that only the pictures tell.
+
+    All that comes after follows a car that drives forward; where it backs up, the drive breaks.
 
     Args:
         drive: The drive.
         notes: What was found is added, a sentence each.
+
+    Raises:
+        TrackingLostError: If the car was told to reverse all the time.
     """
     small = small_pictures(drive)
     standing, elsewhere = standing_frames(small), put_elsewhere(small)
     if elsewhere.any():
         where = ", ".join(str(number) for number in drive.frames[elsewhere][:5])
         notes.append(f"{elsewhere.sum()} breaks in the pictures, the first before frame {where}")
-    drive = replace(drive, breaks=drive.breaks | elsewhere)
-    if standing.any():
-        notes.append(f"{standing.sum()} frames show the same as the one before, and are left out")
-        drive = drive.subset(np.flatnonzero(~standing))
-    return drive
+    breaks = drive.breaks | elsewhere
+    backing = reversing_runs(drive.commands, standing)
+    backs_up = np.zeros(len(drive), dtype=bool)
+    for start, stop in backing:
+        backs_up[start:stop] = True
+        breaks[stop : stop + 1] = True
+    if backing:
+        where = ", ".join(f"{drive.frames[start]}-{drive.frames[stop - 1]}" for start, stop in backing[:5])
+        more = f" and {len(backing) - 5} times more" if len(backing) > 5 else ""
+        notes.append(f"the car was told to reverse in frames {where}{more}: left out")
+        if (standing | backs_up).all():
+            raise TrackingLostError(
+                f"{drive.path}: the car was told to reverse in frames {where}{more} and stands in any other, "
+                "expected a car that drives forward"
+            )
+    same = standing & ~backs_up
+    if same.any():
+        notes.append(f"{same.sum()} frames show the same as the one before, and are left out")
+    drive, left_out = replace(drive, breaks=breaks), standing | backs_up
+    return drive.subset(np.flatnonzero(~left_out)) if left_out.any() else drive
+
+
+def reversing_runs(commands: Commands, standing: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """Find where the car was told to drive backwards, and moved for several frames.
+
+    A throttle is only asked where no speed was recorded and it is positive as a rule: it may be that of a
+    motor that turns the other way.
+
+    Args:
+        commands: What the car was told.
+        standing: See :func:`standing_frames`.
+
+    Returns:
+        First row of each run, and the row after its last.
+    """
+    told = np.zeros(len(standing), dtype=bool)
+    if commands.speed_cm_s is not None:
+        told = commands.speed_cm_s < 0.0
+    elif commands.throttle is not None and np.sum(commands.throttle > 0.0) > np.sum(commands.throttle < 0.0):
+        told = commands.throttle < _BACKWARDS_THROTTLE
+    bounds = np.flatnonzero(np.diff(told.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    return [(int(a), int(b)) for a, b in bounds if (~standing[a:b]).sum() >= _BACKING]
 
 
 def small_pictures(drive: Drive) -> Float32[np.ndarray, "n h w"]:

@@ -7,7 +7,7 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
-from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step
+from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
 from datagen.slam.odometry_kernels import SECTORS, index_edges
 from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
 from lanenet.perception.edges import EdgePixels
@@ -75,6 +75,18 @@ def test_a_pair_fits_best_at_its_true_motion(road, camera):
     assert np.median(np.abs(off_turn)) < 1.2 * pictures.turn_step_rad
 
 
+def test_frames_are_compared_alike_whatever_was_compared_before(edges):
+    pictures, steps = _pictures(edges), STEP * np.array([0.8, 1.0, 1.25])
+    turns = turns_up_to(0.05, pictures.turn_step_rad)
+    together = {k: pictures.fit(k, steps, turns, np.ones(60)) for k in (8, 30)}
+    for k in (30, 30, 8, 30, 8):
+        alone = [_pictures(edges).fit(k, steps[i : i + 1], turns, np.ones(60))[0] for i in range(3)]
+        again = [pictures.fit(k, steps[i : i + 1], turns, np.ones(60))[0] for i in range(3)]
+        np.testing.assert_array_equal(again, together[k])
+        np.testing.assert_array_equal(alone, together[k])
+    assert not np.array_equal(together[8], together[30])
+
+
 def test_steps_put_together_give_poses():
     ways, turns = np.array([0.0, 2.0, 2.0]), np.array([0.0, 0.0, np.pi / 2.0])
     poses = Odometry(ways, turns).poses
@@ -111,6 +123,24 @@ def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
         step, fit = usual_step(_pictures(_with_a_lamp(edges, lamp)), np.ones(60), steps)
         assert step == pytest.approx(STEP, rel=0.03)
         assert fit.shape == steps.shape
+
+
+@pytest.mark.parametrize(("off", "lamp"), [(0.1, 0), (0.25, 60), (4.0, 0), (4.0, 60), (100.0, 60)])
+def test_a_recorded_speed_that_is_far_off_gives_the_right_way(edges, off, lamp):
+    pictures = _pictures(_with_a_lamp(edges, lamp))
+    usual = usual_way(pictures, np.full(60, off * STEP_CM), True, HEIGHT_CM)
+    assert usual.step == pytest.approx(STEP, rel=0.03)
+    assert usual.factor == pytest.approx(1.0 / off, rel=0.03)
+
+
+def test_a_speed_in_the_wrong_unit_asks_for_no_more_turns_than_a_fast_car_makes():
+    # Without edges nothing contradicts it.
+    nothing = [EdgePixels(np.empty((0, 2)), np.empty((0, 2)))] * 30
+    pictures = _pictures(nothing)
+    evidence = Evidence(pictures, np.full(30, 100.0 * STEP_CM), True, HEIGHT_CM)
+    assert evidence.grid.usual == pytest.approx(100.0 * STEP)
+    most = 1.3 * SETTINGS.max_curvature_heights * STEPS_HEIGHTS[-1]
+    assert evidence.grid.turns_rad[-1] == pytest.approx(most, abs=pictures.turn_step_rad)
 
 
 def test_a_long_frame_takes_a_long_way(road):

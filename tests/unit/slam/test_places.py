@@ -12,6 +12,8 @@ from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
 from datagen.slam.places import (
     RevisitSettings,
+    alike,
+    diagonal_mean,
     match_places,
     path_lengths,
     propose_revisits,
@@ -110,6 +112,35 @@ def test_fewer_pairs_are_asked_for_than_found():
     thumbs = _pictures(np.random.default_rng(0), 2 * LAP)
     pairs = propose_revisits(thumbs, _circle(2 * LAP, 0.1), HEIGHT_CM, RevisitSettings(max_pairs=8))
     assert 3 <= len(pairs) <= 8
+
+
+def test_likeness_is_averaged_over_neighbours_of_both_frames():
+    similarity = np.zeros((30, 40), np.float32)
+    similarity[10, 20] = 9.0
+    expected = np.zeros_like(similarity)
+    for d in range(-4, 5):
+        expected[10 + d, 20 + d] = 1.0
+    np.testing.assert_allclose(diagonal_mean(similarity), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [3, 240, 256, 259, 261, 700])
+def test_revisits_are_those_of_all_pairs_at_once(frames):
+    rng = np.random.default_rng(frames)
+    # Random walks through pictures, so that neighbours are alike and places far apart may be.
+    thumbs = np.cumsum(rng.normal(size=(frames, 18 * 24)), axis=0).astype(np.float32)
+    thumbs = thumbs @ np.diag(rng.uniform(size=18 * 24) ** 8).astype(np.float32)
+    thumbs /= np.linalg.norm(thumbs, axis=1, keepdims=True)
+    poses = np.cumsum(rng.normal(size=(frames, 3)), axis=0)
+    bounds = RevisitSettings(min_similarity=0.01, min_gap_heights=1.0, max_pairs=10 * frames)
+    whole = diagonal_mean(alike(thumbs, thumbs))
+    path = path_lengths(poses)
+    whole[path[None, :] - path[:, None] < HEIGHT_CM] = -1.0
+    before, after = whole.argmax(axis=0), whole.argmax(axis=1)
+    expected = [
+        (int(before[k]), k) for k in range(frames) if whole[before[k], k] >= 0.01 and after[before[k]] == k
+    ]
+    assert propose_revisits(thumbs, poses, HEIGHT_CM, bounds) == expected
+    assert len(expected) > frames // 50 or frames < 10
 
 
 def test_thumbnails_ignore_brightness_and_contrast():

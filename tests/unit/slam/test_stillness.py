@@ -12,10 +12,12 @@ from datagen.slam.stillness import (
     SMALL_WIDTH,
     following_frames,
     put_elsewhere,
+    reversing_runs,
     small_pictures,
     standing_frames,
 )
 from lanenet.data.recording import Commands, Drive
+from lanenet.errors import TrackingLostError
 
 
 def pictures(place_px, noise=0.3, seed=0):
@@ -137,3 +139,58 @@ def test_a_break_after_a_stop_is_not_left_out_with_it():
     kept = following_frames(_drive(place), [])
     assert kept.frames[kept.breaks].tolist() == [110]
     assert len(kept) < 165
+
+
+@pytest.mark.parametrize("name", ["speed_cm_s", "throttle"])
+def test_a_car_that_backs_up_makes_a_break_and_its_frames_are_left_out(name):
+    place = np.concatenate(
+        [np.arange(80) * 0.8, 63.2 - np.arange(1, 21) * 0.8, 47.2 + np.arange(1, 80) * 0.8]
+    )
+    told = np.full(len(place), 0.4)
+    told[80:100] = -0.3
+    told[[0, 50]] = np.nan
+    notes: list[str] = []
+    numbers = np.arange(len(place)) + 1000
+    kept = following_frames(_drive(place, commands=Commands(**{name: told}), frames=numbers), notes)
+    assert np.setdiff1d(numbers, kept.frames).tolist() == list(range(1080, 1100))
+    assert kept.frames[kept.breaks].tolist() == [1100]
+    assert notes == ["the car was told to reverse in frames 1080-1099: left out"]
+
+
+def test_a_stop_beside_backing_up_is_told_apart_and_keeps_the_break():
+    back = 63.2 - np.arange(1, 21) * 0.8
+    place = np.concatenate(
+        [np.arange(80) * 0.8, back, np.full(30, back[-1]), back[-1] + np.arange(1, 80) * 0.8]
+    )
+    speed = np.full(len(place), 40.0)
+    speed[80:100], speed[100:130] = -40.0, 0.0
+    drive, notes = _drive(place, commands=Commands(speed_cm_s=speed)), []
+    kept = following_frames(drive, notes)
+    assert kept.breaks.sum() == 1 and 100 <= kept.frames[kept.breaks][0] <= 130
+    assert notes[0] == "the car was told to reverse in frames 80-99: left out"
+    same = len(place) - len(kept) - 20
+    assert 20 < same <= 30
+    assert notes[1:] == [f"{same} frames show the same as the one before, and are left out"]
+
+
+def test_what_may_not_be_reversing_is_not_taken_for_it():
+    moving, told = np.zeros(60, dtype=bool), np.full(60, 0.5)
+    told[20:30] = -0.5
+    assert reversing_runs(Commands(throttle=told), moving) == [(20, 30)]
+    assert reversing_runs(Commands(), moving) == []
+    # A speed says it better.
+    assert reversing_runs(Commands(throttle=told, speed_cm_s=np.full(60, 50.0)), moving) == []
+    # A motor that turns the other way.
+    assert reversing_runs(Commands(throttle=-told), moving) == []
+    assert reversing_runs(Commands(speed_cm_s=-told), moving) == [(0, 20), (30, 60)]
+    # Brakes, until the car stands.
+    assert reversing_runs(Commands(throttle=told), np.arange(60) >= 24) == []
+    short = np.where((np.arange(60) >= 20) & (np.arange(60) < 24), -0.5, 0.5)
+    assert reversing_runs(Commands(throttle=short), moving) == []
+    assert reversing_runs(Commands(throttle=np.where(told < 0.0, -0.04, 0.5)), moving) == []
+
+
+def test_a_car_that_only_backs_up_is_an_error():
+    drive = _drive(np.arange(60) * 0.8, commands=Commands(speed_cm_s=np.full(60, -40.0)))
+    with pytest.raises(TrackingLostError, match="told to reverse in frames 0-59"):
+        following_frames(drive, [])
