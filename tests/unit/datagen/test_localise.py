@@ -48,7 +48,7 @@ def test_every_pose_is_on_disk_before_the_next_frame_comes(simulated, tmp_path):
 
     def watched():
         for moment in moments_of(drive):
-            written.append(len(rows_of(out)))
+            written.append(len(rows_of(out)) if out.exists() else 0)
             yield moment
 
     report = localise(watched(), drive.camera, SETTINGS, out, KNOWN)
