@@ -20,7 +20,7 @@ from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_
 _SMALL_DRIFT_RAD = 0.6
 #: Frames to either side over which the likeness of a pair is averaged.
 _DIAGONAL = 4
-#: Frames whose likeness to all before them is held at once.
+#: Frames whose likeness to all before them is held at once: that of all pairs of a long drive is too much.
 _BLOCK = 256
 
 
@@ -107,13 +107,12 @@ def propose_revisits(
     path = path_lengths(poses)
     before, after = np.zeros(n, np.int64), np.zeros(n, np.int64)
     score, score_after = np.full(n, -1.0, np.float32), np.full(n, -1.0, np.float32)
-    # All pairs of a long drive at once are more than a small computer holds.
     for start in range(0, n, _BLOCK):
         stop = min(start + _BLOCK, n)
         # What is averaged reaches beyond the block; what comes after it is no earlier visit.
         first, last = max(start - _DIAGONAL, 0), min(stop + _DIAGONAL, n)
-        similarity = diagonal_mean(alike(thumbs[:last], thumbs[first:last]))[:stop, start - first :]
-        similarity = similarity[:, : stop - start]
+        wider = diagonal_mean(alike(thumbs[:last], thumbs[first:last]))
+        similarity = wider[:stop, start - first : stop - first]
         apart = path[start:stop] - path[:stop, None]
         similarity[apart < settings.min_gap_heights * camera_height_cm] = -1.0
         before[start:stop], score[start:stop] = similarity.argmax(axis=0), similarity.max(axis=0)
@@ -125,15 +124,12 @@ def propose_revisits(
         for later in range(n)
         if score[later] >= settings.min_similarity and later == after[before[later]]
     ]
-    if not pairs:
-        return []
     # The best of each stretch of the drive, so that no corner takes all the pairs.
     stretch = max(1.0, n / settings.max_pairs)
     best: dict[int, tuple[float, int, int]] = {}
     for pair in pairs:
         key = int(pair[2] / stretch)
-        if key not in best or pair > best[key]:
-            best[key] = pair
+        best[key] = max(best.get(key, pair), pair)
     return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda p: p[2])]
 
 
@@ -149,9 +145,8 @@ def alike(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.
 
 def diagonal_mean(similarity: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
     """Average over neighbouring frames of both drives: a pair counts when its neighbours agree."""
-    size = 2 * _DIAGONAL + 1
-    kernel = np.eye(size, dtype=np.float32) / size
-    return np.asarray(cv2.filter2D(similarity, -1, kernel, borderType=cv2.BORDER_REPLICATE))
+    kernel = np.eye(2 * _DIAGONAL + 1, dtype=np.float32)
+    return np.asarray(cv2.filter2D(similarity, -1, kernel / len(kernel), borderType=cv2.BORDER_REPLICATE))
 
 
 def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:

@@ -79,11 +79,10 @@ def test_frames_are_compared_alike_whatever_was_compared_before(edges):
     pictures, steps = _pictures(edges), STEP * np.array([0.8, 1.0, 1.25])
     turns = turns_up_to(0.05, pictures.turn_step_rad)
     together = {k: pictures.fit(k, steps, turns, np.ones(60)) for k in (8, 30)}
+    np.testing.assert_array_equal(_pictures(edges).fit(30, steps, turns, np.ones(60)), together[30])
     for k in (30, 30, 8, 30, 8):
-        alone = [_pictures(edges).fit(k, steps[i : i + 1], turns, np.ones(60))[0] for i in range(3)]
         again = [pictures.fit(k, steps[i : i + 1], turns, np.ones(60))[0] for i in range(3)]
         np.testing.assert_array_equal(again, together[k])
-        np.testing.assert_array_equal(alone, together[k])
     assert not np.array_equal(together[8], together[30])
 
 
@@ -125,7 +124,7 @@ def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
         assert fit.shape == steps.shape
 
 
-@pytest.mark.parametrize(("off", "lamp"), [(0.1, 0), (0.25, 60), (4.0, 0), (4.0, 60), (100.0, 60)])
+@pytest.mark.parametrize(("off", "lamp"), [(0.25, 60), (4.0, 0), (10.0, 60), (100.0, 0)])
 def test_a_recorded_speed_that_is_far_off_gives_the_right_way(edges, off, lamp):
     pictures = _pictures(_with_a_lamp(edges, lamp))
     usual = usual_way(pictures, np.full(60, off * STEP_CM), True, HEIGHT_CM)
