@@ -23,6 +23,10 @@ from datagen.lanes.profile import EdgeProfile, edge_profile, shifted
 from lanenet.config import Settings
 from lanenet.errors import TrackingLostError
 
+#: Shares of the distance of two lines within which a third one lies in the middle between them, and how well
+#: it must be seen beside them: it may be dashed.
+_HALF, _MIDDLE_LINE = (0.44, 0.56), 0.6
+
 
 class TraceSettings(Settings):
     """How lane lines are looked for; lengths in camera heights where the name says so.
@@ -49,7 +53,7 @@ class TraceSettings(Settings):
     side_heights: float = Field(default=8.0, gt=0.0)
     min_side: float = Field(default=0.75, gt=0.0, lt=1.0)
     tape_heights: tuple[float, float] = (0.05, 0.6)
-    lane_heights: tuple[float, float] = (1.2, 6.5)
+    lane_heights: tuple[float, float] = (0.8, 6.5)
     smoothness: float = Field(default=0.04, gt=0.0)
     sideways: float = Field(default=0.3, ge=0.0)
     second_line: float = Field(default=0.08, gt=0.0, le=1.0)
@@ -147,7 +151,10 @@ def _tape_width(profile: EdgeProfile, driven: int, camera_height_cm: float, sett
 def _lane_width(
     tapes: Float[np.ndarray, "m c"], profile: EdgeProfile, camera_height_cm: float, settings: TraceSettings
 ) -> float:
-    """Smallest distance at which two markings run side by side along the path, one on either side of it."""
+    """Distance at which two markings run side by side along the path, one on either side of it.
+
+    Where a line runs in the middle between the two, the car drives in one of two lanes.
+    """
     low, high = (w * camera_height_cm for w in settings.lane_heights)
     widths = np.arange(low, high, 2.0 * profile.cell_cm)
     scores = []
@@ -161,8 +168,10 @@ def _lane_width(
     peaks = [i for i in range(1, len(score) - 1) if score[i] >= score[i - 1] and score[i] > score[i + 1]]
     if not peaks:
         raise TrackingLostError("no two lines run side by side along the drive, so that its scale is unknown")
-    good = [i for i in peaks if score[i] >= 0.7 * max(score[p] for p in peaks)]
-    return float(widths[good[0]])
+    best = max(peaks, key=lambda i: score[i])
+    low, high = (share * widths[best] for share in _HALF)
+    halves = [i for i in peaks if low < widths[i] < high and score[i] >= _MIDDLE_LINE * score[best]]
+    return float(widths[max(halves, key=lambda i: score[i]) if halves else best])
 
 
 def _pair_score(tapes: Float[np.ndarray, "m c"], width_cells: float) -> Float[np.ndarray, "m c"]:
