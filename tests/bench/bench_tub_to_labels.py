@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from datagen import pipeline, self_calibration
+from datagen import pipeline, self_calibration, stretches
 from datagen.map_settings import MapSettings
 from datagen.slam import mapper, segment
 
@@ -32,12 +32,13 @@ STAGES: list[tuple[ModuleType, str]] = [
     (self_calibration, "coarse_camera"),
     (self_calibration, "solve_segment"),
     (segment, "edges_of_drive"),
+    (segment, "without_reflections"),
     (segment, "scans_of"),
     (mapper, "Evidence"),
     (mapper, "run_filter"),
     (segment, "match_places"),
     (segment, "adjust"),
-    (pipeline, "_find_lane"),
+    (stretches, "_find_lane"),
     (pipeline, "measure_map"),
     (pipeline, "report_page"),
     (pipeline, "label_map"),
