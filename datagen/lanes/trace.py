@@ -25,7 +25,10 @@ from lanenet.errors import TrackingLostError
 
 #: Shares of the distance of two lines within which a third one lies in the middle between them, and how well
 #: it must be seen beside them: it may be dashed.
-_HALF, _MIDDLE_LINE = (0.44, 0.56), 0.6
+_HALF, _MIDDLE_LINE = (0.44, 0.56), 0.8
+#: How far off the middle of its lane the car may drive, as a share of the lane's width: what is further off is
+#: half of a lane, beside a crack or a shadow that it drives over.
+_OFF_CENTRE = 0.4
 
 
 class TraceSettings(Settings):
@@ -160,7 +163,7 @@ def _lane_width(
     scores = []
     for width in widths:
         pair = _pair_score(tapes, width / profile.cell_cm)
-        within = int(0.6 * width / profile.cell_cm)
+        within = int(_OFF_CENTRE * width / profile.cell_cm)
         scores.append(
             np.sqrt(pair[:, profile.half_cells - within : profile.half_cells + within + 1]).max(axis=1).mean()
         )
