@@ -26,8 +26,8 @@ from lanenet.errors import TrackingLostError
 #: Shares of the distance of two lines within which a third one lies in the middle between them, and how well
 #: it must be seen beside them: it may be dashed.
 _HALF, _MIDDLE_LINE = (0.44, 0.56), 0.8
-#: How far off the middle of its lane the car may drive, as a share of the lane's width: what is further off is
-#: half of a lane, beside a crack or a shadow that it drives over.
+#: How far off the middle of its lane the car may drive, as a share of the lane's width: what is further off
+#: is half of a lane, beside a crack or a shadow that it drives over.
 _OFF_CENTRE = 0.4
 
 
