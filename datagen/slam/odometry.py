@@ -155,7 +155,11 @@ def _at_rim(step: float, steps: Float[np.ndarray, "w"]) -> bool:
 
 
 class Evidence:
-    """What the pictures say of each frame's motion, and the grid that it is said on."""
+    """What the pictures say of each frame's motion, and the grid that it is said on.
+
+    Attributes:
+        usual: What the commands mean in centimetres.
+    """
 
     def __init__(
         self,
@@ -176,8 +180,8 @@ class Evidence:
         """
         s, n = pictures.settings, len(pictures)
         self.settings, self.height_cm = s, height_cm
-        usual = usual_way(pictures, distance_cm, speed_known, height_cm)
-        self.relative, step = usual.relative, usual.step
+        self.usual = usual_way(pictures, distance_cm, speed_known, height_cm)
+        self.relative, step = self.usual.relative, self.usual.step
         spread, keep = s.unknown_spread, s.unknown_keep
         if speed_known:
             spread, keep = s.known_spread, s.known_keep

@@ -26,7 +26,7 @@ from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory, run_filter
 from datagen.slam.live_motion import live_motion
 from datagen.slam.mapper import commands_of, delayed, fit_steering
-from datagen.slam.odometry import Evidence, usual_way
+from datagen.slam.odometry import Evidence
 from datagen.slam.picture_pairs import Pictures
 from datagen.slam.places import path_lengths
 from datagen.slam.scans import scans_of
@@ -91,13 +91,12 @@ def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tu
     commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)
     pictures = Pictures(edges, camera, settings.odometry, rng)
-    ways = commands.distance_cm, commands.speed_known, height
-    evidence, usual = Evidence(pictures, *ways), usual_way(pictures, *ways)
+    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height)
     fit = fit_steering(evidence.motion().poses, commands, height)
     predicted = None
     if fit is not None and commands.turn is not None:
         predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    motion = live_motion(commands, predicted, usual.factor, height)
+    motion = live_motion(commands, predicted, evidence.usual.factor, height)
     begun = time.process_time()
     trajectory = run_filter(scans, motion, settings.filter, height, camera.wheelbase_cm, rng)
     return trajectory, 1e3 * (time.process_time() - begun) / len(drive)

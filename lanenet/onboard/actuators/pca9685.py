@@ -19,6 +19,7 @@ from pydantic import Field
 
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
+from lanenet.onboard.actuators.brief_lock import brief_lock
 from lanenet.onboard.actuators.pulses import PulseSettings, command_pulses, neutral_pulses
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
@@ -154,15 +155,11 @@ class PCA9685:
         self._stops += 1
         if self._bus is None:
             return
-        # A command that hangs in the driver must not keep the motor running.
-        locked = self._lock.acquire(timeout=0.02)
-        try:
-            self._write_neutral()
-        except Exception as error:
-            _log.error("pca9685: neutral could not be sent: %s", error)
-        finally:
-            if locked:
-                self._lock.release()
+        with brief_lock(self._lock):
+            try:
+                self._write_neutral()
+            except Exception as error:
+                _log.error("pca9685: neutral could not be sent: %s", error)
 
     def close(self) -> None:
         """Go to neutral and release the bus; the chip goes on with neutral pulses."""

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
+from lanenet.onboard.actuators.brief_lock import brief_lock
 from lanenet.onboard.actuators.line_protocol import BAUD, VERSION, Line, LineReader, encode
 from lanenet.onboard.actuators.pulses import Pulses, PulseSettings, command_pulses, neutral_pulses
 
@@ -145,17 +146,15 @@ class SerialBoard:
         """Stop the motor and straighten the wheels; never raises."""
         if self._port is None:
             return
-        # A command that hangs in the driver must not keep the motor running.
-        locked = self._lock.acquire(timeout=0.02)
-        try:
-            self._write(neutral_pulses(self._settings))
-        except Exception as error:
-            _log.error(
-                "%s: neutral could not be sent, the board's watchdog stops: %s", self._settings.port, error
-            )
-        finally:
-            if locked:
-                self._lock.release()
+        with brief_lock(self._lock):
+            try:
+                self._write(neutral_pulses(self._settings))
+            except Exception as error:
+                _log.error(
+                    "%s: neutral could not be sent, the board's watchdog stops: %s",
+                    self._settings.port,
+                    error,
+                )
 
     def close(self) -> None:
         """Go to neutral and release the port; the board stays in neutral."""
