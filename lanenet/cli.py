@@ -1,18 +1,16 @@
 """The command line: one verb per thing people do, each a thin shell over a Python function.
 
-Only this file and :mod:`lanenet.evaluation` know both ``datagen`` and ``lanenet.learn``. They are imported
-inside the commands, since the car has neither torch nor numba.
+This file, :mod:`lanenet.train_cli` and :mod:`lanenet.evaluation` know both ``datagen`` and ``lanenet.learn``.
+They are imported inside the commands, since the car has neither torch nor numba.
 """
 
 from __future__ import annotations
 
-import functools
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import Field
 from typer.core import TyperGroup
 
 from lanenet import (
@@ -24,12 +22,12 @@ from lanenet import (
     localise_cli,
     onboard_cli,
     reality_cli,
+    train_cli,
     val_cli,
     world_cli,
 )
-from lanenet.config import Settings, dump_settings, load_settings
+from lanenet.config import load_settings
 from lanenet.errors import LanenetError
-from lanenet.onboard_cli import MarkingOption
 from lanenet.outputs import check_ending, check_not_source
 
 _Config = Annotated[
@@ -80,6 +78,7 @@ app = typer.Typer(
 )
 
 
+app.add_typer(train_cli.app)
 app.add_typer(calibrate_cli.app, name="calibrate")
 app.add_typer(onboard_cli.app)
 app.add_typer(drive_cli.app)
@@ -96,43 +95,6 @@ def main() -> None:
     app()
 
 
-@functools.cache
-def run_settings_schema() -> type[Settings]:
-    """Return the schema of ``lanenet train CONFIG``; built here because its parts need the workstation."""
-    from datagen.dataset_settings import DataSettings
-    from lanenet.learn.config import LearnSettings
-
-    class RunSettings(Settings):
-        """Everything that one training run needs.
-
-        Attributes:
-            name: Names the checkpoint.
-            data: Where the label sets come from.
-            learn: How the network is trained.
-            work_dir: Drives, maps and label sets; None stands for ``runs/<name>``.
-            checkpoints_dir: Parent of the checkpoint's folder.
-        """
-
-        name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-        data: DataSettings = Field(default_factory=DataSettings)
-        learn: LearnSettings = Field(default_factory=LearnSettings)
-        work_dir: Path | None = None
-        checkpoints_dir: Path = Path("checkpoints")
-
-        @property
-        def work_folder(self) -> Path:
-            """Folder of the drives, maps and label sets."""
-            return Path("runs") / self.name if self.work_dir is None else self.work_dir
-
-    return RunSettings
-
-
-def __getattr__(name: str) -> Any:
-    if name == "RunSettings":
-        return run_settings_schema()
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
 def _show_version(wanted: bool) -> bool:
     if wanted:
         typer.echo(f"lanenet {metadata.version('lanenet')}")
@@ -147,85 +109,6 @@ def _options(
     ] = False,
 ) -> None:
     pass
-
-
-@app.command(epilog="Example: lanenet train configs/small.yaml learn.epochs=5")
-def train(
-    config: _Config,
-    overrides: _Overrides = None,
-    marking: MarkingOption = None,
-) -> None:
-    """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
-    from datagen.datasets import prepare
-    from lanenet.data.label_set import read_labels
-    from lanenet.evaluation import default_names, evaluate, open_tests
-    from lanenet.learn.publish import publish
-    from lanenet.learn.run_state import hash_run
-    from lanenet.learn.train import train as train_network
-
-    settings: Any = load_settings(run_settings_schema(), config, overrides)
-    checkpoint = settings.checkpoints_dir / settings.name
-    with console.progress_bar("data") as progress:
-        data = prepare(settings.data, settings.work_folder, progress)
-    if data.left_out:
-        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
-    # A folder per settings and data: a stopped run finds its own state again, and no other.
-    run_hash = hash_run(settings.learn, data.train, data.validation)
-    run_folder = settings.work_folder / f"train-{run_hash}"
-    with console.training_bar() as progress:
-        train_network(settings.learn, data.train, data.validation, run_folder, progress)
-    if not data.test:
-        console.show_problems(["the data has no test part: the table is over the validation labels"])
-    sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
-    with console.progress_bar("test") as progress:
-        evaluation = evaluate(
-            sources,
-            default_names(sources, with_model=True),
-            run_folder / "model.onnx",
-            training=[read_labels(path) for path in dict.fromkeys(data.train)],
-            marking_cm=marking,
-            # Which camera made which test drive is settled by the config.
-            any_camera=True,
-            progress=progress,
-        )
-    val_cli.show(evaluation.comparison)
-    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings)}
-    files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
-    if data.camera is not None:
-        files["camera.yaml"] = data.camera.read_bytes()
-    if data.example is not None:
-        files[f"example{data.example.suffix}"] = data.example.read_bytes()
-    publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
-    model = checkpoint / "model.onnx"
-    console.wrote(checkpoint)
-    words = ["detect", "SOURCE", "--detector", "network", "--model", model]
-    words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
-    console.next_command(*words, "--out", "lanes.csv")
-
-
-@app.command(epilog="Example: lanenet sweep configs/small.yaml learn.epochs=10 --minutes 60")
-def sweep(
-    config: _Config,
-    overrides: _Overrides = None,
-    minutes: Annotated[
-        float, typer.Option(min=0.0, help="No longer than this; goes on when called again.")
-    ] = 60.0,
-    trials: Annotated[int, typer.Option(min=1, help="No more finished trials than this, in all.")] = 100,
-) -> None:
-    """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
-    from datagen.datasets import prepare
-    from lanenet.learn.sweep import sweep as sweep_networks
-
-    settings: Any = load_settings(run_settings_schema(), config, overrides)
-    with console.progress_bar("data") as progress:
-        data = prepare(settings.data, settings.work_folder, progress)
-    out = settings.work_folder / "sweep"
-    with console.progress_bar("trials") as progress:
-        table = sweep_networks(
-            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
-        )
-    console.show_lines(table.splitlines()[:14])
-    console.wrote(out / "sweep.md", out / "trials.csv")
 
 
 @app.command(epilog="Example: lanenet simulate configs/drive.yaml seed=3 --out drives/three")

@@ -101,7 +101,7 @@ def measure_robustness(
         ModelMismatchError: If a model has another window.
     """
     for labels, name in zip(label_sets, names, strict=True):
-        if not any(np.isfinite(line).any() for pair in labels.lines for line in pair):
+        if not can_measure(labels):
             raise LabelFormatError(f"{name}: has no lane lines, expected a label set made of a map or a road")
     samples = LaneSamples(label_sets, names)
     for model in models.values():
@@ -135,6 +135,11 @@ def measure_robustness(
         if progress is not None:
             progress(done, len(CHANGES))
     return rows
+
+
+def can_measure(labels: LabelSet) -> bool:
+    """Return whether a label set knows lane lines, from which the labels of a changed frame follow."""
+    return any(np.isfinite(line).any() for pair in labels.lines for line in pair)
 
 
 def _with_width(answers: RasterAnswers, widths_cm: Float[np.ndarray, "n"]) -> RasterAnswers:

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from lanenet.cli import run_settings_schema
 from lanenet.config import check_settings, load_settings, read_yaml
 from lanenet.errors import ConfigError
+from lanenet.train_cli import run_settings_schema
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ALL_FILES = sorted(CONFIGS.rglob("*.y*ml"))

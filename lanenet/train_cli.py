@@ -1,0 +1,172 @@
+"""``lanenet train`` and ``lanenet sweep``: from a config to a checkpoint with its tables and its model card.
+
+Knows both ``datagen`` and ``lanenet.learn``, as :mod:`lanenet.evaluation` does, and imports them inside the
+commands, since the car has neither torch nor numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from pydantic import Field
+
+from lanenet import console, val_cli
+from lanenet.config import Settings, dump_settings, load_settings
+from lanenet.onboard_cli import MarkingOption
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lanenet.evaluation import Opened
+    from lanenet.learn.robust import RobustRow
+
+app = typer.Typer()
+
+_Config = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
+]
+_Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
+]
+
+
+@functools.cache
+def run_settings_schema() -> type[Settings]:
+    """Return the schema of ``lanenet train CONFIG``; built here because its parts need the workstation."""
+    from datagen.dataset_settings import DataSettings
+    from lanenet.learn.config import LearnSettings
+
+    class RunSettings(Settings):
+        """Everything that one training run needs.
+
+        Attributes:
+            name: Names the checkpoint.
+            data: Where the label sets come from.
+            learn: How the network is trained.
+            work_dir: Drives, maps and label sets; None stands for ``runs/<name>``.
+            checkpoints_dir: Parent of the checkpoint's folder.
+        """
+
+        name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+        data: DataSettings = Field(default_factory=DataSettings)
+        learn: LearnSettings = Field(default_factory=LearnSettings)
+        work_dir: Path | None = None
+        checkpoints_dir: Path = Path("checkpoints")
+
+        @property
+        def work_folder(self) -> Path:
+            """Folder of the drives, maps and label sets."""
+            return Path("runs") / self.name if self.work_dir is None else self.work_dir
+
+    return RunSettings
+
+
+@app.command(epilog="Example: lanenet train configs/small.yaml learn.epochs=5")
+def train(
+    config: _Config,
+    overrides: _Overrides = None,
+    marking: MarkingOption = None,
+) -> None:
+    """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
+    from datagen.datasets import prepare
+    from lanenet.data.label_set import read_labels
+    from lanenet.evaluation import default_names, evaluate, open_tests
+    from lanenet.learn.card import CARD_NAME, model_card
+    from lanenet.learn.publish import publish
+    from lanenet.learn.robust import as_dict
+    from lanenet.learn.run_state import METRICS_NAME, hash_run
+    from lanenet.learn.train import train as train_network
+    from lanenet.perception.network import read_model_meta
+
+    settings: Any = load_settings(run_settings_schema(), config, overrides)
+    checkpoint = settings.checkpoints_dir / settings.name
+    with console.progress_bar("data") as progress:
+        data = prepare(settings.data, settings.work_folder, progress)
+    if data.left_out:
+        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
+    # A folder per settings and data: a stopped run finds its own state again, and no other.
+    run_hash = hash_run(settings.learn, data.train, data.validation)
+    run_folder = settings.work_folder / f"train-{run_hash}"
+    with console.training_bar() as progress:
+        train_network(settings.learn, data.train, data.validation, run_folder, progress)
+    if not data.test:
+        console.show_problems(["the data has no test part: the table is over the validation labels"])
+    sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
+    training = [read_labels(path) for path in dict.fromkeys(data.train)]
+    with console.progress_bar("test") as progress:
+        evaluation = evaluate(
+            sources,
+            default_names(sources, with_model=True),
+            run_folder / "model.onnx",
+            training=training,
+            marking_cm=marking,
+            # Which camera made which test drive is settled by the config.
+            any_camera=True,
+            progress=progress,
+        )
+    val_cli.show(evaluation.comparison)
+    robustness = _robustness(run_folder / "model.onnx", sources)
+    card = model_card(
+        settings.name,
+        read_model_meta(run_folder / "model.onnx"),
+        json.loads((run_folder / METRICS_NAME).read_text(encoding="utf-8")),
+        training,
+        evaluation.comparison,
+        robustness,
+    )
+    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card}
+    files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
+    if robustness:
+        files["robustness.json"] = json.dumps(as_dict(robustness), indent=2) + "\n"
+    if data.camera is not None:
+        files["camera.yaml"] = data.camera.read_bytes()
+    if data.example is not None:
+        files[f"example{data.example.suffix}"] = data.example.read_bytes()
+    publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
+    model = checkpoint / "model.onnx"
+    console.wrote(checkpoint)
+    words = ["detect", "SOURCE", "--detector", "network", "--model", model]
+    words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
+    console.next_command(*words, "--out", "lanes.csv")
+
+
+def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:
+    """Errors of a model on changed test frames; none if a label set knows no lines to change."""
+    from lanenet.learn.evaluate import RasterModel
+    from lanenet.learn.robust import can_measure, measure_robustness
+
+    known = [(source.labels, str(source.path)) for source in sources if source.labels is not None]
+    known = [(labels, name) for labels, name in known if can_measure(labels)]
+    if not known:
+        return []
+    label_sets, names = zip(*known, strict=True)
+    return measure_robustness({"network": RasterModel(model)}, label_sets, names)
+
+
+@app.command(epilog="Example: lanenet sweep configs/small.yaml learn.epochs=10 --minutes 60")
+def sweep(
+    config: _Config,
+    overrides: _Overrides = None,
+    minutes: Annotated[
+        float, typer.Option(min=0.0, help="No longer than this; goes on when called again.")
+    ] = 60.0,
+    trials: Annotated[int, typer.Option(min=1, help="No more finished trials than this, in all.")] = 100,
+) -> None:
+    """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
+    from datagen.datasets import prepare
+    from lanenet.learn.sweep import sweep as sweep_networks
+
+    settings: Any = load_settings(run_settings_schema(), config, overrides)
+    with console.progress_bar("data") as progress:
+        data = prepare(settings.data, settings.work_folder, progress)
+    out = settings.work_folder / "sweep"
+    with console.progress_bar("trials") as progress:
+        table = sweep_networks(
+            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
+        )
+    console.show_lines(table.splitlines()[:14])
+    console.wrote(out / "sweep.md", out / "trials.csv")

@@ -1,0 +1,58 @@
+import numpy as np
+from synthetic_labels import make_label_set
+
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.card import model_card
+from lanenet.learn.compare import SourceAnswers, compare_detectors
+from lanenet.perception.network import ModelMeta
+
+TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (50, 1))
+METRICS = {"parameters": 97310, "epochs": 8, "best_epoch": 7, "val_frames": 12, "val_rmse_cm": 0.5}
+
+
+def card(*errors_cm, meta=None):
+    answers = [
+        SourceAnswers(f"d/t{k}", "map", "map", TRUTH, {"n": TRUTH + e}) for k, e in enumerate(errors_cm)
+    ]
+    training = [make_label_set(4, 0), make_label_set(5, 1, camera_hash="cam1")]
+    meta = meta or model_meta()
+    return model_card("mine", meta, METRICS, training, compare_detectors(answers), [])
+
+
+def model_meta(**changes):
+    known = {
+        "window": BirdseyeWindow(),
+        "camera_hashes": ("cam0",),
+        "wheelbase_cm": 26.0,
+        "lane_width_cm": 40.0,
+        "training_hash": "0",
+        "rmse_cm": (1.0,) * 6,
+        "reference": "map",
+    }
+    return ModelMeta(**{**known, **changes})
+
+
+def test_it_says_what_it_learned_from_and_how_good_it_is():
+    text = card(1.0, 1.0)
+    assert text.startswith("# mine\n") and "97,310 weights" in text
+    assert "9 frames of 2 label sets, labels from the map; 2 cameras; lanes of 40 cm" in text
+    assert "100 frames of 2 test drives" in text and "RMSE 1.00 cm" in text
+    assert "No group of frames, point or drive is 1.5 times as wrong" in text
+    assert "0.00 % of the points are off by more than 4 cm" in text
+
+
+def test_weak_spots_are_named_the_worst_drive_first():
+    far = np.zeros(6)
+    far[2] = 5.0
+    text = card(0.1, 0.2, far)
+    weak = [line for line in text.splitlines() if line.startswith("- ")]
+    assert weak[0].startswith("- left line, 30 cm ahead: RMSE 2.8") and weak[1].startswith("- `t2`: RMSE 2.0")
+    assert len(weak) == 2
+    # One of six points of one of three drives.
+    assert "5.56 % of the points are off by more than 4 cm" in text
+
+
+def test_lane_widths_of_the_training_are_its_limits():
+    text = card(1.0, meta=model_meta(lane_width_range_cm=(23.0, 74.6)))
+    assert "lanes of 23 to 75 cm" in text and "narrower than 23 or wider than 75 cm" in text
+    assert "over such drives" not in text
