@@ -28,6 +28,9 @@ _LEAST_SEEN = 0.2
 _LEAST_SHOWN = 0.2
 #: Less than this of one line is clutter that happens to lie along the way.
 _WHOLE_LINE = 0.5
+#: A line of the given lane that is seen along less than this share of the way along which one of another width
+#: is: gaps between dashes leave more.
+_HARDLY = 0.4
 
 
 def check_moving(drive: Drive) -> None:
@@ -154,11 +157,12 @@ def trace_known_lane(
 def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
     """Whether the lane that was found freely is more likely the driven one than that of the given width.
 
-    The free search alone is no proof: clutter beside a line makes a narrower lane. It counts where its weaker
-    line is better seen, or where the car keeps to its middle and not to that of the given lane, as on a road
+    The free search alone is no proof: clutter beside a line makes a narrower lane, and the far line of a road
+    of two lanes, where the one in its middle is dashed, a wider one. It counts where the weaker line of the
+    given lane is hardly seen beside its own, or where the car keeps to its middle and not to that of the given lane, as on a road
     of two lanes whose whole width was given.
     """
-    if min(_seen(free)) > min(_seen(lane)):
+    if min(_seen(lane)) < _HARDLY * min(_seen(free)):
         return True
     aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
     return min(_seen(free)) >= _LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
