@@ -32,7 +32,8 @@ class AugmentSettings(Settings):
         double_points: Up to this share of the edge points comes twice, the second within 1.5 cm.
         jitter_cm: Standard deviation of the noise on each edge point.
         missing_stretch: Probability that the points in a disc or ring are dropped (glare, worn paint).
-        missing_line: Probability that the points of one of the two lines are dropped.
+        missing_line: Probability that the points of one of the two lines are dropped, and with them what
+            runs along it farther out: nobody could tell the next lane's border from a line that is gone.
         missing_both: Probability that the points of both are.
         objects: Up to this many closed outlines of unknown things; boxes, cones and cars hide the road below
             them, shadows do not.

@@ -19,11 +19,12 @@ SEEN_CM, UNSEEN_CM = 18.0, 3.0
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def near_lines(edges, left_cm, right_cm, out):
-    """Tell which lines edge points are near, and of which they are likely to be.
+    """Tell which lines edge points belong to, and which go with a line that is missing.
 
-    Bit 0 is set for points within ``LINE_REACH_CM`` of the left line, bit 1 for the right one; bits 2 and 3
-    likewise for those of them that run along it, as the borders of a marking do, and not across it, as most
-    of what lies on the road.
+    Bit 0 is set for points within ``LINE_REACH_CM`` of the left line, and for those that run along it farther
+    to the left: the other borders of the road, which would be taken for it once it is gone. Bit 1 is set
+    likewise for the right line. Bits 2 and 3 are set for points within ``LINE_REACH_CM`` that run along the
+    line, as the borders of a marking do, and not across it, as most of what lies on the road.
     """
     reach = LINE_REACH_CM * LINE_REACH_CM
     for k in range(len(edges)):
@@ -31,19 +32,23 @@ def near_lines(edges, left_cm, right_cm, out):
         found = 0
         for side in range(2):
             line = left_cm if side == 0 else right_cm
+            nearest, outside, along = np.inf, False, False
             for j in range(len(line) - 1):
                 ax, ay = line[j, 0], line[j, 1]
                 bx, by = line[j + 1, 0] - ax, line[j + 1, 1] - ay
                 length = bx * bx + by * by
                 t = ((x - ax) * bx + (y - ay) * by) / length if length > 0.0 else 0.0
                 t = min(max(t, 0.0), 1.0)
+                square = (x - ax - t * bx) ** 2 + (y - ay - t * by) ** 2
                 # NaN, where a polyline is broken, is never near.
-                if (x - ax - t * bx) ** 2 + (y - ay - t * by) ** 2 <= reach:
-                    found |= 1 << side
+                if square < nearest:
                     lean = edges[k, 2] * bx + edges[k, 3] * by
-                    if lean * lean <= _LEAN * _LEAN * length:
-                        found |= 4 << side
-                        break
+                    nearest, along = square, lean * lean <= _LEAN * _LEAN * length
+                    outside = (bx * (y - ay) - by * (x - ax) > 0.0) == (side == 0)
+            if nearest <= reach:
+                found |= 5 << side if along else 1 << side
+            elif outside and along:
+                found |= 1 << side
         out[k] = found
 
 

@@ -165,6 +165,31 @@ def test_what_lies_across_a_missing_line_goes_with_it():
     assert not augment_batch(frames, ALL, WINDOW, gone, 0, 0)[0].any()
 
 
+def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
+    y = np.arange(-60.0, 120.0, 2.0)
+    lines = tuple(np.stack([np.full(len(y), x), y], 1) for x in (-20.0, 20.0))
+
+    def column(x, normal):
+        edge = np.stack([np.full(120, x), np.linspace(4.0, 64.0, 120)], 1)
+        return np.hstack([edge, np.tile(normal, (120, 1))]).astype(np.float32)
+
+    # Left line, the next lane's border, a scratch between them, and the right line.
+    parts = [column(-20.0, (1.0, 0.0)), column(-40.0, (1.0, 0.1)), column(-30.0, (0.0, 1.0))]
+    right = column(20.0, (1.0, 0.0))
+    frames = join_frames([np.concatenate([*parts, right])], [lines], np.repeat([-20.0, 20.0], 3)[None])
+    fine, seen = BirdseyeWindow(), set()
+    for seed in range(8):
+        gone = NOTHING.model_copy(update={"missing_line": 1.0})
+        rasters, _, present = augment_batch(frames, ALL[:1], fine, gone, seed, 0)
+        kept = [parts[2], right] if present[0, 0] == 0.0 else parts
+        np.testing.assert_array_equal(rasters[0, 0], fine.rasterise(np.concatenate(kept)[:, :2]))
+        seen.add(tuple(present[0].tolist()))
+    assert seen == {(0.0, 1.0), (1.0, 0.0)}
+    # A border farther out is not the line itself.
+    beyond = lines_present(np.concatenate([parts[1], right]), lines, fine)
+    np.testing.assert_array_equal(beyond, [0.0, 1.0])
+
+
 def test_a_bent_road_keeps_its_width_and_its_labels_follow():
     y = np.arange(-60.0, 120.0, 2.0)
     lines = tuple(np.stack([np.full(len(y), x), y], 1) for x in (-20.0, 20.0))
