@@ -18,11 +18,11 @@ from lanenet.learn.augment_kernels import (
     Amounts,
     Frames,
     augment_frames,
-    near_lines,
     rasterise_frames,
 )
 from lanenet.learn.config import AugmentSettings
 from lanenet.learn.mounting_kernels import misplace_points
+from lanenet.learn.presence_kernels import near_lines
 from lanenet.learn.raster_kernels import Grid
 
 Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
@@ -62,7 +62,7 @@ def make_view(mirror: bool, shift_cm: float, turn_rad: float, scale: float = 1.0
 
 
 def join_frames(
-    edges_cm: Sequence[Float[np.ndarray, "_ 2"]],
+    edges: Sequence[Float[np.ndarray, "_ 4"]],
     lines_cm: Sequence[Lines],
     points_cm: Float[np.ndarray, "n 6"],
     camera_cm: Float[np.ndarray, "n 3"] | None = None,
@@ -70,24 +70,26 @@ def join_frames(
     """Lay frames one after the other, as the compiled loops take them.
 
     Args:
-        edges_cm: Edge points of each frame, frame car.
+        edges: Edge points of each frame, as label sets hold them: x, y, [cm], normal x, normal y, frame car.
         lines_cm: Left and right lane line of each frame, in the direction of travel, frame car.
         points_cm: Labels of each frame; a point that is masked here stays masked.
         camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
             one for all.
     """
-    size = len(edges_cm)
+    size = len(edges)
     polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
     lines_of_edges = []
     for k in range(size):
-        near = np.empty(len(edges_cm[k]), np.uint8)
-        near_lines(np.asarray(edges_cm[k], np.float32), polylines[2 * k], polylines[2 * k + 1], near)
+        near = np.empty(len(edges[k]), np.uint8)
+        near_lines(np.asarray(edges[k], np.float32), polylines[2 * k], polylines[2 * k + 1], near)
         lines_of_edges.append(near)
     typical = np.tile(np.array(TYPICAL_CAMERA_CM), (size, 1))
     return Frames(
-        edges_cm=np.concatenate([np.empty((0, 2), np.float32), *edges_cm]).astype(np.float32),
+        edges_cm=np.concatenate([np.empty((0, 2), np.float32), *(e[:, :2] for e in edges)]).astype(
+            np.float32
+        ),
         edge_lines=np.concatenate([np.empty(0, np.uint8), *lines_of_edges]),
-        edge_start=_starts(edges_cm),
+        edge_start=_starts(edges),
         lines_cm=np.concatenate([np.empty((0, 2)), *polylines]),
         line_start=_starts(polylines),
         points_cm=np.ascontiguousarray(points_cm, np.float64),
@@ -145,22 +147,23 @@ def augment_batch(
 
 
 def lines_present(
-    edges_cm: Float[np.ndarray, "m 2"], lines_cm: Lines, window: BirdseyeWindow
+    edges: Float[np.ndarray, "m 4"], lines_cm: Lines, window: BirdseyeWindow
 ) -> Float[np.ndarray, "2"]:
     """Say which lines of the lane a raster of edge points shows.
 
-    A line is there if the edge points within 4 cm of its polyline mark cells of the raster over a length of
-    at least 9 cm (both edges of a tape count), and not there if they do so over less than 3 cm.
+    A line is there if the edge points within 4 cm of its polyline that run along it, by up to 30 degrees,
+    mark cells of the raster over a length of at least 9 cm (both edges of a tape count), and not there if
+    they do so over less than 3 cm.
 
     Args:
-        edges_cm: Edge points, frame car.
+        edges: Edge points, [cm], and their normals, frame car.
         lines_cm: Left and right lane line, frame car; NaN rows break them.
         window: Grid of the raster.
 
     Returns:
         Left and right: 1 there, 0 not there; NaN in between, and where the place of the line is unknown.
     """
-    frames = join_frames([np.asarray(edges_cm, np.float32)], [lines_cm], np.full((1, 6), np.nan))
+    frames = join_frames([np.asarray(edges, np.float32)], [lines_cm], np.full((1, 6), np.nan))
     return plain_batch(frames, np.zeros(1, np.int64), window)[2][0]
 
 

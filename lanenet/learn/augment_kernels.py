@@ -16,6 +16,7 @@ from numba import njit
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.learn.clutter_kernels import CORNERS, add_clutter, draw_outline, is_inside, mark_outline
 from lanenet.learn.mounting_kernels import misplace
+from lanenet.learn.presence_kernels import count_cells, presence
 from lanenet.learn.random_stream import (
     next_amount,
     next_bell,
@@ -26,11 +27,6 @@ from lanenet.learn.random_stream import (
     start_stream,
 )
 from lanenet.learn.raster_kernels import mark
-
-#: Both edges of a wide tape, and what a blurred frame puts beside them.
-LINE_REACH_CM = 4.0
-#: A line that marks cells over this length is there for everybody; over less than the second it is not.
-SEEN_CM, UNSEEN_CM = 9.0, 3.0
 
 _STRETCH_CM = (4.0, 20.0)
 _DOUBLE_CM = 1.5
@@ -44,6 +40,7 @@ class Amounts(NamedTuple):
     shift_cm: float
     rotate_rad: float
     scale: float
+    bend_per_m: float
     drop_points: float
     double_points: float
     jitter_cm: float
@@ -57,11 +54,15 @@ class Amounts(NamedTuple):
     height: float
     pitch_rad: float
     roll_rad: float
+    beside_cm: float
     limit: int
 
 
 class Frames(NamedTuple):
-    """Frames one after the other; the attributes of :class:`lanenet.learn.dataset.LaneSamples`."""
+    """Frames one after the other; the attributes of :class:`lanenet.learn.dataset.LaneSamples`.
+
+    ``edge_lines`` is what :func:`lanenet.learn.presence_kernels.near_lines` answers.
+    """
 
     edges_cm: np.ndarray
     edge_lines: np.ndarray
@@ -83,9 +84,9 @@ def rasterise_frames(out, indices, frames, grid, present):
         cells[:] = 0
         for k in range(frames.edge_start[i], frames.edge_start[i + 1]):
             if mark(out[slot, 0], frames.edges_cm[k, 0], frames.edges_cm[k, 1], grid):
-                _count(cells, frames.edge_lines[k])
+                count_cells(cells, frames.edge_lines[k])
         for side in range(2):
-            present[slot, side] = _presence(cells[side], frames, 2 * i + side, grid)
+            present[slot, side] = presence(cells[side], frames, 2 * i + side, grid)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -109,12 +110,13 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
         shift = next_spread(rng, amounts.shift_cm, amounts.limit)
         turn = next_spread(rng, amounts.rotate_rad, amounts.limit)
         scale = np.exp(next_spread(rng, np.log1p(amounts.scale), amounts.limit))
+        bend = 0.01 * next_spread(rng, amounts.bend_per_m, amounts.limit)
         sign = -1.0 if mirror else 1.0
         c, s = np.cos(turn), np.sin(turn)
         # As in `lanenet.learn.augment.make_view`.
         xx, xy, yx, yy = sign * c * scale, -sign * s * scale, s * scale, c * scale
         x0, y0 = -shift * c, shift * s
-        _label(labels[slot], frames, i, (mirror, xx, xy, yx, yy, x0, y0), grid)
+        _label(labels[slot], frames, i, (mirror, bend, xx, xy, yx, yy, x0, y0), grid, amounts.beside_cm)
         height, pitch, roll = (
             1.0 + next_spread(rng, amounts.height, amounts.limit),
             next_spread(rng, amounts.pitch_rad, amounts.limit),
@@ -141,6 +143,7 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
                 continue
             if kind == 2 and abs(np.sqrt(px * px + py * py) - place_x) <= radius:
                 continue
+            px, py = bent(px, py, bend)
             x, y = px * xx + py * yx + x0, px * xy + py * yy + y0
             hidden = False
             for o in range(n_objects):
@@ -154,13 +157,13 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
                 y += amounts.jitter_cm * next_bell(rng)
             if mark(raster, x, y, grid):
                 count += 1
-                _count(cells, lines)
+                count_cells(cells, lines)
             if doubled > 0.0 and next_uniform(rng) < doubled:
                 x += next_between(rng, -_DOUBLE_CM, _DOUBLE_CM)
                 mark(raster, x, y + next_between(rng, -_DOUBLE_CM, _DOUBLE_CM), grid)
         for side in range(2):
             line = 2 * i + (1 - side if mirror else side)
-            present[slot, side] = _presence(cells[1 - side if mirror else side], frames, line, grid)
+            present[slot, side] = presence(cells[1 - side if mirror else side], frames, line, grid)
         for o in range(n_objects):
             mark_outline(raster, corners[o], grid)
         add_clutter(rng, raster, count, grid, amounts)
@@ -168,36 +171,28 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def near_lines(edges_cm, left_cm, right_cm, out):
-    """Set bit 0 for edge points within ``LINE_REACH_CM`` of the left line, bit 1 for the right one."""
-    reach = LINE_REACH_CM * LINE_REACH_CM
-    for k in range(len(edges_cm)):
-        x, y = edges_cm[k, 0], edges_cm[k, 1]
-        found = 0
-        for side in range(2):
-            line = left_cm if side == 0 else right_cm
-            for j in range(len(line) - 1):
-                ax, ay = line[j, 0], line[j, 1]
-                bx, by = line[j + 1, 0] - ax, line[j + 1, 1] - ay
-                length = bx * bx + by * by
-                t = ((x - ax) * bx + (y - ay) * by) / length if length > 0.0 else 0.0
-                t = min(max(t, 0.0), 1.0)
-                # NaN, where a polyline is broken, is never near.
-                if (x - ax - t * bx) ** 2 + (y - ay - t * by) ** 2 <= reach:
-                    found |= 1 << side
-                    break
-        out[k] = found
+def bent(x, y, bend):
+    """Bend the road: the line x = 0 becomes an arc of this curvature, [1/cm], positive to the left.
+
+    What lies across the road stays at right angles to it and as wide as it was. Sine and cosine are cut off
+    after their first terms, by 1e-3 at an angle of 0.6 rad: the road need not be a circle, as long as edges
+    and lines are bent alike.
+    """
+    angle = bend * y
+    square = angle * angle
+    sine, cosine = angle * (1.0 - square / 6.0), 1.0 - 0.5 * square * (1.0 - square / 12.0)
+    return x * cosine - 0.5 * y * angle * (1.0 - square / 12.0), y * (1.0 - square / 6.0) + x * sine
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def _label(labels, frames, i, view, grid):
+def _label(labels, frames, i, view, grid, beside_cm):
     """Labels of the moved car: where its lines cross the rows, for points that the label set vouches for.
 
-    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points beside the window have no
-    label, as in :meth:`BirdseyeWindow.labelled`.
+    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points farther than ``beside_cm``
+    beside the window have no label, as in :meth:`BirdseyeWindow.labelled`.
     """
-    mirror, xx, xy, yx, yy, x0, y0 = view
+    mirror, bend, xx, xy, yx, yy, x0, y0 = view
     for side in range(2):
         old = 1 - side if mirror else side
         first, last = frames.line_start[2 * i + old], frames.line_start[2 * i + old + 1]
@@ -207,37 +202,17 @@ def _label(labels, frames, i, view, grid):
                 continue
             y_row = _LABEL_ROWS_CM[row]
             for k in range(first, last - 1):
-                ax, ay = frames.lines_cm[k, 0], frames.lines_cm[k, 1]
-                bx, by = frames.lines_cm[k + 1, 0], frames.lines_cm[k + 1, 1]
+                ax, ay = bent(frames.lines_cm[k, 0], frames.lines_cm[k, 1], bend)
+                bx, by = bent(frames.lines_cm[k + 1, 0], frames.lines_cm[k + 1, 1], bend)
                 a = ax * xy + ay * yy + y0
                 b = bx * xy + by * yy + y0
                 if a <= y_row and b > y_row:
                     t = (y_row - a) / (b - a)
                     x_a, x_b = ax * xx + ay * yx + x0, bx * xx + by * yx + x0
                     x = x_a + t * (x_b - x_a)
-                    if grid.label_left_cm <= x <= grid.label_right_cm:
+                    if grid.label_left_cm - beside_cm <= x <= grid.label_right_cm + beside_cm:
                         labels[3 * side + row] = x
                     break
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def _presence(cells, frames, line, grid):
-    """1 for a line that is seen, 0 for one that is not, NaN between them or where its place is unknown."""
-    known = False
-    for k in range(frames.line_start[line], frames.line_start[line + 1]):
-        known = known or not np.isnan(frames.lines_cm[k, 0])
-    seen_cm = cells * grid.cell_cm
-    if not known or UNSEEN_CM <= seen_cm < SEEN_CM:
-        return np.nan
-    return 1.0 if seen_cm >= SEEN_CM else 0.0
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def _count(cells, lines):
-    cells[0] += lines & 1
-    cells[1] += lines >> 1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -83,7 +83,7 @@ class LaneSamples:
         self.wheelbase_cm = float(np.mean([labels.meta.wheelbase_cm for labels, _ in pairs]))
         self.points_cm: Float[np.ndarray, "n 6"] = np.array([labels.points_cm[i] for labels, i in pairs])
         self.frames = join_frames(
-            [labels.edges[i][:, :2] for labels, i in pairs],
+            [labels.edges[i] for labels, i in pairs],
             [labels.lines[i] for labels, i in pairs],
             self.points_cm,
             np.array([labels.meta.camera_cm or TYPICAL_CAMERA_CM for labels, _ in pairs]),

@@ -39,9 +39,11 @@ NOTHING = AugmentSettings(
     height=0.0,
     pitch_rad=0.0,
     roll_rad=0.0,
+    bend_per_m=0.0,
+    beside_cm=0.0,
 )
 LABELS = make_label_set(12, seed=5)
-EDGES = [e[:, :2] for e in LABELS.edges]
+EDGES = LABELS.edges
 FRAMES = join_frames(EDGES, LABELS.lines, LABELS.points_cm)
 ALL = np.arange(12)
 
@@ -68,7 +70,10 @@ def test_rasters_are_those_of_the_window_byte_for_byte(points, window):
         [window.left_cm + k * window.cell_cm, window.far_cm - k * window.cell_cm] for k in range(-1, 52)
     ]
     edges = np.array([*points, *border, [np.nan, 3.0], [3.0, np.inf]], np.float32)
-    frames = join_frames([edges], [(np.empty((0, 2)), np.empty((0, 2)))], np.full((1, 6), np.nan))
+    normals = np.tile(np.float32([1.0, 0.0]), (len(edges), 1))
+    frames = join_frames(
+        [np.hstack([edges, normals])], [(np.empty((0, 2)), np.empty((0, 2)))], np.full((1, 6), np.nan)
+    )
     expected = window.rasterise(edges)
     np.testing.assert_array_equal(plain_batch(frames, np.array([0]), window)[0][0, 0], expected)
     unchanged = augment_batch(frames, np.array([0]), window, NOTHING, 0, 0)[0][0, 0]
@@ -140,7 +145,7 @@ def test_labels_are_those_of_the_moved_polylines():
     lines = (np.stack([-20.0 + 0.01 * y * y, y], 1), np.stack([20.0 + 0.3 * y, y], 1))
     lines[1][30] = np.nan
     points = np.array([-20.0, -20.0, np.nan, 20.0, 20.0, np.nan])
-    frames = join_frames([np.empty((0, 2), np.float32)], [lines], points[None])
+    frames = join_frames([np.empty((0, 4), np.float32)], [lines], points[None])
     window = BirdseyeWindow()
     for mirror in (0.0, 1.0):
         for shift in (-5.0, 5.0):
@@ -150,6 +155,74 @@ def test_labels_are_those_of_the_moved_polylines():
             found = [augment_batch(frames, ALL[:1], window, fixed, k, 0)[1][0] for k in range(20)]
             assert any(np.allclose(f, window.labelled(expected), atol=1e-4, equal_nan=True) for f in found)
     assert np.isnan(found[0][[2, 5]]).all()
+
+
+def test_what_lies_across_a_missing_line_goes_with_it():
+    # The ends of a tape lie across it: they would tell where the line was.
+    across = [edge * np.float32([1.0, 1.0, 0.0, 0.0]) + np.float32([0.0, 0.0, 0.0, 1.0]) for edge in EDGES]
+    frames = join_frames(across, LABELS.lines, LABELS.points_cm)
+    gone = NOTHING.model_copy(update={"missing_both": 1.0})
+    assert not augment_batch(frames, ALL, WINDOW, gone, 0, 0)[0].any()
+
+
+def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
+    y = np.arange(-60.0, 120.0, 2.0)
+    lines = tuple(np.stack([np.full(len(y), x), y], 1) for x in (-20.0, 20.0))
+
+    def column(x, normal):
+        edge = np.stack([np.full(120, x), np.linspace(4.0, 64.0, 120)], 1)
+        return np.hstack([edge, np.tile(normal, (120, 1))]).astype(np.float32)
+
+    # Left line, the next lane's border, a scratch between them, and the right line.
+    parts = [column(-20.0, (1.0, 0.0)), column(-40.0, (1.0, 0.1)), column(-30.0, (0.0, 1.0))]
+    right = column(20.0, (1.0, 0.0))
+    frames = join_frames([np.concatenate([*parts, right])], [lines], np.repeat([-20.0, 20.0], 3)[None])
+    fine, seen = BirdseyeWindow(), set()
+    for seed in range(8):
+        gone = NOTHING.model_copy(update={"missing_line": 1.0})
+        rasters, _, present = augment_batch(frames, ALL[:1], fine, gone, seed, 0)
+        kept = [parts[2], right] if present[0, 0] == 0.0 else parts
+        np.testing.assert_array_equal(rasters[0, 0], fine.rasterise(np.concatenate(kept)[:, :2]))
+        seen.add(tuple(present[0].tolist()))
+    assert seen == {(0.0, 1.0), (1.0, 0.0)}
+    # A border farther out is not the line itself.
+    beyond = lines_present(np.concatenate([parts[1], right]), lines, fine)
+    np.testing.assert_array_equal(beyond, [0.0, 1.0])
+
+
+def test_a_bent_road_keeps_its_width_and_its_labels_follow():
+    y = np.arange(-60.0, 120.0, 2.0)
+    lines = tuple(np.stack([np.full(len(y), x), y], 1) for x in (-20.0, 20.0))
+    edges = np.concatenate([np.stack([np.full(400, x), np.linspace(2, 70, 400)], 1) for x in (-20.0, 20.0)])
+    normals = np.tile([1.0, 0.0], (len(edges), 1))
+    frames = join_frames([np.hstack([edges, normals])], [lines], np.repeat([-20.0, 20.0], 3)[None])
+    wide = BirdseyeWindow(left_cm=-80.0, near_cm=-20.0, cell_cm=0.5, rows=220, columns=320)
+    bend = NOTHING.model_copy(update={"bend_per_m": 0.5, "draw": "limit"})
+    signs = set()
+    for seed in range(8):
+        rasters, points, present = augment_batch(frames, ALL[:1], wide, bend, seed, 0)
+        middle = points[0].reshape(2, 3).mean(axis=0)
+        signs.add(np.sign(middle[2]))
+        # Circles about (-R, 0) and (R, 0), of radii R - 20 and R + 20.
+        radius, side = 200.0, np.sign(middle[2])
+        for line, offset in zip(points[0].reshape(2, 3), (-20.0, 20.0), strict=True):
+            r = radius - side * offset
+            expected = side * (radius - np.sqrt(r * r - np.array([0.0, 15.0, 30.0]) ** 2))
+            np.testing.assert_allclose(line, expected, atol=0.05)
+        seen = wide.points(np.argwhere(rasters[0, 0]).astype(float))
+        off = np.abs(np.abs(np.hypot(seen[:, 0] - side * radius, seen[:, 1]) - radius) - 20.0)
+        assert off.max() < 0.6
+        np.testing.assert_array_equal(present, [[1.0, 1.0]])
+    assert signs == {-1.0, 1.0}
+
+
+def test_labels_beside_the_window_are_given_where_they_are_asked_for():
+    narrow = BirdseyeWindow(left_cm=-22.0, near_cm=0.0, cell_cm=1.0, rows=72, columns=44)
+    inside, asked = augment({}, narrow)[1], augment({"beside_cm": 5.0}, narrow)[1]
+    plain = LABELS.points_cm
+    np.testing.assert_array_equal(np.isfinite(inside), np.abs(plain) <= 22.0)
+    np.testing.assert_array_equal(np.isfinite(asked), np.abs(plain) <= 27.0)
+    assert np.isfinite(asked).sum() > np.isfinite(inside).sum()
 
 
 def test_scaling_scales_the_labels():
@@ -188,7 +261,9 @@ def test_a_wrong_calibration_moves_the_raster_and_not_the_labels():
     rasters, points = augment({"pitch_rad": 0.0175, "draw": "limit"}, BirdseyeWindow())
     np.testing.assert_allclose(points, LABELS.points_cm, atol=1e-4)
     for i in ALL:
-        edges = [misplaced(EDGES[i], np.array([0.0, 0.0, 18.0]), pitch_rad=p) for p in (-0.0175, 0.0175)]
+        edges = [
+            misplaced(EDGES[i][:, :2], np.array([0.0, 0.0, 18.0]), pitch_rad=p) for p in (-0.0175, 0.0175)
+        ]
         expected = [BirdseyeWindow().rasterise(e.astype(np.float32)) for e in edges]
         different = [np.count_nonzero(rasters[i, 0] != e) for e in expected]
         assert min(different) <= 2 < max(different)
@@ -253,11 +328,16 @@ def test_presence_needs_enough_edges_near_the_line():
     near = EDGES[0][: 144 * 2]  # both edges of the left tape, 8 to 80 cm ahead
     np.testing.assert_array_equal(lines_present(near, lines, fine), [1.0, 0.0])
     np.testing.assert_array_equal(lines_present(EDGES[0], lines, fine), [1.0, 1.0])
-    # 1.5 cm of one edge are nothing, 5 cm could be anything, 15 cm are a line.
-    for points, expected in ((3, 0.0), (10, np.nan), (30, 1.0)):
+    # 1.5 cm of one edge are nothing, 10 cm could be anything, 25 cm are a line.
+    for points, expected in ((3, 0.0), (20, np.nan), (50, 1.0)):
         np.testing.assert_array_equal(lines_present(near[:points], lines, fine), [expected, 0.0])
-    beside = near + np.float32([5.5, 0.0])
+    beside = near + np.float32([5.5, 0.0, 0.0, 0.0])
     assert lines_present(beside, lines, fine)[0] == 0.0
+    # As many edges, but across the road: the shadow of something, no tape.
+    for lean_deg, expected in ((20.0, 1.0), (45.0, 0.0), (90.0, 0.0)):
+        lean, turned = math.radians(lean_deg), near.copy()
+        turned[:, 2:] = math.cos(lean), math.sin(lean)
+        np.testing.assert_array_equal(lines_present(turned, lines, fine), [expected, 0.0])
     nowhere = (np.full((3, 2), np.nan), np.empty((0, 2)))
     assert np.isnan(lines_present(near, nowhere, fine)).all()
 
@@ -288,7 +368,7 @@ def test_clutter_only_adds():
 
 
 def test_an_empty_frame_can_be_augmented():
-    edges, lines = np.empty((0, 2), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
+    edges, lines = np.empty((0, 4), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
     frames = join_frames([edges], [lines], np.full((1, 6), np.nan))
     changes = {"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0, "clutter_share": 1.0}
     one = np.array([0])
