@@ -78,6 +78,12 @@ class AugmentSettings(Settings):
             raise ValueError("missing_line and missing_both must sum to at most 1")
         return self
 
+    @classmethod
+    def only(cls, **changes: object) -> AugmentSettings:
+        """Return settings that change nothing but what is named."""
+        nothing: dict[str, object] = {name: 0 for name in cls.model_fields if name != "draw"}
+        return cls.model_validate(nothing | changes)
+
 
 #: Channels of the convolutions and width of the fully connected layer of the compact family.
 _SIZES: dict[str, tuple[tuple[int, ...], int]] = {
