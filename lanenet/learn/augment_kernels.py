@@ -40,7 +40,6 @@ class Amounts(NamedTuple):
     shift_cm: float
     rotate_rad: float
     scale: float
-    bend_per_m: float
     drop_points: float
     double_points: float
     jitter_cm: float
@@ -54,7 +53,6 @@ class Amounts(NamedTuple):
     height: float
     pitch_rad: float
     roll_rad: float
-    beside_cm: float
     limit: int
 
 
@@ -110,13 +108,12 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
         shift = next_spread(rng, amounts.shift_cm, amounts.limit)
         turn = next_spread(rng, amounts.rotate_rad, amounts.limit)
         scale = np.exp(next_spread(rng, np.log1p(amounts.scale), amounts.limit))
-        bend = 0.01 * next_spread(rng, amounts.bend_per_m, amounts.limit)
         sign = -1.0 if mirror else 1.0
         c, s = np.cos(turn), np.sin(turn)
         # As in `lanenet.learn.augment.make_view`.
         xx, xy, yx, yy = sign * c * scale, -sign * s * scale, s * scale, c * scale
         x0, y0 = -shift * c, shift * s
-        _label(labels[slot], frames, i, (mirror, bend, xx, xy, yx, yy, x0, y0), grid, amounts.beside_cm)
+        _label(labels[slot], frames, i, (mirror, xx, xy, yx, yy, x0, y0), grid)
         height, pitch, roll = (
             1.0 + next_spread(rng, amounts.height, amounts.limit),
             next_spread(rng, amounts.pitch_rad, amounts.limit),
@@ -143,7 +140,6 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
                 continue
             if kind == 2 and abs(np.sqrt(px * px + py * py) - place_x) <= radius:
                 continue
-            px, py = bent(px, py, bend)
             x, y = px * xx + py * yx + x0, px * xy + py * yy + y0
             hidden = False
             for o in range(n_objects):
@@ -171,28 +167,13 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def bent(x, y, bend):
-    """Bend the road: the line x = 0 becomes an arc of this curvature, [1/cm], positive to the left.
-
-    What lies across the road stays at right angles to it and as wide as it was. Sine and cosine are cut off
-    after their first terms, by 1e-3 at an angle of 0.6 rad: the road need not be a circle, as long as edges
-    and lines are bent alike.
-    """
-    angle = bend * y
-    square = angle * angle
-    sine, cosine = angle * (1.0 - square / 6.0), 1.0 - 0.5 * square * (1.0 - square / 12.0)
-    return x * cosine - 0.5 * y * angle * (1.0 - square / 12.0), y * (1.0 - square / 6.0) + x * sine
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def _label(labels, frames, i, view, grid, beside_cm):
+def _label(labels, frames, i, view, grid):
     """Labels of the moved car: where its lines cross the rows, for points that the label set vouches for.
 
-    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points farther than ``beside_cm``
-    beside the window have no label, as in :meth:`BirdseyeWindow.labelled`.
+    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points beside the window have no
+    label, as in :meth:`BirdseyeWindow.labelled`.
     """
-    mirror, bend, xx, xy, yx, yy, x0, y0 = view
+    mirror, xx, xy, yx, yy, x0, y0 = view
     for side in range(2):
         old = 1 - side if mirror else side
         first, last = frames.line_start[2 * i + old], frames.line_start[2 * i + old + 1]
@@ -202,15 +183,15 @@ def _label(labels, frames, i, view, grid, beside_cm):
                 continue
             y_row = _LABEL_ROWS_CM[row]
             for k in range(first, last - 1):
-                ax, ay = bent(frames.lines_cm[k, 0], frames.lines_cm[k, 1], bend)
-                bx, by = bent(frames.lines_cm[k + 1, 0], frames.lines_cm[k + 1, 1], bend)
+                ax, ay = frames.lines_cm[k, 0], frames.lines_cm[k, 1]
+                bx, by = frames.lines_cm[k + 1, 0], frames.lines_cm[k + 1, 1]
                 a = ax * xy + ay * yy + y0
                 b = bx * xy + by * yy + y0
                 if a <= y_row and b > y_row:
                     t = (y_row - a) / (b - a)
                     x_a, x_b = ax * xx + ay * yx + x0, bx * xx + by * yx + x0
                     x = x_a + t * (x_b - x_a)
-                    if grid.label_left_cm - beside_cm <= x <= grid.label_right_cm + beside_cm:
+                    if grid.label_left_cm <= x <= grid.label_right_cm:
                         labels[3 * side + row] = x
                     break
 

@@ -26,8 +26,6 @@ class AugmentSettings(Settings):
         rotate_rad: The car is turned about its front axle by up to this much.
         scale: All lengths, those of the labels too, become larger or smaller by up to this share: another
             lane width, another tape, another height of the camera.
-        bend_per_m: The road is bent to the left or to the right by up to this curvature, over its own one;
-            sharp bends are rare in drives, and what a network is worst at.
         drop_points: Up to this share of the edge points is dropped, a new share for every sample.
         double_points: Up to this share of the edge points comes twice, the second within 1.5 cm.
         jitter_cm: Standard deviation of the noise on each edge point.
@@ -45,8 +43,6 @@ class AugmentSettings(Settings):
             labels do not.
         pitch_rad: Its pitch is taken wrong by up to this much.
         roll_rad: Its roll likewise.
-        beside_cm: Points that the moved car sees up to this far beside the window have labels too. Without
-            them a network learns that no line ever leaves the window, and draws those that do back into it.
         draw: ``even`` draws every amount anew for each sample; ``limit`` takes all amounts at their limits,
             with either sign, for tests of robustness.
     """
@@ -55,7 +51,6 @@ class AugmentSettings(Settings):
     shift_cm: float = Field(default=8.0, ge=0.0, le=50.0)
     rotate_rad: float = Field(default=0.26, ge=0.0, le=0.8)
     scale: float = Field(default=0.0, ge=0.0, le=1.0)
-    bend_per_m: float = Field(default=0.0, ge=0.0, le=1.0)
     drop_points: float = Field(default=0.3, ge=0.0, lt=1.0)
     double_points: float = Field(default=0.1, ge=0.0, le=1.0)
     jitter_cm: float = Field(default=0.15, ge=0.0, le=5.0)
@@ -69,7 +64,6 @@ class AugmentSettings(Settings):
     height: float = Field(default=0.03, ge=0.0, le=0.3)
     pitch_rad: float = Field(default=0.0175, ge=0.0, le=0.2)
     roll_rad: float = Field(default=0.0175, ge=0.0, le=0.2)
-    beside_cm: float = Field(default=16.0, ge=0.0, le=100.0)
     draw: Literal["even", "limit"] = "even"
 
     @model_validator(mode="after")
@@ -77,6 +71,12 @@ class AugmentSettings(Settings):
         if self.missing_line + self.missing_both > 1.0:
             raise ValueError("missing_line and missing_both must sum to at most 1")
         return self
+
+    @classmethod
+    def only(cls, **changes: object) -> AugmentSettings:
+        """Return settings that change nothing but what is named."""
+        nothing: dict[str, object] = {name: 0 for name in cls.model_fields if name != "draw"}
+        return cls.model_validate(nothing | changes)
 
 
 #: Channels of the convolutions and width of the fully connected layer of the compact family.

@@ -86,6 +86,13 @@ class LaneNet(nn.Module):
         sigma = torch.exp(middle + half * torch.tanh(spread / half)) * self.sigma_factor
         return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
 
+    @torch.no_grad()
+    def lower_presence(self, by: float) -> None:
+        """Take this from the logarithm of the odds of both lines, for all rasters."""
+        last = self.head[-1] if isinstance(self.head, nn.Sequential) else self.head
+        assert isinstance(last, nn.Linear)
+        last.bias[-len(SIDES) :] -= by
+
     @property
     def n_parameters(self) -> int:
         """Number of trainable values."""

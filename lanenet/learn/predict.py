@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.evaluate import ErrorTable, point_errors
-from lanenet.learn.network import LaneNet, input_of_rasters
+from lanenet.learn.network import LaneNet, LaneOutput, input_of_rasters
 
 _BATCH = 256
 
@@ -41,18 +41,27 @@ class Answers:
         return point_errors(self.points_cm, self.truth_cm, self.reference)
 
 
-def predict(network: LaneNet, samples: LaneSamples) -> Answers:
-    """Run a network over frames as they are; it is left in the mode in which it was."""
+def answer_rasters(network: LaneNet, rasters: UInt8[np.ndarray, "n 1 r c"]) -> LaneOutput:
+    """Run a network over rasters of 0 and 255; it is left in the mode in which it was."""
     was_training, device = network.training, network.mean_cm.device
     network.eval()
-    parts: list[tuple[np.ndarray, ...]] = []
     with torch.inference_mode():
-        for start in range(0, len(samples), _BATCH):
-            chosen = np.arange(start, min(start + _BATCH, len(samples)))
-            rasters, _, present = samples.plain_batch(chosen)
-            output = network(input_of_rasters(torch.from_numpy(rasters).to(device)))
-            values = (output.points_cm, output.sigma_cm, torch.sigmoid(output.presence_logit))
-            parts.append((*(v.cpu().numpy().astype(np.float64) for v in values), present.astype(np.float64)))
+        parts = [
+            network(input_of_rasters(torch.from_numpy(rasters[start : start + _BATCH]).to(device)))
+            for start in range(0, len(rasters), _BATCH)
+        ]
     network.train(was_training)
+    return LaneOutput(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def predict(network: LaneNet, samples: LaneSamples) -> Answers:
+    """Run a network over frames as they are; it is left in the mode in which it was."""
+    parts: list[tuple[np.ndarray, ...]] = []
+    for start in range(0, len(samples), _BATCH):
+        # A batch at a time: the rasters of many frames take more memory than the frames.
+        rasters, _, present = samples.plain_batch(np.arange(start, min(start + _BATCH, len(samples))))
+        output = answer_rasters(network, rasters)
+        values = (output.points_cm, output.sigma_cm, torch.sigmoid(output.presence_logit))
+        parts.append((*(v.cpu().numpy().astype(np.float64) for v in values), present.astype(np.float64)))
     points, sigma, presence, present = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Answers(points, sigma, presence, samples.points_cm, present, samples.reference)

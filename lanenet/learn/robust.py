@@ -23,12 +23,6 @@ Progress = Callable[[int, int], None]
 
 FORMAT = "lanenet-robustness/1"
 
-_NONE: dict[str, object] = {
-    **dict.fromkeys(("mirror", "shift_cm", "rotate_rad", "scale", "drop_points", "double_points"), 0.0),
-    **dict.fromkeys(("bend_per_m", "jitter_cm", "missing_stretch", "missing_line", "missing_both"), 0.0),
-    **dict.fromkeys(("clutter_share", "height", "pitch_rad", "roll_rad", "beside_cm"), 0.0),
-    **dict.fromkeys(("objects", "clutter_segments", "clutter_points"), 0),
-}
 #: What is changed, and how much; with the draw "limit" every frame by all of it, with either sign.
 CHANGES: dict[str, dict[str, object]] = {
     "none": {},
@@ -153,7 +147,7 @@ def _with_width(answers: RasterAnswers, widths_cm: Float[np.ndarray, "n"]) -> Ra
 
 def change_settings(change: str) -> AugmentSettings:
     """Return one of ``CHANGES`` as settings of the augmentation that change nothing else."""
-    return AugmentSettings.model_validate({**_NONE, **CHANGES[change]})
+    return AugmentSettings.only(**CHANGES[change])
 
 
 def robust_table(rows: Sequence[RobustRow]) -> TextTable:

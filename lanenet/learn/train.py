@@ -15,10 +15,11 @@ from torch import Tensor
 
 from lanenet.data.label_set import read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
+from lanenet.learn.calibrate import calibrate_presence, calibrate_sigma
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
 from lanenet.learn.export import MODEL_NAME
-from lanenet.learn.loss import lane_loss, sigma_factors
+from lanenet.learn.loss import lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
 from lanenet.learn.predict import predict
@@ -111,17 +112,11 @@ def train(
                     )
         network = run.best_network()
         calibrate_sigma(network, val)
+        calibrate_presence(network, val)
         answers = predict(network, val)
         best = run.state().best_record
         write_checkpoint(out, settings, network, samples, val, answers, run.history, run_hash)
     return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
-
-
-def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
-    """Scale a network's spread so that 68 % of its errors on frames it did not learn from lie within it."""
-    answers = predict(network, val)
-    factors = sigma_factors(answers.points_cm - answers.truth_cm, answers.sigma_cm)
-    network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
 
 
 class TrainingRun:

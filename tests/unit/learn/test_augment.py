@@ -39,8 +39,6 @@ NOTHING = AugmentSettings(
     height=0.0,
     pitch_rad=0.0,
     roll_rad=0.0,
-    bend_per_m=0.0,
-    beside_cm=0.0,
 )
 LABELS = make_label_set(12, seed=5)
 EDGES = LABELS.edges
@@ -188,41 +186,6 @@ def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
     # A border farther out is not the line itself.
     beyond = lines_present(np.concatenate([parts[1], right]), lines, fine)
     np.testing.assert_array_equal(beyond, [0.0, 1.0])
-
-
-def test_a_bent_road_keeps_its_width_and_its_labels_follow():
-    y = np.arange(-60.0, 120.0, 2.0)
-    lines = tuple(np.stack([np.full(len(y), x), y], 1) for x in (-20.0, 20.0))
-    edges = np.concatenate([np.stack([np.full(400, x), np.linspace(2, 70, 400)], 1) for x in (-20.0, 20.0)])
-    normals = np.tile([1.0, 0.0], (len(edges), 1))
-    frames = join_frames([np.hstack([edges, normals])], [lines], np.repeat([-20.0, 20.0], 3)[None])
-    wide = BirdseyeWindow(left_cm=-80.0, near_cm=-20.0, cell_cm=0.5, rows=220, columns=320)
-    bend = NOTHING.model_copy(update={"bend_per_m": 0.5, "draw": "limit"})
-    signs = set()
-    for seed in range(8):
-        rasters, points, present = augment_batch(frames, ALL[:1], wide, bend, seed, 0)
-        middle = points[0].reshape(2, 3).mean(axis=0)
-        signs.add(np.sign(middle[2]))
-        # Circles about (-R, 0) and (R, 0), of radii R - 20 and R + 20.
-        radius, side = 200.0, np.sign(middle[2])
-        for line, offset in zip(points[0].reshape(2, 3), (-20.0, 20.0), strict=True):
-            r = radius - side * offset
-            expected = side * (radius - np.sqrt(r * r - np.array([0.0, 15.0, 30.0]) ** 2))
-            np.testing.assert_allclose(line, expected, atol=0.05)
-        seen = wide.points(np.argwhere(rasters[0, 0]).astype(float))
-        off = np.abs(np.abs(np.hypot(seen[:, 0] - side * radius, seen[:, 1]) - radius) - 20.0)
-        assert off.max() < 0.6
-        np.testing.assert_array_equal(present, [[1.0, 1.0]])
-    assert signs == {-1.0, 1.0}
-
-
-def test_labels_beside_the_window_are_given_where_they_are_asked_for():
-    narrow = BirdseyeWindow(left_cm=-22.0, near_cm=0.0, cell_cm=1.0, rows=72, columns=44)
-    inside, asked = augment({}, narrow)[1], augment({"beside_cm": 5.0}, narrow)[1]
-    plain = LABELS.points_cm
-    np.testing.assert_array_equal(np.isfinite(inside), np.abs(plain) <= 22.0)
-    np.testing.assert_array_equal(np.isfinite(asked), np.abs(plain) <= 27.0)
-    assert np.isfinite(asked).sum() > np.isfinite(inside).sum()
 
 
 def test_scaling_scales_the_labels():
