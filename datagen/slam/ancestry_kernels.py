@@ -22,6 +22,7 @@ from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PLAC
 
 _PLACE = (1 << PLACE_BITS) - 1
 _U = np.uint32  # as an index it needs no check for counting from the end
+_RECENT = 8  # cells along each side of the square that a node's last entries are known of
 
 
 @njit(cache=True, error_model="numpy")
@@ -151,19 +152,15 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     Returns:
         First point that was not entered, because the pages might not suffice for it.
     """
-    pose, points = tree.pose, tree.points
-    state, root = cells.state, cells.root
-    following, used, entered, vector, free = (
-        pages.following,
-        pages.used,
-        pages.node,
-        pages.vector,
-        pages.free,
-    )
+    pose, points, state, root = tree.pose, tree.points, cells.state, cells.root
+    following, used, free = pages.following, pages.used, pages.free
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
     nodes, mask = tree.nodes[row], state.shape[0] - 1
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    # Neighbouring points share cells: the entry that a node made last in each of a few cells takes both.
+    recent = np.full((nodes, _RECENT * _RECENT, 3), -1, np.int32)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
             return i
@@ -186,26 +183,35 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                 for jx in range(reach):
                     share = weight * wx[jx] * wy[jy]
                     ix, iy = cx + jx, cy + jy
-                    a, b = iy & mask, ix & mask
+                    a, b = _U(iy & mask), _U(ix & mask)
+                    slot = _U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
                     if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
                         # Another patch of road takes the cell over; what it held is forgotten.
-                        _free(pages, state[a, b, PAGE])
+                        if state[a, b, PAGE] >= 0:
+                            _free(pages, state[a, b, PAGE])
+                            recent[:] = -1
                         state[a, b, PAGE], state[a, b, STAMP] = -1, -1
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
                         state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
+                    elif recent[node, slot, 0] == ix and recent[node, slot, 1] == iy:
+                        like = _U(recent[node, slot, 2])
+                        vector[like, 0] += share * nx
+                        vector[like, 1] += share * ny
+                        continue
                     page = state[a, b, PAGE]
-                    if page < 0 or used[page] == PAGE_SIZE:
+                    if page < 0 or used[_U(page)] == PAGE_SIZE:
                         fresh = free[0]
                         free[0] = following[fresh]
                         free[1] -= 1
                         following[fresh] = page
                         used[fresh] = 0
                         state[a, b, PAGE] = page = fresh
-                    e = used[page]
-                    entered[page, e] = row << PLACE_BITS | node
-                    vector[page, e, 0] = share * nx
-                    vector[page, e, 1] = share * ny
-                    used[page] = e + 1
+                    out = page * PAGE_SIZE + used[_U(page)]
+                    used[_U(page)] += 1
+                    entered[_U(out)] = row << PLACE_BITS | node
+                    vector[_U(out), 0] = share * nx
+                    vector[_U(out), 1] = share * ny
+                    recent[node, slot, 0], recent[node, slot, 1], recent[node, slot, 2] = ix, iy, out
     return tree.size[row]
 
 
@@ -251,7 +257,7 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
             cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm - half))
             for iy in range(cy, cy + reach):
                 for ix in range(cx, cx + reach):
-                    a, b = iy & mask, ix & mask
+                    a, b = _U(iy & mask), _U(ix & mask)
                     if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
                         prune(tree, cells, pages, a, b, memory)
     if forced:

@@ -7,11 +7,12 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PLACE_BITS, PRUNED, STAMP
+from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PLACE_BITS, PRUNED, STAMP
 from datagen.slam.ancestry_kernels import prune
 
 _BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
 _PLACE = (1 << PLACE_BITS) - 1
+_U = np.uint32  # as an index it needs no check for counting from the end
 _FEW = 4  # particles that ask for the same cell and are yet looked up singly
 
 
@@ -35,7 +36,8 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
     """
     particles = len(poses)
     state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
-    following, used, entered, vector = pages.following, pages.used, pages.node, pages.vector
+    following, used = pages.following, pages.used
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
     span, window = tree.span, tree.span.shape[0]
     fade_of = np.empty(window)
     for row in range(window):
@@ -65,7 +67,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                 # Looked up before, for all particles.
                 x, y = values[rows[box], p, 0], values[rows[box], p, 1]
             else:
-                a, b = iy[p] & mask, ix[p] & mask
+                a, b = _U(iy[p] & mask), _U(ix[p] & mask)
                 mine = state[a, b, OWNER_X] == ix[p] and state[a, b, OWNER_Y] == iy[p]
                 page = -1
                 if mine:
@@ -79,11 +81,11 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     held = values[filled]
                     held[:, :] = 0.0
                     while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            row, place = node >> PLACE_BITS, node & _PLACE
-                            start, stop = span[row, place, 0], span[row, place, 1]
-                            vx, vy = fade_of[row] * vector[page, e, 0], fade_of[row] * vector[page, e, 1]
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = _U(at)
+                            row, place = _U(entered[e] >> PLACE_BITS), _U(entered[e] & _PLACE)
+                            start, stop = _U(span[row, place, 0]), _U(span[row, place, 1])
+                            vx, vy = fade_of[row] * vector[e, 0], fade_of[row] * vector[e, 1]
                             # Steps at both ends of the interval; the running sum makes them plateaus.
                             held[start, 0] += vx
                             held[start, 1] += vy
@@ -99,12 +101,12 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     x, y = held[p, 0], held[p, 1]
                 else:
                     while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            row, place = node >> PLACE_BITS, node & _PLACE
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = _U(at)
+                            row, place = _U(entered[e] >> PLACE_BITS), _U(entered[e] & _PLACE)
                             if span[row, place, 0] <= p < span[row, place, 1]:
-                                x += fade_of[row] * vector[page, e, 0]
-                                y += fade_of[row] * vector[page, e, 1]
+                                x += fade_of[row] * vector[e, 0]
+                                y += fade_of[row] * vector[e, 1]
                         page = following[page]
             seen_x[p], seen_y[p] = x, y
         if occupied > 0.0:
