@@ -22,7 +22,8 @@ from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PLAC
 
 _PLACE = (1 << PLACE_BITS) - 1
 _U = np.uint32  # as an index it needs no check for counting from the end
-_RECENT = 8  # cells along each side of the square that a node's last entries are known of
+_RECENT = 4  # cells along each side of the square that a node's last entries are known of
+_NOWHERE = -(1 << 31)  # no cell has this number
 
 
 @njit(cache=True, error_model="numpy")
@@ -160,7 +161,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
     # Neighbouring points share cells: the entry that a node made last in each of a few cells takes both.
-    recent = np.full((nodes, _RECENT * _RECENT, 3), -1, np.int32)
+    recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
             return i
@@ -189,7 +190,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                         # Another patch of road takes the cell over; what it held is forgotten.
                         if state[a, b, PAGE] >= 0:
                             _free(pages, state[a, b, PAGE])
-                            recent[:] = -1
+                            recent[:] = _NOWHERE
                         state[a, b, PAGE], state[a, b, STAMP] = -1, -1
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
                         state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
