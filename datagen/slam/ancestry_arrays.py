@@ -11,6 +11,9 @@ from jaxtyping import Float, Int32, Int64
 PAGE_SIZE = 16
 #: A node's number in an entry: its row above this many bits, its place in the row below.
 PLACE_BITS = 16
+PLACE = (1 << PLACE_BITS) - 1
+#: Type of an index: without a sign, numba need not look whether it counts from the end.
+U = np.uint32
 #: Columns of a cell's state.
 OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
 

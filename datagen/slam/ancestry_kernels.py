@@ -18,10 +18,18 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PLACE_BITS, PRUNED, STAMP
+from datagen.slam.ancestry_arrays import (
+    OWNER_X,
+    OWNER_Y,
+    PAGE,
+    PAGE_SIZE,
+    PLACE,
+    PLACE_BITS,
+    PRUNED,
+    STAMP,
+    U,
+)
 
-_PLACE = (1 << PLACE_BITS) - 1
-_U = np.uint32  # as an index it needs no check for counting from the end
 _RECENT = 4  # cells along each side of the square that a node's last entries are known of
 _NOWHERE = -(1 << 31)  # no cell has this number
 
@@ -83,10 +91,10 @@ def prune(tree, cells, pages, a, b, memory):
         first, stop_at = page * PAGE_SIZE, page * PAGE_SIZE + used[page]
         page = following[page]
         for at in range(first, stop_at):
-            e = _U(at)
+            e = U(at)
             node = entered[e]
-            row, place = _U(node >> PLACE_BITS), _U(node & _PLACE)
-            start, stop = _U(span[row, place, 0]), np.int64(span[row, place, 1])
+            row, place = U(node >> PLACE_BITS), U(node & PLACE)
+            start, stop = U(span[row, place, 0]), np.int64(span[row, place, 1])
             size, frame = stop - np.int64(start), np.int64(frames[row])
             if size == particles:
                 stamp, fade = state[a, b, STAMP], 1.0
@@ -101,7 +109,7 @@ def prune(tree, cells, pages, a, b, memory):
                 root[a, b, 1] += fade * vector[e, 1]
             elif size > 0:
                 if mark[start, 0] == serial and mark[start, 1] == stop:
-                    like, fade = _U(mark[start, 3]), fades[_U(window + mark[start, 2] - frame)]
+                    like, fade = U(mark[start, 3]), fades[U(window + mark[start, 2] - frame)]
                     vector[like, 0] += fade * vector[e, 0]
                     vector[like, 1] += fade * vector[e, 1]
                     continue
@@ -109,8 +117,8 @@ def prune(tree, cells, pages, a, b, memory):
                     used[into] = PAGE_SIZE
                     into = following[into]
                     out = into * PAGE_SIZE
-                entered[_U(out)] = node
-                vector[_U(out), 0], vector[_U(out), 1] = vector[e, 0], vector[e, 1]
+                entered[U(out)] = node
+                vector[U(out), 0], vector[U(out), 1] = vector[e, 0], vector[e, 1]
                 mark[start, 0], mark[start, 1], mark[start, 2], mark[start, 3] = serial, stop, frame, out
                 out += 1
     rest, filled = state[a, b, PAGE], out - into * PAGE_SIZE
@@ -184,8 +192,8 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                 for jx in range(reach):
                     share = weight * wx[jx] * wy[jy]
                     ix, iy = cx + jx, cy + jy
-                    a, b = _U(iy & mask), _U(ix & mask)
-                    slot = _U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
+                    a, b = U(iy & mask), U(ix & mask)
+                    slot = U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
                     if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
                         # Another patch of road takes the cell over; what it held is forgotten.
                         if state[a, b, PAGE] >= 0:
@@ -195,23 +203,23 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
                         state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
                     elif recent[node, slot, 0] == ix and recent[node, slot, 1] == iy:
-                        like = _U(recent[node, slot, 2])
+                        like = U(recent[node, slot, 2])
                         vector[like, 0] += share * nx
                         vector[like, 1] += share * ny
                         continue
                     page = state[a, b, PAGE]
-                    if page < 0 or used[_U(page)] == PAGE_SIZE:
+                    if page < 0 or used[U(page)] == PAGE_SIZE:
                         fresh = free[0]
                         free[0] = following[fresh]
                         free[1] -= 1
                         following[fresh] = page
                         used[fresh] = 0
                         state[a, b, PAGE] = page = fresh
-                    out = page * PAGE_SIZE + used[_U(page)]
-                    used[_U(page)] += 1
-                    entered[_U(out)] = row << PLACE_BITS | node
-                    vector[_U(out), 0] = share * nx
-                    vector[_U(out), 1] = share * ny
+                    out = page * PAGE_SIZE + used[U(page)]
+                    used[U(page)] += 1
+                    entered[U(out)] = row << PLACE_BITS | node
+                    vector[U(out), 0] = share * nx
+                    vector[U(out), 1] = share * ny
                     recent[node, slot, 0], recent[node, slot, 1], recent[node, slot, 2] = ix, iy, out
     return tree.size[row]
 
@@ -258,7 +266,7 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
             cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm - half))
             for iy in range(cy, cy + reach):
                 for ix in range(cx, cx + reach):
-                    a, b = _U(iy & mask), _U(ix & mask)
+                    a, b = U(iy & mask), U(ix & mask)
                     if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
                         prune(tree, cells, pages, a, b, memory)
     if forced:

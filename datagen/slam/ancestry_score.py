@@ -7,12 +7,20 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PLACE_BITS, PRUNED, STAMP
+from datagen.slam.ancestry_arrays import (
+    OWNER_X,
+    OWNER_Y,
+    PAGE,
+    PAGE_SIZE,
+    PLACE,
+    PLACE_BITS,
+    PRUNED,
+    STAMP,
+    U,
+)
 from datagen.slam.ancestry_kernels import prune
 
 _BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
-_PLACE = (1 << PLACE_BITS) - 1
-_U = np.uint32  # as an index it needs no check for counting from the end
 _FEW = 4  # particles that ask for the same cell and are yet looked up singly
 
 
@@ -67,7 +75,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                 # Looked up before, for all particles.
                 x, y = values[rows[box], p, 0], values[rows[box], p, 1]
             else:
-                a, b = _U(iy[p] & mask), _U(ix[p] & mask)
+                a, b = U(iy[p] & mask), U(ix[p] & mask)
                 mine = state[a, b, OWNER_X] == ix[p] and state[a, b, OWNER_Y] == iy[p]
                 page = -1
                 if mine:
@@ -82,9 +90,9 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     held[:, :] = 0.0
                     while page >= 0:
                         for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
-                            e = _U(at)
-                            row, place = _U(entered[e] >> PLACE_BITS), _U(entered[e] & _PLACE)
-                            start, stop = _U(span[row, place, 0]), _U(span[row, place, 1])
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
+                            start, stop = U(span[row, place, 0]), U(span[row, place, 1])
                             vx, vy = fade_of[row] * vector[e, 0], fade_of[row] * vector[e, 1]
                             # Steps at both ends of the interval; the running sum makes them plateaus.
                             held[start, 0] += vx
@@ -102,8 +110,8 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                 else:
                     while page >= 0:
                         for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
-                            e = _U(at)
-                            row, place = _U(entered[e] >> PLACE_BITS), _U(entered[e] & _PLACE)
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
                             if span[row, place, 0] <= p < span[row, place, 1]:
                                 x += fade_of[row] * vector[e, 0]
                                 y += fade_of[row] * vector[e, 1]
