@@ -27,7 +27,7 @@ FORMAT = "lanenet-map/1"
 #: The first version has a left and a right line per segment, without period and uncertainty.
 LANES_FORMATS = ("lanenet-lanes/1", "lanenet-lanes/2")
 REPORT_FORMAT = "lanenet-map-report/1"
-EDGES_FORMAT = "lanenet-edges/1"
+EDGES_FORMAT = "lanenet-edges/2"
 
 
 class MapMeta(Settings):

@@ -30,7 +30,7 @@ class MappedSegment:
     """A segment with its lane, in the scale of its camera.
 
     Attributes:
-        rows: Frames of the drive that it covers, as positions in it.
+        rows: Frames of the drive that it covers, as positions among those that count.
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
@@ -47,8 +47,17 @@ class MappedSegment:
     free_lane_cm: float | None = None
 
 
-def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict[str, np.ndarray]:
-    """Every edge point with its direction, frame map, float32."""
+def map_edges(
+    parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], camera: Camera, factor: float
+) -> dict[str, np.ndarray]:
+    """Every edge point with its direction, frame map, float32, and the number of its frame.
+
+    Args:
+        parts: Segments.
+        numbers: Frame number, as the drive counts, by the positions that the segments know.
+        camera: The map's camera.
+        factor: Turns the segments' lengths into centimetres.
+    """
     points, normals, frames, segments = [], [], [], []
     for i, part in enumerate(parts):
         solved = part.solved
@@ -57,11 +66,11 @@ def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict
             pose = solved.poses[k] * [factor, factor, 1.0]
             points.append(map_from_car(factor * solved.scans.points_cm[points_of], pose, camera.wheelbase_cm))
             normals.append(map_from_car_directions(solved.scans.normals[points_of], pose[2]))
-            frames.append(np.full(points_of.stop - points_of.start, part.rows[k]))
+            frames.append(np.full(points_of.stop - points_of.start, numbers[part.rows[k]]))
             segments.append(np.full(points_of.stop - points_of.start, i))
     xy, normal = np.concatenate(points).astype(np.float32), np.concatenate(normals).astype(np.float32)
     return {
-        "frame_index": np.concatenate(frames),
+        "frame": np.concatenate(frames),
         "segment": np.concatenate(segments),
         "x_cm": xy[:, 0],
         "y_cm": xy[:, 1],
@@ -70,8 +79,10 @@ def map_edges(parts: list[MappedSegment], camera: Camera, factor: float) -> dict
     }
 
 
-def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) -> dict[str, Any]:
-    """Collect a map's figures; ``factor`` turns the segments' lengths into centimetres."""
+def map_figures(
+    drive_map: DriveMap, parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], factor: float
+) -> dict[str, Any]:
+    """Collect a map's figures; ``numbers`` and ``factor`` as for :func:`map_edges`."""
     camera = drive_map.camera
     segments = []
     for part in parts:
@@ -79,7 +90,7 @@ def map_figures(drive_map: DriveMap, parts: list[MappedSegment], factor: float) 
         residual = np.abs(solved.residuals)
         segments.append(
             {
-                "first_frame": int(part.rows[0]),
+                "first_frame": int(numbers[part.rows[0]]),
                 "frames": len(solved.poses),
                 "path_cm": factor * float(solved.path_cm[-1]),
                 "median_match": float(np.nanmedian(solved.trajectory.match)),

@@ -119,7 +119,7 @@ def _map_drive(
     drive_map = _assemble(drive, drive_path, lane_width_cm, camera, parts, factor, known is None)
     rows_of_map = _rows_of_map(parts)
     drive_map = replace(drive_map, held_out=held_out[rows_of_map])
-    figures |= map_figures(drive_map, parts, factor)
+    figures |= map_figures(drive_map, parts, drive.frames, factor)
     notes += map_notes(drive_map, figures, known is not None)
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
     drive_map = replace(drive_map, contradicted=contradicted_frames(mapped))
@@ -135,7 +135,7 @@ def _map_drive(
     shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
     clear_unfinished(out)
     with atomic_folder(out, "map") as folder:
-        write_map(folder, drive_map, map_edges(parts, camera, factor), figures, how)
+        write_map(folder, drive_map, map_edges(parts, drive.frames, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
         opened = _in_order(parts, [part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)

@@ -2,34 +2,55 @@
 
 from __future__ import annotations
 
+import logging
+import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from lanenet import console
-from lanenet.errors import CalibrationError
+from lanenet.errors import CalibrationError, ConfigError, HardwareError
 from lanenet.outputs import check_ending, check_not_source
 
+if TYPE_CHECKING:
+    from datagen.localise import LiveReport
+    from datagen.slam.moments import Moment
+    from lanenet.onboard.hardware import FrameSource
+
 app = typer.Typer()
+log = logging.getLogger(__name__)
+
+#: The longest wait for a frame; a signal is answered at least this often.
+_WAIT_S = 0.1
 
 
 @app.command(
     epilog="Example: lanenet localise data/tub --camera maps/tub/camera.yaml "
-    "--config maps/tub/settings.yaml --out poses.csv"
+    "--config maps/tub/settings.yaml --out poses.csv; lanenet localise --live car.yaml --out poses.csv"
 )
 def localise(
-    source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Drive, tub or video.", show_default=False)
-    ],
     out: Annotated[
         Path,
         typer.Option(
             help="Poses to write, frame by frame (.csv); beside it a .tum and a .png.", show_default=False
         ),
     ],
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="SOURCE", help="Drive, tub or video; none with --live.", show_default=False),
+    ] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CONFIG", help="YAML of the car, as for drive: its camera as it runs.", show_default=False
+        ),
+    ] = None,
     camera: Annotated[
-        Path | None, typer.Option("--camera", help="Camera YAML; default: the drive's.", show_default=False)
+        Path | None,
+        typer.Option("--camera", help="Camera YAML; default: the drive's or the car's.", show_default=False),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML with the mapping's settings, or a map's settings.yaml.")
@@ -45,6 +66,17 @@ def localise(
     start_frames: Annotated[
         int, typer.Option(min=60, help="Frames in which speed and steering are found.")
     ] = 300,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="With --live: how fast the car is driven, cm/s. Default: the CONFIG's cruise_cm_s.",
+            show_default=False,
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="With --live: end after this many frames.", show_default=False)
+    ] = None,
 ) -> None:
     """Run the particle filter alone, as on the car: a pose per frame as it comes, memory bounded."""
     from datagen.localise import localise as run
@@ -55,15 +87,119 @@ def localise(
     from lanenet.data.drive import open_drive
 
     check_ending(out, ".csv")
-    check_not_source(source, out, out.with_suffix(".tum"), out.with_suffix(".png"))
+    given = source if live is None else live
+    if given is None or (source is not None and live is not None):
+        raise ConfigError(
+            "expected either SOURCE or --live CONFIG, found " + ("both" if given else "neither")
+        )
+    check_not_source(given, out, out.with_suffix(".tum"), out.with_suffix(".png"))
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
-    drive = open_drive(source)
-    known = read_camera(camera) if camera is not None else drive.camera
-    if known is None:
-        raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
     start = StartSettings(frames=start_frames, factor=factor)
-    with console.progress_bar("localise") as progress:
-        report = run(moments_of(drive), known, settings, out, start, lambda done: progress(done, len(drive)))
+    if live is None:
+        drive = open_drive(given)
+        known = read_camera(camera) if camera is not None else drive.camera
+        if known is None:
+            raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
+        with console.progress_bar("localise") as progress:
+            moments = moments_of(drive)
+            report = run(moments, known, settings, out, start, lambda done: progress(done, len(drive)))
+        _show(report)
+        console.next_command("map", given, "--lane-width", "CM", "--out", "MAP")
+        return
+    from lanenet.onboard.cameras import open_source
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    car = load_drive_settings(live)
+    chosen = camera if camera is not None else car.camera
+    if chosen is None:
+        raise CalibrationError(f"{live}: key 'camera' is missing: expected one, or --camera camera.yaml")
+    cruise_cm_s = car.control.speed.cruise_cm_s if speed is None else speed
+    running = LiveMoments(open_source(car.source), cruise_cm_s, frames)
+    with console.live_line() as show:
+        report = run(
+            running,
+            read_camera(chosen),
+            settings,
+            out,
+            start,
+            lambda done: show(lambda: f"{done} frames, {running.skipped} left out"),
+        )
+    _show(report)
+    if running.failure is not None:
+        raise running.failure
+    console.next_command("drive", live, "--dry-run")
+
+
+class LiveMoments:
+    """Frames of a running camera, as the filter takes them, with the speed that the car is meant to hold.
+
+    The filter is given the newest frame each time it asks: those that it was too slow for are left out, and
+    the car has come further by so much time. Ctrl-C and the other signals that end a drive end the frames,
+    and so does a camera that is gone for good: what was localised by then is kept.
+
+    Attributes:
+        failure: Why the camera gave no more frames; None where it did not fail.
+        skipped: Frames of the camera that were left out.
+    """
+
+    def __init__(self, source: FrameSource, speed_cm_s: float, most: int | None = None) -> None:
+        """Take the frames of a source, which is opened when the first is asked for.
+
+        Args:
+            source: Camera, or a recording that plays one.
+            speed_cm_s: Speed that whoever drives the car holds, about; what it really is the filter finds.
+            most: Ends after so many frames; None goes on.
+        """
+        self._source, self._speed_cm_s = source, speed_cm_s
+        self._most = math.inf if most is None else most
+        self.failure: HardwareError | None = None
+        self.skipped = 0
+        self._asked = ""
+
+    def __iter__(self) -> Iterator[Moment]:
+        """Yield frames until a signal, an end or a failure.
+
+        Raises:
+            HardwareError: If the camera is not there to begin with.
+            MissingExtraError: If its driver is not installed.
+        """
+        from lanenet.onboard.signals import ending_signals
+
+        with ending_signals(self._stop):
+            self._source.open()
+            try:
+                yield from self._frames()
+            finally:
+                self._source.close()
+
+    def _stop(self, why: str) -> None:
+        self._asked = why
+
+    def _frames(self) -> Iterator[Moment]:
+        from datagen.slam.moments import Moment
+        from lanenet.data.recording import Commands
+        from lanenet.onboard.hardware import SourceEnded
+
+        commands = Commands(speed_cm_s=np.array([self._speed_cm_s]))
+        taken, number, t_s = 0, -1, -math.inf
+        while taken < self._most and not self._asked:
+            try:
+                frame = self._source.read(_WAIT_S)
+            except SourceEnded:
+                return
+            except HardwareError as error:
+                log.error("the camera is gone: %s", error)
+                self.failure = error
+                return
+            # A driver that corrects its clock may stamp a frame before the last one.
+            if frame is None or frame.t_s <= t_s:
+                continue
+            self.skipped += max(0, frame.number - number - 1) if taken else 0
+            taken, number, t_s = taken + 1, frame.number, frame.t_s
+            yield Moment(frame.number, frame.t_s, frame.image_bgr, commands)
+
+
+def _show(report: LiveReport) -> None:
     lines = [
         f"{report.poses} poses of {report.frames} frames, {report.segments} segment(s); "
         f"{report.unreadable} unreadable, {report.standing} standing, {report.dropped} left out",
@@ -83,4 +219,3 @@ def localise(
         )
     console.show_lines(lines)
     console.wrote(report.out, report.trajectory, report.picture)
-    console.next_command("map", source, "--lane-width", "CM", "--out", "MAP")

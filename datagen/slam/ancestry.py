@@ -8,7 +8,7 @@ Once all particles descend from one node, its entries belong to all; once none d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -49,7 +49,6 @@ class AncestryMap:
     pages: Pages
     forced: int = 0
     _oldest: int = 0
-    _fades: Float[np.ndarray, "w1"] = field(default_factory=lambda: np.ones(1))
 
     @staticmethod
     def empty(
@@ -84,7 +83,8 @@ class AncestryMap:
             np.zeros((window, points, 5)),
             np.zeros(window, np.int32),
             np.zeros(2, np.int64),
-            np.zeros((particles, 2), np.int64),
+            np.exp(-np.arange(-window, window + 1) / memory_frames),
+            np.zeros((particles, 4), np.int64),
         )
         state = np.zeros((size, size, 8), np.int32)
         state[:, :, 2:] = -1
@@ -98,7 +98,6 @@ class AncestryMap:
             np.zeros((pages, PAGE_SIZE, 2)),
             np.array([0, pages], np.int32),
         )
-        fades = np.exp(-np.arange(window + 1) / memory_frames)
         return AncestryMap(
             cell_cm,
             memory_frames,
@@ -107,7 +106,6 @@ class AncestryMap:
             tree,
             cells,
             pool,
-            _fades=fades,
         )
 
     @property
@@ -148,7 +146,6 @@ class AncestryMap:
             self.wheelbase_cm,
             self.cell_cm,
             self.memory_frames,
-            self._fades,
             occupied,
             scores,
         )

@@ -9,6 +9,11 @@ from jaxtyping import Float, Int32, Int64
 
 #: Entries per page.
 PAGE_SIZE = 16
+#: A node's number in an entry: its row above this many bits, its place in the row below.
+PLACE_BITS = 16
+PLACE = (1 << PLACE_BITS) - 1
+#: Type of an index: without a sign, numba need not look whether it counts from the end.
+U = np.uint32
 #: Columns of a cell's state.
 OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
 
@@ -25,8 +30,9 @@ class Tree(NamedTuple):
         points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
         size: How many points each frame wrote.
         version: How often intervals have changed, and how many cells were pruned.
-        mark: For pruning: the last pruned cell in which an entry's interval began with this particle, and
-            where that entry is.
+        fades: Fade by age in frames, from minus the window (what is newer counts more) to the window.
+        mark: For pruning, by the particle that an entry's interval begins with: the last pruned cell with
+            such an entry, and the interval's end, the frame and the place of that entry.
     """
 
     span: Int32[np.ndarray, "w p 2"]
@@ -36,7 +42,8 @@ class Tree(NamedTuple):
     points: Float[np.ndarray, "w m 5"]
     size: Int32[np.ndarray, "w"]
     version: Int64[np.ndarray, "2"]
-    mark: Int64[np.ndarray, "p 2"]
+    fades: Float[np.ndarray, "w21"]
+    mark: Int64[np.ndarray, "p 4"]
 
 
 class Cells(NamedTuple):
@@ -59,7 +66,7 @@ class Pages(NamedTuple):
     Attributes:
         following: Next page of the cell, or of the free ones; -1 at the end.
         used: Entries in each page.
-        node: Who saw it: row * particles + number in the row.
+        node: Who saw it: row << PLACE_BITS | place in the row.
         vector: What was seen.
         free: First free page, and how many are free.
     """

@@ -18,7 +18,20 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PAGE_SIZE, PRUNED, STAMP
+from datagen.slam.ancestry_arrays import (
+    OWNER_X,
+    OWNER_Y,
+    PAGE,
+    PAGE_SIZE,
+    PLACE,
+    PLACE_BITS,
+    PRUNED,
+    STAMP,
+    U,
+)
+
+_RECENT = 4  # cells along each side of the square that a node's last entries are known of
+_NOWHERE = -(1 << 31)  # no cell has this number
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,54 +77,52 @@ def prune(tree, cells, pages, a, b, memory):
     Entries with the same descendants will have the same for ever: they become one.
     """
     state, root = cells.state, cells.root
-    following, used, nodes, vector = pages.following, pages.used, pages.node, pages.vector
-    particles = tree.span.shape[1]
-    span = tree.span.reshape((-1, 2))
+    following, used = pages.following, pages.used
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    span, frames, fades, mark = tree.span, tree.frame, tree.fades, tree.mark
+    window, particles = span.shape[0], span.shape[1]
     state[a, b, PRUNED] = tree.version[0]
-    mark = tree.mark
     tree.version[1] += 1
     serial = tree.version[1]
-    # Entries that stay move up to the front; ``into`` is the page that is being filled.
-    into, filled = state[a, b, PAGE], 0
-    page = into
+    # Entries that stay move up to the front; ``into`` is the page that is being filled, ``out`` the place.
+    page = into = state[a, b, PAGE]
+    out = into * PAGE_SIZE
     while page >= 0:
-        for e in range(used[page]):
-            node = nodes[page, e]
-            start, stop = span[node, 0], span[node, 1]
-            if stop - start == particles:
-                frame, stamp = tree.frame[node // particles], state[a, b, STAMP]
-                fade = 1.0
+        first, stop_at = page * PAGE_SIZE, page * PAGE_SIZE + used[page]
+        page = following[page]
+        for at in range(first, stop_at):
+            e = U(at)
+            node = entered[e]
+            row, place = U(node >> PLACE_BITS), U(node & PLACE)
+            start, stop = U(span[row, place, 0]), np.int64(span[row, place, 1])
+            size, frame = stop - np.int64(start), np.int64(frames[row])
+            if size == particles:
+                stamp, fade = state[a, b, STAMP], 1.0
                 if stamp < frame:
                     old = np.exp((stamp - frame) / memory) if stamp >= 0 else 0.0
                     root[a, b, 0] *= old
                     root[a, b, 1] *= old
                     state[a, b, STAMP] = frame
-                else:
+                elif stamp > frame:
                     fade = np.exp((frame - stamp) / memory)
-                root[a, b, 0] += fade * vector[page, e, 0]
-                root[a, b, 1] += fade * vector[page, e, 1]
-            elif stop > start:
-                if mark[start, 0] == serial:
-                    other, place = mark[start, 1] // PAGE_SIZE, mark[start, 1] % PAGE_SIZE
-                    like = nodes[other, place]
-                    if span[like, 1] == stop:
-                        fade = np.exp(
-                            (tree.frame[node // particles] - tree.frame[like // particles]) / memory
-                        )
-                        vector[other, place, 0] += fade * vector[page, e, 0]
-                        vector[other, place, 1] += fade * vector[page, e, 1]
-                        continue
-                if filled == PAGE_SIZE:
+                root[a, b, 0] += fade * vector[e, 0]
+                root[a, b, 1] += fade * vector[e, 1]
+            elif size > 0:
+                if mark[start, 0] == serial and mark[start, 1] == stop:
+                    like, fade = U(mark[start, 3]), fades[U(window + mark[start, 2] - frame)]
+                    vector[like, 0] += fade * vector[e, 0]
+                    vector[like, 1] += fade * vector[e, 1]
+                    continue
+                if out == (into + 1) * PAGE_SIZE:
                     used[into] = PAGE_SIZE
-                    into, filled = following[into], 0
-                nodes[into, filled] = node
-                vector[into, filled, 0] = vector[page, e, 0]
-                vector[into, filled, 1] = vector[page, e, 1]
-                mark[start, 0], mark[start, 1] = serial, into * PAGE_SIZE + filled
-                filled += 1
-        page = following[page]
-    rest = state[a, b, PAGE]
-    if filled:
+                    into = following[into]
+                    out = into * PAGE_SIZE
+                entered[U(out)] = node
+                vector[U(out), 0], vector[U(out), 1] = vector[e, 0], vector[e, 1]
+                mark[start, 0], mark[start, 1], mark[start, 2], mark[start, 3] = serial, stop, frame, out
+                out += 1
+    rest, filled = state[a, b, PAGE], out - into * PAGE_SIZE
+    if filled > 0:
         used[into] = filled
         rest = following[into]
         following[into] = -1
@@ -150,20 +161,15 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     Returns:
         First point that was not entered, because the pages might not suffice for it.
     """
-    pose, points = tree.pose, tree.points
-    state, root = cells.state, cells.root
-    following, used, entered, vector, free = (
-        pages.following,
-        pages.used,
-        pages.node,
-        pages.vector,
-        pages.free,
-    )
-    particles, nodes = tree.span.shape[1], tree.nodes[row]
-    mask = state.shape[0] - 1
+    pose, points, state, root = tree.pose, tree.points, cells.state, cells.root
+    following, used, free = pages.following, pages.used, pages.free
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    nodes, mask = tree.nodes[row], state.shape[0] - 1
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    # Neighbouring points share cells: the entry that a node made last in each of a few cells takes both.
+    recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
             return i
@@ -186,26 +192,35 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                 for jx in range(reach):
                     share = weight * wx[jx] * wy[jy]
                     ix, iy = cx + jx, cy + jy
-                    a, b = iy & mask, ix & mask
+                    a, b = U(iy & mask), U(ix & mask)
+                    slot = U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
                     if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
                         # Another patch of road takes the cell over; what it held is forgotten.
-                        _free(pages, state[a, b, PAGE])
+                        if state[a, b, PAGE] >= 0:
+                            _free(pages, state[a, b, PAGE])
+                            recent[:] = _NOWHERE
                         state[a, b, PAGE], state[a, b, STAMP] = -1, -1
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
                         state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
+                    elif recent[node, slot, 0] == ix and recent[node, slot, 1] == iy:
+                        like = U(recent[node, slot, 2])
+                        vector[like, 0] += share * nx
+                        vector[like, 1] += share * ny
+                        continue
                     page = state[a, b, PAGE]
-                    if page < 0 or used[page] == PAGE_SIZE:
+                    if page < 0 or used[U(page)] == PAGE_SIZE:
                         fresh = free[0]
                         free[0] = following[fresh]
                         free[1] -= 1
                         following[fresh] = page
                         used[fresh] = 0
                         state[a, b, PAGE] = page = fresh
-                    e = used[page]
-                    entered[page, e] = row * particles + node
-                    vector[page, e, 0] = share * nx
-                    vector[page, e, 1] = share * ny
-                    used[page] = e + 1
+                    out = page * PAGE_SIZE + used[U(page)]
+                    used[U(page)] += 1
+                    entered[U(out)] = row << PLACE_BITS | node
+                    vector[U(out), 0] = share * nx
+                    vector[U(out), 1] = share * ny
+                    recent[node, slot, 0], recent[node, slot, 1], recent[node, slot, 2] = ix, iy, out
     return tree.size[row]
 
 
@@ -251,7 +266,7 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
             cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm - half))
             for iy in range(cy, cy + reach):
                 for ix in range(cx, cx + reach):
-                    a, b = iy & mask, ix & mask
+                    a, b = U(iy & mask), U(ix & mask)
                     if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
                         prune(tree, cells, pages, a, b, memory)
     if forced:

@@ -7,7 +7,17 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from datagen.slam.ancestry_arrays import OWNER_X, OWNER_Y, PAGE, PRUNED, STAMP
+from datagen.slam.ancestry_arrays import (
+    OWNER_X,
+    OWNER_Y,
+    PAGE,
+    PAGE_SIZE,
+    PLACE,
+    PLACE_BITS,
+    PRUNED,
+    STAMP,
+    U,
+)
 from datagen.slam.ancestry_kernels import prune
 
 _BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
@@ -16,7 +26,7 @@ _FEW = 4  # particles that ask for the same cell and are yet looked up singly
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, fades, occupied, scores):
+def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, occupied, scores):
     """Score each particle's view of a frame against the map of its own lineage.
 
     Args:
@@ -29,17 +39,17 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
         wheelbase: Distance between the axles, [cm].
         cell_cm: Side of a cell.
         memory: Frames after which what was mapped has faded to 1/e.
-        fades: Fade by age in frames.
         occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
         scores: Filled.
     """
     particles = len(poses)
     state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
-    following, used, entered, vector = pages.following, pages.used, pages.node, pages.vector
-    span = tree.span.reshape((-1, 2))
-    fade_of = np.empty(len(span))
-    for row in range(len(tree.frame)):
-        fade_of[row * particles : row * particles + tree.nodes[row]] = fades[max(frame - tree.frame[row], 0)]
+    following, used = pages.following, pages.used
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    span, window = tree.span, tree.span.shape[0]
+    fade_of = np.empty(window)
+    for row in range(window):
+        fade_of[row] = tree.fades[window + min(frame - tree.frame[row], window)]
     cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
@@ -65,7 +75,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                 # Looked up before, for all particles.
                 x, y = values[rows[box], p, 0], values[rows[box], p, 1]
             else:
-                a, b = iy[p] & mask, ix[p] & mask
+                a, b = U(iy[p] & mask), U(ix[p] & mask)
                 mine = state[a, b, OWNER_X] == ix[p] and state[a, b, OWNER_Y] == iy[p]
                 page = -1
                 if mine:
@@ -79,14 +89,16 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     held = values[filled]
                     held[:, :] = 0.0
                     while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            vx, vy = fade_of[node] * vector[page, e, 0], fade_of[node] * vector[page, e, 1]
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
+                            start, stop = U(span[row, place, 0]), U(span[row, place, 1])
+                            vx, vy = fade_of[row] * vector[e, 0], fade_of[row] * vector[e, 1]
                             # Steps at both ends of the interval; the running sum makes them plateaus.
-                            held[span[node, 0], 0] += vx
-                            held[span[node, 0], 1] += vy
-                            held[span[node, 1], 0] -= vx
-                            held[span[node, 1], 1] -= vy
+                            held[start, 0] += vx
+                            held[start, 1] += vy
+                            held[stop, 0] -= vx
+                            held[stop, 1] -= vy
                         page = following[page]
                     for q in range(particles):
                         x += held[q, 0]
@@ -97,11 +109,12 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                     x, y = held[p, 0], held[p, 1]
                 else:
                     while page >= 0:
-                        for e in range(used[page]):
-                            node = entered[page, e]
-                            if span[node, 0] <= p < span[node, 1]:
-                                x += fade_of[node] * vector[page, e, 0]
-                                y += fade_of[node] * vector[page, e, 1]
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
+                            if span[row, place, 0] <= p < span[row, place, 1]:
+                                x += fade_of[row] * vector[e, 0]
+                                y += fade_of[row] * vector[e, 1]
                         page = following[page]
             seen_x[p], seen_y[p] = x, y
         if occupied > 0.0:

@@ -41,7 +41,7 @@ class FilterSettings(Settings):
         stray_factor: How many times as far (see :func:`widen_steps`).
     """
 
-    particles: int = Field(default=300, ge=10)
+    particles: int = Field(default=300, ge=10, lt=1 << 16)
     likelihood: Likelihood = "direction"
     maps: Literal["lineage", "mean"] = "lineage"
     cell_heights: float = Field(default=0.08, gt=0.0)
@@ -49,7 +49,7 @@ class FilterSettings(Settings):
     memory_frames: float = Field(default=40.0, gt=0.0)
     patch_heights: float = Field(default=0.08, gt=0.0)
     max_points: int = Field(default=80, ge=20)
-    window: int = Field(default=64, ge=2)
+    window: int = Field(default=64, ge=2, lt=1 << 15)
     effective_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     resample_below: float = Field(default=0.5, gt=0.0, le=1.0)
     stray_every: int = Field(default=5, ge=0)

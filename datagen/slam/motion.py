@@ -120,15 +120,27 @@ def widen_steps(
     Source:
         Mixture of two normal distributions; own derivation.
     """
-    if every == 0:
-        return
-    turn = states[:, HEADING] - before[:, HEADING]
-    middle = before[:, HEADING] + 0.5 * turn
-    # A step is a chord in the direction of the middle heading (see MotionModel.predict).
-    distance = (states[:, X] - before[:, X]) * np.cos(middle) + (states[:, Y] - before[:, Y]) * np.sin(middle)
-    turn = turn.mean() + factor * (turn[::every] - turn.mean())
-    distance = distance.mean() + factor * (distance[::every] - distance.mean())
-    middle = before[::every, HEADING] + 0.5 * turn
-    states[::every, X] = before[::every, X] + distance * np.cos(middle)
-    states[::every, Y] = before[::every, Y] + distance * np.sin(middle)
-    states[::every, HEADING] = before[::every, HEADING] + turn
+    if every > 0:
+        stray(before, states, every, factor)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def stray(before, states, every, factor):
+    """See :func:`widen_steps`."""
+    particles = len(states)
+    turns, ways = np.empty(particles), np.empty(particles)
+    for p in range(particles):
+        turns[p] = states[p, HEADING] - before[p, HEADING]
+        middle = before[p, HEADING] + 0.5 * turns[p]
+        # A step is a chord in the direction of the middle heading (see MotionModel.predict).
+        dx, dy = states[p, X] - before[p, X], states[p, Y] - before[p, Y]
+        ways[p] = dx * np.cos(middle) + dy * np.sin(middle)
+    mean_turn, mean_way = turns.mean(), ways.mean()
+    for p in range(0, particles, every):
+        turn = mean_turn + factor * (turns[p] - mean_turn)
+        way = mean_way + factor * (ways[p] - mean_way)
+        middle = before[p, HEADING] + 0.5 * turn
+        states[p, X] = before[p, X] + way * np.cos(middle)
+        states[p, Y] = before[p, Y] + way * np.sin(middle)
+        states[p, HEADING] = before[p, HEADING] + turn

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 #: Spacing of the steps, as a logarithm, and how many spreads they reach to either side, at least so far.
 _SPACING, _SPREADS, _LEAST_REACH = 0.056, 2.8, 0.3
@@ -91,7 +91,7 @@ class MotionGrid:
 
 def follow_motion(
     grid: MotionGrid,
-    log_likelihood: Float32[np.ndarray, "n w t"],
+    log_likelihood: Float[np.ndarray, "n w t"],
     relative: Float[np.ndarray, "n"],
     turn_walk_rad: float,
     curvature: Float[np.ndarray, "n"],

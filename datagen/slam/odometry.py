@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float16
 
 from datagen.slam.motion_grid import MotionGrid, follow_motion
 from datagen.slam.picture_pairs import Pictures, turns_up_to
@@ -186,11 +186,13 @@ class Evidence:
         if speed_known:
             spread, keep = s.known_spread, s.known_keep
         self.grid = MotionGrid(step, spread, keep, s.jump, _turns_of(pictures, 1.3 * step))
-        self.log_likelihood: Float32[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float32)
+        # Half precision: differences that matter are near zero, where it is finest.
+        self.log_likelihood: Float16[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float16)
+        least = np.finfo(np.float16).min
         for k in range(n):
             if k > 0:
                 fit = pictures.fit(k, self.grid.steps, self.grid.turns_rad, self.relative)
-                self.log_likelihood[k] = s.temper * (fit - fit.max())
+                self.log_likelihood[k] = np.maximum(s.temper * (fit - fit.max()), least)
             if progress is not None:
                 progress(k + 1, n)
 

@@ -128,27 +128,25 @@ def _goes_on(view: _View) -> Bool[np.ndarray, "n"]:
     grid = np.zeros((_AHEAD_CELLS + 2, 2 * _SIDE_CELLS + 2), np.uint8)
     row, column = _road_cells(view.points)
     bits = (1 << sector) | (1 << (sector + 1) % _SECTORS) | (1 << (sector - 1) % _SECTORS)
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            at = np.clip(row + dr, 0, grid.shape[0] - 1), np.clip(column + dc, 0, grid.shape[1] - 1)
-            np.bitwise_or.at(grid, at, bits.astype(np.uint8))
+    np.bitwise_or.at(grid, (row, column), bits.astype(np.uint8))
+    grid[[0, -1]] = 0
+    grid[:, [0, -1]] = 0
+    # An edge is found from the cells around its own, too.
+    grid[1:-1] |= grid[:-2] | grid[2:]
+    grid[:, 1:-1] |= grid[:, :-2] | grid[:, 2:]
     tangent = np.stack([-view.normals[:, 1], view.normals[:, 0]], axis=1)
     own = (1 << sector).astype(np.uint8)
-    found = {
-        (side, way): grid[_road_cells(view.points + side * way * tangent)] & own > 0
-        for side in (-1.0, 1.0)
-        for way in _ON_STRAIGHT_HEIGHTS
-    }
-    near, far = _ON_STRAIGHT_HEIGHTS[:2], _ON_STRAIGHT_HEIGHTS
-    both = np.logical_and.reduce([found[side, way] for side in (-1.0, 1.0) for way in near])
-    one = [np.logical_and.reduce([found[side, way] for way in far]) for side in (-1.0, 1.0)]
-    return both | one[0] | one[1]
+    ways = np.array(_ON_STRAIGHT_HEIGHTS)
+    offsets = np.stack([-ways, ways])[..., None, None] * tangent
+    # By side, way and point; all places are looked up at once.
+    found = grid[_road_cells(view.points + offsets)] & own > 0
+    return found[:, :2].all(axis=(0, 1)) | found.all(axis=1).any(axis=0)
 
 
-def _road_cells(points: Float[np.ndarray, "n 2"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+def _road_cells(points: Float[np.ndarray, "*k 2"]) -> tuple[Int[np.ndarray, "*k"], Int[np.ndarray, "*k"]]:
     """Row and column of points of the road; what lies outside goes to the border, which stays empty."""
-    column = np.floor(points[:, 0] / _CELL_HEIGHTS).astype(np.int64) + _SIDE_CELLS + 1
-    row = np.floor(points[:, 1] / _CELL_HEIGHTS).astype(np.int64) + 1
+    column = np.floor(points[..., 0] / _CELL_HEIGHTS).astype(np.int64) + _SIDE_CELLS + 1
+    row = np.floor(points[..., 1] / _CELL_HEIGHTS).astype(np.int64) + 1
     return np.clip(row, 0, _AHEAD_CELLS + 1), np.clip(column, 0, 2 * _SIDE_CELLS + 1)
 
 

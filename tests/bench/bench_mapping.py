@@ -15,6 +15,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
 
-CAMERAS = (
+CAMERAS: tuple[dict[str, Any], ...] = (
     {},
     {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0,
      "pitch_down_rad": math.radians(15.0), "roll_rad": 0.02, "yaw_rad": -0.03,
@@ -95,7 +96,7 @@ def drift_percent(opened: np.ndarray, true_xy: np.ndarray, way_cm: float = 300.0
     return 100.0 * float(np.mean(misses)) if misses else float("nan")
 
 
-def judge(number: int, folder: Path, known: bool) -> dict[str, object]:
+def judge(number: int, folder: Path, known: bool) -> dict[str, Any]:
     """Map one drive and compare with its truth."""
     settings = drive_settings(number)
     drive = folder / f"{number:03d}"
@@ -109,7 +110,7 @@ def judge(number: int, folder: Path, known: bool) -> dict[str, object]:
     truth = read_truth(drive)
     assert truth is not None
     name = settings.track.preset
-    row: dict[str, object] = {"drive": number, "preset": name, "camera": "known" if known else "found"}
+    row: dict[str, Any] = {"drive": number, "preset": name, "camera": "known" if known else "found"}
     row |= {"frames": settings.frames, "recording": settings.recording}
     lane_width_cm = settings.track.lane_width_cm
     start = time.process_time()
@@ -125,14 +126,14 @@ def judge(number: int, folder: Path, known: bool) -> dict[str, object]:
     index = drive_map.frames
     true_points = np.stack([truth[name] for name in POINT_NAMES], axis=1)[index]
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
-    error = frames.points_cm - true_points
+    miss_cm = frames.points_cm - true_points
     known_truth = np.isfinite(true_points)
-    row["labelled"] = round(float(np.isfinite(error).sum() / max(known_truth.sum(), 1)), 4)
+    row["labelled"] = round(float(np.isfinite(miss_cm).sum() / max(known_truth.sum(), 1)), 4)
     for k, y_cm in enumerate(ROWS_CM):
-        part = error[:, [k, k + len(ROWS_CM)]]
+        part = miss_cm[:, [k, k + len(ROWS_CM)]]
         part = part[np.isfinite(part)]
         row[f"rmse_{y_cm:.0f}_cm"] = round(float(np.sqrt(np.mean(part**2))), 3) if part.size else None
-    part = error[np.isfinite(error)]
+    part = miss_cm[np.isfinite(miss_cm)]
     row["p95_cm"] = round(float(np.percentile(np.abs(part), 95.0)), 3) if part.size else None
     xy = np.stack([truth["x_cm"], truth["y_cm"]], axis=1)[index]
     miss = np.linalg.norm(aligned(drive_map.poses[:, :2], xy) - xy, axis=1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -52,7 +51,7 @@ def test_painter_finds_both_lines_of_a_road(shared_data: Path, name: str, least:
 def test_painter_finds_both_lines_of_the_photos(shared_data: Path) -> None:
     painter = LanePainter(None, PainterSettings(mode="photo"))
     photos = sorted((shared_data / "road").glob("*photos/*.jpg"))
-    missed = [p.name for p in photos if painter.detect(cv2.imread(str(p))).confidence < 1.0]
+    missed = [p.name for p in photos if painter.detect(open_source(p).image(0)).confidence < 1.0]
     LOG.warning("painter: both lines in %d of %d photos", len(photos) - len(missed), len(photos))
     assert len(photos) == 14 and not missed
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import signal
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from datagen.live_picture import LiveCanvas
@@ -21,7 +23,9 @@ from lanenet.cli import app
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.trajectory import read_tum
-from lanenet.errors import LanenetError, TrackingLostError
+from lanenet.errors import HardwareError, LanenetError, TrackingLostError
+from lanenet.localise_cli import LiveMoments
+from lanenet.onboard.hardware import Frame, SourceEnded
 
 SETTINGS = MapSettings(filter=FilterSettings(particles=60))
 KNOWN = StartSettings(factor=1.0)
@@ -133,3 +137,122 @@ def test_the_command(simulated, tmp_path):
     assert read_camera(simulated / "camera.yaml").hash == open_drive(simulated).camera.hash
     wrong = invoke(simulated, "--out", tmp_path / "poses.txt")
     assert wrong.exit_code == 1 and "ends in .csv" in wrong.stderr
+
+
+@pytest.fixture
+def car(simulated, tmp_path) -> Path:
+    """A car whose camera is a replayed drive, at the pace at which it was recorded or near it."""
+    config = {
+        "source": {"kind": "replay", "path": str(simulated), "pace": "real", "rate_hz": 40.0, "loop": True},
+        "camera": str(simulated / "camera.yaml"),
+        "detector": {"kind": "lane-filter", "lane_width_cm": 35.0},
+        "control": {},
+    }
+    path = tmp_path / "car.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+class Replayed:
+    """A source of given frames; then a failure, or the end."""
+
+    def __init__(self, frames: list[Frame | None], failure: Exception | None = None) -> None:
+        self.frames, self.failure = list(frames), failure
+        self.opened = self.closed = 0
+
+    def open(self) -> None:
+        self.opened += 1
+
+    def read(self, timeout_s: float) -> Frame | None:
+        if self.frames:
+            return self.frames.pop(0)
+        raise SourceEnded("over") if self.failure is None else self.failure
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def frames_at(*rows: tuple[int, float]) -> list[Frame | None]:
+    return [Frame(np.full((4, 6, 3), number, np.uint8), t_s, number) for number, t_s in rows]
+
+
+def test_a_running_camera_gives_moments_at_the_speed_that_is_meant():
+    rows = frames_at((0, 5.0), (1, 5.1), (4, 5.4))
+    source = Replayed([rows[0], None, *rows[1:]])
+    moments = LiveMoments(source, 50.0)
+    taken = list(moments)
+    assert [(m.frame, m.t_s, m.starts) for m in taken] == [(0, 5.0, False), (1, 5.1, False), (4, 5.4, False)]
+    assert all(m.image is row.image_bgr for m, row in zip(taken, rows, strict=True))
+    assert all(m.commands.speed_cm_s == [50.0] and m.commands.steering_rad is None for m in taken)
+    assert moments.skipped == 2 and moments.failure is None and (source.opened, source.closed) == (1, 1)
+
+
+def test_a_frame_stamped_before_the_last_one_is_left_out():
+    moments = list(LiveMoments(Replayed(frames_at((0, 1.0), (1, 1.0), (2, 0.9), (3, 1.1))), 50.0))
+    assert [m.frame for m in moments] == [0, 3]
+
+
+def test_as_many_frames_as_asked():
+    source = Replayed(frames_at(*((k, 0.1 * k) for k in range(9))))
+    assert [m.frame for m in LiveMoments(source, 50.0, 4)] == [0, 1, 2, 3] and source.closed == 1
+
+
+def test_a_signal_ends_the_frames_and_the_camera_is_let_go():
+    source, numbers = Replayed(frames_at(*((k, 0.1 * k) for k in range(9)))), []
+    for moment in LiveMoments(source, 50.0):
+        numbers.append(moment.frame)
+        if moment.frame == 3:
+            signal.raise_signal(signal.SIGTERM)
+    assert numbers == [0, 1, 2, 3] and source.closed == 1
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_a_camera_that_is_lost_ends_the_frames_and_is_told():
+    moments = LiveMoments(Replayed(frames_at((0, 0.0), (1, 0.1)), HardwareError("cam: lost for 60 s")), 50.0)
+    assert len(list(moments)) == 2
+    assert str(moments.failure) == "cam: lost for 60 s"
+
+
+def test_a_filter_that_is_too_slow_for_its_camera_keeps_to_the_way(simulated, tmp_path):
+    """Frames that were left out make the next way longer, and the speed's gain is what the truth says."""
+    drive, truth = open_drive(simulated), read_truth(simulated)
+    kept = [k for k in range(len(drive)) if k % 3 != 1]
+    source = Replayed([Frame(drive.image(k), float(drive.t_s[k]), k) for k in kept])
+    way_cm = np.hypot(*(np.diff(truth[name][kept]) for name in ("x_cm", "y_cm"))).sum()
+    speed_cm_s = way_cm / (drive.t_s[kept[-1]] - drive.t_s[0])
+    moments = LiveMoments(source, speed_cm_s)
+    report = localise(moments, drive.camera, SETTINGS, tmp_path / "poses.csv", KNOWN)
+    assert (report.frames, report.poses, report.segments) == (len(kept), len(kept), 1)
+    assert moments.skipped == len(drive) - len(kept) and report.speed_known
+    _, poses = read_tum(report.trajectory)
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() == pytest.approx(way_cm, rel=0.06)
+
+
+def test_the_live_command(simulated, car, tmp_path):
+    few, out = tmp_path / "few.yaml", tmp_path / "poses.csv"
+    few.write_text("filter: {particles: 40}\n")
+    words = ["--live", car, "--config", few, "--factor", 1.0, "--frames", 20, "--out", out]
+    result = CliRunner().invoke(app, ["localise", *map(str, words)])
+    assert result.exit_code == 0, result.output
+    assert "of 20 frames" in result.output and "gain of the speed 1.000" in result.output
+    rows = rows_of(out)
+    numbers = np.array([int(row[0]) for row in rows])
+    # However busy the machine is: each frame once, numbers and times are the camera's.
+    assert len(rows) > 10 and (np.diff(numbers) > 0).all()
+    np.testing.assert_allclose(np.diff([float(row[1]) for row in rows]), np.diff(numbers) / 40.0, atol=2e-6)
+    assert out.with_suffix(".png").is_file() and out.with_suffix(".tum").is_file()
+
+
+def test_either_a_recording_or_a_running_camera(simulated, car, tmp_path):
+    def said(*words: object) -> str:
+        result = CliRunner().invoke(app, ["localise", *map(str, words), "--out", str(tmp_path / "p.csv")])
+        assert result.exit_code == 1
+        return result.stderr
+
+    assert "expected either SOURCE or --live CONFIG, found both" in said(simulated, "--live", car)
+    assert "expected either SOURCE or --live CONFIG, found neither" in said()
+    blind = tmp_path / "blind.yaml"
+    blind.write_text(car.read_text().replace("control: {}", "control: {steering: {wheelbase_cm: 17}}"))
+    text = "".join(line for line in blind.read_text().splitlines(True) if not line.startswith("camera"))
+    blind.write_text(text)
+    assert "key 'camera' is missing" in said("--live", blind)

@@ -79,7 +79,7 @@ def _drive_map() -> DriveMap:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    edges = {"frame_index": np.arange(5), "x_cm": np.linspace(0.0, 1.0, 5).astype(np.float32)}
+    edges = {"frame": np.arange(5), "x_cm": np.linspace(0.0, 1.0, 5).astype(np.float32)}
     report = {"frames": N, "figures": np.array([1.0, np.nan])}
     write_map(tmp_path, _drive_map(), edges, report, "from the drive")
     return tmp_path
@@ -115,7 +115,7 @@ def test_the_camera_nods_with_the_frame(folder):
 
 def test_an_older_map_has_no_tilt_no_held_out_frames_and_no_verdict(tmp_path):
     older = replace(_drive_map(), tilt_rad=None, held_out=None, contradicted=None)
-    write_map(tmp_path, older, {"frame_index": np.arange(2)}, {}, "given")
+    write_map(tmp_path, older, {"frame": np.arange(2)}, {}, "given")
     assert "pitch_rad" not in (tmp_path / "poses.csv").read_text()
     path = tmp_path / "map.yaml"
     path.write_text(re.sub(r"^verdict:.*\n", "", path.read_text(), flags=re.MULTILINE))
@@ -152,7 +152,7 @@ def _closed_map() -> DriveMap:
 
 def test_closed_lines_and_lines_beside_the_lane_are_read_back(tmp_path):
     written = _closed_map()
-    write_map(tmp_path, written, {"frame_index": np.arange(2)}, {}, "given")
+    write_map(tmp_path, written, {"frame": np.arange(2)}, {}, "given")
     found = read_map(tmp_path)
     s = np.linspace(-100.0, 700.0, 97)
     for line, again in zip(written.lines[0], found.lines[0], strict=True):
@@ -193,7 +193,7 @@ def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "map"
     out.mkdir()
-    write_map(out, _drive_map(), {"frame_index": np.arange(2)}, {}, "given")
+    write_map(out, _drive_map(), {"frame": np.arange(2)}, {}, "given")
     monkeypatch.chdir(out)
     assert read_map(out).meta.drive == str(tmp_path / "drives" / "circuit")
 
@@ -206,8 +206,8 @@ def test_an_older_map_holds_the_drive_as_typed(folder):
 
 def test_other_tools_can_read_the_folder(folder):
     table = require("pyarrow.parquet", "data").read_table(folder / "edges.parquet")
-    assert table.column("frame_index").to_pylist() == list(range(5))
-    assert json.loads(table.schema.metadata[b"lanenet"]) == {"format": "lanenet-edges/1"}
+    assert table.column("frame").to_pylist() == list(range(5))
+    assert json.loads(table.schema.metadata[b"lanenet"]) == {"format": "lanenet-edges/2"}
     # A trajectory in metres, by the TUM convention: time, position, quaternion.
     tum = np.loadtxt(folder / "trajectory.tum")
     assert tum.shape == (N, 8)

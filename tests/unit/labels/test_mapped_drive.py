@@ -81,7 +81,7 @@ def folder(tmp_path: Path) -> Path:
     )
     out = tmp_path / "map"
     out.mkdir()
-    write_map(out, drive_map, {"frame_index": np.arange(2)}, {}, "given")
+    write_map(out, drive_map, {"frame": np.arange(2)}, {}, "given")
     (out / SETTINGS_NAME).write_text(dump_settings(MapSettings(perception=HIDDEN)))
     return out
 

@@ -97,6 +97,23 @@ def test_any_family_tree_scores_as_separate_maps_do(seed, frames, particles):
         assert matches[p] == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.parametrize("likelihood", ["direction", "count"])
+def test_no_cell_of_the_plane_is_special(likelihood):
+    """Whole cells to either side of the origin, what was entered is seen again alike."""
+    rng = np.random.default_rng(4)
+    states, scan = _states(rng, 3), _scan(rng)
+    seen = []
+    for ix in range(-42, 2):
+        for iy in (-1, 0, 1):
+            moved = states + [ix * CELL_CM, iy * CELL_CM, 0.0]
+            shared = _map(3, likelihood)
+            shared.descend(moved, np.arange(3), 0)
+            shared.enter(*scan, 0)
+            seen.append(shared.score(moved, *scan, 1))
+    assert seen[0].min() > 1.0
+    np.testing.assert_allclose(seen, np.tile(seen[0], (len(seen), 1)), rtol=1e-6)
+
+
 def test_entries_live_exactly_as_long_as_their_lineages_differ():
     rng = np.random.default_rng(0)
     shared = _map(4)

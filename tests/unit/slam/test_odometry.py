@@ -7,6 +7,7 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
+from datagen.slam.motion_grid import follow_motion
 from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
 from datagen.slam.odometry_kernels import SECTORS, index_edges
 from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
@@ -169,3 +170,19 @@ def test_points_are_drawn_from_every_direction_alike():
     pictures = _pictures([EdgePixels(uv, normals)])
     sector = pictures._pictures[0].sector
     assert (sector == SECTORS // 4).sum() >= SETTINGS.points // 4
+
+
+def test_half_precision_follows_the_same_motion_in_half_the_memory(edges):
+    evidence = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM)
+    kept = evidence.motion()
+    assert evidence.log_likelihood.nbytes == 2 * 60 * np.prod(evidence.grid.shape)
+    full, s = np.zeros((60, *evidence.grid.shape)), SETTINGS
+    pictures = _pictures(edges)
+    for k in range(1, 60):
+        fit = pictures.fit(k, evidence.grid.steps, evidence.grid.turns_rad, evidence.relative)
+        full[k] = s.temper * (fit - fit.max())
+    steps, turns = follow_motion(
+        evidence.grid, full, evidence.relative, s.turn_walk_rad, np.zeros(60), s.max_curvature_heights
+    )
+    np.testing.assert_allclose(kept.ways_cm[1:], (steps * evidence.relative * HEIGHT_CM)[1:], rtol=2e-3)
+    np.testing.assert_allclose(kept.turns_rad[1:], turns[1:], atol=1e-4)
