@@ -23,6 +23,7 @@ from lanenet.data.files import atomic_file
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.perception.model_file import BATCH_NAME
 from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 
 #: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
@@ -196,7 +197,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
             opset_version=OPSET,
             input_names=[INPUT_NAME],
             output_names=list(OUTPUT_NAMES),
-            dynamic_shapes={"raster": {0: torch.export.Dim("n", min=1)}},
+            dynamic_shapes={INPUT_NAME: {0: torch.export.Dim(BATCH_NAME, min=1)}},
         )
     if program is None:
         raise CheckpointError("torch.onnx.export answered nothing, expected a program")
