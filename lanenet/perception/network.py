@@ -157,8 +157,9 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
     elif camera.hash not in meta.camera_hashes:
         raise ModelMismatchError(
             f"{model_path}: trained with camera {', '.join(meta.camera_hashes) or 'unknown'}, but "
-            f"this camera is {camera.hash}; train with this camera, or allow any camera if both are "
-            "calibrated and see about the same road"
+            f"this camera, {camera.model} {camera.width}x{camera.height}, is {camera.hash}; train with this "
+            "camera, or allow any camera (--any-camera, detector.any_camera) if both are calibrated and see "
+            "about the same road"
         )
 
 
