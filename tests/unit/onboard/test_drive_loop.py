@@ -291,3 +291,15 @@ def test_latencies_are_those_of_the_numbers() -> None:
     assert histogram.above(0.01) == pytest.approx((values_ms > 10.0).sum(), abs=10)
     histogram.add(10.0)
     assert histogram.longest_ms == pytest.approx(10_000.0) and len(histogram) == 5001
+
+
+def test_an_error_before_the_first_frame_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    car = Car(armed=True)
+
+    def fail(_: float) -> Frame:
+        raise HardwareError("no such drive")
+
+    car.camera.read = fail  # type: ignore[method-assign]
+    with pytest.raises(HardwareError, match="no such drive"):
+        car.loop.run()
+    assert "neutral: HardwareError before the first frame: no such drive" in caplog.text
