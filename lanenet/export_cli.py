@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet import console
+from lanenet.errors import ConfigError
 
 app = typer.Typer()
 
@@ -21,6 +22,10 @@ def export(
         Path | None,
         typer.Option(help="Model to write; default CHECKPOINT/model.onnx, with --int8 model-int8.onnx."),
     ] = None,
+    check: Annotated[
+        list[Path] | None,
+        typer.Option(help="Labels on whose frames the file is checked as well.", metavar="LABELS.parquet"),
+    ] = None,
     int8: Annotated[
         bool,
         typer.Option(
@@ -29,15 +34,23 @@ def export(
     ] = False,
 ) -> None:
     """Write a checkpoint as one ONNX file, checked against PyTorch."""
+    if int8 and check:
+        raise ConfigError("--check: compares with PyTorch, expected it without --int8")
     if int8:
+        from lanenet.learn.export import MODEL_NAME
         from lanenet.learn.quantise import export_int8
 
         path, report = export_int8(checkpoint, out)
         console.show_lines(report.lines)
         console.wrote(path, path.with_suffix(".json"))
+        path = path if report.recommended else checkpoint / MODEL_NAME
     else:
         from lanenet.learn.export import export_checkpoint
 
-        path = export_checkpoint(checkpoint, out)
+        done = export_checkpoint(checkpoint, out, check or ())
+        path = done.path
+        typer.echo(
+            f"onnxruntime and PyTorch differ by {done.difference:.1g} cm at most, on {done.rasters} rasters"
+        )
         console.wrote(path)
     console.next_command("bench", "--model", path)

@@ -54,7 +54,8 @@ def detect(
     lane_width: Annotated[
         float | None,
         typer.Option(
-            min=1.0, help="Lane width for the lane filter, cm; default: the settings file's or the drive's."
+            min=1.0,
+            help="Lane width for lane-filter and network, cm; default: the settings file's or the drive's.",
         ),
     ] = None,
     marking: MarkingOption = None,

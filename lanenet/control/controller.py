@@ -5,19 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
 from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.speed import SpeedSettings, curve_speed_cm_s, lane_curvature_per_cm
 from lanenet.control.steering import SteeringSettings, steering_target_rad
-from lanenet.geometry.lane import lane_width_cm
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.lane_memory import LaneMemory
 
-#: Share of a new lane width that enters the memory, and the largest step, as a share of the width.
-_WIDTH_GAIN = 0.05
-_WIDTH_STEP = 0.1
 #: Frames of less confidence teach no width.
 _WIDTH_CONFIDENCE = 0.5
 
@@ -31,7 +27,8 @@ class ControlSettings(Settings):
         speed: On straights and in bends.
         own_target: Follow the detector's own steering target instead of a law, for detectors that know no
             centimetres.
-        width_memory: Remember the lane's width, so that one line is enough where the other is not seen.
+        width_memory: Remember the lane's width where none is given, so that one line is enough where the
+            other is not seen.
     """
 
     steering: SteeringSettings
@@ -64,13 +61,13 @@ class LaneController:
         self._settings = settings
         self._smoother = LaneSmoother(settings.smoothing, settings.steering.wheelbase_cm)
         self._steering = settings.steering
-        self._width_cm = settings.steering.lane_width_cm
+        self._memory = LaneMemory(settings.steering.lane_width_cm)
         self._t_s = math.nan
 
     @property
     def lane_width_cm(self) -> float | None:
         """Width of the lane: given, or learnt from frames with both lines; None when neither is there."""
-        return self._width_cm
+        return self._memory.width_cm
 
     def reset(self) -> None:
         """Forget earlier frames; the lane's width stays, since the road is the same."""
@@ -94,8 +91,9 @@ class LaneController:
         dt_s = t_s - self._t_s if math.isfinite(self._t_s) else 0.0
         self._t_s = t_s
         smooth = self._smoother.update(estimate, dt_s, speed_cm_s * dt_s, steering_rad)
-        if self._settings.width_memory:
-            self._learn_width(estimate)
+        # Points of the frame itself: a line that is only carried on knows nothing new.
+        if self._settings.width_memory and estimate.confidence >= _WIDTH_CONFIDENCE:
+            self._memory.learn(estimate.points_cm, estimate.presence)
         steering = self._target_rad(estimate, smooth)
         curvature = lane_curvature_per_cm(smooth, self._steering.look_ahead_cm)
         if math.isfinite(steering):
@@ -109,19 +107,9 @@ class LaneController:
             limit, wished = self._steering.max_steering_rad, estimate.steering_rad
             return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
         # Smoothing carries one line on, and never a frame that shows none.
-        if not estimate.mask.any():
+        if not any(map(math.isfinite, estimate.points_cm.tolist())):
             return math.nan
-        return steering_target_rad(smooth, self._steering, self._width_cm)
-
-    def _learn_width(self, estimate: LaneEstimate) -> None:
-        # Points of the frame itself: a line that is only carried on knows nothing new.
-        if not (estimate.confidence >= _WIDTH_CONFIDENCE and np.isfinite(estimate.points_cm).all()):
-            return
-        seen = lane_width_cm(estimate.points_cm)
-        if not seen > 0.0:
-            return
-        if self._width_cm is None:
-            self._width_cm = seen
-            return
-        largest = _WIDTH_STEP * self._width_cm
-        self._width_cm += _WIDTH_GAIN * min(max(seen - self._width_cm, -largest), largest)
+        # The width counts only where a line is missing.
+        complete = all(map(math.isfinite, smooth.points_cm.tolist()))
+        width_cm = None if complete else self._memory.width_cm
+        return steering_target_rad(smooth, self._steering, width_cm)

@@ -75,22 +75,20 @@ class LaneSmoother:
         self._predict(max(dt_s, 0.0), travel_cm, steering_rad)
         confidence = estimate.confidence if math.isfinite(estimate.confidence) else 0.0
         weight = 1.0 / max(confidence, _MIN_CONFIDENCE)
-        seen = zip(estimate.points_cm.tolist(), estimate.sigma_cm.tolist(), strict=True)
-        for i, (x_cm, sigma_cm) in enumerate(seen):
-            if not math.isfinite(x_cm):
-                continue
-            sigma_cm = sigma_cm if math.isfinite(sigma_cm) else self._settings.default_sigma_cm
-            measured = weight * max(sigma_cm, _MIN_SIGMA_CM) ** 2
-            if math.isfinite(self._points_cm[i]):
-                gain = self._variance[i] / (self._variance[i] + measured)
-                self._points_cm[i] += gain * (x_cm - self._points_cm[i])
-                self._variance[i] *= 1.0 - gain
-            else:
-                self._points_cm[i], self._variance[i] = x_cm, measured
-            self._unseen_s[i] = 0.0
-        spread = zip(self._points_cm, self._variance, strict=True)
-        sigmas_cm = [math.sqrt(variance) if math.isfinite(x) else math.nan for x, variance in spread]
-        return replace(estimate, points_cm=np.array(self._points_cm), sigma_cm=np.array(sigmas_cm))
+        points, variances, sigmas_cm = self._points_cm, self._variance, estimate.sigma_cm.tolist()
+        for i, x_cm in enumerate(estimate.points_cm.tolist()):
+            if math.isfinite(x_cm):
+                sigma_cm = sigmas_cm[i] if math.isfinite(sigmas_cm[i]) else self._settings.default_sigma_cm
+                measured = weight * max(sigma_cm, _MIN_SIGMA_CM) ** 2
+                if math.isfinite(points[i]):
+                    gain = variances[i] / (variances[i] + measured)
+                    points[i] += gain * (x_cm - points[i])
+                    variances[i] *= 1.0 - gain
+                else:
+                    points[i], variances[i] = x_cm, measured
+                self._unseen_s[i] = 0.0
+            sigmas_cm[i] = math.sqrt(variances[i]) if math.isfinite(points[i]) else math.nan
+        return replace(estimate, points_cm=np.array(points), sigma_cm=np.array(sigmas_cm))
 
     def _predict(self, dt_s: float, travel_cm: float, steering_rad: float) -> None:
         growth = dt_s * self._settings.drift_cm_per_sqrt_s**2

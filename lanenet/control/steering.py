@@ -92,10 +92,11 @@ def _line_at(x_rows_cm: Float[np.ndarray, "3"], y_cm: float) -> tuple[float, flo
 
     Two known rows are not extended beyond themselves, one not beyond itself: NaN there.
     """
-    known = [(row, x) for row, x in zip(ROWS_CM, x_rows_cm.tolist(), strict=True) if math.isfinite(x)]
-    if len(known) == len(ROWS_CM):
-        a, b, c = parabola_through(*(x for _, x in known))
+    x_rows = x_rows_cm.tolist()
+    if math.isfinite(sum(x_rows)):
+        a, b, c = parabola_through(*x_rows)
         return (a * y_cm + b) * y_cm + c, 2.0 * a * y_cm + b
+    known = [(row, x) for row, x in zip(ROWS_CM, x_rows, strict=True) if math.isfinite(x)]
     if not known or not known[0][0] <= y_cm <= known[-1][0]:
         return math.nan, math.nan
     (row, x), (last_row, last_x) = known[0], known[-1]

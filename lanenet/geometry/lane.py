@@ -7,6 +7,8 @@ Three points and the parabola x = a y^2 + b y + c are one-to-one (Kozlowski et a
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -87,7 +89,7 @@ def lane_width_cm(points_cm: Float[np.ndarray, "6"]) -> float:
     Returns:
         Width; NaN where a point is missing, negative where the lines are swapped.
     """
-    lines = np.asarray(points_cm, np.float64).reshape(2, len(ROWS_CM))
-    a, b, _ = PARABOLA_FROM_POINTS @ lines.mean(axis=0)
-    slope = 2.0 * a * ROWS_CM[1] + b
-    return float((lines[1, 1] - lines[0, 1]) / np.sqrt(1.0 + slope * slope))
+    left_0, left_15, left_30, right_0, right_15, right_30 = points_cm.tolist()
+    # The slope of a parabola in the middle between two rows is that of the chord through them.
+    slope = 0.5 * (left_30 - left_0 + right_30 - right_0) / (ROWS_CM[2] - ROWS_CM[0])
+    return float((right_15 - left_15) / math.hypot(1.0, slope))

@@ -6,7 +6,8 @@ import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,9 +21,11 @@ from safetensors.torch import save
 
 from lanenet.config import load_settings, read_yaml
 from lanenet.data.files import atomic_file
+from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.perception.model_file import BATCH_NAME
 from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 
 #: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
@@ -30,6 +33,8 @@ OPSET = 18
 IR_VERSION = 9
 #: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
 TOLERANCE = 1e-3
+#: Rasters that the check takes at a time.
+_BATCH = 256
 
 CHECKPOINT_FORMAT = "lanenet-checkpoint/1"
 MARKER_NAME = "checkpoint.yaml"
@@ -79,24 +84,47 @@ def export_onnx(
     return difference
 
 
-def export_checkpoint(checkpoint: Path, out: Path | None = None) -> Path:
+@dataclass(frozen=True)
+class Exported:
+    """A file that was checked and written.
+
+    Attributes:
+        path: The file.
+        rasters: Number of rasters of the check.
+        difference: Largest difference of any output on them, [cm] or smaller units.
+    """
+
+    path: Path
+    rasters: int
+    difference: float
+
+
+def export_checkpoint(checkpoint: Path, out: Path | None = None, labels: Sequence[Path] = ()) -> Exported:
     """Export the weights of a checkpoint folder.
 
     Args:
         checkpoint: Folder that :func:`lanenet.learn.train.train` wrote.
         out: File to write; None replaces the folder's ``model.onnx``.
+        labels: Label sets on whose rasters the file is checked, beside those that the folder holds.
 
     Returns:
-        The file that was written.
+        The file that was written, and how well it agrees with PyTorch.
 
     Raises:
-        CheckpointError: If a file of the folder is missing or does not fit, or the check fails.
+        CheckpointError: If a file of the folder is missing or does not fit, a label set has another window,
+            or the check fails.
+        LabelFormatError: If a label set cannot be used.
     """
     path = checkpoint / MODEL_NAME if out is None else out
     network, meta = read_network(checkpoint)
-    rasters = read_rasters(checkpoint / RASTERS_NAME, meta)
-    export_onnx(network, meta, rasters, path)
-    return path
+    rasters = [read_rasters(checkpoint / RASTERS_NAME, meta)]
+    for file in labels:
+        label_set = read_labels(file)
+        if label_set.meta.window != meta.window:
+            raise CheckpointError(f"{file}: made for {label_set.meta.window}, expected {meta.window}")
+        rasters.append(np.stack([label_set.raster(i) for i in range(len(label_set))])[:, None])
+    every = np.concatenate(rasters)
+    return Exported(path, len(every), export_onnx(network, meta, every, path))
 
 
 def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
@@ -196,7 +224,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
             opset_version=OPSET,
             input_names=[INPUT_NAME],
             output_names=list(OUTPUT_NAMES),
-            dynamic_shapes={"raster": {0: torch.export.Dim("n", min=1)}},
+            dynamic_shapes={INPUT_NAME: {0: torch.export.Dim(BATCH_NAME, min=1)}},
         )
     if program is None:
         raise CheckpointError("torch.onnx.export answered nothing, expected a program")
@@ -221,10 +249,15 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
 def _largest_difference(
     deployed: DeployedLaneNet, session: onnxruntime.InferenceSession, rasters: UInt8[np.ndarray, "n 1 r c"]
 ) -> float:
-    with torch.inference_mode():
-        expected = deployed(torch.from_numpy(rasters))
-    found = session.run(OUTPUT_NAMES, {INPUT_NAME: rasters})
-    return max(float(np.max(np.abs(np.asarray(f) - e.numpy()))) for f, e in zip(found, expected, strict=True))
+    off = []
+    for begin in range(0, len(rasters), _BATCH):
+        some = rasters[begin : begin + _BATCH]
+        with torch.inference_mode():
+            expected = deployed(torch.from_numpy(some))
+        found = session.run(OUTPUT_NAMES, {INPUT_NAME: some})
+        off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
+    # Not Python's max(), which passes over what is no number.
+    return float(np.max(off))
 
 
 @contextlib.contextmanager

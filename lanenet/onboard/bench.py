@@ -156,9 +156,10 @@ def _time_frame(
 
     cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
     mark("canny")
-    pixels = find_edges(frame, extractor.settings.edges, extractor.table.keep, extractor.table.scale)
+    table = extractor.table
+    pixels = find_edges(frame, extractor.settings.edges, table.keep, table.scale, table.sample)
     mark("edges")
-    road = extractor.table.lift(pixels)
+    road = table.lift(pixels)
     mark("lift")
     raster = window.rasterise(road.points_cm)
     mark("raster")

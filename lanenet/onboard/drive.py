@@ -82,6 +82,8 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
         camera,
         model=chosen.model,
         lane_width_cm=chosen.lane_width_cm,
+        # What the car's file tells the controller counts for the detector as well.
+        drive_lane_width_cm=settings.control.steering.lane_width_cm,
         any_camera=chosen.any_camera,
         config=chosen.config,
         mask=None if chosen.mask is None else read_mask(chosen.mask),

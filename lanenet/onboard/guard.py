@@ -33,9 +33,11 @@ DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
 #: Time for the interpreter, the driver and the device; an Arduino restarts when its port is opened.
 _START_S = 30.0
 #: Commands without an answer for this long: the guard hangs in the actuator's driver.
-_STUCK_S = 0.5
+_STUCK_S = 0.25
 #: Closing takes no longer than this.
 _CLOSE_S = 2.0
+#: A process that is killed is gone within this time, if ever.
+_DIE_S = 0.1
 #: Lines that the guard may leave behind, each of which may be an error.
 _LAST_WORDS = 8
 
@@ -172,7 +174,23 @@ class GuardedActuator:
         self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:
-            raise HardwareError(f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs")
+            # The guard cannot go to neutral any more, and meanwhile the motor runs on.
+            self._kill()
+            self._rescue()
+            raise HardwareError(
+                f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs; the guard was "
+                "killed and neutral was set without it"
+            )
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            # What hangs in the kernel does not even die.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_DIE_S)
+        if self._line is not None:
+            self._line.close()
+            self._line = None
 
     def neutral(self) -> None:
         """Go to neutral at once; never raises."""
@@ -189,8 +207,8 @@ class GuardedActuator:
             self._process.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
             log.error("the guard does not end, its driver hangs: it is killed")
-            self._process.kill()
-            self._process.wait()
+            self._kill()
+            self._rescue()
         # What it had to say at the end decides whether it left the actuator in order.
         for _ in range(_LAST_WORDS):
             with contextlib.suppress(HardwareError):

@@ -44,7 +44,8 @@ class SafetySettings(Settings):
     """When the car slows down, stops and gives up.
 
     Attributes:
-        watchdog_s: Without a new command for this long the motor goes to neutral.
+        watchdog_s: Without a new command for this long the motor goes to neutral. The default leaves a fifth
+            of 100 ms to the system, which has to wake the guard, and to the wire.
         max_age_s: A command is good until its frame is this old.
         countdown_s: An armed car starts after it has seen the lane this long without a break.
         slow_below: Below this confidence the car slows down.
@@ -56,7 +57,7 @@ class SafetySettings(Settings):
             only when it hangs; a simulator without noise always, while the car stands.
     """
 
-    watchdog_s: float = Field(default=0.1, gt=0.0, le=0.5)
+    watchdog_s: float = Field(default=0.08, gt=0.0, le=0.5)
     max_age_s: float = Field(default=0.1, gt=0.0, le=0.5)
     countdown_s: float = Field(default=3.0, ge=0.0)
     slow_below: float = Field(default=0.5, ge=0.0, le=1.0)

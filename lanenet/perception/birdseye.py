@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from lanenet.config import Settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.colour import PixelScale
-from lanenet.perception.edges import EdgePixels, EdgeSettings, check_frame, find_edges
+from lanenet.perception.edges import EdgePixels, EdgeSettings, check_frame, find_edges, sample_pixels
 
 
 class RangeSettings(Settings):
@@ -63,6 +64,7 @@ class RoadTable:
     Attributes:
         keep: uint8 mask of the pixels that see the useful part of the road.
         useful_pixels: Number of them.
+        sample: Those of them that tell the contrast, for :func:`lanenet.perception.edges.find_edges`.
         scale: Road that a pixel spans sideways.
         points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
         jacobian: d(point)/d(pixel), [cm/px], height x width x 2 x 2 (row x, y; column u, v).
@@ -81,6 +83,7 @@ class RoadTable:
         grid = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 2)
         du = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
         dv = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
+        self._last_px = np.array([self.width - 1.0, self.height - 1.0])
         # A pixel's six numbers side by side, so that a lookup touches the memory once.
         self._rows = np.concatenate([grid[1:-1, 1:-1], du, dv], axis=-1).reshape(-1, 6)
         table = self._rows.reshape(self.height, self.width, 6)
@@ -107,6 +110,7 @@ class RoadTable:
             useful &= mask == 0
         self.keep: UInt8[np.ndarray, "h w"] = np.where(useful, 255, 0).astype(np.uint8)
         self.useful_pixels = int(np.count_nonzero(useful))
+        self.sample = sample_pixels(self.keep)
         if not useful.any():
             raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
         across = np.linalg.norm(du, axis=-1)
@@ -125,24 +129,31 @@ class RoadTable:
         Returns:
             Their points and directions on the road, [cm], frame car.
         """
-        nearest = np.rint(edges.uv_px)
-        nearest = np.minimum(np.maximum(nearest, 0.0), [self.width - 1.0, self.height - 1.0])
-        at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
-        x, y, x_u, y_u, x_v, y_v = np.ascontiguousarray(self._rows.take(at, axis=0).T)
-        off_u, off_v = (edges.uv_px - nearest).T
+        points, rows = self._look_up(edges)
+        _, _, x_u, y_u, x_v, y_v = rows
         normal_u, normal_v = edges.normals.T
-        points, across = np.empty((len(at), 2)), np.empty((len(at), 2))
-        points[:, 0] = x + (x_u * off_u + x_v * off_v)
-        points[:, 1] = y + (y_u * off_u + y_v * off_v)
         # A direction along the edge maps by the Jacobian; the normal is perpendicular to it, on the side to
         # which the image gradient leads. Together: the cofactors, with the sign of the determinant.
-        side = np.sign(x_u * y_v - x_v * y_u)
-        across_x = side * (y_v * normal_u - y_u * normal_v)
-        across_y = side * (x_u * normal_v - x_v * normal_u)
-        shrink = 1.0 / np.maximum(np.sqrt(across_x * across_x + across_y * across_y), 1e-12)
-        across[:, 0] = across_x * shrink
-        across[:, 1] = across_y * shrink
-        return RoadEdges(points, across)
+        across = np.empty_like(points)
+        np.subtract(y_v * normal_u, y_u * normal_v, out=across[0])
+        np.subtract(x_u * normal_v, x_v * normal_u, out=across[1])
+        across *= np.sign(x_u * y_v - x_v * y_u)
+        across *= 1.0 / np.maximum(np.sqrt(across[0] * across[0] + across[1] * across[1]), 1e-12)
+        return RoadEdges(np.ascontiguousarray(points.T), np.ascontiguousarray(across.T))
+
+    def lift_points(self, edges: EdgePixels) -> Float[np.ndarray, "n 2"]:
+        """Return the points of :meth:`lift` alone."""
+        return np.ascontiguousarray(self._look_up(edges)[0].T)
+
+    def _look_up(self, edges: EdgePixels) -> tuple[Float[np.ndarray, "2 n"], Float[np.ndarray, "6 n"]]:
+        """Return x and y of each edge point, and the six numbers of the pixel that it lies in."""
+        nearest = np.rint(edges.uv_px)
+        np.maximum(nearest, 0.0, out=nearest)
+        np.minimum(nearest, self._last_px, out=nearest)
+        at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
+        rows = np.ascontiguousarray(self._rows.take(at, axis=0).T)
+        off_u, off_v = (edges.uv_px - nearest).T
+        return rows[:2] + (rows[2:4] * off_u + rows[4:] * off_v), rows
 
 
 class RoadEdgeExtractor:
@@ -165,12 +176,12 @@ class RoadEdgeExtractor:
         self.settings = settings
         self.table = RoadTable(camera, settings.range, mask)
 
-    def is_crowded(self, edges: RoadEdges, max_share: float) -> bool:
-        """Tell whether more than this share of the pixels that see the road are edges.
+    def is_crowded(self, n_edges: int, max_share: float) -> bool:
+        """Tell whether so many edges are more than this share of the pixels that see the road.
 
         A frame of noise has an edge everywhere, and any lane can be found in it.
         """
-        return len(edges.points_cm) > max_share * self.table.useful_pixels
+        return n_edges > max_share * self.table.useful_pixels
 
     def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> RoadEdges:
         """Find a frame's edges and move them to the road.
@@ -179,15 +190,31 @@ class RoadEdgeExtractor:
             CalibrationError: If the frame's size is not the camera's.
             DriveFormatError: If the array is no image.
         """
+        edges = self.table.lift(self._find(frame_bgr))
+        # The precision of the label files, so that a raster made from a file and one made on the car agree.
+        points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
+        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
+        return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])
+
+    def extract_points(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> Float[np.ndarray, "n 2"]:
+        """Return the points of :meth:`extract` alone, which is all that a raster takes.
+
+        Raises:
+            CalibrationError: If the frame's size is not the camera's.
+            DriveFormatError: If the array is no image.
+        """
+        points = self.table.lift_points(self._find(frame_bgr)).astype(np.float32)
+        # A normal is missing only where its point is: both follow from the same numbers of the table.
+        # One sum tells that nothing is missing, as in nearly every frame.
+        return points if math.isfinite(points.sum()) else points[np.isfinite(points).all(axis=1)]
+
+    def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
         height, width = check_frame(frame_bgr).shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise CalibrationError(
                 f"frame of {width}x{height} px, but the camera is calibrated for "
                 f"{self.camera.width}x{self.camera.height}"
             )
-        pixels = find_edges(frame_bgr, self.settings.edges, self.table.keep, self.table.scale)
-        edges = self.table.lift(pixels)
-        # The precision of the label files, so that a raster made from a file and one made on the car agree.
-        points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
-        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
-        return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])
+        return find_edges(
+            frame_bgr, self.settings.edges, self.table.keep, self.table.scale, self.table.sample
+        )

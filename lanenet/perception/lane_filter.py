@@ -51,7 +51,7 @@ class LaneFilter:
         if self.extractor is None:
             raise CalibrationError("lane filter: built without a camera, it takes edge points, not frames")
         edges = self.extractor.extract(frame_bgr)
-        if self.extractor.is_crowded(edges, self.settings.max_edge_share):
+        if self.extractor.is_crowded(len(edges.points_cm), self.settings.max_edge_share):
             self.reset()
             return LaneEstimate()
         return self.estimate(edges.points_cm, edges.normals)

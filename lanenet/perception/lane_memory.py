@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import deque
 
 import numpy as np
@@ -37,7 +38,26 @@ class LaneMemory:
         """The lane's width; None while it is unknown."""
         if self.given_cm is not None:
             return self.given_cm
-        return float(np.median(self._widths_cm)) if len(self._widths_cm) >= _ENOUGH else None
+        return statistics.median(self._widths_cm) if len(self._widths_cm) >= _ENOUGH else None
+
+    def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> bool:
+        """Take the width of a frame that shows both lines; any other frame teaches nothing.
+
+        Args:
+            points_cm: The six points, frame car; NaN where unknown.
+            presence: Probability that each line can be seen; NaN of a detector that gives the points of the
+                lines that it sees and no others.
+
+        Returns:
+            True if both lines are seen beyond doubt.
+        """
+        left, right = presence.tolist()
+        if left <= _SURE or right <= _SURE:
+            return False
+        width_cm = lane_width_cm(points_cm)
+        if width_cm > 0.0:
+            self._widths_cm.append(width_cm)
+        return True
 
     def reset(self) -> None:
         """Forget the frames; a given width stays."""
@@ -62,19 +82,17 @@ class LaneMemory:
         Returns:
             Points and standard deviations, changed for the missing line only.
         """
-        if presence.min() > _SURE:
-            width_cm = lane_width_cm(points_cm)
-            if width_cm > 0.0:
-                self._widths_cm.append(width_cm)
+        if self.learn(points_cm, presence):
             return points_cm, sigma_cm
-        if (presence < _SEEN).sum() != 1 or self.width_cm is None:
+        width_cm = self.width_cm
+        if (presence < _SEEN).sum() != 1 or width_cm is None:
             return points_cm, sigma_cm
         missing = int(np.argmin(presence))
         # The left line is 0: the missing right line lies to the right of it, and the other way round.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
-        rebuilt = parallel_points(lines[1 - missing], side * self.width_cm)
-        rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * self.width_cm)
+        rebuilt = parallel_points(lines[1 - missing], side * width_cm)
+        rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
         if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
             lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
         return lines.reshape(6), sigmas.reshape(6)

@@ -21,6 +21,8 @@ FORMAT = "lanenet-model/2"
 #: Of models from before the network told its uncertainty; they are still read.
 FORMAT_WITHOUT_SIGMA = "lanenet-model/1"
 INPUT_NAME = "raster"
+#: The dimension of inputs and outputs that counts the rasters.
+BATCH_NAME = "n"
 OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
 #: Stands for the cameras of a model that was trained with many.
 ANY_CAMERA = "any"
@@ -146,12 +148,15 @@ class ModelMeta:
         return meta
 
 
-def open_model(path: Path, threads: int = 1) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
+def open_model(
+    path: Path, threads: int = 1, frames: int | None = None
+) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
     """Open a model file and check that it is what its description says.
 
     Args:
         path: ONNX file that :mod:`lanenet.learn` exported.
         threads: Threads of the computation.
+        frames: Rasters of every run, which is faster for being known; None takes any number.
 
     Raises:
         ModelMismatchError: If the file is missing, is not an ONNX file, or its description is of another
@@ -163,6 +168,8 @@ def open_model(path: Path, threads: int = 1) -> tuple[onnxruntime.InferenceSessi
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
+    if frames is not None:
+        options.add_free_dimension_override_by_name(BATCH_NAME, frames)
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has no common base class of its own

@@ -82,7 +82,7 @@ class NetworkDetector:
             ModelMismatchError: If the file is not a model of this format, or was made for another window or
                 camera; the message says which.
         """
-        self._session, self.meta = open_model(model_path, threads)
+        self._session, self.meta = open_model(model_path, threads, frames=1)
         if window is not None and window != self.meta.window:
             raise ModelMismatchError(
                 f"{model_path}: made for the window {self.meta.window}, but {window} is in use"
@@ -104,10 +104,10 @@ class NetworkDetector:
         Raises:
             CalibrationError: If the frame's size is not the camera's.
         """
-        edges = self._extractor.extract(frame_bgr)
-        if self._extractor.is_crowded(edges, _MAX_EDGE_SHARE):
+        points_cm = self._extractor.extract_points(frame_bgr)
+        if self._extractor.is_crowded(len(points_cm), _MAX_EDGE_SHARE):
             return LaneEstimate()
-        return self.detect_raster(self.meta.window.rasterise(edges.points_cm, out=self._raster[0, 0]))
+        return self.detect_raster(self.meta.window.rasterise(points_cm, out=self._raster[0, 0]))
 
     def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
         """Find the lane in a bird's-eye raster of 0 and 255."""
@@ -157,8 +157,9 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
     elif camera.hash not in meta.camera_hashes:
         raise ModelMismatchError(
             f"{model_path}: trained with camera {', '.join(meta.camera_hashes) or 'unknown'}, but "
-            f"this camera is {camera.hash}; train with this camera, or allow any camera if both are "
-            "calibrated and see about the same road"
+            f"this camera, {camera.model} {camera.width}x{camera.height}, is {camera.hash}; train with this "
+            "camera, or allow any camera (--any-camera, detector.any_camera) if both are calibrated and see "
+            "about the same road"
         )
 
 

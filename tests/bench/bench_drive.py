@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 
 from lanenet.onboard.drive import build_loop
-from lanenet.onboard.drive_report import Step
+from lanenet.onboard.drive_report import LatencyHistogram, Step
 from lanenet.onboard.drive_settings import DriveSettings
 
 RATE_HZ = 30.0
@@ -56,6 +56,10 @@ class Watch:
 
     def memory_at(self, t_s: float) -> float:
         return next((mb for at_s, mb in self.memory if at_s >= t_s), self.memory[-1][1])
+
+
+def _percentiles_ms(times: LatencyHistogram) -> dict[str, float]:
+    return {"median": times.percentile_ms(50.0), "p99": times.percentile_ms(99.0)}
 
 
 def main() -> int:
@@ -94,7 +98,8 @@ def main() -> int:
         "commands_late": late,
         "missed_share": missed / (report.frames + report.skipped),
         "late_by_cpu": watch.late_by_cpu,
-        "work_ms": {"median": report.work.percentile_ms(50.0), "p99": report.work.percentile_ms(99.0)},
+        "work_ms": _percentiles_ms(report.work),
+        "frame_to_command_ms": _percentiles_ms(report.latency),
         "states": {str(state): count for state, count in report.states.items()},
         "machine": {
             "platform": platform.platform(),

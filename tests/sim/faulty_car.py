@@ -1,108 +1,183 @@
-"""A car that drives until its fault comes: ``python faulty_car.py FAULT WIRE``; noted on the wire."""
+"""A car that drives until its fault comes: ``python faulty_car.py FAULT WIRE``; noted on the wire.
+
+FAULT is ``STEP raises``, ``STEP hangs`` (deaf to signals, as a driver in the kernel would be) or one of those
+that are named below. The steps are those of the drive loop with the network that ships.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from wire_log import guarded_wire, note, settings_of
 
-from lanenet.control.controller import ControlSettings, LaneController
+from lanenet.control.controller import ControlSettings, LaneController, Wish
 from lanenet.control.steering import SteeringSettings
-from lanenet.errors import HardwareError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.hardware import Frame
 from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
+from lanenet.perception import birdseye, network
 from lanenet.perception.estimate import LaneEstimate
 
+MODEL = Path(__file__).resolve().parents[2] / "checkpoints" / "small" / "model.onnx"
 RATE_HZ = 30.0
 #: By then the throttle has risen.
 FAULT_AT = 20
-LANE = LaneEstimate(np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0]), confidence=1.0)
 fault, wire = sys.argv[1], Path(sys.argv[2])
+camera = example_camera()
+frames = example_frames(camera, 16, np.random.default_rng(0))
+begun: list[int] = []
+
+
+def begin() -> None:
+    """Note the fault, when it begins."""
+    if not begun:
+        begun.append(1)
+        note(wire, "fault")
+
+
+def at_fault(
+    step: str, answer: Callable[..., Any], faults: dict[str, Callable[..., Any]]
+) -> Callable[..., Any]:
+    """Return ``answer``, which from its FAULT_AT-th call on does what the fault of this step is."""
+    calls = [-1]
+
+    def raises(*_: Any, **__: Any) -> None:
+        raise RuntimeError(f"{step} failed")
+
+    def hangs(*_: Any, **__: Any) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM, signal.SIGINT])
+        time.sleep(3600.0)
+
+    wrong = {f"{step} raises": raises, f"{step} hangs": hangs, **faults}.get(fault)
+
+    def called(*values: Any, **named: Any) -> Any:
+        calls[0] += 1
+        if wrong is None or calls[0] < FAULT_AT:
+            return answer(*values, **named)
+        begin()
+        return wrong(*values, **named)
+
+    return called
 
 
 class Camera:
+    """30 new frames per second."""
+
     def __init__(self) -> None:
-        self.number, self.noted = -1, False
+        self.number = -1
+        faults = {
+            "camera gone": self.gone,
+            "camera frozen": self.frozen,
+            "camera late": lambda _: self.frame(age_s=0.2),
+            "camera of another clock": lambda _: self.frame(age_s=-1000.0),
+            "camera of another size": lambda _: self.frame(small=True),
+        }
+        self.read = at_fault("camera", lambda _: self.frame(), faults)
 
     def open(self) -> None:
         self.begin_s = time.monotonic()
 
-    def read(self, timeout_s: float) -> Frame | None:
-        if fault == "camera gone" and self.number >= FAULT_AT:
-            if not self.noted:
-                note(wire, "fault")
-                self.noted = True
-            time.sleep(timeout_s)
-            return None
+    def frame(self, age_s: float = 0.0, picture: int | None = None, small: bool = False) -> Frame:
         self.number += 1
         time.sleep(max(0.0, self.begin_s + self.number / RATE_HZ - time.monotonic()))
-        level = self.number
-        if self.number == FAULT_AT and fault.startswith("camera") and fault != "camera gone":
-            note(wire, "fault")
-        if self.number >= FAULT_AT:
-            if fault == "camera raises":
-                raise HardwareError("the camera was unplugged")
-            if fault == "camera hangs":
-                time.sleep(3600.0)
-            if fault == "camera frozen":
-                level = FAULT_AT - 1
-        return Frame(np.full((24, 32, 3), level % 250, np.uint8), time.monotonic(), self.number)
+        image = frames[(self.number if picture is None else picture) % len(frames)].copy()
+        return Frame(image[::2, ::2] if small else image, time.monotonic() - age_s, self.number)
+
+    def gone(self, timeout_s: float) -> None:
+        time.sleep(timeout_s)
+
+    def frozen(self, _: float) -> Frame:
+        return self.frame(picture=FAULT_AT - 1)
 
     def close(self) -> None:
         pass
 
 
-class Eye:
-    def __init__(self) -> None:
-        self.seen = -1
+class Recorder:
+    """Breaks its promise never to block and never to raise."""
 
-    def reset(self) -> None:
+    path, recorded, dropped = Path("nowhere"), 0, 0
+
+    def __init__(self) -> None:
+        self.add = at_fault("recorder", lambda *_, **__: None, {})
+
+    def close(self) -> None:
         pass
 
-    def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
-        self.seen += 1
-        if self.seen == FAULT_AT and not fault.startswith("camera"):
-            note(wire, "fault")
-        if self.seen < FAULT_AT:
-            return LANE
-        if fault == "network raises":
-            raise RuntimeError("the network failed")
-        if fault == "network answers NaN":
-            return LaneEstimate(confidence=1.0)
-        if fault == "network doubts":
-            return LaneEstimate(LANE.points_cm, confidence=0.05)
-        if fault == "loop hangs":
-            # Deaf to signals, as a driver in the kernel would be.
-            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM, signal.SIGINT])
-            time.sleep(3600.0)
-        if fault == "process crashes":
-            os.abort()
-        if fault.startswith("SIG"):
-            os.kill(os.getpid(), getattr(signal, fault))
-        if fault == "guard killed":
-            os.kill(sink.pid, signal.SIGKILL)
-        return LANE
+
+class Session:
+    """The network's session, until its fault."""
+
+    def __init__(self, session: Any) -> None:
+        def filled(points: float, spread: float, presence: float) -> Callable[..., Any]:
+            return lambda *_: [
+                np.full((1, count), value, np.float32)
+                for count, value in ((6, points), (6, spread), (2, presence))
+            ]
+
+        faults = {
+            "network answers NaN": filled(math.nan, math.nan, math.nan),
+            "network answers infinity": filled(math.inf, 1.0, 1.0),
+        }
+        self.run = at_fault("network", session.run, faults)
+
+
+def doubtful(*_: Any) -> float:
+    return 0.05
+
+
+def kill(what: Callable[[], None]) -> Callable[..., LaneEstimate]:
+    def detect(frame_bgr: np.ndarray) -> LaneEstimate:
+        what()
+        return detect_well(frame_bgr)
+
+    return detect
 
 
 logging.basicConfig(level=logging.INFO)
-control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
-faults = {"fail_at": FAULT_AT} if fault == "actuator raises" else {}
-sink = guarded_wire(settings_of(wire, **faults), 0.1)
+control = ControlSettings(steering=SteeringSettings(wheelbase_cm=camera.wheelbase_cm))
+safety = SafetySettings(countdown_s=0.0)
+actuator = {"actuator raises": {"fail_at": FAULT_AT}, "actuator hangs": {"hang_at": FAULT_AT}}.get(fault, {})
+sink = guarded_wire(settings_of(wire, **actuator), safety.watchdog_s)
+detector = network.NetworkDetector(MODEL, camera, any_camera=True)
+detector._session = Session(detector._session)  # type: ignore[assignment]
+birdseye.find_edges = at_fault("edges", birdseye.find_edges, {})
+BirdseyeWindow.rasterise = at_fault("raster", BirdseyeWindow.rasterise, {})  # type: ignore[method-assign]
+network.confidence = at_fault("estimate", network.confidence, {"network doubts": doubtful})
+detect_well = detector.detect
+ends: dict[str, Callable[..., Any]] = {
+    name: kill(lambda name=name: os.kill(os.getpid(), getattr(signal, name)))  # type: ignore[misc]
+    for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
+}
+ends |= {
+    "process crashes": kill(os.abort),
+    "guard killed": kill(lambda: os.kill(sink.pid, signal.SIGKILL)),
+    "guard ended": kill(lambda: os.kill(sink.pid, signal.SIGTERM)),
+}
+detector.detect = at_fault("detector", detect_well, ends)  # type: ignore[method-assign]
+controller = LaneController(control)
+lost = {"control answers NaN": lambda estimate, *_: Wish(math.nan, math.nan, estimate)}
+controller.wish = at_fault("control", controller.wish, lost)  # type: ignore[method-assign]
 loop = DriveLoop(
     Camera(),
-    Eye(),
-    LaneController(control),
+    detector,
+    controller,
     sink,
-    SafetySettings(countdown_s=0.0),
+    safety,
     CommandLimiter(LimitSettings()),
     control.speed,
     armed=True,
+    recorder=Recorder(),
 )
 sys.exit(3 if loop.run().by_fault else 0)

@@ -4,54 +4,46 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from wire_log import Line, read_wire
 
 HERE = Path(__file__).parent
-#: Fault, exit code of the loop (None: it has to be killed), and what its log says.
+#: Exit code of a loop that has to be killed, and of one that stopped for a fault.
+HUNG, BY_FAULT = None, 3
+STEPS = ("camera", "edges", "raster", "network", "estimate", "detector", "control", "recorder")
+#: Fault, exit code of the loop, and what its log says.
 FAULTS: dict[str, tuple[int | None, str]] = {
-    "camera raises": (1, "the camera was unplugged"),
-    "camera gone": (3, "no frame from the camera"),
-    "camera frozen": (3, "the camera hangs"),
-    "camera hangs": (None, "no command from the drive loop"),
-    "network raises": (1, "the network failed"),
-    "network answers NaN": (3, "no lane in frame"),
-    "network doubts": (3, "confidence 0.05"),
-    "loop hangs": (None, "no command from the drive loop"),
+    **{f"{step} raises": (1, f"{step} failed") for step in STEPS},
+    **{f"{step} hangs": (HUNG, "no command from the drive loop") for step in STEPS},
+    "camera gone": (BY_FAULT, "no frame from the camera"),
+    "camera frozen": (BY_FAULT, "the camera hangs"),
+    "camera late": (BY_FAULT, "ms old"),
+    "camera of another clock": (BY_FAULT, "ahead of the clock"),
+    "camera of another size": (1, "160x120 px, but the camera is calibrated for 320x240"),
+    "network answers NaN": (BY_FAULT, "no lane in frame"),
+    "network answers infinity": (BY_FAULT, "no lane in frame"),
+    "network doubts": (BY_FAULT, "confidence 0.05"),
+    "control answers NaN": (BY_FAULT, "no lane in frame"),
     "process crashes": (-signal.SIGABRT, "the drive loop is gone"),
     "actuator raises": (1, "Remote I/O error"),
+    "actuator hangs": (1, "its driver hangs; the guard was killed"),
     "guard killed": (1, "neutral was set without it"),
+    "guard ended": (1, "ended from outside"),
     "SIGKILL": (-signal.SIGKILL, "the drive loop is gone"),
     "SIGTERM": (0, "neutral: SIGTERM"),
     "SIGINT": (0, "neutral: SIGINT"),
     "SIGHUP": (0, "neutral: SIGHUP"),
 }
-#: Neutral this long after the fault.
+#: Neutral this long after the fault, read from the wire; nothing is allowed for the machine.
 ALLOWED_S = 0.1
-
-
-@pytest.fixture
-def lateness() -> Iterator[list[float]]:
-    """How late this machine wakes a process, at worst, while the test runs: other work holds the cores."""
-    worst = [0.0]
-    over = threading.Event()
-
-    def measure() -> None:
-        while not over.is_set():
-            begin_s = time.monotonic()
-            time.sleep(0.005)
-            worst[0] = max(worst[0], time.monotonic() - begin_s - 0.005)
-
-    thread = threading.Thread(target=measure)
-    thread.start()
-    yield worst
-    over.set()
-    thread.join()
+#: A driver that hangs holds the guard as well: the loop waits 0.25 s for an answer, until its next turn.
+ALLOWED_HUNG_DRIVER_S = 0.3
+#: Other work on the machine may wake a process late: one of so many drives has to keep the time.
+TRIES = 3
 
 
 def is_neutral(line: Line) -> bool:
@@ -68,13 +60,24 @@ def wait_for_neutral(wire: Path, process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.usefixtures("hang_up_ends")
-@pytest.mark.parametrize("fault", FAULTS)
-def test_every_fault_ends_in_neutral(
-    fault: str, tmp_path: Path, lateness: list[float], record_property: pytest.RecordProperty
-) -> None:
-    code, told = FAULTS[fault]
-    wire, log = tmp_path / "wire.txt", tmp_path / "log.txt"
+@dataclass(frozen=True)
+class Drive:
+    code: int | None
+    log: str
+    lines: list[Line]
+
+    @property
+    def fault_s(self) -> float:
+        return next(line.t_s for line in self.lines if line.kind == "fault")
+
+    @property
+    def neutral_s(self) -> float:
+        return next(line.t_s for line in self.lines if line.t_s >= self.fault_s and is_neutral(line))
+
+
+def drive_into(fault: str, folder: Path) -> Drive:
+    wire, log = folder / "wire.txt", folder / "log.txt"
+    folder.mkdir()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])}
     with log.open("w") as stream:
         process = subprocess.Popen(
@@ -86,20 +89,32 @@ def test_every_fault_ends_in_neutral(
         )
         try:
             wait_for_neutral(wire, process)
-            found = process.poll()
+            code = process.poll()
         finally:
             process.kill()
             process.wait()
     time.sleep(0.3)  # the guard goes after its loop
-    lines = read_wire(wire)
-    fault_s = next(line.t_s for line in lines if line.kind == "fault")
-    moving = [line for line in lines if line.kind == "send" and line.throttle > 0.0]
-    assert any(line.throttle > 0.2 for line in moving), "the car did not drive before the fault"
-    neutral_s = next(line.t_s for line in lines if line.t_s >= fault_s and is_neutral(line))
-    record_property("neutral_after_ms", round(1e3 * (neutral_s - fault_s), 1))
-    slack_s = 0.01 + 2.0 * lateness[0]
-    assert neutral_s - fault_s <= ALLOWED_S + slack_s
-    assert moving[-1].t_s <= neutral_s, "the motor was driven again"
-    assert is_neutral(lines[-1]) and lines[-1].kind == "close"
-    assert found == code
-    assert told in log.read_text()
+    return Drive(code, log.read_text(), read_wire(wire))
+
+
+@pytest.mark.usefixtures("hang_up_ends")
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_ends_in_neutral(
+    fault: str, tmp_path: Path, record_property: pytest.RecordProperty
+) -> None:
+    code, told = FAULTS[fault]
+    allowed_s = ALLOWED_HUNG_DRIVER_S if fault == "actuator hangs" else ALLOWED_S
+    after_s = []
+    for number in range(TRIES):
+        drive = drive_into(fault, tmp_path / str(number))
+        moving = [line for line in drive.lines if line.kind == "send" and line.throttle > 0.0]
+        assert any(line.throttle > 0.2 for line in moving), "the car did not drive before the fault"
+        assert moving[-1].t_s <= drive.neutral_s, "the motor was driven again"
+        assert is_neutral(drive.lines[-1]) and drive.lines[-1].kind == "close"
+        assert drive.code == code
+        assert told in drive.log
+        after_s.append(drive.neutral_s - drive.fault_s)
+        if after_s[-1] <= allowed_s:
+            break
+    record_property("neutral_after_ms", [round(1e3 * value, 1) for value in after_s])
+    assert min(after_s) <= allowed_s

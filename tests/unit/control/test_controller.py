@@ -72,13 +72,15 @@ def test_one_line_is_enough_once_the_width_is_known() -> None:
     one = np.where(np.arange(6) < 3, np.nan, lane(5.0))
     no_smoothing = {"smoothing": {"enabled": False}}
     forgetful = LaneController(settings(**no_smoothing, width_memory=False))
-    forgetful.wish(LaneEstimate(lane(), confidence=1.0), 0.0)
-    assert math.isnan(forgetful.wish(LaneEstimate(one, confidence=1.0), 0.03).steering_rad)
+    for k in range(20):
+        forgetful.wish(LaneEstimate(lane(), confidence=1.0), 0.03 * k)
+    assert math.isnan(forgetful.wish(LaneEstimate(one, confidence=1.0), 0.6).steering_rad)
     controller = LaneController(settings(**no_smoothing))
-    assert controller.lane_width_cm is None
-    both = controller.wish(LaneEstimate(lane(5.0), confidence=1.0), 0.0)
+    for k in range(10):
+        assert controller.lane_width_cm is None
+        both = controller.wish(LaneEstimate(lane(5.0), confidence=1.0), 0.03 * k)
     assert controller.lane_width_cm == pytest.approx(40.0)
-    fallback = controller.wish(LaneEstimate(one, confidence=1.0), 0.03)
+    fallback = controller.wish(LaneEstimate(one, confidence=1.0), 0.3)
     assert fallback.steering_rad == pytest.approx(both.steering_rad)
     controller.reset()
     assert controller.wish(LaneEstimate(one, confidence=1.0), 0.0).steering_rad == fallback.steering_rad
@@ -90,8 +92,19 @@ def test_a_wrong_width_moves_the_memory_little() -> None:
         controller.wish(LaneEstimate(lane(width_cm=80.0 if k % 10 == 0 else 40.0), confidence=1.0), 0.03 * k)
     assert controller.lane_width_cm == pytest.approx(40.0, abs=1.0)
     doubtful = LaneController(settings())
-    doubtful.wish(LaneEstimate(lane(), confidence=0.2), 0.0)
-    assert doubtful.lane_width_cm is None
+    guessed = LaneController(settings())
+    for k in range(20):
+        doubtful.wish(LaneEstimate(lane(), confidence=0.2), 0.03 * k)
+        # Six points of a network that does not see the right line.
+        guessed.wish(LaneEstimate(lane(), confidence=1.0, presence=np.array([1.0, 0.2])), 0.03 * k)
+    assert doubtful.lane_width_cm is None and guessed.lane_width_cm is None
+
+
+def test_a_given_width_stays() -> None:
+    controller = LaneController(settings(steering={"wheelbase_cm": 26.0, "lane_width_cm": 35.0}))
+    for k in range(20):
+        controller.wish(LaneEstimate(lane(width_cm=40.0), confidence=1.0), 0.03 * k)
+    assert controller.lane_width_cm == 35.0
 
 
 def test_a_bend_slows_down_and_an_unknown_lane_has_no_answer() -> None:

@@ -2,6 +2,7 @@ import contextlib
 import logging
 import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -11,6 +12,7 @@ import torch
 from synthetic_labels import WINDOW, make_label_set
 
 from lanenet.config import dump_settings
+from lanenet.data.label_set import write_labels
 from lanenet.errors import CheckpointError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
@@ -135,3 +137,22 @@ def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
         with pytest.raises(CheckpointError, match=message):
             export_checkpoint(folder)
         assert not (folder / "model.onnx").exists()
+
+
+def test_an_export_is_checked_on_labels_as_well(checkpoint, tmp_path):
+    write_labels(tmp_path / "labels.parquet", LABELS)
+    done = export_checkpoint(checkpoint, tmp_path / "m.onnx", [tmp_path / "labels.parquet"] * 60)
+    assert done.path.is_file() and done.rasters == 5 + 60 * 5
+    assert 0.0 <= done.difference <= 1e-3
+    other = replace(LABELS, meta=replace(LABELS.meta, window=BirdseyeWindow(rows=48)))
+    write_labels(tmp_path / "other.parquet", other)
+    with pytest.raises(CheckpointError, match=r"other\.parquet: made for .*rows=48.*expected"):
+        export_checkpoint(checkpoint, tmp_path / "n.onnx", [tmp_path / "other.parquet"])
+    assert not (tmp_path / "n.onnx").exists()
+
+
+def test_an_output_that_is_no_number_is_a_difference(tmp_path):
+    network = make_network()
+    network.mean_cm[0] = math.nan
+    with pytest.raises(CheckpointError, match="differs from PyTorch by nan"):
+        export_onnx(network, META, RASTERS, tmp_path / "m.onnx")

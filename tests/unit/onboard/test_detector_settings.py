@@ -11,16 +11,21 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from lanenet import cli
+from lanenet.config import check_settings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.detectors import build_detector, lane_filter_settings
+from lanenet.onboard.drive import build_drive_detector
+from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.masks import find_mask, read_mask
 from lanenet.onboard.sources import Source
 from lanenet.perception.lane_filter import LaneFilter
+from lanenet.perception.network import NetworkDetector
 
 CAMERA = example_camera()
+MODEL = Path(__file__).resolve().parents[3] / "checkpoints" / "small" / "model.onnx"
 #: Rows of the picture in which the car of these tests sees itself, and the columns.
 BUMPER = slice(215, None), slice(90, 230)
 
@@ -207,3 +212,27 @@ def test_detect_with_a_mask(tmp_path: Path, photos: Path) -> None:
         assert refused.exit_code == 1 and "takes no mask" in refused.stderr
     missing = detect(tmp_path, photos, "--lane-width", "40", "--mask", tmp_path / "n.png")
     assert missing.exit_code == 1 and "n.png" in missing.stderr
+
+
+def test_a_network_hears_the_lanes_width_from_the_nearest_source() -> None:
+    def width_cm(**told: float) -> float | None:
+        detector = build_detector("network", CAMERA, model=MODEL, any_camera=True, **told)
+        assert isinstance(detector, NetworkDetector) and detector.memory is not None
+        return detector.memory.width_cm
+
+    assert width_cm() is None
+    assert width_cm(drive_lane_width_cm=35.0) == 35.0
+    assert width_cm(drive_lane_width_cm=35.0, lane_width_cm=42.0) == 42.0
+    steering = {"wheelbase_cm": 26.0, "lane_width_cm": 33.0}
+    settings = check_settings(
+        DriveSettings,
+        {
+            "source": {"kind": "replay", "path": "nowhere"},
+            "detector": {"model": str(MODEL), "any_camera": True},
+            "control": {"steering": steering},
+        },
+        "test",
+    )
+    detector = build_drive_detector(settings, CAMERA)
+    assert isinstance(detector, NetworkDetector) and detector.memory is not None
+    assert detector.memory.width_cm == 33.0

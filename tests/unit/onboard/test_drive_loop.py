@@ -135,9 +135,9 @@ def test_an_armed_car_drives_and_ends_in_neutral() -> None:
     assert throttles[-1] == pytest.approx(0.25) and throttles[3] == pytest.approx(3.0 / RATE_HZ)
     assert [kind for _, kind, *_ in car.wire.log][-2:] == ["neutral", "close"]
     assert car.camera.closed == 1
-    # Each command is good until its frame is 100 ms old.
+    # Each command is good for 80 ms; its frame, which is 10 ms old, would allow 90.
     sent = [(t, until) for t, kind, _, _, until in car.wire.log if kind == "send"]
-    assert all(until == pytest.approx(t + 0.09) for t, until in sent)
+    assert all(until == pytest.approx(t + 0.08) for t, until in sent)
 
 
 @pytest.mark.parametrize(("options", "steers"), [({}, False), ({"steering_only": True}, True)])
@@ -205,7 +205,7 @@ def test_a_short_gap_goes_on_with_the_throttle_rising_again() -> None:
     car = Car(120, dict.fromkeys(range(60, 70), lambda: None), armed=True)
     report = car.loop.run()
     assert report.ended == "the recording is over"
-    # The last command holds for 90 ms: two frames may be missing without a stop.
+    # The last command holds for 80 ms: two frames may be missing without a stop.
     assert report.states == {State.DRIVING: 110, State.STOPPED: 8}
     by_time = [(t, throttle) for t, kind, _, throttle, _ in car.wire.log if kind == "send"]
     after = [throttle for t, throttle in by_time if t > 100.0 + 70.5 / RATE_HZ]
@@ -291,3 +291,15 @@ def test_latencies_are_those_of_the_numbers() -> None:
     assert histogram.above(0.01) == pytest.approx((values_ms > 10.0).sum(), abs=10)
     histogram.add(10.0)
     assert histogram.longest_ms == pytest.approx(10_000.0) and len(histogram) == 5001
+
+
+def test_an_error_before_the_first_frame_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    car = Car(armed=True)
+
+    def fail(_: float) -> Frame:
+        raise HardwareError("no such drive")
+
+    car.camera.read = fail  # type: ignore[method-assign]
+    with pytest.raises(HardwareError, match="no such drive"):
+        car.loop.run()
+    assert "neutral: HardwareError before the first frame: no such drive" in caplog.text

@@ -8,7 +8,7 @@ import pytest
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadEdgeExtractor, RoadTable
-from lanenet.perception.edges import EdgePixels, EdgeSettings, find_edges, to_gray
+from lanenet.perception.edges import EdgePixels, EdgeSettings, find_edges, sample_pixels, to_gray
 
 DIRECTIONAL = EdgeSettings()
 CANNY = EdgeSettings(method="canny")
@@ -258,3 +258,28 @@ def test_a_camera_that_looks_up_is_refused() -> None:
 def test_a_range_that_leaves_no_rows_is_refused() -> None:
     with pytest.raises(CalibrationError, match="240 rows"):
         RoadTable(CAMERA, RangeSettings(top_row=200, bottom_rows=40))
+
+
+def test_points_alone_are_those_of_the_whole_extraction(tape_frame: np.ndarray) -> None:
+    settings = PerceptionSettings(range=RangeSettings(far_cm=300.0, max_cm_per_px=50.0))
+    noise = np.random.default_rng(0).integers(0, 256, tape_frame.shape).astype(np.uint8)
+    found = RoadEdgeExtractor(CAMERA, settings)
+    for frame in (tape_frame, noise, np.zeros_like(noise)):
+        whole, points = found.extract(frame).points_cm, found.extract_points(frame)
+        assert (whole.dtype, whole.shape, whole.tobytes()) == (points.dtype, points.shape, points.tobytes())
+    assert len(found.extract_points(noise)) > 1000
+
+
+def test_the_sample_of_a_mask_is_found_alike_by_the_caller_and_by_the_search(tape_frame: np.ndarray) -> None:
+    keep = np.zeros((240, 320), np.uint8)
+    keep[120:, 40:] = 255
+    sample = sample_pixels(keep)
+    assert {(int(i) // 320 % 3, int(i) % 320 % 3) for i in sample} == {(0, 0)}
+    assert len(sample) == 40 * 93 and keep.ravel()[sample].all()
+    given, own = (
+        find_edges(tape_frame, DIRECTIONAL, keep, None, sample),
+        find_edges(tape_frame, DIRECTIONAL, keep),
+    )
+    np.testing.assert_array_equal(given.uv_px, own.uv_px)
+    assert len(given.uv_px) > 100
+    assert len(find_edges(tape_frame, DIRECTIONAL, np.zeros_like(keep)).uv_px) == 0

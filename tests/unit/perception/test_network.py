@@ -118,6 +118,15 @@ def test_another_camera_is_refused_unless_allowed(model_path):
     assert NetworkDetector(model_path, other, any_camera=True).detect(striped_frame()).mask.all()
 
 
+def test_the_same_camera_at_another_resolution_is_refused(model_path):
+    K = CAMERA.K * [[0.5], [0.5], [1.0]]
+    half = replace(CAMERA, width=80, height=60, K=K)
+    with pytest.raises(
+        ModelMismatchError, match=rf"{CAMERA.hash}, but this camera, pinhole 80x60, is {half.hash}"
+    ):
+        NetworkDetector(model_path, half)
+
+
 def test_another_window_is_refused(model_path, tmp_path):
     with pytest.raises(ModelMismatchError, match="window"):
         NetworkDetector(model_path, CAMERA, window=BirdseyeWindow())
