@@ -119,8 +119,41 @@ def test_a_hung_actuator_is_told_and_set_neutral_without_its_guard(wire: Path) -
     with pytest.raises(HardwareError, match="driver hangs"):
         drive(sink, 200)
     sink.close()
-    assert [line.kind for line in read_wire(wire)][-2:] == ["open", "close"]
-    assert read_wire(wire)[-1].process == os.getpid()
+    lines = read_wire(wire)
+    assert [line.kind for line in lines][-2:] == ["open", "close"]
+    assert lines[-1].process == os.getpid()
+    # Half a second without an answer tells that it hangs; from then on nobody waits for it.
+    fault = next(line for line in lines if line.kind == "fault")
+    assert lines[-1].t_s - fault.t_s <= 0.5 + WATCHDOG_S + LATE_S
+
+
+def test_a_guard_that_the_kernel_holds_holds_nobody_up(wire: Path) -> None:
+    class Held:
+        """A process that waits for its device in the kernel: no signal reaches it."""
+
+        def __init__(self, process: subprocess.Popen[bytes]) -> None:
+            self.pid = process.pid
+
+        def kill(self) -> None:
+            pass
+
+        def wait(self, timeout: float) -> int:
+            raise subprocess.TimeoutExpired("guard", timeout)
+
+    sink = guarded(wire, hang_at=3)
+    sink.open()
+    process = sink._process
+    assert process is not None
+    sink._process = Held(process)
+    try:
+        with pytest.raises(HardwareError, match="driver hangs"):
+            drive(sink, 200)
+        sink.close()
+        rescue = [line.kind for line in read_wire(wire) if line.process == os.getpid()]
+        assert rescue == ["open", "close"]
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_an_actuator_that_is_not_there_is_named(wire: Path) -> None:
