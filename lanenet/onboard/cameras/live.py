@@ -27,7 +27,7 @@ _GRAB_S = 0.1
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
 #: A camera driver may hang; nothing waits for it longer than this.
 _JOIN_S = 3.0
-#: An exposure that is said to be older than this was measured on another clock.
+#: A device all of whose exposures are older than this measures them on another clock.
 _OLDEST_S = 1.0
 
 
@@ -103,6 +103,7 @@ class LiveSource:
         self._returned = -1
         self._count = 0
         self._failure: HardwareError | None = None
+        self._clock_agrees = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -224,14 +225,20 @@ class LiveSource:
             )
         if self._settings.rotate_180:
             image = np.asarray(cv2.flip(image, -1))
-        exposed_s = capture.t_s
-        if exposed_s is None or not arrived_s - _OLDEST_S < exposed_s <= arrived_s:
-            exposed_s = arrived_s
+        exposed_s = self._exposed_s(capture.t_s, arrived_s)
         with self._fresh:
             self._count += 1 + capture.skipped
             self._newest = Frame(image, exposed_s, self._count - 1)
             self._fresh.notify_all()
         return True
+
+    def _exposed_s(self, stamp_s: float | None, arrived_s: float) -> float:
+        """Return when an image was exposed: as the device tells it, else when it arrived."""
+        if stamp_s is None or not stamp_s <= arrived_s:
+            return arrived_s
+        # Once the clocks have agreed, an old time belongs to an old image, which nobody may steer by.
+        self._clock_agrees = self._clock_agrees or arrived_s - stamp_s < _OLDEST_S
+        return stamp_s if self._clock_agrees else arrived_s
 
 
 def stop_quietly(*actions: Callable[[], object]) -> None:
