@@ -113,7 +113,7 @@ def test_lost_camera_is_found_again(device, source, caplog):
     assert source.read(0.3) is None
     device.lost = device.refuses = False
     assert read(source).number > before
-    assert "camera lost: unplugged" in caplog.text and "found again" in caplog.text
+    assert "camera lost: unplugged" in caplog.text and "starts again" in caplog.text
     assert device.starts >= 3, "it was not tried several times"
 
 
@@ -133,6 +133,21 @@ def test_camera_gone_for_good_is_an_error(device):
     with pytest.raises(HardwareError, match=r"fake camera: lost for 0\.3 s \(unplugged\)"):
         for _ in range(40):
             source.read(0.1)
+    source.close()
+
+
+@pytest.mark.parametrize("comes_back", ["as another camera", "with a driver that raises anything"])
+def test_camera_that_comes_back_of_no_use_is_given_up(device, comes_back):
+    source = LiveSource(device, CameraSettings(width=64, height=48, give_up_s=0.6))
+    source.open()
+    if comes_back == "as another camera":
+        device.shape = (50, 64, 3)
+    else:
+        device.lost, device.start = True, lambda: 1 / 0
+    with pytest.raises(HardwareError, match=r"fake camera: lost for 0\.6 s"):
+        for _ in range(60):
+            source.read(0.1)
+    assert device.starts < 8
     source.close()
 
 
