@@ -179,8 +179,8 @@ class LiveSource:
                 elif time.monotonic() - heard_s > self._settings.silence_s:
                     raise HardwareError(f"{self._device.name}: no frame for {self._settings.silence_s:g} s")
             except Exception as error:
-                # A driver may raise anything when its device is pulled out. A camera that starts again and then
-                # has no frame of use was not found.
+                # A driver may raise anything when its device is pulled out. A camera that starts again
+                # without sending what is expected was not found.
                 lost_s = time.monotonic() if math.isnan(lost_s) else lost_s
                 if not self._find_again(error, lost_s):
                     break
