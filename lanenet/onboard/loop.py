@@ -128,7 +128,8 @@ class DriveLoop:
             except BaseException as error:
                 self._sink.neutral()
                 if not self._asked or not isinstance(error, HardwareError):
-                    log.error("neutral: %s in frame %d: %s", type(error).__name__, self._number, error)
+                    where = f"in frame {self._number}" if self._number >= 0 else "before the first frame"
+                    log.error("neutral: %s %s: %s", type(error).__name__, where, error)
                     raise
                 # Who ends this process often ends the guard as well, and that is no fault.
                 self.report.ended = self._asked
