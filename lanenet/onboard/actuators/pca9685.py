@@ -190,7 +190,7 @@ class PCA9685:
         self._write(LED0_ON_L + 4 * channel, 0, 0, off & 0xFF, off >> 8)
 
     def _is_asleep(self) -> bool:
-        """Tell whether the chip has started anew: after a moment without its supply it answers, and sleeps."""
+        """Tell whether the chip has started anew: after a moment without supply it answers, and sleeps."""
         # The bus has no checksum: one wrong bit ends no drive.
         return all(self._read(MODE1) & SLEEP for _ in range(2))
 
