@@ -33,9 +33,11 @@ DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
 #: Time for the interpreter, the driver and the device; an Arduino restarts when its port is opened.
 _START_S = 30.0
 #: Commands without an answer for this long: the guard hangs in the actuator's driver.
-_STUCK_S = 0.5
-#: The longest wait for the guard's end, and for a killed one: a driver may hold it in the kernel.
+_STUCK_S = 0.25
+#: Closing takes no longer than this.
 _CLOSE_S = 2.0
+#: A process that is killed is gone within this time, if ever.
+_DIE_S = 0.1
 #: Lines that the guard may leave behind, each of which may be an error.
 _LAST_WORDS = 8
 
@@ -111,7 +113,7 @@ class GuardedActuator:
         self._heard = b""
         self._sent = self._answered = 0
         self._waiting_since_s = 0.0
-        self._ready = self._closed = self._hangs = False
+        self._ready = self._closed = False
 
     @property
     def pid(self) -> int:
@@ -172,8 +174,23 @@ class GuardedActuator:
         self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:
-            self._hangs = True
-            raise HardwareError(f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs")
+            # The guard cannot go to neutral any more, and meanwhile the motor runs on.
+            self._kill()
+            self._rescue()
+            raise HardwareError(
+                f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs; the guard was "
+                "killed and neutral was set without it"
+            )
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            # What hangs in the kernel does not even die.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_DIE_S)
+        if self._line is not None:
+            self._line.close()
+            self._line = None
 
     def neutral(self) -> None:
         """Go to neutral at once; never raises."""
@@ -187,11 +204,11 @@ class GuardedActuator:
         with contextlib.suppress(HardwareError):
             self._post(QUIT, 0.0, 0.0, 0.0)
         try:
-            # The motor may be running: a guard that is known to hang gets no more time.
-            self._process.wait(0.0 if self._hangs else _CLOSE_S)
+            self._process.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
             log.error("the guard does not end, its driver hangs: it is killed")
             self._kill()
+            self._rescue()
         # What it had to say at the end decides whether it left the actuator in order.
         for _ in range(_LAST_WORDS):
             with contextlib.suppress(HardwareError):
@@ -199,16 +216,6 @@ class GuardedActuator:
         if self._line is not None:
             self._line.close()
         self._process = self._line = None
-
-    def _kill(self) -> None:
-        assert self._process is not None
-        self._process.kill()
-        try:
-            self._process.wait(_CLOSE_S)
-        except subprocess.TimeoutExpired:
-            # Held in the kernel it cannot say goodbye, and its end of the line stays open.
-            with contextlib.suppress(HardwareError):
-                self._lost()
 
     def _post(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         if self._line is None:
@@ -219,7 +226,6 @@ class GuardedActuator:
         try:
             self._line.send(MESSAGE.pack(kind, self._sent, steering_rad, throttle, until_s))
         except BlockingIOError:
-            self._hangs = True
             raise HardwareError("the actuator takes no more commands: its driver hangs") from None
         except OSError:
             self._lost()

@@ -128,8 +128,8 @@ def test_a_hung_actuator_is_told_and_set_neutral_past_its_command_and_without_it
     # ... and once more from here.
     assert [line.kind for line in lines][-2:] == ["open", "close"]
     assert lines[-1].process == os.getpid()
-    # Half a second without an answer tells that it hangs; from then on nobody waits for it.
-    assert lines[-1].t_s - fault.t_s <= 0.5 + WATCHDOG_S + LATE_S
+    # A quarter of a second without an answer tells that it hangs; from then on nobody waits for it.
+    assert lines[-1].t_s - fault.t_s <= 0.25 + WATCHDOG_S + LATE_S
 
 
 def test_a_guard_that_the_kernel_holds_holds_nobody_up(wire: Path) -> None:
@@ -155,7 +155,7 @@ def test_a_guard_that_the_kernel_holds_holds_nobody_up(wire: Path) -> None:
             drive(sink, 200)
         sink.close()
         rescue = [line.kind for line in read_wire(wire) if line.process == os.getpid()]
-        assert rescue == ["open", "close"]
+        assert rescue[:2] == ["open", "close"] and rescue[-1] == "close"
     finally:
         process.kill()
         process.wait()
