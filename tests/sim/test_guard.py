@@ -193,6 +193,19 @@ def test_a_guard_that_is_ended_goes_to_neutral_itself(wire: Path) -> None:
     sink.close()
 
 
+def test_a_guard_that_is_slow_to_end_is_not_one_that_hangs(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    drive(sink)
+    # As on a busy machine: its goodbye comes long before its end of the line is closed.
+    sink._take("closed")
+    with pytest.raises(HardwareError, match="ended from outside"):
+        drive(sink, 1)
+    sink.close()
+    assert os.getpid() not in {line.process for line in read_wire(wire)}
+    assert read_wire(wire)[-1].kind == "close"
+
+
 def test_an_idle_loop_notices_that_its_guard_died(wire: Path) -> None:
     sink = guarded(wire)
     sink.open()
