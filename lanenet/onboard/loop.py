@@ -128,8 +128,8 @@ class DriveLoop:
             except BaseException as error:
                 self._sink.neutral()
                 if not self._asked or not isinstance(error, HardwareError):
-                    where = f"in frame {self._number}" if self._number >= 0 else "before the first frame"
-                    log.error("neutral: %s %s: %s", type(error).__name__, where, error)
+                    when = "before the first frame" if self._number < 0 else f"in frame {self._number}"
+                    log.error("neutral: %s %s: %s", type(error).__name__, when, error)
                     raise
                 # Who ends this process often ends the guard as well, and that is no fault.
                 self.report.ended = self._asked
