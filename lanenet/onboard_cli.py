@@ -241,7 +241,10 @@ def doctor(
     if problems:
         raise LanenetError(f"{problems} problem(s) found, see above")
     if settings is None or config is None:
-        console.next_command("train", "configs/small.yaml")
+        # A car has no more than the base installation.
+        trains = any(check.name == "extra train" and check.state == "ok" for check in checks)
+        words = ("train", "configs/small.yaml") if trains else ("doctor", "--config", "CAR.yaml")
+        console.next_command(*words)
     elif settings.actuator is None:
         console.next_command("drive", config, "--dry-run")
     else:

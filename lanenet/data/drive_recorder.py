@@ -182,17 +182,21 @@ class DriveRecorder:
                 item = self._queue.get(timeout=0.5 * self._settings.sync_s)
             except queue.Empty:
                 item = None
+            ended = item is None and self._ending.is_set()
             try:
                 if item is not None:
                     self._store(item)
-                ended = item is None and self._ending.is_set()
+                    item = None
                 # The first frame is forced at once: from then on the folder is a drive.
                 if self._rows and (ended or self.recorded == 0 or time.monotonic() >= due_s):
                     self._commit()
                     due_s = time.monotonic() + self._settings.sync_s
-            except (OSError, cv2.error, LanenetError) as error:
-                self._stop(str(error))
+            except Exception as error:
+                # Whatever it is, a thread that dies in silence would look like a slow card.
+                self._stop(str(error) or type(error).__name__)
                 self._discard()
+                # The one in hand has no row yet.
+                self.dropped += item is not None
                 return
             if ended:
                 return
@@ -234,6 +238,9 @@ class DriveRecorder:
         if not table.exists():
             header = ",".join(["frame", "t_s", *self._names, "file"])
             write_text(table, f"{header}\n{''.join(self._rows)}")
+            # The folder's own name is as safe as what is in it; its parent may be as new.
+            sync_path(self.path.parent)
+            sync_path(self.path.parent.parent)
         else:
             self._append(table, "".join(self._rows).encode())
         self.recorded += len(self._rows)

@@ -46,10 +46,13 @@ from lanenet.geometry.camera import Camera
 from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.drive_settings import DriveDetectorSettings
 from lanenet.onboard.masks import read_mask
-from lanenet.onboard.safety import CommandLimiter, LimitSettings
+from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.views import birdseye_view, undistorting_view
+
+#: Donkeycar asks its pilot in every turn of its loop, unless a person drives.
+_PAUSE_S = 0.5
 
 
 class DonkeySettings(Settings):
@@ -61,7 +64,11 @@ class DonkeySettings(Settings):
         control: Steering and speed.
         limits: What no command exceeds; Donkeycar's angle of 1 is ``max_steering_rad``.
         min_confidence: A frame of less confidence counts as one without a lane.
-        hold_s: Without a lane the car goes on as before for this long, then it stops.
+        hold_s: Without a lane, or without a new image, the car goes on as before for this long, then it
+            stops. Longer than the time between two images of the camera.
+        allow_repeated_frames: Take an image that equals the one before, pixel for pixel, for a new one.
+            Donkeycar hands out the last image of a camera that hangs for ever; a simulator without noise
+            gives equal ones while the car stands.
     """
 
     camera: Path | None = None
@@ -70,6 +77,7 @@ class DonkeySettings(Settings):
     limits: LimitSettings = Field(default_factory=LimitSettings)
     min_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
     hold_s: float = Field(default=0.2, ge=0.0)
+    allow_repeated_frames: bool = False
 
 
 class LanePilot:
@@ -113,7 +121,8 @@ class LanePilot:
         self._controller = LaneController(settings.control)
         self._limiter = CommandLimiter(settings.limits)
         self._clock = clock
-        self._seen_s = -math.inf
+        self._before: UInt8[np.ndarray, "h w 3"] | None = None
+        self._run_s = self._seen_s = -math.inf
         self._wish = (0.0, 0.0)
 
     @staticmethod
@@ -136,8 +145,14 @@ class LanePilot:
             Angle, -1 (left) to 1 (right), and throttle; a throttle of 0 when the lane is lost.
         """
         now_s = self._clock()
-        self.estimate = LaneEstimate()
-        if image_rgb is not None:
+        if now_s - self._run_s > _PAUSE_S:
+            # A person drove meanwhile: the throttle rises from 0, and nothing is known of the lane.
+            self._limiter.neutral(now_s)
+            self._controller.reset()
+        self._run_s = now_s
+        if image_rgb is None:
+            self.estimate = LaneEstimate()
+        elif self._is_new(image_rgb):
             # Donkeycar hands out views that OpenCV does not take.
             bgr = np.ascontiguousarray(image_rgb[:, :, ::-1])
             self.estimate = self._detector.detect(bgr)
@@ -148,6 +163,14 @@ class LanePilot:
         throttle = throttle_of(speed_cm_s, self._settings.control.speed)
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
+
+    def _is_new(self, image_rgb: UInt8[np.ndarray, "h w 3"]) -> bool:
+        before = self._before
+        # A copy: some of Donkeycar's cameras fill the same array again and again.
+        self._before = image_rgb.copy()
+        if self._settings.allow_repeated_frames or before is None:
+            return True
+        return not same_image(before, image_rgb)
 
     def _follow(self, now_s: float) -> None:
         wish = self._controller.wish(self.estimate, now_s, self._wish[1], self._limiter.steering_rad)

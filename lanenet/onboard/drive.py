@@ -13,7 +13,9 @@ from lanenet.data.drive_recorder import DriveRecorder, new_drive_folder
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.cameras import open_source
+from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.drive_report import Step
 from lanenet.onboard.drive_settings import DriveSettings
@@ -45,13 +47,16 @@ def build_loop(
         watch: Called after every turn of the loop.
 
     Raises:
-        ConfigError: If the options contradict each other, or the car has no actuator and this is no dry run.
+        ConfigError: If the options contradict each other, the car has no actuator and this is no dry run, or
+            an armed car would drive by a recording.
         LanenetError: If camera file, model, mask or the recording's folder cannot be used.
     """
     if arm + steering_only + dry_run > 1:
         raise ConfigError("expected one of --arm, --steering-only and --dry-run, found several")
     if settings.actuator is None and not dry_run:
         raise ConfigError("key 'actuator' is missing: expected one, or --dry-run")
+    if arm:
+        _refuse_blind_drive(settings)
     cv2.setNumThreads(settings.threads)
     camera = None if settings.camera is None else read_camera(settings.camera)
     safety = settings.safety
@@ -98,6 +103,16 @@ def build_sink(settings: DriveSettings) -> CommandSink:
     # What was left out has to stay so: there a Donkeycar's myconfig.py may have a say.
     text = actuator.model_dump_json(exclude_unset=True)
     return GuardedActuator(text, lambda: make_actuator(actuator), safety.watchdog_s, safety.end_after_s)
+
+
+def _refuse_blind_drive(settings: DriveSettings) -> None:
+    """Keep a car with a motor from driving by what another drive saw."""
+    source, has_motor = settings.source, isinstance(settings.actuator, PulseSettings)
+    if has_motor and isinstance(source, ReplaySettings) and not source.may_drive:
+        raise ConfigError(
+            f"key 'source.kind': found 'replay' ({source.path}) for an armed car, which would drive blind; "
+            "expected a camera, or source.may_drive=true for a car whose wheels are off the ground"
+        )
 
 
 def _recorder(settings: DriveSettings, camera: Camera | None) -> DriveRecorder | None:

@@ -171,6 +171,9 @@ class GuardedActuator:
 
     def _order(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         self._listen()
+        if self._closed:
+            # It has said goodbye; that its process takes a while to end is no hanging driver.
+            self._lost()
         self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:

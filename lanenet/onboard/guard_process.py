@@ -16,8 +16,10 @@ import select
 import signal
 import socket
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from pydantic import TypeAdapter
@@ -31,6 +33,8 @@ log = logging.getLogger("lanenet.onboard.guard")
 
 #: Neutral is written again and again: a write that was lost on the wire is made good.
 _REFRESH_S = 0.05
+#: A driver needs a few milliseconds; after this long it hangs. Looked at this often.
+_SLOW_S, _LOOK_S = 0.05, 0.02
 
 
 class Guard:
@@ -45,10 +49,40 @@ class Guard:
         self._driving = False
         #: Once set, no command is taken any more.
         self._over = ""
+        #: Since when the actuator's driver has been at work; it is not now where this is infinite.
+        self._busy_s = math.inf
         self.asked_to_end = False
 
     def run(self) -> str:
         """Serve until the loop is gone or says goodbye; returns why it ended."""
+        ended = threading.Event()
+        threading.Thread(target=self._oversee, args=(ended,), name="driver hangs", daemon=True).start()
+        try:
+            return self._serve()
+        finally:
+            ended.set()
+
+    def _oversee(self, ended: threading.Event) -> None:
+        """Say neutral past a driver that hangs in a command, again and again until it goes on."""
+        told_s = math.inf
+        while not ended.wait(_LOOK_S):
+            begun_s = self._busy_s
+            if time.monotonic() - begun_s <= _SLOW_S:
+                continue
+            self._actuator.neutral()
+            if begun_s != told_s:
+                told_s = begun_s
+                log.warning("neutral: the actuator's driver hangs in a command")
+
+    @contextmanager
+    def _busy(self) -> Iterator[None]:
+        self._busy_s = time.monotonic()
+        try:
+            yield
+        finally:
+            self._busy_s = math.inf
+
+    def _serve(self) -> str:
         buffer = b""
         while True:
             now_s = time.monotonic()
@@ -82,7 +116,8 @@ class Guard:
         sane = math.isfinite(steering_rad) and math.isfinite(throttle) and abs(throttle) <= 1.0
         if kind == DRIVE and sane and until_s > now_s and not self._over:
             try:
-                self._actuator.send(steering_rad, throttle)
+                with self._busy():
+                    self._actuator.send(steering_rad, throttle)
             except Exception as error:
                 self._neutral()
                 self._over = f"the actuator failed: {error}"
@@ -109,12 +144,13 @@ class Guard:
                 self._logged_s = now_s
                 log.warning("neutral: %s", reason)
         elif not self._driving and not readable:
-            self._actuator.neutral()
+            self._neutral()
         if not self._over and now_s - self._heard_s > self._give_up_s and math.isfinite(self._until_s):
             self._over = f"the drive loop was silent for {self._give_up_s:g} s"
 
     def _neutral(self) -> None:
-        self._actuator.neutral()
+        with self._busy():
+            self._actuator.neutral()
         self._driving = False
 
     def _say(self, text: str) -> None:

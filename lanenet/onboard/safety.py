@@ -186,7 +186,11 @@ class FrameCheck:
             return f"frame {frame.number} is timed {-age_s:.2f} s ahead of the clock"
         if age_s > self._settings.max_age_s:
             return f"frame {frame.number} is {1e3 * age_s:.0f} ms old"
-        if not self._settings.allow_repeated_frames and before is not None and _same(before, frame.image_bgr):
+        if (
+            not self._settings.allow_repeated_frames
+            and before is not None
+            and same_image(before, frame.image_bgr)
+        ):
             return f"frame {frame.number} is the one before once more: the camera hangs"
         return ""
 
@@ -228,7 +232,8 @@ def _since(before_s: float, now_s: float) -> float:
     return max(0.0, now_s - before_s) if math.isfinite(before_s) else 0.0
 
 
-def _same(before: UInt8[np.ndarray, "h w 3"], now: UInt8[np.ndarray, "h w 3"]) -> bool:
+def same_image(before: UInt8[np.ndarray, "h w 3"], now: UInt8[np.ndarray, "h w 3"]) -> bool:
+    """Tell whether two images are equal, pixel for pixel."""
     if before.shape != now.shape:
         return False
     # Noise tells frames apart in a few pixels; only frames that may be the same are compared in full.

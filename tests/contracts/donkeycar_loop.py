@@ -1,6 +1,6 @@
 """Runs the parts in Donkeycar's own vehicle loop, on a tub's frames; for an environment with donkeycar.
 
-python donkeycar_loop.py TUB PILOT.yaml CAMERA.yaml FRAMES OUT.json
+python donkeycar_loop.py TUB PILOT.yaml CAMERA.yaml FIRST FRAMES OUT.json
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,9 +25,9 @@ import lanenet.onboard.donkey as parts
 class TubCamera:
     """Hands out a tub's images as Donkeycar's cameras do, and what the driver did."""
 
-    def __init__(self, tub_path: str, frames: int) -> None:
+    def __init__(self, tub_path: str, first: int, frames: int) -> None:
         self.tub = Tub(tub_path, read_only=True)
-        self.records = [record for record, _ in zip(self.tub, range(frames), strict=False)]
+        self.records = list(islice(self.tub, first, first + frames))
         self.images = Path(tub_path) / "images"
         self.next = 0
 
@@ -47,7 +48,7 @@ class Notes:
         self.shapes = {name: list(v.shape) for name, v in zip(("cv", "view"), values[5:], strict=True)}
 
 
-def main(tub_path: str, pilot_path: str, camera_path: str, frames: int, out: Path) -> None:
+def main(tub_path: str, pilot_path: str, camera_path: str, first: int, frames: int, out: Path) -> None:
     cfg = SimpleNamespace(
         LANENET_CONFIG=pilot_path,
         LANENET_CAMERA=camera_path,
@@ -59,7 +60,7 @@ def main(tub_path: str, pilot_path: str, camera_path: str, frames: int, out: Pat
     )
     vehicle = donkeycar.vehicle.Vehicle()
     vehicle.mem.put(["run_pilot"], True)
-    vehicle.add(TubCamera(tub_path, frames), outputs=["cam/image_array", "user/angle"])
+    vehicle.add(TubCamera(tub_path, first, frames), outputs=["cam/image_array", "user/angle"])
     pilot = parts.LanePilot.from_file(pilot_path)
     vehicle.add(pilot, inputs=["cam/image_array"], outputs=["pilot/angle", "pilot/throttle"])
     # As the template cv_control itself does it.
@@ -76,5 +77,5 @@ def main(tub_path: str, pilot_path: str, camera_path: str, frames: int, out: Pat
 
 
 if __name__ == "__main__":
-    tub_, pilot_, camera_, frames_, out_ = sys.argv[1:]
-    main(tub_, pilot_, camera_, int(frames_), Path(out_))
+    tub_, pilot_, camera_, first_, frames_, out_ = sys.argv[1:]
+    main(tub_, pilot_, camera_, int(first_), int(frames_), Path(out_))

@@ -36,11 +36,16 @@ def test_detect_in_an_empty_environment(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("version", ["3.11", "3.13"])
-def test_wheels_for_a_raspberry_pi(tmp_path, version):
-    """Python of Raspberry Pi OS Bookworm (3.11) and Trixie (3.13), 64 bit: nothing has to be compiled."""
+@pytest.mark.parametrize(
+    ("version", "limits"), [("3.11", []), ("3.11", ["numpy<2"]), ("3.12", []), ("3.13", [])]
+)
+def test_wheels_for_a_raspberry_pi(tmp_path, version, limits):
+    """Python of Raspberry Pi OS Bookworm (3.11) and Trixie (3.13), 64 bit: nothing has to be compiled.
+
+    Bookworm's picamera2 and Donkeycar need NumPy 1.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["car"]]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["car"], *limits]
     words = [
         "install",
         "--dry-run",

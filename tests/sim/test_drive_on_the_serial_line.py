@@ -87,7 +87,13 @@ def start(folder: Path, board: Board) -> subprocess.Popen[bytes]:
         for k, frame in enumerate(example_frames(camera, 16, np.random.default_rng(0))):
             writer.add(frame, 0.05 * k)
     config = {
-        "source": {"kind": "replay", "path": str(folder / "drive"), "rate_hz": 30, "loop": True},
+        "source": {
+            "kind": "replay",
+            "path": str(folder / "drive"),
+            "rate_hz": 30,
+            "loop": True,
+            "may_drive": True,
+        },
         "camera": str(folder / "drive" / "camera.yaml"),
         "detector": {"kind": "lane-filter", "lane_width_cm": LANE_WIDTH_CM},
         "control": {"steering": {"look_ahead_cm": 20.0}},

@@ -113,14 +113,52 @@ def test_a_failing_actuator_is_told_and_stays_neutral(wire: Path) -> None:
     assert not [line for line in read_wire(wire) if line.kind == "send" and line.t_s > fault.t_s]
 
 
-def test_a_hung_actuator_is_told_and_set_neutral_without_its_guard(wire: Path) -> None:
+def test_a_hung_actuator_is_told_and_set_neutral_past_its_command_and_without_its_guard(wire: Path) -> None:
     sink = guarded(wire, hang_at=3)
     sink.open()
+    guard = sink.pid
     with pytest.raises(HardwareError, match="driver hangs"):
         drive(sink, 200)
     sink.close()
-    assert [line.kind for line in read_wire(wire)][-2:] == ["open", "close"]
-    assert read_wire(wire)[-1].process == os.getpid()
+    lines = read_wire(wire)
+    fault = next(line for line in lines if line.kind == "fault")
+    # Within the watchdog's time, if the device itself still answers ...
+    first = next(line for line in lines if line.kind == "neutral" and line.t_s > fault.t_s)
+    assert first.process == guard and first.t_s - fault.t_s <= WATCHDOG_S + LATE_S
+    # ... and once more from here.
+    assert [line.kind for line in lines][-2:] == ["open", "close"]
+    assert lines[-1].process == os.getpid()
+    # A quarter of a second without an answer tells that it hangs; from then on nobody waits for it.
+    assert lines[-1].t_s - fault.t_s <= 0.25 + WATCHDOG_S + LATE_S
+
+
+def test_a_guard_that_the_kernel_holds_holds_nobody_up(wire: Path) -> None:
+    class Held:
+        """A process that waits for its device in the kernel: no signal reaches it."""
+
+        def __init__(self, process: subprocess.Popen[bytes]) -> None:
+            self.pid = process.pid
+
+        def kill(self) -> None:
+            pass
+
+        def wait(self, timeout: float) -> int:
+            raise subprocess.TimeoutExpired("guard", timeout)
+
+    sink = guarded(wire, hang_at=3)
+    sink.open()
+    process = sink._process
+    assert process is not None
+    sink._process = Held(process)
+    try:
+        with pytest.raises(HardwareError, match="driver hangs"):
+            drive(sink, 200)
+        sink.close()
+        rescue = [line.kind for line in read_wire(wire) if line.process == os.getpid()]
+        assert rescue[:2] == ["open", "close"] and rescue[-1] == "close"
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_an_actuator_that_is_not_there_is_named(wire: Path) -> None:
@@ -153,6 +191,19 @@ def test_a_guard_that_is_ended_goes_to_neutral_itself(wire: Path) -> None:
         drive(sink, 40)
     assert wait_for(wire, "close", ended_s).process != os.getpid()
     sink.close()
+
+
+def test_a_guard_that_is_slow_to_end_is_not_one_that_hangs(wire: Path) -> None:
+    sink = guarded(wire)
+    sink.open()
+    drive(sink)
+    # As on a busy machine: its goodbye comes long before its end of the line is closed.
+    sink._take("closed")
+    with pytest.raises(HardwareError, match="ended from outside"):
+        drive(sink, 1)
+    sink.close()
+    assert os.getpid() not in {line.process for line in read_wire(wire)}
+    assert read_wire(wire)[-1].kind == "close"
 
 
 def test_an_idle_loop_notices_that_its_guard_died(wire: Path) -> None:

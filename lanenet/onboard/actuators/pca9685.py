@@ -30,7 +30,7 @@ OSCILLATOR_HZ = 25e6
 COUNTS = 4096
 #: The oscillator needs 0.5 ms to start after sleep.
 _OSCILLATOR_START_S = 0.001
-#: Motors disturb the bus now and then; a byte that was not acknowledged is sent again.
+#: Motors disturb the bus now and then; what was not acknowledged is sent again.
 _TRIES = 3
 
 _log = logging.getLogger(__name__)
@@ -133,7 +133,8 @@ class PCA9685:
         """Set both outputs; see :class:`lanenet.onboard.hardware.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not a number, or the chip did not answer.
+            HardwareError: If it is not open, a value is not a number, or the chip did not answer or has
+                started again.
         """
         stops = self._stops
         pulses = command_pulses(self._settings, steering_rad, throttle)
@@ -144,11 +145,17 @@ class PCA9685:
                 self._write_channel(self._settings.steering_channel, pulses.steering_us)
                 if stops == self._stops:
                     self._write_channel(self._settings.throttle_channel, pulses.throttle_us)
+                asleep = self._is_asleep()
             except OSError as error:
                 raise HardwareError(
                     f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} stopped "
                     f"answering ({error.strerror or error}); check its cable and supply"
                 ) from None
+        if asleep:
+            raise HardwareError(
+                f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} has started "
+                "again by itself, and gives no pulses; check its supply"
+            )
 
     def neutral(self) -> None:
         """Stop the motor, then straighten the wheels; never raises."""
@@ -182,18 +189,24 @@ class PCA9685:
         off = counts_of(pulse_us, self._prescale)
         self._write(LED0_ON_L + 4 * channel, 0, 0, off & 0xFF, off >> 8)
 
+    def _is_asleep(self) -> bool:
+        """Tell whether the chip has started anew: after a moment without supply it answers, and sleeps."""
+        # The bus has no checksum: one wrong bit ends no drive.
+        return all(self._read(MODE1) & SLEEP for _ in range(2))
+
     def _write(self, register: int, *values: int) -> None:
+        self._transfer(self._message.write(self._settings.address, [register, *values]))
+
+    def _read(self, register: int) -> int:
+        answer = self._message.read(self._settings.address, 1)
+        self._transfer(self._message.write(self._settings.address, [register]), answer)
+        return int(next(iter(answer)))
+
+    def _transfer(self, *messages: Any) -> None:
         for left in reversed(range(_TRIES)):
-            message = self._message.write(self._settings.address, [register, *values])
             try:
-                self._bus.i2c_rdwr(message)
+                self._bus.i2c_rdwr(*messages)
                 return
             except OSError:
                 if not left:
                     raise
-
-    def _read(self, register: int) -> int:
-        point = self._message.write(self._settings.address, [register])
-        answer = self._message.read(self._settings.address, 1)
-        self._bus.i2c_rdwr(point, answer)
-        return int(next(iter(answer)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -16,18 +17,18 @@ from jaxtyping import UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.errors import HardwareError, MissingExtraError
+from lanenet.errors import HardwareError
 from lanenet.onboard.hardware import Frame
 
 _log = logging.getLogger(__name__)
 
 #: The longest that one call of a device waits, so that ``close`` is not held up.
 _GRAB_S = 0.1
-#: First and longest pause between two attempts to find a lost camera; each is twice the one before.
+#: First and longest pause between two attempts to find a lost camera; each is as long as it has been lost.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
 #: A camera driver may hang; nothing waits for it longer than this.
 _JOIN_S = 3.0
-#: An exposure that is said to be older than this was measured on another clock.
+#: A device all of whose exposures are older than this measures them on another clock.
 _OLDEST_S = 1.0
 
 
@@ -103,6 +104,7 @@ class LiveSource:
         self._returned = -1
         self._count = 0
         self._failure: HardwareError | None = None
+        self._clock_agrees = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -169,40 +171,41 @@ class LiveSource:
     def _run(self) -> None:
         """Grab until closed; the thread is the only one that touches the device meanwhile."""
         heard_s = time.monotonic()
+        lost_s = math.nan
         while not self._closing.is_set():
             try:
                 if self._take(self._device.grab(_GRAB_S)):
-                    heard_s = time.monotonic()
+                    heard_s, lost_s = time.monotonic(), math.nan
                 elif time.monotonic() - heard_s > self._settings.silence_s:
                     raise HardwareError(f"{self._device.name}: no frame for {self._settings.silence_s:g} s")
             except Exception as error:
-                # A driver may raise anything when its device is pulled out.
-                if not self._find_again(error):
+                # A driver may raise anything when its device is pulled out. A camera that starts again
+                # without sending what is expected was not found.
+                lost_s = time.monotonic() if math.isnan(lost_s) else lost_s
+                if not self._find_again(error, lost_s):
                     break
                 heard_s = time.monotonic()
         self._device.stop()
 
-    def _find_again(self, error: Exception) -> bool:
+    def _find_again(self, error: Exception, lost_s: float) -> bool:
         """Start the device anew until it works; False if it is closed or given up."""
         _log.error("camera lost: %s; looking for it", error)
-        lost_s = time.monotonic()
-        pause_s = _FIRST_PAUSE_S
         while not self._closing.is_set():
             self._device.stop()
-            left_s = lost_s + self._settings.give_up_s - time.monotonic()
+            gone_s = time.monotonic() - lost_s
+            left_s = self._settings.give_up_s - gone_s
             if left_s <= 0.0:
                 self._fail(
                     HardwareError(f"{self._device.name}: lost for {self._settings.give_up_s:g} s ({error})")
                 )
                 return False
-            self._closing.wait(min(pause_s, left_s))
-            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+            self._closing.wait(min(max(gone_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S, left_s))
             try:
                 self._device.start()
-            except (HardwareError, MissingExtraError, OSError) as again:
+            except Exception as again:
                 _log.warning("camera not found yet: %s", again)
                 continue
-            _log.warning("%s: found again after %.1f s", self._device.name, time.monotonic() - lost_s)
+            _log.warning("%s: starts again after %.1f s", self._device.name, time.monotonic() - lost_s)
             return True
         return False
 
@@ -224,14 +227,20 @@ class LiveSource:
             )
         if self._settings.rotate_180:
             image = np.asarray(cv2.flip(image, -1))
-        exposed_s = capture.t_s
-        if exposed_s is None or not arrived_s - _OLDEST_S < exposed_s <= arrived_s:
-            exposed_s = arrived_s
+        exposed_s = self._exposed_s(capture.t_s, arrived_s)
         with self._fresh:
             self._count += 1 + capture.skipped
             self._newest = Frame(image, exposed_s, self._count - 1)
             self._fresh.notify_all()
         return True
+
+    def _exposed_s(self, stamp_s: float | None, arrived_s: float) -> float:
+        """Return when an image was exposed: as the device tells it, else when it arrived."""
+        if stamp_s is None or not stamp_s <= arrived_s:
+            return arrived_s
+        # Once the clocks have agreed, an old time belongs to an old image, which nobody may steer by.
+        self._clock_agrees = self._clock_agrees or arrived_s - stamp_s < _OLDEST_S
+        return stamp_s if self._clock_agrees else arrived_s
 
 
 def stop_quietly(*actions: Callable[[], object]) -> None:

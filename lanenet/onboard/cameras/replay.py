@@ -30,6 +30,7 @@ class ReplaySettings(Settings):
             ``fast`` shows every frame, as soon as it is asked for.
         rate_hz: Frames per second in place of the recorded times.
         loop: Start again at the end.
+        may_drive: Let an armed car with wheels follow the recording. It is blind then: for a car on a box.
     """
 
     kind: Literal["replay"] = "replay"
@@ -37,6 +38,7 @@ class ReplaySettings(Settings):
     pace: Literal["real", "fast"] = "real"
     rate_hz: float | None = Field(default=None, gt=0.0, le=1000.0)
     loop: bool = False
+    may_drive: bool = False
 
 
 class ReplaySource:

@@ -78,6 +78,31 @@ def test_the_folder_is_a_drive_after_its_first_frame(tmp_path: Path) -> None:
     recorder.close()
 
 
+def test_the_folders_name_is_forced_onto_the_card_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forced: list[Path] = []
+    monkeypatch.setattr(drive_recorder, "sync_path", forced.append)
+    record(tmp_path / "drives" / "one", 3)
+    images = [path for path in forced if path.suffix == ".jpg"]
+    assert images == [tmp_path / "drives" / "one" / "images" / f"00000{k}.jpg" for k in range(3)]
+    # A new name lies in the folder above it.
+    assert forced.count(tmp_path / "drives") == forced.count(tmp_path) == 1
+
+
+def test_whatever_fails_the_recording_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorder = DriveRecorder(tmp_path / "one", settings())
+    monkeypatch.setattr(drive_recorder, "image_name", lambda number: 1 / 0)
+    with caplog.at_level(logging.WARNING):
+        for k in range(3):
+            recorder.add(picture(k), 0.05 * k)
+        recorder.close()
+    assert recorder.problem == "division by zero" and (recorder.recorded, recorder.dropped) == (0, 3)
+    assert any("recording stopped after 0 frames: division by zero" in r.message for r in caplog.records)
+
+
 def test_wherever_the_table_is_cut_the_drive_opens(tmp_path: Path) -> None:
     record(tmp_path / "whole", 4)
     table = (tmp_path / "whole" / FRAMES_FILE).read_bytes()

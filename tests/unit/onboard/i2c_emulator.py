@@ -27,9 +27,16 @@ class Message:
 
 
 class Chip:
-    """Registers after power-on: asleep, every output fully off, 200 Hz."""
+    """A chip, and what it has put out."""
 
     def __init__(self):
+        self.power_on()
+        #: Pulses that left the chip: (channel, counts) from the moment it was awake.
+        self.pulses = []
+        self.refused_prescale = 0
+
+    def power_on(self):
+        """Set the registers as they are after power-on: asleep, every output fully off, 200 Hz."""
         self.registers = bytearray(256)
         self.registers[MODE1] = SLEEP | ALLCALL
         self.registers[MODE2] = 0x04
@@ -37,9 +44,6 @@ class Chip:
         for channel in range(16):
             self.registers[LED0_ON_L + 4 * channel + 3] = 0x10
         self.pointer = 0
-        #: Pulses that left the chip: (channel, counts) from the moment it was awake.
-        self.pulses = []
-        self.refused_prescale = 0
 
     def write(self, data):
         self.pointer, *values = data

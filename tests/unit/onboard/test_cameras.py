@@ -113,7 +113,7 @@ def test_lost_camera_is_found_again(device, source, caplog):
     assert source.read(0.3) is None
     device.lost = device.refuses = False
     assert read(source).number > before
-    assert "camera lost: unplugged" in caplog.text and "found again" in caplog.text
+    assert "camera lost: unplugged" in caplog.text and "starts again" in caplog.text
     assert device.starts >= 3, "it was not tried several times"
 
 
@@ -133,6 +133,21 @@ def test_camera_gone_for_good_is_an_error(device):
     with pytest.raises(HardwareError, match=r"fake camera: lost for 0\.3 s \(unplugged\)"):
         for _ in range(40):
             source.read(0.1)
+    source.close()
+
+
+@pytest.mark.parametrize("comes_back", ["as another camera", "with a driver that raises anything"])
+def test_camera_that_comes_back_of_no_use_is_given_up(device, comes_back):
+    source = LiveSource(device, CameraSettings(width=64, height=48, give_up_s=0.6))
+    source.open()
+    if comes_back == "as another camera":
+        device.shape = (50, 64, 3)
+    else:
+        device.lost, device.start = True, lambda: 1 / 0
+    with pytest.raises(HardwareError, match=r"fake camera: lost for 0\.6 s"):
+        for _ in range(60):
+            source.read(0.1)
+    assert device.starts < 8
     source.close()
 
 
@@ -207,16 +222,29 @@ def test_time_is_the_sensors(pi):
     frame = read(source)
     late_s = time.monotonic() - frame.t_s
     assert 0.012 <= late_s < 0.5, "the sensor's time is 12 ms before the frame arrives"
-    pi.age_ns = 3_600_000_000_000
+    pi.age_ns = 5_000_000_000
     source.read(0.1)
     time.sleep(0.05)
-    assert abs(time.monotonic() - read(source).t_s) < 0.5, "a time of another clock is not used"
+    assert time.monotonic() - read(source).t_s > 4.9, "an image that was held up for 5 s counts as new"
     pi.stamps = False
     source.read(0.1)
     time.sleep(0.05)
     assert abs(time.monotonic() - read(source).t_s) < 0.5
     source.close()
     assert pi.held == 0, "requests were not given back"
+
+
+def test_time_of_another_clock_is_not_used(pi):
+    pi.age_ns = 3_600_000_000_000
+    source = open_source(PiCameraSettings(**SMALL))
+    source.open()
+    time.sleep(0.05)
+    assert abs(time.monotonic() - read(source).t_s) < 0.5
+    pi.age_ns = -3_600_000_000_000
+    source.read(0.1)
+    time.sleep(0.05)
+    assert abs(time.monotonic() - read(source).t_s) < 0.5
+    source.close()
 
 
 def test_late_camera_gets_no_pile_of_jobs(pi):

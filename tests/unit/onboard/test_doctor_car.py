@@ -13,7 +13,7 @@ from lanenet.cli import app
 from lanenet.config import check_settings
 from lanenet.data.drive_writer import DriveWriter
 from lanenet.errors import HardwareError
-from lanenet.onboard import doctor_car
+from lanenet.onboard import doctor, doctor_car
 from lanenet.onboard.bench import example_camera
 from lanenet.onboard.doctor_car import check_car, check_source, check_temperature, check_throttling
 from lanenet.onboard.drive_settings import DriveSettings
@@ -197,3 +197,13 @@ def test_answers_are_written_into_the_file(car, monkeypatch):
     }
     assert data["control"]["speed"]["throttle_at_rest"] == 0.04
     assert done.output.count("wrote") == 1
+
+
+@pytest.mark.parametrize(
+    ("missing", "told"), [((), "train configs/small.yaml"), (("torch",), "doctor --config CAR.yaml")]
+)
+def test_next_is_what_this_installation_can_do(monkeypatch, missing, told):
+    there = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name in missing else there(name))
+    done = CliRunner().invoke(app, ["doctor"])
+    assert done.exit_code == 0 and f"next: lanenet {told}" in done.stdout

@@ -70,7 +70,13 @@ def pilot():
             "throttle_rate_s": 50,
         },
         hold_s=0.12,
+        # These tests show the same picture again and again, unless they say otherwise.
+        allow_repeated_frames=True,
     )
+    return pilot_of(settings)
+
+
+def pilot_of(settings):
     pilot = LanePilot(settings, clock=Clock())
     pilot._detector = Answers()
     # Before its first image the car stands straight; from there it may turn as fast as its limits allow.
@@ -115,13 +121,40 @@ def test_lost_lane_stops_the_car_after_its_time(pilot):
     assert pilot.run(IMAGE)[1] > 0.0
 
 
+def test_camera_that_hangs_stops_the_car_after_its_time(pilot):
+    pilot = pilot_of(pilot._settings.model_copy(update={"allow_repeated_frames": False}))
+    pilot._detector.estimate = lane(-5.0)
+    image = IMAGE.copy()
+    assert pilot.run(image)[1] > 0.0
+    # One array that is filled again and again, as some of Donkeycar's cameras do.
+    for k in range(5):
+        image[3, 4] = k + 1
+        assert pilot.run(image)[1] > 0.0
+    assert [pilot.run(image)[1] > 0.0 for _ in range(5)] == [True, True, False, False, False]
+    assert pilot._detector.seen is not None and pilot.estimate.mask.all()
+    image[3, 4] = 200
+    assert pilot.run(image)[1] > 0.0
+
+
+def test_throttle_rises_from_zero_after_a_person_drove(pilot):
+    limits = pilot._settings.limits.model_copy(update={"throttle_rate_s": 1.0})
+    pilot = pilot_of(pilot._settings.model_copy(update={"limits": limits}))
+    pilot._detector.estimate = lane(0.0)
+    before = [pilot.run(IMAGE)[1] for _ in range(6)][-1]
+    assert before == 0.25
+    pilot._clock.now_s += 10.0
+    after = [pilot.run(IMAGE)[1] for _ in range(3)]
+    assert after == pytest.approx([0.0, 0.05, 0.1])
+
+
 def test_doubtful_frame_counts_as_none(pilot):
     pilot._detector.estimate = lane(0.0, confidence=0.2)
     assert [pilot.run(IMAGE)[1] for _ in range(3)] == [0.0, 0.0, 0.0]
 
 
 def test_shipped_settings_drive_on_the_example(example_rgb):
-    pilot = LanePilot(load_settings(DonkeySettings, CONFIG), CONFIG.parent, clock=Clock())
+    settings = load_settings(DonkeySettings, CONFIG).model_copy(update={"allow_repeated_frames": True})
+    pilot = LanePilot(settings, CONFIG.parent, clock=Clock())
     throttles = [pilot.run(example_rgb)[1] for _ in range(20)]
     assert np.diff(throttles).max() <= 0.0501, "the throttle rises by 1 per second at most"
     angle, throttle = pilot.run(example_rgb)

@@ -76,6 +76,22 @@ def test_options_that_contradict_each_other_are_refused(car: Path) -> None:
         build_loop(settings, arm=True)
 
 
+@pytest.mark.parametrize("kind", ["pca9685", "serial"])
+def test_a_car_with_a_motor_does_not_follow_a_recording(car: Path, kind: str) -> None:
+    settings = load_drive_settings(car, [f"actuator={{kind: {kind}}}"])
+    with pytest.raises(ConfigError, match=r"found 'replay' \(.*drive\) for an armed car"):
+        build_loop(settings, arm=True)
+    # The wheels alone may follow it, and so may a car on a box.
+    build_loop(settings, steering_only=True)
+    build_loop(load_drive_settings(car, [f"actuator={{kind: {kind}}}", "source.may_drive=true"]), arm=True)
+
+
+def test_a_device_that_is_missing_is_named_before_the_first_frame(car: Path) -> None:
+    result = drive(car, "source.path=nowhere", "--dry-run")
+    assert result.exit_code == 1
+    assert "neutral: HardwareError before the first frame: replay: nowhere: no such drive" in result.stderr
+
+
 def test_a_dry_run_shows_what_would_be_sent(car: Path) -> None:
     result = drive(car, "--dry-run")
     assert result.exit_code == 0, result.output

@@ -39,7 +39,7 @@ def car(board, tmp_path):
         for i, frame in enumerate(frames):
             writer.add(frame, 0.04 * i)
     data = {
-        "source": {"kind": "replay", "path": str(tmp_path / "drive"), "loop": True},
+        "source": {"kind": "replay", "path": str(tmp_path / "drive"), "loop": True, "may_drive": True},
         "camera": str(CHECKPOINT / "camera.yaml"),
         "detector": {"kind": "network", "model": str(CHECKPOINT / "model.onnx")},
         "control": {"steering": {"look_ahead_cm": 15.0}},

@@ -111,6 +111,22 @@ def test_glitch_is_tried_again(bus, actuator):
     assert (bus.chip.counts(1), bus.chip.counts(0)) == (460, 500)
 
 
+def test_chip_that_lost_its_supply_is_noticed(bus, actuator):
+    actuator.send(0.0, 0.1)
+    bus.chip.power_on()
+    with pytest.raises(HardwareError, match="started again by itself, and gives no pulses"):
+        actuator.send(0.0, 0.1)
+    assert bus.chip.asleep and bus.chip.pulse_us(0) == 0.0
+
+
+def test_one_wrong_bit_of_an_answer_ends_nothing(bus, actuator):
+    answers = iter([0x30])
+    right = bus.chip.read
+    bus.chip.read = lambda length: bytes([next(answers, right(length)[0])])
+    actuator.send(0.0, 0.1)
+    assert next(answers, None) is None, "the chip was not asked"
+
+
 def test_lost_bus_is_an_error_and_neutral_only_logs(bus, actuator, caplog):
     bus.broken = True
     with pytest.raises(HardwareError, match=r"/dev/i2c-1: the PCA9685 at 0x40 stopped answering"):
