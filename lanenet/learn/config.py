@@ -133,12 +133,12 @@ class LossSettings(Settings):
         kind: How errors are thought to be spread about the answer: ``student`` (heavy tails, round middle),
             ``laplace`` (heavy tails, sharp middle) or ``gaussian`` (no outliers).
         evenness: Power of the predicted spread that each point's term is multiplied with: 0 is the plain
-            likelihood, which cares little for points that it holds for uncertain; 1 gives them more weight.
+            likelihood, which cares little for points that it holds for uncertain; 1 lets them all pull alike.
         presence: Weight of the presence of the lines beside the points.
     """
 
     kind: Literal["student", "laplace", "gaussian"] = "student"
-    evenness: float = Field(default=1.0, ge=0.0, le=2.0)
+    evenness: float = Field(default=0.5, ge=0.0, le=2.0)
     presence: float = Field(default=1.0, ge=0.0)
 
 

@@ -34,7 +34,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "layers": (4, 3, 5),
     "hidden": (64, 32, 128),
     "loss": ("student", "laplace", "gaussian"),
-    "evenness": (1.0, 0.0, 0.5, 2.0),
+    "evenness": (0.5, 0.0, 1.0, 2.0),
 }
 #: From and to.
 LEARNING_RATE = (5e-4, 1e-2)

@@ -50,7 +50,9 @@ def test_fine_tuning_begins_where_the_checkpoint_ended(data, checkpoint, tmp_pat
     publish(tuned.folder, tmp_path / "p", "p", {})
     after = read_network(tmp_path / "p")[0].state_dict()
     for name, value in read_network(checkpoint)[0].named_parameters():
-        np.testing.assert_allclose(after[name].numpy(), value.detach().numpy(), atol=1e-5)
+        # Where presence begins (the last two) is set anew after each training.
+        told = slice(-2) if name == "head.2.bias" else slice(None)
+        np.testing.assert_allclose(after[name][told].numpy(), value[told].detach().numpy(), atol=1e-5)
     assert tuned.val_rmse_cm < 0.8 * anew.val_rmse_cm
 
 
