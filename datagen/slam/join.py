@@ -36,6 +36,9 @@ from lanenet.geometry.frames import wrap_angle
 #: What alignments of one stretch may differ by: in camera heights, as a share of the way between them, which
 #: the open loop drifts over, and in heading.
 _AGREE_HEIGHTS, _AGREE_WAY, _AGREE_RAD = 0.6, 0.06, 0.2
+#: Way between two places that count as two, camera heights: on a road that repeats itself, neighbouring frames
+#: all show the same wrong place, and agree on it.
+_PLACE_HEIGHTS = 3.0
 #: Frames beside a break whose surroundings belong to both stretches.
 _EDGE = 21
 
@@ -111,7 +114,8 @@ def _join(
         if match is not None:
             found.append(match)
     cross, moved = _agreeing(apart, first, found, height)
-    if len(cross) < s.min_revisits:
+    ways = path_lengths(apart[first:])[[r.later - first for r in cross]]
+    if _places(ways, height) < s.min_revisits:
         return None
     # Of both maps what they know of themselves already, beside what they share.
     later = [replace(r, earlier=r.earlier + first, later=r.later + first) for r in other.solved.revisits]
@@ -220,6 +224,15 @@ def _agreeing(
         if len(kept) > len(best):
             best, moved = kept, carried
     return best, moved
+
+
+def _places(ways_cm: Float[np.ndarray, "r"], height_cm: float) -> int:
+    """Number of separate places among some that lie so far along a stretch."""
+    count, last = 0, -np.inf
+    for way in np.sort(ways_cm):
+        if way - last >= _PLACE_HEIGHTS * height_cm:
+            count, last = count + 1, way
+    return count
 
 
 def _compose(pose: Float[np.ndarray, "3"], relative: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
