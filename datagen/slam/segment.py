@@ -13,6 +13,7 @@ from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
+from datagen.slam.mutual import with_supported
 from datagen.slam.places import (
     Revisit,
     consistent_revisits,
@@ -194,20 +195,41 @@ def _close(
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
     best: _Closure | None = None
     height = opened.camera.mounting.height_cm
-    for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
-        poses, missed = close_loops(opened.poses, revisits, height)
-        along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
-        if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
-            continue
-        loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
-        closed = adjust(
-            edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-            expected=expected, believed=believed,
-        )  # fmt: skip
-        fits = closed.misfit < MAX_MISFIT * opened.misfit
-        if fits and (best is None or closed.misfit < best.bundle.misfit):
-            best = _Closure(revisits, missed, drift, closed)
+    for explained, drift in consistent_revisits(opened.poses, matched, settings.revisits):
+        supported = with_supported(opened.poses, explained, matched, height, settings.revisits)
+        # Those that a drift explains are enough where the others do not fit.
+        for revisits in [supported, explained][: 1 + (len(supported) > len(explained))]:
+            closure = _closed_by(revisits, drift, edges, opened, settings, rng, free, expected, believed)
+            if closure is not None:
+                if best is None or closure.bundle.misfit < best.bundle.misfit:
+                    best = closure
+                break
     return best
+
+
+def _closed_by(
+    revisits: list[Revisit],
+    drift: float,
+    edges: list[EdgePixels],
+    opened: BundleResult,
+    settings: MapSettings,
+    rng: np.random.Generator,
+    free: Sequence[str],
+    expected: Float[np.ndarray, "n"],
+    believed: Camera,
+) -> _Closure | None:
+    """Close the loops with these revisits; None where they do not meet, or frames agree less with them."""
+    height = opened.camera.mounting.height_cm
+    poses, missed = close_loops(opened.poses, revisits, height)
+    along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
+    if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
+        return None
+    loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
+    closed = adjust(
+        edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
+        expected=expected, believed=believed,
+    )  # fmt: skip
+    return _Closure(revisits, missed, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
 
 def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:

@@ -12,7 +12,7 @@ from pixel_road import fisheye
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
-from datagen.slam.join import Stretch, _agreeing, _carried, _places, frames_text, join_stretches
+from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
 from datagen.slam.places import Revisit, RevisitSettings, relative_pose
 from datagen.slam.segment import loop_pairs, solve_segment
 from lanenet.data.recording import Commands, Drive
@@ -132,12 +132,6 @@ def test_alignments_that_contradict_each_other_do_not_join():
     assert {(r.earlier, *r.relative) for r in kept} == {(r.earlier, *r.relative) for r in right}
     np.testing.assert_allclose(moved, true, atol=1e-9)
     assert len(_agreeing(poses, 30, wrong, 15.0)[0]) < 3
-
-
-def test_neighbouring_frames_are_one_place():
-    assert _places(np.array([100.0, 96.0, 104.0, 130.0]), 15.0) == 1
-    assert _places(np.array([100.0, 96.0, 104.0, 145.0, 400.0]), 15.0) == 3
-    assert _places(np.empty(0), 15.0) == 0
 
 
 def test_alignments_of_one_place_alone_do_not_join(same_road, monkeypatch):
