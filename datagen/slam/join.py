@@ -30,7 +30,15 @@ from datagen.slam.places import (
 )
 from datagen.slam.posegraph import close_loops
 from datagen.slam.scans import Scans, scans_of
-from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways, road_edges
+from datagen.slam.segment import (
+    MAX_MISFIT,
+    MAX_MISSED,
+    SolvedSegment,
+    loop_pairs,
+    relative_ways,
+    road_edges,
+    side_by_side,
+)
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
 
@@ -124,10 +132,13 @@ def _join(
     edges = [pixels for part in drives for pixels in road_edges(part, camera, limits, settings)]
     expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
-    bundle = adjust(
-        edges, poses, camera, settings.bundle, rng, (), loop_pairs(revisits, breaks), tilt, breaks,
-        expected=expected,
-    )  # fmt: skip
+    loops = loop_pairs(revisits, breaks)
+    for _ in range(2):
+        bundle = adjust(
+            edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks, expected=expected
+        )
+        poses, tilt = bundle.poses, bundle.tilt
+        loops = loop_pairs(revisits, breaks) + side_by_side(poses, height, s)
     before = np.average(
         [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
     )
