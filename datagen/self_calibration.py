@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import CAMERA_NAMES, BundleSettings
-from datagen.slam.calibrate import Candidate, coarse_camera, nudged
+from datagen.slam.calibrate import Candidate, coarse_camera, looking_alike, nudged
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
 from lanenet.data.drive import Drive
@@ -188,8 +188,7 @@ def _started_anew(
         else:
             focal_px = float(searched.K[0, 0]) * factor
         # Principal point, roll and k1 begin where they are believed to be.
-        m = found.camera.mounting if found.revisits else first.camera.mounting
-        turned = searched.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
+        turned = looking_alike(searched, found.camera if found.revisits else first.camera)
         start = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
         again = solve_segment(drive, start, settings, rng, progress, find_camera=True)
         if len(again.revisits) < 0.5 * len(found.revisits):

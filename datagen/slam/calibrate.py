@@ -156,6 +156,21 @@ def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Cam
     return kept.with_mounting(ahead_of_front_axle_cm=lever - guess.wheelbase_cm)
 
 
+def looking_alike(camera: Camera, like: Camera) -> Camera:
+    """Turn a camera so that the middle of its picture shows the place that it shows with another one.
+
+    Pitch and yaw were found together with a principal point, and with another one they are others: a few
+    pixels make up for degrees.
+    """
+    m = like.mounting
+    middle = np.array([[0.5 * (like.width - 1), 0.5 * (like.height - 1)]])
+    x_cm, y_cm = like.intersect_ground(middle)[0] - [m.right_of_centre_cm, m.ahead_of_front_axle_cm]
+    if not np.isfinite(x_cm):
+        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
+    pitch = float(np.arctan2(m.height_cm, np.hypot(x_cm, y_cm)))
+    return camera.with_mounting(pitch_down_rad=pitch, yaw_rad=float(np.arctan2(-x_cm, y_cm)))
+
+
 def nudged(camera: Camera, name: str, by: float) -> Camera:
     """Return the camera with one of its adjustable numbers changed, in the adjustment's units."""
     m = camera.mounting

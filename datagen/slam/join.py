@@ -18,6 +18,7 @@ from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import commands_of
+from datagen.slam.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
 from datagen.slam.places import (
     Revisit,
     alike,
@@ -29,13 +30,18 @@ from datagen.slam.places import (
 )
 from datagen.slam.posegraph import close_loops
 from datagen.slam.scans import Scans, scans_of
-from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment, loop_pairs, relative_ways, road_edges
+from datagen.slam.segment import (
+    MAX_MISFIT,
+    MAX_MISSED,
+    SolvedSegment,
+    loop_pairs,
+    relative_ways,
+    road_edges,
+    side_by_side,
+)
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
 
-#: What alignments of one stretch may differ by: in camera heights, as a share of the way between them, which
-#: the open loop drifts over, and in heading.
-_AGREE_HEIGHTS, _AGREE_WAY, _AGREE_RAD = 0.6, 0.06, 0.2
 #: Frames beside a break whose surroundings belong to both stretches.
 _EDGE = 21
 
@@ -111,7 +117,8 @@ def _join(
         if match is not None:
             found.append(match)
     cross, moved = _agreeing(apart, first, found, height)
-    if len(cross) < s.min_revisits:
+    ways = path_lengths(apart[first:])[[r.later - first for r in cross]]
+    if separate_places(ways, height) < s.min_revisits:
         return None
     # Of both maps what they know of themselves already, beside what they share.
     later = [replace(r, earlier=r.earlier + first, later=r.later + first) for r in other.solved.revisits]
@@ -125,10 +132,13 @@ def _join(
     edges = [pixels for part in drives for pixels in road_edges(part, camera, limits, settings)]
     expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
-    bundle = adjust(
-        edges, poses, camera, settings.bundle, rng, (), loop_pairs(revisits, breaks), tilt, breaks,
-        expected=expected,
-    )  # fmt: skip
+    loops = loop_pairs(revisits, breaks)
+    for _ in range(2):
+        bundle = adjust(
+            edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks, expected=expected
+        )
+        poses, tilt = bundle.poses, bundle.tilt
+        loops = loop_pairs(revisits, breaks) + side_by_side(poses, height, s)
     before = np.average(
         [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
     )
@@ -208,25 +218,18 @@ def _agreeing(
     moved = other
     for one in found:
         # Where the frame would be in the base's map.
-        carried = _carried(other, other[one.later - first], _compose(poses[one.earlier], one.relative))
+        carried = _carried(other, other[one.later - first], compose(poses[one.earlier], one.relative))
         kept = []
         for r in found:
             seen = relative_pose(poses[r.earlier], carried[r.later - first]) - r.relative
             between = abs(way[r.later - first] - way[one.later - first])
-            near = float(np.hypot(seen[0], seen[1])) < _AGREE_HEIGHTS * height_cm + _AGREE_WAY * between
-            if near and abs(float(wrap_angle(seen[2:])[0])) < _AGREE_RAD:
+            near = float(np.hypot(seen[0], seen[1])) < AGREE_HEIGHTS * height_cm + AGREE_WAY * between
+            if near and abs(float(wrap_angle(seen[2:])[0])) < AGREE_RAD:
                 turns = carried[r.later - first, 2] - poses[r.earlier, 2] - r.relative[2]
                 kept.append(replace(r, turns=round(turns / (2.0 * np.pi))))
         if len(kept) > len(best):
             best, moved = kept, carried
     return best, moved
-
-
-def _compose(pose: Float[np.ndarray, "3"], relative: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Pose that is seen at ``relative`` from ``pose``."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y, turn = relative
-    return np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + turn])
 
 
 def _carried(

@@ -148,6 +148,18 @@ def usual_way(
     return UsualWay(relative, step, step * height_cm / usual)
 
 
+def _likelihood(fits: Float32[np.ndarray, "n w t"], temper: float) -> Float16[np.ndarray, "n w t"]:
+    """Tempered log likelihood of each frame's states, at most 0.
+
+    In half precision: differences that matter are near zero, where it is finest.
+    """
+    best, least = fits.max(axis=(1, 2)), np.finfo(np.float16).min
+    result = np.empty(fits.shape, np.float16)
+    for k in range(len(fits)):
+        result[k] = np.maximum(np.float32(temper) * (fits[k] - best[k]), least)
+    return result
+
+
 def _at_rim(step: float, steps: Float[np.ndarray, "w"]) -> bool:
     """Whether a step lies within about one of either end of those that were tried."""
     half = np.sqrt(steps[1] / steps[0])
@@ -186,15 +198,23 @@ class Evidence:
         if speed_known:
             spread, keep = s.known_spread, s.known_keep
         self.grid = MotionGrid(step, spread, keep, s.jump, _turns_of(pictures, 1.3 * step))
-        # Half precision: differences that matter are near zero, where it is finest.
-        self.log_likelihood: Float16[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float16)
-        least = np.finfo(np.float16).min
-        for k in range(n):
-            if k > 0:
-                fit = pictures.fit(k, self.grid.steps, self.grid.turns_rad, self.relative)
-                self.log_likelihood[k] = np.maximum(s.temper * (fit - fit.max()), least)
-            if progress is not None:
-                progress(k + 1, n)
+        fits: Float32[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float32)
+        # Neighbours first: a car that slides, or is caught, turns otherwise from frame to frame, and pictures
+        # that are further apart meet at no one turn then.
+        nearest, further = s.lags[:1], s.lags[1:]
+        turns: Float[np.ndarray, "n"] | None = None
+        rounds = [nearest, further] if further else [nearest]
+        for number, lags in enumerate(rounds):
+            for k in range(1, n):
+                steps, grid_turns = self.grid.steps, self.grid.turns_rad
+                fits[k] += pictures.fit(k, steps, grid_turns, self.relative, lags, turns)
+                if progress is not None:
+                    progress((number * n + k + 1) // len(rounds), n)
+            if number + 1 < len(rounds):
+                # As strong as all pairs together.
+                self.log_likelihood = _likelihood(fits, s.temper * len(s.lags))
+                turns = self.motion().turns_rad
+        self.log_likelihood = _likelihood(fits, s.temper)
 
     def motion(self, curvature_per_cm: Float[np.ndarray, "n"] | None = None) -> Odometry:
         """Find the likeliest motion.

@@ -42,7 +42,7 @@ def index_edges(uv, sector, nearest, distance):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def fit_of_motions(
-    points, sector, uv, normals, nearest, pixel_of, origin, cell, ways, turns, sigma_px, gain, unseen, out
+    points, sector, uv, normals, nearest, pixel_of, origin, cell, ways, turns, sigma_px, gain, out, unseen
 ):
     """Add up how well each motion carries the points of one frame onto the edges of a later one.
 
@@ -59,8 +59,8 @@ def fit_of_motions(
         turns: Turns to try, positive left.
         sigma_px: Standard deviation of an edge's place across itself.
         gain: How much likelier a place is on an edge than off it.
-        unseen: What a point adds that leaves the view.
-        out: The sums, a row per way and a column per turn.
+        out: The sums over the points that stay in view, a row per way and a column per turn.
+        unseen: Of the same shape: number of points that leave the view.
     """
     height, width = nearest.shape[1:]
     rows, columns = pixel_of.shape[:2]
@@ -68,13 +68,13 @@ def fit_of_motions(
         for b in range(turns.shape[0]):
             c, s = np.cos(turns[b]), np.sin(turns[b])
             dx, dy = ways[a] * np.cos(0.5 * turns[b]), ways[a] * np.sin(0.5 * turns[b])
-            total = 0.0
+            total, lost = 0.0, 0
             for p in range(points.shape[0]):
                 x, y = points[p, 0] - dx, points[p, 1] - dy
                 gx, gy = (c * x + s * y - origin[0]) / cell, (c * y - s * x - origin[1]) / cell
                 ix, iy = int(np.floor(gx)), int(np.floor(gy))
                 if not (0 <= ix < rows - 1 and 0 <= iy < columns - 1):
-                    total += unseen
+                    lost += 1
                     continue
                 tx, ty = gx - ix, gy - iy
                 w00, w01 = (1.0 - tx) * (1.0 - ty), (1.0 - tx) * ty
@@ -84,10 +84,10 @@ def fit_of_motions(
                 u = w00 * p00[0] + w01 * p01[0] + w10 * p10[0] + w11 * p11[0]
                 v = w00 * p00[1] + w01 * p01[1] + w10 * p10[1] + w11 * p11[1]
                 if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
-                    total += unseen
+                    lost += 1
                     continue
                 q = nearest[sector[p], int(v + 0.5), int(u + 0.5)]
                 if q >= 0:
                     e = (u - uv[q, 0]) * normals[q, 0] + (v - uv[q, 1]) * normals[q, 1]
                     total += np.log1p(gain * np.exp(-0.5 * (e / sigma_px) ** 2))
-            out[a, b] += total
+            out[a, b], unseen[a, b] = total, lost

@@ -20,6 +20,8 @@ _CELL_HEIGHTS, _REACH_HEIGHTS = 0.05, 7.0
 _KINDS = 4
 #: Pixels that a far edge moves by from one turn of the grid to the next, in standard deviations.
 _TURN_SIGMAS = 1.2
+#: Share of a picture's points whose match tells how well it meets another one.
+_LEAST_SEEN = 0.5
 #: Width up to which an edge's place is known to the same part of a pixel.
 _FINE_WIDTH = 320
 
@@ -32,7 +34,8 @@ class OdometrySettings(Settings):
         points: Edge points of the earlier picture that are moved.
         sigma_px: Standard deviation of an edge's place across itself, for images up to 320 px wide.
         gain: How much likelier a point of the road falls on an edge of the later picture than off it.
-        unseen_share: Share of a full match that a point counts for which leaves the view.
+        unseen_share: What a point counts for that leaves the view, as a share of the best mean match that its
+            pair of pictures has with the same step: where they are blurred, no point gains by leaving.
         temper: Power of the likelihood: neighbouring points share their errors, and so do the lags.
         known_spread: Spread of the speed about the recorded one, times its usual gain, as a logarithm.
         known_keep: Share of that deviation which stays until the next frame.
@@ -148,28 +151,36 @@ class Pictures:
         steps: Float[np.ndarray, "w"],
         turns_rad: Float[np.ndarray, "t"],
         relative: Float[np.ndarray, "n"],
+        lags: Sequence[int] | None = None,
+        usual_turns_rad: Float[np.ndarray, "n"] | None = None,
     ) -> Float[np.ndarray, "w t"]:
         """Compare frame k with those before it, for every step and turn.
 
         Args:
             k: Frame.
             steps: Ways per frame of usual length.
-            turns_rad: Turns per frame; the same for all frames between a pair.
+            turns_rad: Turns of frame k.
             relative: Way of each frame relative to the usual one.
+            lags: Frames between the pictures of a pair; None for those of the settings.
+            usual_turns_rad: Turn of each frame, about: by how much they differ, the frames between a pair
+                turn otherwise than frame k. None where all of them turn alike.
 
         Returns:
             Log likelihood up to a constant, not tempered.
         """
         s, later = self.settings, self._pictures[k]
-        out = np.zeros((len(steps), len(turns_rad)))
+        out, seen_fit, unseen = (np.zeros((len(steps), len(turns_rad))) for _ in range(3))
         # The usual step asks for one frame again and again, with other turns for every step.
         if self._indexed != k:
             index_edges(later.uv_px, later.edge_sector, self._nearest, self._distance)
             self._indexed = k
-        for lag in s.lags:
+        for lag in s.lags if lags is None else lags:
             if lag > k:
                 continue
             earlier = self._pictures[k - lag]
+            turned = 0.0
+            if usual_turns_rad is not None:
+                turned = float(np.sum(usual_turns_rad[k - lag + 1 : k + 1] - usual_turns_rad[k]))
             fit_of_motions(
                 earlier.points,
                 earlier.sector,
@@ -180,12 +191,18 @@ class Pictures:
                 self._origin,
                 _CELL_HEIGHTS,
                 relative[k - lag + 1 : k + 1].sum() * steps,
-                lag * turns_rad,
+                lag * turns_rad + turned,
                 self._sigma_px,
                 s.gain,
-                s.unseen_share * np.log1p(s.gain),
-                out,
+                seen_fit,
+                unseen,
             )
+            count = len(earlier.points)
+            seen = count - unseen
+            # Few points fit anywhere.
+            enough = seen >= max(_LEAST_SEEN * count, 1.0)
+            best = np.where(enough, seen_fit / np.maximum(seen, 1.0), 0.0).max(axis=1, keepdims=True)
+            out += seen_fit + s.unseen_share * best * unseen
         return out
 
 

@@ -13,8 +13,10 @@ from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
+from datagen.slam.mutual import with_supported
 from datagen.slam.places import (
     Revisit,
+    RevisitSettings,
     consistent_revisits,
     match_places,
     path_lengths,
@@ -27,6 +29,7 @@ from datagen.slam.scans import Progress, Scans, edges_of_drive, scans_of
 from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import wrap_angle
 from lanenet.perception.birdseye import RangeSettings, RoadTable
 from lanenet.perception.edges import EdgePixels
 
@@ -34,6 +37,9 @@ from lanenet.perception.edges import EdgePixels
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
+#: Every so many frames one is compared with the nearest one of an earlier lap, if that is no further away, in
+#: camera heights and in heading.
+_BESIDE_EVERY, _BESIDE_HEIGHTS, _BESIDE_RAD = 5, 1.0, 0.3
 #: What revisits may miss once closed (medians along and across the road, in camera heights), and how much
 #: worse frames may agree than before: places that only look alike, as on an open road, miss more.
 MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.1
@@ -140,7 +146,8 @@ def solve_segment(
             # A camera that has changed sees other edges on the road.
             edges = road_edges(drive, bundle.camera, limits, settings)
             before = bundle.camera.K[0, 0]
-            loops = loop_pairs(closure.revisits, np.zeros(len(drive), dtype=bool))
+            none = np.zeros(len(drive), dtype=bool)
+            loops = loop_pairs(closure.revisits, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,
@@ -194,20 +201,41 @@ def _close(
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
     best: _Closure | None = None
     height = opened.camera.mounting.height_cm
-    for revisits, drift in consistent_revisits(opened.poses, matched, settings.revisits):
-        poses, missed = close_loops(opened.poses, revisits, height)
-        along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
-        if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
-            continue
-        loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
-        closed = adjust(
-            edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-            expected=expected, believed=believed,
-        )  # fmt: skip
-        fits = closed.misfit < MAX_MISFIT * opened.misfit
-        if fits and (best is None or closed.misfit < best.bundle.misfit):
-            best = _Closure(revisits, missed, drift, closed)
+    for explained, drift in consistent_revisits(opened.poses, matched, settings.revisits):
+        supported = with_supported(opened.poses, explained, matched, height, settings.revisits)
+        # Those that a drift explains are enough where the others do not fit.
+        for revisits in [supported, explained][: 1 + (len(supported) > len(explained))]:
+            closure = _closed_by(revisits, drift, edges, opened, settings, rng, free, expected, believed)
+            if closure is not None:
+                if best is None or closure.bundle.misfit < best.bundle.misfit:
+                    best = closure
+                break
     return best
+
+
+def _closed_by(
+    revisits: list[Revisit],
+    drift: float,
+    edges: list[EdgePixels],
+    opened: BundleResult,
+    settings: MapSettings,
+    rng: np.random.Generator,
+    free: Sequence[str],
+    expected: Float[np.ndarray, "n"],
+    believed: Camera,
+) -> _Closure | None:
+    """Close the loops with these revisits; None where they do not meet, or frames agree less with them."""
+    height = opened.camera.mounting.height_cm
+    poses, missed = close_loops(opened.poses, revisits, height)
+    along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
+    if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
+        return None
+    loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
+    closed = adjust(
+        edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
+        expected=expected, believed=believed,
+    )  # fmt: skip
+    return _Closure(revisits, missed, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
 
 def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
@@ -225,6 +253,33 @@ def loop_pairs(revisits: list[Revisit], breaks: Bool[np.ndarray, "n"]) -> list[t
         for r, a, b in pairs
         if a >= 0 and b < len(breaks) and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
     ]
+
+
+def side_by_side(
+    poses: Float[np.ndarray, "n 3"], camera_height_cm: float, settings: RevisitSettings
+) -> list[tuple[int, int]]:
+    """Pairs of frames of different laps that a closed map has at about the same place and heading.
+
+    Revisits are too few to hold all of one lap on the others; between them every lap would have lines of its
+    own.
+
+    Args:
+        poses: Rear-axle poses after closing loops.
+        camera_height_cm: Sets the scale.
+        settings: What counts as another visit.
+    """
+    path = path_lengths(poses)
+    pairs = []
+    for later in range(0, len(poses), _BESIDE_EVERY):
+        before = int(np.searchsorted(path, path[later] - settings.min_gap_heights * camera_height_cm))
+        if not before:
+            continue
+        apart = np.hypot(*(poses[:before, :2] - poses[later, :2]).T)
+        turned = np.abs(wrap_angle(poses[:before, 2] - poses[later, 2]))
+        earlier = int(np.argmin(np.where(turned < _BESIDE_RAD, apart, np.inf)))
+        if turned[earlier] < _BESIDE_RAD and apart[earlier] < _BESIDE_HEIGHTS * camera_height_cm:
+            pairs.append((earlier, later))
+    return pairs
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from picture_road import loop_drive
@@ -12,6 +14,7 @@ from datagen.slam.calibrate import (
     GuessSettings,
     coarse_camera,
     guessed_camera,
+    looking_alike,
     mapping_range,
     with_known_scale,
 )
@@ -31,6 +34,28 @@ def test_the_guessed_camera_sits_ahead_of_the_rear_axle():
     np.testing.assert_allclose(
         centre, [0.0, m.ahead_of_front_axle_cm + NOMINAL_HEIGHT_CM / np.tan(np.deg2rad(15.0))], atol=1e-9
     )
+
+
+def test_a_camera_looks_where_one_with_another_principal_point_does():
+    usual = guessed_camera(160, 120, 110.0, 20.0, GUESS)
+    K = np.array(usual.K)
+    K[:2, 2] += [-6.0, 9.0]
+    found = replace(usual, K=K).with_mounting(pitch_down_rad=0.4, yaw_rad=-0.01, roll_rad=0.03)
+    turned = looking_alike(usual, found)
+    middle = np.array([[79.5, 59.5]])
+    np.testing.assert_allclose(turned.intersect_ground(middle), found.intersect_ground(middle), atol=1e-6)
+    # Nine pixels of 110 are 4.7 degrees.
+    assert turned.mounting.pitch_down_rad == pytest.approx(0.4 - 9.0 / 110.0, abs=0.005)
+    assert turned.mounting.yaw_rad < -0.05
+    assert turned.mounting.roll_rad == usual.mounting.roll_rad
+    np.testing.assert_array_equal(turned.K, usual.K)
+
+
+def test_a_camera_whose_middle_shows_no_road_keeps_its_angles():
+    usual = guessed_camera(160, 120, 110.0, 20.0, GUESS)
+    level = usual.with_mounting(pitch_down_rad=-0.05, yaw_rad=0.02)
+    turned = looking_alike(usual, level)
+    assert (turned.mounting.pitch_down_rad, turned.mounting.yaw_rad) == (-0.05, 0.02)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.7])

@@ -134,6 +134,14 @@ def test_alignments_that_contradict_each_other_do_not_join():
     assert len(_agreeing(poses, 30, wrong, 15.0)[0]) < 3
 
 
+def test_alignments_of_one_place_alone_do_not_join(same_road, monkeypatch):
+    drive, _, stretches = same_road
+    # All pairs that look alike lie within a few frames, as where a printed road repeats itself once.
+    pairs = [(k, FIRST + k - SECOND.start + LAP_FRAMES) for k in range(70, 76)]
+    monkeypatch.setattr("datagen.slam.join._shared_places", lambda *_: pairs)
+    assert join_stretches(stretches, drive, SMALL, np.random.default_rng(1), []) == stretches
+
+
 def test_one_stretch_is_all_there_is(same_road):
     drive, _, stretches = same_road
     assert join_stretches(stretches[:1], drive, SMALL, np.random.default_rng(1), []) == stretches[:1]

@@ -107,6 +107,55 @@ def test_way_and_turn_of_a_drive_are_found(road, edges, known, lamp):
     assert np.abs(odometry.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(3.0)
 
 
+def _blurred(edges: list[EdgePixels], sigma_px: float, seed: int = 0) -> list[EdgePixels]:
+    """The same with every edge found a little beside its place."""
+    rng = np.random.default_rng(seed)
+    return [
+        EdgePixels(e.uv_px + rng.normal(0.0, sigma_px, (len(e.uv_px), 1)) * e.normals, e.normals)
+        for e in edges
+    ]
+
+
+def test_a_slide_that_is_caught_is_followed(road):
+    # Within a few frames the car swings round, and back again twice as quickly as it ever turns on the road.
+    turns = _true_turns(road)
+    turns[20:26] += np.array([0.04, 0.08, 0.12, 0.12, 0.08, 0.04])
+    turns[28:34] -= np.array([0.04, 0.08, 0.12, 0.12, 0.08, 0.04])
+    heading = np.cumsum(turns)
+    middle = heading - 0.5 * turns
+    steps = STEP_CM * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    steps[0] = 0.0
+    poses = np.column_stack([np.cumsum(steps, axis=0), heading])
+    slid = pixels(TapeRoad(road.points_cm, road.normals, poses), fisheye())
+    odometry = Evidence(_pictures(_blurred(slid, 0.5)), np.ones(60), False, HEIGHT_CM).motion()
+    assert np.abs(odometry.poses[:, 2] - heading).max() < np.deg2rad(6.0)
+    assert odometry.turns_rad[28:34].min() < -0.05
+
+
+def test_pictures_that_are_further_apart_meet_where_the_turns_between_them_are_known(road):
+    turns = np.where(np.arange(60) % 12 < 6, 0.06, -0.03)
+    middle = np.cumsum(turns) - 0.5 * turns
+    xy = np.cumsum(STEP_CM * np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)
+    swerving = TapeRoad(road.points_cm, road.normals, np.column_stack([xy, np.cumsum(turns)]))
+    pictures = _pictures(pixels(swerving, fisheye()))
+    # Frame 25 turns to the left, as the one before it does; the two before those turn to the right.
+    tried = turns_up_to(0.12, pictures.turn_step_rad)
+    alike, known = (
+        pictures.fit(25, np.array([STEP]), tried, np.ones(60), (4,), usual)[0] for usual in (None, turns)
+    )
+    assert abs(tried[alike.argmax()] - turns[25]) > 0.03
+    assert tried[known.argmax()] == pytest.approx(turns[25], abs=pictures.turn_step_rad)
+
+
+def test_no_point_gains_by_leaving_the_view_of_blurred_pictures(edges):
+    steps, turns = np.array([STEP]), np.array([0.0, 0.5])
+    for sigma_px in (0.0, 1.5, 3.0):
+        pictures = _pictures(_blurred(edges, sigma_px))
+        for k in range(6, 60, 6):
+            true, away = pictures.fit(k, steps, turns, np.ones(60))[0]
+            assert away < true
+
+
 def test_a_mirrored_drive_turns_the_other_way(road, edges):
     flipped = pixels(road.mirrored(), mirrored(fisheye()))
     plain, other = (

@@ -15,7 +15,7 @@ from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import CommandedMotion
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.segment import SolvedSegment, loop_pairs, relative_ways, solve_segment
+from datagen.slam.segment import SolvedSegment, loop_pairs, relative_ways, side_by_side, solve_segment
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.recording import Commands, Drive
@@ -54,6 +54,20 @@ def _errors_cm(poses: np.ndarray, true: np.ndarray) -> np.ndarray:
 def solved() -> tuple[SolvedSegment, np.ndarray]:
     drive, poses = _drive(125)
     return solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None), poses
+
+
+def test_laps_side_by_side_are_paired_once_each():
+    # Three laps of a circle of 64 cm, the second one 5 cm further out and the third one 30 cm.
+    angle = 2.0 * np.pi * np.arange(270) / 90
+    radius = 64.0 + np.repeat([0.0, 5.0, 30.0], 90)
+    poses = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), angle])
+    pairs = side_by_side(poses, 15.0, RevisitSettings())
+    assert {later for _, later in pairs} == set(range(90, 180, 5))
+    assert all(later - earlier == 90 for earlier, later in pairs)
+    # Driven the other way round, no picture shows the same.
+    back = poses.copy()
+    back[90:, 2] += np.pi
+    assert not side_by_side(back[:180], 15.0, RevisitSettings())
 
 
 def test_two_laps_of_pictures_give_the_true_path(solved):
