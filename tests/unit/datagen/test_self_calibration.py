@@ -83,6 +83,16 @@ def test_a_car_that_stands_is_refused(tmp_path):
         calibrate_drive(drive, 40.0, None, None, MapSettings())
 
 
+def test_a_car_that_only_reverses_is_refused(tmp_path):
+    with DriveWriter(tmp_path / "d") as writer:
+        rng = np.random.default_rng(0)
+        for k in range(220):
+            image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            writer.add(image, 0.05 * k, speed_cm_s=-20.0, truth=None)
+    with pytest.raises(CalibrationError, match=r"told to reverse in frames .*Drive two laps"):
+        calibrate_drive(tmp_path / "d", 40.0, None, None, MapSettings())
+
+
 def test_lengths_and_sizes_have_to_be_known(tmp_path):
     drive = write_drive(tmp_path / "d", np.arange(60) * 3.0)
     with pytest.raises(CalibrationError, match="the lane's width or the camera's height, found neither"):
