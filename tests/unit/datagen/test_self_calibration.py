@@ -198,10 +198,14 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
     asked: list[float] = []
     lap = np.linspace(0.0, 4.0 * np.pi, 400)
 
-    def solve(drive, camera, settings, rng, progress, find_camera):
+    def solve(drive, camera, settings, rng, progress, find_camera, believed=None):
         asked.append(float(camera.K[0, 0]))
-        # Roll and principal point are believed to be as usual, whatever came out before.
-        assert camera.mounting.roll_rad == 0.0 and camera.K[0, 2] == 79.5 and find_camera
+        # Roll and principal point are believed to be as usual, whatever came out before; the drive is
+        # followed with what a closed loop has found.
+        usual = camera if believed is None else believed
+        assert usual.mounting.roll_rad == 0.0 and usual.K[0, 2] == 79.5 and find_camera
+        once_closed = any(was_closed for _, was_closed in answers[: len(asked) - 1])
+        assert camera.mounting.roll_rad == pytest.approx(0.04 if once_closed else 0.0)
         focal_px, closed = answers[len(asked) - 1]
         adjusted = nudged(nudged(nudged(CAMERA, "roll", 0.04), "cx", 2.0), "focal", np.log(focal_px / 80.0))
         solved = found(lap, 8 if closed else 0).solved
