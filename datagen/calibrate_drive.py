@@ -221,9 +221,9 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
             f"for {start.width}x{start.height} px"
         )
     _check_count(recorded, len(recorded), "frames")
-    moving = following_frames(recorded, notes)
-    _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
     try:
+        moving = following_frames(recorded, notes)
+        _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
         segments = split_segments(moving)
     except TrackingLostError as error:
         raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error

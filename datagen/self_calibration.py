@@ -187,10 +187,12 @@ def _started_anew(
             return first
         else:
             focal_px = float(searched.K[0, 0]) * factor
-        # Principal point, roll and k1 begin where they are believed to be.
+        # A closed loop knows best where to begin, also with the lever, without which every bend is off. But
+        # what is believed of principal point, roll and k1 must not walk along with what was found of them.
         turned = looking_alike(searched, found.camera if found.revisits else first.camera)
-        start = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
-        again = solve_segment(drive, start, settings, rng, progress, find_camera=True)
+        believed = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
+        start = found.camera if found.revisits else believed
+        again = solve_segment(drive, start, settings, rng, progress, find_camera=True, believed=believed)
         if len(again.revisits) < 0.5 * len(found.revisits):
             # The map that more places agree on.
             return found

@@ -18,7 +18,7 @@ from datagen.slam.join import Stretch, frames_text, join_stretches
 from datagen.slam.scans import Progress
 from datagen.slam.segment import SolvedSegment, solve_segment
 from lanenet.data.drive import Drive
-from lanenet.errors import TrackingLostError
+from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
 
 
@@ -53,14 +53,15 @@ def map_stretches(
 
     Raises:
         TrackingLostError: If no stretch can be mapped; says why the longest one cannot.
+        CalibrationError: The same, where the longest one shows a lane of another width.
     """
-    refused: list[tuple[np.ndarray, TrackingLostError]] = []
+    refused: list[tuple[np.ndarray, TrackingLostError | CalibrationError]] = []
     stretches = []
     for i, segment in enumerate(segments):
         rows = np.arange(segment.start, segment.stop)
         try:
             found = solved.get(i) or solve_segment(drive.subset(segment), camera, settings, rng, progress)
-        except TrackingLostError as error:
+        except (TrackingLostError, CalibrationError) as error:
             refused.append((rows, error))
         else:
             stretches.append(Stretch(rows, found))
@@ -69,7 +70,7 @@ def map_stretches(
         try:
             part = _find_lane(stretch, lane_width_cm, settings, held_out[stretch.rows])
             check_lane([part], drive)
-        except TrackingLostError as error:
+        except (TrackingLostError, CalibrationError) as error:
             refused.append((stretch.rows, error))
         else:
             parts.append(part)

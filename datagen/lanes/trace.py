@@ -26,6 +26,8 @@ from lanenet.errors import TrackingLostError
 #: Shares of the distance of two lines within which a third one lies in the middle between them, and how well
 #: it must be seen beside them: it may be dashed.
 _HALF, _MIDDLE_LINE = (0.44, 0.56), 0.8
+#: How much better a line in the middle is seen than what lies beside it, in the middles of the two lanes.
+_CLEAR_MIDDLE = 1.25
 #: How far off the middle of its lane the car may drive, as a share of the lane's width: what is further off
 #: is half of a lane, beside a crack or a shadow that it drives over.
 _OFF_CENTRE = 0.4
@@ -117,7 +119,7 @@ def trace_lane(
     tape = _tape_width(profile, driven, camera_height_cm, settings)
     tapes = profile.tapes(tape)
     if lane_width_cm is None:
-        lane_width_cm = _lane_width(tapes[:driven], profile, camera_height_cm, settings)
+        lane_width_cm = _lane_width(path, tapes, profile, driven, camera_height_cm, settings)
     lane, centre = _best_lane(path, tapes, profile, lane_width_cm, settings)
     band = settings.width_share * lane
     left = _follow(path, tapes, profile, centre + 0.5 * lane, band, settings)
@@ -152,7 +154,12 @@ def _tape_width(profile: EdgeProfile, driven: int, camera_height_cm: float, sett
 
 
 def _lane_width(
-    tapes: Float[np.ndarray, "m c"], profile: EdgeProfile, camera_height_cm: float, settings: TraceSettings
+    path: Path,
+    tapes: Float[np.ndarray, "m c"],
+    profile: EdgeProfile,
+    driven: int,
+    camera_height_cm: float,
+    settings: TraceSettings,
 ) -> float:
     """Distance at which two markings run side by side along the path, one on either side of it.
 
@@ -162,7 +169,7 @@ def _lane_width(
     widths = np.arange(low, high, 2.0 * profile.cell_cm)
     scores = []
     for width in widths:
-        pair = _pair_score(tapes, width / profile.cell_cm)
+        pair = _pair_score(tapes[:driven], width / profile.cell_cm)
         within = int(_OFF_CENTRE * width / profile.cell_cm)
         scores.append(
             np.sqrt(pair[:, profile.half_cells - within : profile.half_cells + within + 1]).max(axis=1).mean()
@@ -172,9 +179,34 @@ def _lane_width(
     if not peaks:
         raise TrackingLostError("no two lines run side by side along the drive, so that its scale is unknown")
     best = max(peaks, key=lambda i: score[i])
-    low, high = (share * widths[best] for share in _HALF)
+    whole = float(widths[best])
+    low, high = (share * whole for share in _HALF)
     halves = [i for i in peaks if low < widths[i] < high and score[i] >= _MIDDLE_LINE * score[best]]
-    return float(widths[max(halves, key=lambda i: score[i]) if halves else best])
+    if not halves:
+        return whole
+    # On a mottled floor the followed specks of any place across the road look half like a line.
+    _, centre = _best_lane(path, tapes, profile, whole, settings)
+    left, middle, right = (
+        _followed_support(path, tapes, profile, centre + share * whole, whole, settings)
+        for share in (0.25, 0.0, -0.25)
+    )
+    if middle < _CLEAR_MIDDLE * max(left, right):
+        return whole
+    return float(widths[max(halves, key=lambda i: score[i])])
+
+
+def _followed_support(
+    path: Path,
+    tapes: Float[np.ndarray, "m c"],
+    profile: EdgeProfile,
+    guess_cm: Float[np.ndarray, "m"],
+    whole_cm: float,
+    settings: TraceSettings,
+) -> float:
+    """Mean support of the marking, or what looks most like one, that runs about these offsets."""
+    followed = _follow(path, tapes, profile, guess_cm, (max(_HALF) - 0.5) * whole_cm, settings)
+    column = np.rint(followed / profile.cell_cm).astype(np.intp) + profile.half_cells
+    return float(tapes[np.arange(len(tapes)), np.clip(column, 0, tapes.shape[1] - 1)].mean())
 
 
 def _pair_score(tapes: Float[np.ndarray, "m c"], width_cells: float) -> Float[np.ndarray, "m c"]:

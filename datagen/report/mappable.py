@@ -28,8 +28,8 @@ _LEAST_SEEN = 0.2
 _LEAST_SHOWN = 0.2
 #: Less than this of one line is clutter that happens to lie along the way.
 _WHOLE_LINE = 0.5
-#: A line of the given lane that is seen along less than this share of the way along which one of another width
-#: is: gaps between dashes leave more.
+#: A line of the given lane that is seen along less than this share of the way along which one of another
+#: width is: gaps between dashes leave more.
 _HARDLY = 0.4
 
 
@@ -159,8 +159,8 @@ def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
 
     The free search alone is no proof: clutter beside a line makes a narrower lane, and the far line of a road
     of two lanes, where the one in its middle is dashed, a wider one. It counts where the weaker line of the
-    given lane is hardly seen beside its own, or where the car keeps to its middle and not to that of the given lane, as on a road
-    of two lanes whose whole width was given.
+    given lane is hardly seen beside its own, or where the car keeps to its middle and not to that of the
+    given lane, as on a road of two lanes whose whole width was given.
     """
     if min(_seen(lane)) < _HARDLY * min(_seen(free)):
         return True

@@ -1,19 +1,22 @@
-"""A coarse camera from the drive alone: focal length and pitch by how well neighbouring pictures fit.
+"""A coarse camera from the drive alone: focal length and pitch by how clearly pictures tell the motion.
 
-This is a start for the bundle adjustment. Pairs of pictures tell the pitch to a degree or two, but the focal
-length hardly at all before a loop is closed, so that what lenses usually have counts, too. The lens is taken
-as an equidistant fisheye with its axis in the image's middle. Scale is not observable: the camera's height is
+This is a start for the bundle adjustment. Seen with the right camera, the edges of a picture meet those of
+the next one at the true motion and nowhere else. That tells the pitch to a few degrees and the focal length
+to a fifth or so before a loop is closed, so that what lenses usually have counts, too. The lens is taken as
+an equidistant fisheye with its axis in the image's middle. Scale is not observable: the camera's height is
 nominal until the lane width sets it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field
 
-from datagen.slam.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.odometry import STEPS_HEIGHTS, at_rim, standing_out, usual_step
 from datagen.slam.picture_pairs import OdometrySettings, Pictures
 from datagen.slam.scans import Progress, seen_edges
 from lanenet.config import Settings
@@ -44,11 +47,14 @@ class GuessSettings(Settings):
     frames: int = Field(default=250, ge=50)
 
 
-#: Steps tried with each camera, relative to the one that suits the best camera so far.
-_AROUND = np.exp(np.linspace(-0.4, 0.4, 9))
+#: Steps tried with each camera, relative to the one that suits the best camera so far, and the part of them
+#: that may be the best: those beyond are what it is compared with.
+_AROUND, _INNER = np.exp(np.linspace(-0.6, 0.6, 13)), slice(2, -2)
+#: Frames that are compared with those before them: while nothing is known of the camera, and then.
+_FIRST_PAIRS, _PAIRS = 20, 40
 #: What a squared logarithm between the focal length and the middle of those to try costs, in log likelihood
-#: per point: the fit alone is flat from the shortest to the longest.
-_FOCAL_PRIOR = 0.5
+#: per point: for half or twice the usual one a tenth to a third of what a clear step is worth.
+_FOCAL_PRIOR = 0.05
 #: Height of the camera before the scale is known.
 NOMINAL_HEIGHT_CM = 15.0
 
@@ -78,7 +84,8 @@ def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings
 class Candidate:
     """One camera of the search, with its best step, in camera heights, and how well it does.
 
-    ``fit`` is the log likelihood per edge point that pairs of pictures have with it, less its prior's.
+    ``fit`` is how much likelier an edge point of a pair of pictures is with this step than with clearly
+    shorter and longer ones, as a logarithm, less the prior's.
     """
 
     focal_px: float
@@ -94,7 +101,7 @@ def coarse_camera(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Camera, list[Candidate]]:
-    """Search focal length and pitch for the best fit of pairs of pictures.
+    """Search focal length and pitch for the camera with which the motion between pictures is clearest.
 
     Returns:
         The camera, and all candidates for the report.
@@ -107,10 +114,15 @@ def coarse_camera(
     tried: dict[tuple[float, float], Candidate] = {}
     grid = [(f * scale, p) for f in guess.focal_px for p in guess.pitch_deg]
     total = len(grid) + 9
-    focal, pitch = (float(np.median(values)) for values in zip(*grid, strict=True))
-    middle = guessed_camera(drive.width, drive.height, focal, pitch, guess)
     relative = np.ones(count)
-    usual, _ = usual_step(_pictures(pixels, middle, perception, seed), relative, np.array(STEPS_HEIGHTS))
+    # Every second camera of the grid, as on a chessboard.
+    spread = [
+        guessed_camera(drive.width, drive.height, f * scale, p, guess)
+        for i, f in enumerate(guess.focal_px)
+        for j, p in enumerate(guess.pitch_deg)
+        if (i + j) % 2 == 0
+    ]
+    usual = clearest_step((_pictures(pixels, camera, perception, seed) for camera in spread), relative)
     usual_focal = float(np.exp(np.mean(np.log(guess.focal_px)))) * scale
     # Two rounds: the given grid, then half its steps around the best.
     for round_index in range(2):
@@ -118,10 +130,13 @@ def coarse_camera(
             if (focal, pitch) not in tried:
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
                 pictures = _pictures(pixels, camera, perception, seed)
-                _, fits = usual_step(pictures, relative, usual * _AROUND)
-                prior = _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2
-                fit = float(fits.max()) / pictures.points_per_frame - float(prior)
-                step = usual * float(_AROUND[np.argmax(fits)])
+                steps = usual * _AROUND
+                _, fits = usual_step(pictures, relative, steps, _PAIRS)
+                # How well a step fits says little: with a camera that looks too far down, standing still
+                # fits better than the truth with the right one.
+                clear = standing_out(fits, steps)[_INNER] / pictures.points_per_frame
+                fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2)
+                step = float(steps[_INNER][np.argmax(clear)])
                 tried[focal, pitch] = Candidate(focal, pitch, step, fit)
             if progress is not None:
                 progress(min(len(tried), total), total)
@@ -133,6 +148,26 @@ def coarse_camera(
             grid = [(best.focal_px + i * df, best.pitch_deg + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     camera = guessed_camera(drive.width, drive.height, best.focal_px, best.pitch_deg, guess)
     return camera, list(tried.values())
+
+
+def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"]) -> float:
+    """The way per frame, in camera heights, with the camera in which one stands out most.
+
+    A camera that is far off has no step that the pictures meet at. What it likes best then lies at either
+    end: next to nothing, which leaves all edges where they are, or more than a picture shows.
+
+    Args:
+        cameras: The same pictures, seen with each camera.
+        relative: Way of each frame relative to the usual one.
+    """
+    steps = np.array(STEPS_HEIGHTS)
+    best, most = float(np.sqrt(steps[0] * steps[-1])), 0.0
+    for pictures in cameras:
+        step, fit = usual_step(pictures, relative, steps, _FIRST_PAIRS)
+        clear = float(standing_out(fit, steps).max()) / pictures.points_per_frame
+        if clear > most and not at_rim(step, steps):
+            best, most = step, clear
+    return best
 
 
 def _spacing(values: tuple[float, ...]) -> float:

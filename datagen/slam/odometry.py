@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float16
+from jaxtyping import Float, Float16, Float32
 
 from datagen.slam.motion_grid import MotionGrid, follow_motion
 from datagen.slam.picture_pairs import Pictures, turns_up_to
@@ -57,7 +57,7 @@ class Odometry:
 
 
 def usual_step(
-    pictures: Pictures, relative: Float[np.ndarray, "n"], steps: Float[np.ndarray, "w"]
+    pictures: Pictures, relative: Float[np.ndarray, "n"], steps: Float[np.ndarray, "w"], pairs: int = _PAIRS
 ) -> tuple[float, Float[np.ndarray, "w"]]:
     """Find the way per frame of usual length that suits pairs from all over the drive.
 
@@ -65,19 +65,20 @@ def usual_step(
         pictures: The drive.
         relative: Way of each frame relative to the usual one.
         steps: Steps to try, each longer than the one before by the same factor, camera heights.
+        pairs: Frames that are compared with those before them, at most.
 
     Returns:
         The step, between the tried ones by a parabola, and the mean fit of each tried one.
     """
     s, n = pictures.settings, len(pictures)
     first = min(max(s.lags), n - 1)
-    frames = np.unique(np.linspace(first, n - 1, min(_PAIRS, n - first)).astype(np.int64))
+    frames = np.unique(np.linspace(first, n - 1, min(pairs, n - first)).astype(np.int64))
     fit = np.zeros(len(steps))
     for k in frames:
         for i, step in enumerate(steps):
             turns = _turns_of(pictures, step * relative[k])
             fit[i] += pictures.fit(int(k), steps[i : i + 1], turns, relative).max() / len(frames)
-    above = _standing_out(fit, steps)
+    above = standing_out(fit, steps)
     log_ratio = float(np.log(steps[1] / steps[0]))
     best = int(np.argmax(above))
     shift = 0.0
@@ -88,7 +89,7 @@ def usual_step(
     return float(steps[best] * np.exp(shift * log_ratio)), fit
 
 
-def _standing_out(fit: Float[np.ndarray, "w"], steps: Float[np.ndarray, "w"]) -> Float[np.ndarray, "w"]:
+def standing_out(fit: Float[np.ndarray, "w"], steps: Float[np.ndarray, "w"]) -> Float[np.ndarray, "w"]:
     """By how much each step fits better than clearly shorter and longer ones."""
     beside = round(float(np.log(_BESIDE) / np.log(steps[1] / steps[0])))
     padded = np.pad(fit, beside, mode="edge")
@@ -140,10 +141,10 @@ def usual_way(
         recorded = usual / height_cm
         steps = recorded * np.array(_GAINS)
         near, near_fit = usual_step(pictures, relative, steps)
-        clearer = _standing_out(fit, any_step).max() > _CLEARLY * _standing_out(near_fit, steps).max()
-        if not (_at_rim(near, steps) or clearer):
+        clearer = standing_out(fit, any_step).max() > _CLEARLY * standing_out(near_fit, steps).max()
+        if not (at_rim(near, steps) or clearer):
             step = near
-        elif _at_rim(step, any_step):
+        elif at_rim(step, any_step):
             step = recorded
     return UsualWay(relative, step, step * height_cm / usual)
 
@@ -160,7 +161,7 @@ def _likelihood(fits: Float32[np.ndarray, "n w t"], temper: float) -> Float16[np
     return result
 
 
-def _at_rim(step: float, steps: Float[np.ndarray, "w"]) -> bool:
+def at_rim(step: float, steps: Float[np.ndarray, "w"]) -> bool:
     """Whether a step lies within about one of either end of those that were tried."""
     half = np.sqrt(steps[1] / steps[0])
     return not steps[1] * half < step < steps[-2] / half

@@ -105,6 +105,7 @@ def solve_segment(
     rng: np.random.Generator,
     progress: Progress | None,
     find_camera: bool = False,
+    believed: Camera | None = None,
 ) -> SolvedSegment:
     """Track one segment, close its loops, and adjust all of it together.
 
@@ -115,7 +116,9 @@ def solve_segment(
         rng: Source of randomness.
         progress: Called with (done, total).
         find_camera: Adjust the camera too.
+        believed: What is believed of the camera, where that is not the camera to start with.
     """
+    believed = camera if believed is None else believed
     height = camera.mounting.height_cm
     limits = mapping_range(height, settings.perception.range)
     edges = road_edges(drive, camera, limits, settings)
@@ -131,7 +134,9 @@ def solve_segment(
     )
     free = _OPEN_LOOP if find_camera else ()
     expected = relative_ways(commands)
-    opened = adjust(edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected)
+    opened = adjust(
+        edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected, believed=believed
+    )
     scans = scans_of(edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
     found = [
@@ -139,7 +144,7 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    closure = _close(edges, opened, matched, settings, rng, free, expected, camera)
+    closure = _close(edges, opened, matched, settings, rng, free, expected, believed)
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
@@ -150,7 +155,7 @@ def solve_segment(
             loops = loop_pairs(closure.revisits, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=expected, believed=camera,
+                loops=loops, tilt=bundle.tilt, expected=expected, believed=believed,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break

@@ -83,6 +83,16 @@ def test_a_car_that_stands_is_refused(tmp_path):
         calibrate_drive(drive, 40.0, None, None, MapSettings())
 
 
+def test_a_car_that_only_reverses_is_refused(tmp_path):
+    with DriveWriter(tmp_path / "d") as writer:
+        rng = np.random.default_rng(0)
+        for k in range(220):
+            image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            writer.add(image, 0.05 * k, speed_cm_s=-20.0, truth=None)
+    with pytest.raises(CalibrationError, match=r"told to reverse in frames .*Drive two laps"):
+        calibrate_drive(tmp_path / "d", 40.0, None, None, MapSettings())
+
+
 def test_lengths_and_sizes_have_to_be_known(tmp_path):
     drive = write_drive(tmp_path / "d", np.arange(60) * 3.0)
     with pytest.raises(CalibrationError, match="the lane's width or the camera's height, found neither"):
@@ -188,10 +198,14 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
     asked: list[float] = []
     lap = np.linspace(0.0, 4.0 * np.pi, 400)
 
-    def solve(drive, camera, settings, rng, progress, find_camera):
+    def solve(drive, camera, settings, rng, progress, find_camera, believed=None):
         asked.append(float(camera.K[0, 0]))
-        # Roll and principal point are believed to be as usual, whatever came out before.
-        assert camera.mounting.roll_rad == 0.0 and camera.K[0, 2] == 79.5 and find_camera
+        # Roll and principal point are believed to be as usual, whatever came out before; the drive is
+        # followed with what a closed loop has found.
+        usual = camera if believed is None else believed
+        assert usual.mounting.roll_rad == 0.0 and usual.K[0, 2] == 79.5 and find_camera
+        once_closed = any(was_closed for _, was_closed in answers[: len(asked) - 1])
+        assert camera.mounting.roll_rad == pytest.approx(0.04 if once_closed else 0.0)
         focal_px, closed = answers[len(asked) - 1]
         adjusted = nudged(nudged(nudged(CAMERA, "roll", 0.04), "cx", 2.0), "focal", np.log(focal_px / 80.0))
         solved = found(lap, 8 if closed else 0).solved

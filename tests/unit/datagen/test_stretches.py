@@ -20,7 +20,7 @@ from datagen.slam.join import Stretch
 from datagen.slam.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.recording import Commands, Drive, ImageFiles
-from lanenet.errors import TrackingLostError
+from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.perception.birdseye import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
@@ -102,8 +102,9 @@ def _map(
     no_edges: tuple[int, ...] = (),
     no_lane: tuple[int, ...] = (),
     one_line: tuple[int, ...] = (),
+    other_lane: tuple[int, ...] = (),
 ) -> list[MappedSegment]:
-    """Map a drive whose stretches of some lengths show no edges, no lane, or one line only."""
+    """Map a drive whose stretches of some lengths show no edges, no lane, one line only, or another lane."""
 
     def solve(part: Drive, *_: object) -> SolvedSegment:
         if len(part) in no_edges:
@@ -114,6 +115,8 @@ def _map(
         n = len(stretch.rows)
         if n in no_lane:
             raise TrackingLostError(f"no pair of lines in {n} frames")
+        if n in other_lane:
+            raise CalibrationError(f"a lane of 30 cm in {n} frames, expected 40 cm")
         lane = TracedLane(np.zeros(2), np.zeros(2), np.zeros(2), 40.0, 2.0)
         # The right line ends early where there is one line only.
         lines = [_line("left", 3.0 * n), _line("right", 0.3 * n if n in one_line else 3.0 * n)]
@@ -132,6 +135,7 @@ def _map(
         ({"no_edges": (70,)}, "70 frames, 3 edge points per frame"),
         ({"no_lane": (70,)}, "no pair of lines in 70 frames"),
         ({"one_line": (70,)}, "one line only bounds the driven lane"),
+        ({"other_lane": (70,)}, "a lane of 30 cm in 70 frames, expected 40 cm"),
     ],
 )
 def test_a_stretch_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, why):
@@ -148,6 +152,8 @@ def test_the_longest_stretch_says_why_nothing_could_be_mapped(monkeypatch):
         _map(monkeypatch, _drive(200, [70]), notes, no_edges=(70,), no_lane=(130,))
     with pytest.raises(TrackingLostError, match="130 frames, 3 edge points"):
         _map(monkeypatch, _drive(200, [70]), notes, no_edges=(130,), no_lane=(70,))
+    with pytest.raises(CalibrationError, match="a lane of 30 cm in 130 frames"):
+        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(70,), other_lane=(130,))
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):

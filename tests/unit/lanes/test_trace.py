@@ -113,6 +113,23 @@ def test_the_lane_width_is_found(lane_cm):
     assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
 
 
+@pytest.mark.parametrize(("dashed", "specks", "lane_cm"), [(False, 250, 60.0), (True, 120, 30.0)])
+@pytest.mark.parametrize("seed", range(2))
+def test_specks_on_the_floor_are_no_line_in_the_middle(seed, dashed, specks, lane_cm):
+    """Two lines 60 cm apart: a line between them makes two lanes, a mottled floor does not."""
+    rng = np.random.default_rng(seed)
+    path = _path()
+    centre, everywhere = _wandering(path), np.ones(len(path.s_cm), dtype=bool)
+    parts = [_tape(rng, centre + side, everywhere) for side in (30.0, -30.0)]
+    parts.append(_clutter(rng, 1500))
+    if dashed:
+        parts.append(_tape(rng, centre, _dashed(path, 22.0)))
+    places = zip(rng.uniform(0.0, path.s_cm[-1], specks), rng.uniform(-27.0, 27.0, specks), strict=True)
+    parts += [_tape(rng, centre + d, np.abs(path.s_cm - s) < 2.5) for s, d in places]
+    lane = trace_lane(path, _edges(*parts), HEIGHT_CM, None, SETTINGS)
+    assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
+
+
 def test_left_and_right_are_mirror_images():
     rng = np.random.default_rng(4)
     path = _path()

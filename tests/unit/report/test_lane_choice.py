@@ -29,7 +29,7 @@ def traced(lane_cm: float, centre_cm: float, left: float, right: float) -> Trace
         # The whole road was given; the middle line is dashed and the car keeps to the right lane.
         (traced(40.0, 1.0, 0.6, 1.0), traced(80.0, 21.0, 1.0, 1.0), True),
         (traced(40.0, 0.0, 1.0, 1.0), traced(40.0, 0.0, 1.0, 1.0), False),
-        # Right, though the far line is solid and that in the middle of the road dashed: the whole road is wider.
+        # Right, though the far line is solid and that in the middle of the road dashed.
         (traced(46.0, 10.0, 1.0, 1.0), traced(23.0, -1.0, 0.8, 1.0), False),
     ],
 )

