@@ -94,8 +94,14 @@ def build_compared(
         elif name == "network":
             # Beside the rows that the model leaves out, those in which this car sees itself.
             mask = hidden_rows(frames) if frames.perception.range.bottom_rows else None
+            # It is told what the lane filter is told; so is the car.
             detectors[name] = build_detector(
-                name, frames.camera, model=model, any_camera=any_camera, mask=mask
+                name,
+                frames.camera,
+                model=model,
+                lane_width_cm=frames.lane_width_cm,
+                any_camera=any_camera,
+                mask=mask,
             )
         else:
             detectors[name] = build_detector(name, frames.camera)
