@@ -209,8 +209,9 @@ class Evidence:
             for k in range(1, n):
                 steps, grid_turns = self.grid.steps, self.grid.turns_rad
                 fits[k] += pictures.fit(k, steps, grid_turns, self.relative, lags, turns)
-                if progress is not None:
-                    progress((number * n + k + 1) // len(rounds), n)
+                done, rest = divmod(number * n + k + 1, len(rounds))
+                if progress is not None and not rest:
+                    progress(done, n)
             if number + 1 < len(rounds):
                 # As strong as all pairs together.
                 self.log_likelihood = _likelihood(fits, s.temper * len(s.lags))

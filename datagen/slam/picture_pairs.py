@@ -35,7 +35,8 @@ class OdometrySettings(Settings):
         sigma_px: Standard deviation of an edge's place across itself, for images up to 320 px wide.
         gain: How much likelier a point of the road falls on an edge of the later picture than off it.
         unseen_share: What a point counts for that leaves the view, as a share of the best mean match that its
-            pair of pictures has with the same step: where they are blurred, no point gains by leaving.
+            pair of pictures has with the same step: where they are blurred, no point gains by leaving. Less,
+            and short steps win, which lose fewer points; more, and sharp turns in blurred pictures are lost.
         temper: Power of the likelihood: neighbouring points share their errors, and so do the lags.
         known_spread: Spread of the speed about the recorded one, times its usual gain, as a logarithm.
         known_keep: Share of that deviation which stays until the next frame.
@@ -51,7 +52,7 @@ class OdometrySettings(Settings):
     points: int = Field(default=80, ge=20)
     sigma_px: float = Field(default=0.5, gt=0.0)
     gain: float = Field(default=10.0, gt=0.0)
-    unseen_share: float = Field(default=0.4, ge=0.0, le=1.0)
+    unseen_share: float = Field(default=0.6, ge=0.0, le=1.0)
     temper: float = Field(default=0.02, gt=0.0)
     known_spread: float = Field(default=0.05, gt=0.0)
     known_keep: float = Field(default=0.95, gt=0.0, lt=1.0)

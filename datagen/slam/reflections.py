@@ -129,11 +129,11 @@ def _goes_on(view: _View) -> Bool[np.ndarray, "n"]:
     row, column = _road_cells(view.points)
     bits = (1 << sector) | (1 << (sector + 1) % _SECTORS) | (1 << (sector - 1) % _SECTORS)
     np.bitwise_or.at(grid, (row, column), bits.astype(np.uint8))
-    grid[[0, -1]] = 0
-    grid[:, [0, -1]] = 0
     # An edge is found from the cells around its own, too.
-    grid[1:-1] |= grid[:-2] | grid[2:]
-    grid[:, 1:-1] |= grid[:, :-2] | grid[:, 2:]
+    for cells in (grid, grid.T):
+        beside = cells.copy()
+        cells[1:] |= beside[:-1]
+        cells[:-1] |= beside[1:]
     tangent = np.stack([-view.normals[:, 1], view.normals[:, 0]], axis=1)
     own = (1 << sector).astype(np.uint8)
     ways = np.array(_ON_STRAIGHT_HEIGHTS)
@@ -144,7 +144,11 @@ def _goes_on(view: _View) -> Bool[np.ndarray, "n"]:
 
 
 def _road_cells(points: Float[np.ndarray, "*k 2"]) -> tuple[Int[np.ndarray, "*k"], Int[np.ndarray, "*k"]]:
-    """Row and column of points of the road; what lies outside goes to the border, which stays empty."""
+    """Row and column of points of the road; what lies outside goes to the border.
+
+    What leads out of the grid, to the car or to the side, may go on there: the border says so where an edge
+    of that direction lies in it.
+    """
     column = np.floor(points[..., 0] / _CELL_HEIGHTS).astype(np.int64) + _SIDE_CELLS + 1
     row = np.floor(points[..., 1] / _CELL_HEIGHTS).astype(np.int64) + 1
     return np.clip(row, 0, _AHEAD_CELLS + 1), np.clip(column, 0, 2 * _SIDE_CELLS + 1)

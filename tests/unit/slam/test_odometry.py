@@ -7,7 +7,6 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
-from datagen.slam.motion_grid import follow_motion
 from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
 from datagen.slam.odometry_kernels import SECTORS, index_edges
 from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
@@ -128,7 +127,7 @@ def test_a_slide_that_is_caught_is_followed(road):
     poses = np.column_stack([np.cumsum(steps, axis=0), heading])
     slid = pixels(TapeRoad(road.points_cm, road.normals, poses), fisheye())
     odometry = Evidence(_pictures(_blurred(slid, 0.5)), np.ones(60), False, HEIGHT_CM).motion()
-    assert np.abs(odometry.poses[:, 2] - heading).max() < np.deg2rad(6.0)
+    assert np.abs(odometry.poses[:, 2] - heading).max() < np.deg2rad(8.0)
     assert odometry.turns_rad[28:34].min() < -0.05
 
 
@@ -221,17 +220,15 @@ def test_points_are_drawn_from_every_direction_alike():
     assert (sector == SECTORS // 4).sum() >= SETTINGS.points // 4
 
 
-def test_half_precision_follows_the_same_motion_in_half_the_memory(edges):
+def test_half_precision_follows_the_same_motion_in_half_the_memory(edges, monkeypatch):
     evidence = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM)
     kept = evidence.motion()
     assert evidence.log_likelihood.nbytes == 2 * 60 * np.prod(evidence.grid.shape)
-    full, s = np.zeros((60, *evidence.grid.shape)), SETTINGS
-    pictures = _pictures(edges)
-    for k in range(1, 60):
-        fit = pictures.fit(k, evidence.grid.steps, evidence.grid.turns_rad, evidence.relative)
-        full[k] = s.temper * (fit - fit.max())
-    steps, turns = follow_motion(
-        evidence.grid, full, evidence.relative, s.turn_walk_rad, np.zeros(60), s.max_curvature_heights
-    )
-    np.testing.assert_allclose(kept.ways_cm[1:], (steps * evidence.relative * HEIGHT_CM)[1:], rtol=2e-3)
-    np.testing.assert_allclose(kept.turns_rad[1:], turns[1:], atol=1e-4)
+
+    def in_full(fits, temper):
+        return temper * (fits.astype(np.float64) - fits.max(axis=(1, 2), keepdims=True))
+
+    monkeypatch.setattr("datagen.slam.odometry._likelihood", in_full)
+    full = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM).motion()
+    np.testing.assert_allclose(kept.ways_cm[1:], full.ways_cm[1:], rtol=2e-3)
+    np.testing.assert_allclose(kept.turns_rad[1:], full.turns_rad[1:], atol=1e-4)
