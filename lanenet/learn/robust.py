@@ -171,11 +171,10 @@ def robust_table(rows: Sequence[RobustRow]) -> TextTable:
         title="Errors in cm when something is wrong",
         header=["change", "model", "RMSE", "95%", "p95", "in 68%", "lines found", "gaps found"],
         lines=lines,
-        note="one line missing: the errors are those of that line where the other one is there, without and "
-        "with the width of the lane; "
-        "heading and offset: up to 15 degrees and 8 cm; 95%: interval of the RMSE over drives; in 68%: "
-        "errors within a standard deviation; found: lines that are there and called so, and lines that are "
-        "not and called absent",
+        note="the network alone, without the car's memory; one line missing: the errors are those of that "
+        "line where the other one is there, with and without the lane's width; heading and offset: up to "
+        "15 degrees and 8 cm; 95%: interval of the RMSE over drives; in 68%: errors within a standard "
+        "deviation; found: lines that are there and called so, and lines that are not and called absent",
         texts=2,
         # With one model every line would be a group of its own.
         last_of_group=rows[-1].model if len({row.model for row in rows}) > 1 else "",
