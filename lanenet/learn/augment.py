@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -26,11 +27,25 @@ from lanenet.learn.presence_kernels import near_lines
 from lanenet.learn.raster_kernels import Grid
 
 Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
-#: Rasters of 0 and 255; labels, [cm], NaN where masked; whether each line is seen: 1, 0 or NaN for unknown.
-Batch = tuple[UInt8[np.ndarray, "b 1 r c"], Float[np.ndarray, "b 6"], Float[np.ndarray, "b 2"]]
 
 #: Where a camera is taken to be whose label set does not say so: right of, ahead of and above the front axle.
 TYPICAL_CAMERA_CM = (0.0, 0.0, 18.0)
+
+
+class Batch(NamedTuple):
+    """Samples as a network takes them.
+
+    Attributes:
+        rasters: Of 0 and 255.
+        points_cm: Labels, [cm]; NaN where masked.
+        present: Whether each line is seen: 1, 0 or NaN for unknown.
+        lane_cm: The lane's width as the network is told it, [cm]; 0 where it is not told.
+    """
+
+    rasters: UInt8[np.ndarray, "b 1 r c"]
+    points_cm: Float[np.ndarray, "b 6"]
+    present: Float[np.ndarray, "b 2"]
+    lane_cm: Float[np.ndarray, "b"]
 
 
 @dataclass(frozen=True)
@@ -66,6 +81,7 @@ def join_frames(
     lines_cm: Sequence[Lines],
     points_cm: Float[np.ndarray, "n 6"],
     camera_cm: Float[np.ndarray, "n 3"] | None = None,
+    lane_cm: Float[np.ndarray, "n"] | None = None,
 ) -> Frames:
     """Lay frames one after the other, as the compiled loops take them.
 
@@ -75,6 +91,7 @@ def join_frames(
         points_cm: Labels of each frame; a point that is masked here stays masked.
         camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
             one for all.
+        lane_cm: Width of the lane of each frame; None where it is not known.
     """
     size = len(edges)
     polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
@@ -94,14 +111,16 @@ def join_frames(
         line_start=_starts(polylines),
         points_cm=np.ascontiguousarray(points_cm, np.float64),
         camera_cm=typical if camera_cm is None else np.ascontiguousarray(camera_cm, np.float64),
+        lane_cm=np.zeros(size) if lane_cm is None else np.ascontiguousarray(lane_cm, np.float64),
     )
 
 
 def plain_batch(frames: Frames, indices: Int[np.ndarray, "b"], window: BirdseyeWindow) -> Batch:
-    """Return rasters, labels and seen lines of frames as they are."""
+    """Return frames as they are, with the lane's width told."""
     rasters, present = _empty(len(indices), window)
     rasterise_frames(rasters, np.asarray(indices, np.int64), frames, _grid(window), present)
-    return rasters, frames.points_cm[indices].astype(np.float32), present
+    labels, lane_cm = (part[indices].astype(np.float32) for part in (frames.points_cm, frames.lane_cm))
+    return Batch(rasters, labels, present, lane_cm)
 
 
 def augment_batch(
@@ -126,15 +145,16 @@ def augment_batch(
             needs two.
 
     Returns:
-        Rasters, labels and seen lines; a sample follows from seed, epoch, stream and frame alone.
+        The changed samples; each follows from seed, epoch, stream and frame alone.
     """
     rasters, present = _empty(len(indices), window)
-    labels = np.empty((len(indices), 6), np.float32)
+    labels, told = np.empty((len(indices), 6), np.float32), np.empty(len(indices), np.float32)
     chosen = np.asarray(indices, np.int64)
     augment_frames(
         rasters,
         labels,
         present,
+        told,
         chosen,
         chosen if streams is None else np.asarray(streams, np.int64),
         seed,
@@ -143,7 +163,7 @@ def augment_batch(
         _grid(window),
         _amounts(settings),
     )
-    return rasters, labels, present
+    return Batch(rasters, labels, present, told)
 
 
 def lines_present(
@@ -164,7 +184,7 @@ def lines_present(
         Left and right: 1 there, 0 not there; NaN in between, and where the place of the line is unknown.
     """
     frames = join_frames([np.asarray(edges, np.float32)], [lines_cm], np.full((1, 6), np.nan))
-    return plain_batch(frames, np.zeros(1, np.int64), window)[2][0]
+    return plain_batch(frames, np.zeros(1, np.int64), window).present[0]
 
 
 def misplaced(

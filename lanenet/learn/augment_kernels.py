@@ -53,6 +53,8 @@ class Amounts(NamedTuple):
     height: float
     pitch_rad: float
     roll_rad: float
+    untold_width: float
+    width_error: float
     limit: int
 
 
@@ -69,6 +71,7 @@ class Frames(NamedTuple):
     line_start: np.ndarray
     points_cm: np.ndarray
     camera_cm: np.ndarray
+    lane_cm: np.ndarray
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -89,8 +92,8 @@ def rasterise_frames(out, indices, frames, grid, present):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, grid, amounts):
-    """Change frames, each by its own draw, and write rasters, labels and which lines the rasters show.
+def augment_frames(out, labels, present, told, indices, streams, seed, epoch, frames, grid, amounts):
+    """Change frames, each by its own draw; write rasters, labels, which lines are seen, the width to tell.
 
     The order is that of the world: paint comes off, the car is put elsewhere, things stand in its way, and
     then all of it is seen through a camera whose mounting is known wrongly.
@@ -163,6 +166,8 @@ def augment_frames(out, labels, present, indices, streams, seed, epoch, frames, 
         for o in range(n_objects):
             mark_outline(raster, corners[o], grid)
         add_clutter(rng, raster, count, grid, amounts)
+        untold, error = next_uniform(rng), next_spread(rng, amounts.width_error, amounts.limit)
+        told[slot] = 0.0 if untold < amounts.untold_width else frames.lane_cm[i] * scale * (1.0 + error)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

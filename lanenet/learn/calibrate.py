@@ -32,8 +32,8 @@ def calibrate_presence(network: LaneNet, val: LaneSamples) -> None:
     called absent, if it does not lie there already.
     """
     gone = AugmentSettings.only(missing_line=0.8, missing_both=0.2)
-    rasters, _, present = val.augmented_batch(np.arange(len(val)), gone, seed=0, epoch=0)
-    odds = answer_rasters(network, rasters).presence_logit.double().cpu().numpy()
-    absent = odds[present == 0.0]
+    batch = val.augmented_batch(np.arange(len(val)), gone, seed=0, epoch=0)
+    odds = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.double().cpu().numpy()
+    absent = odds[batch.present == 0.0]
     if absent.size:
         network.lower_presence(min(max(float(np.quantile(absent, _ABSENT_FOUND)), 0.0), _MOST_SHIFT))

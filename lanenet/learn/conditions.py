@@ -16,7 +16,7 @@ from lanenet.learn.breakdown import nearest_pose_cm
 def lines_seen(labels: LabelSet) -> Float[np.ndarray, "n 2"]:
     """Return whether each frame's raster shows the left and the right line: 1, 0, or NaN for unknown."""
     frames = join_frames(labels.edges, labels.lines, labels.points_cm)
-    return plain_batch(frames, np.arange(len(labels)), labels.meta.window)[2].astype(np.float64)
+    return plain_batch(frames, np.arange(len(labels)), labels.meta.window).present.astype(np.float64)
 
 
 def way_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[np.ndarray, "n"]:

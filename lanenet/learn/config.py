@@ -43,6 +43,8 @@ class AugmentSettings(Settings):
             labels do not.
         pitch_rad: Its pitch is taken wrong by up to this much.
         roll_rad: Its roll likewise.
+        untold_width: Probability that the lane's width is kept from a network that can be told it.
+        width_error: It is told wrongly by up to this share.
         draw: ``even`` draws every amount anew for each sample; ``limit`` takes all amounts at their limits,
             with either sign, for tests of robustness.
     """
@@ -64,6 +66,8 @@ class AugmentSettings(Settings):
     height: float = Field(default=0.03, ge=0.0, le=0.3)
     pitch_rad: float = Field(default=0.0175, ge=0.0, le=0.2)
     roll_rad: float = Field(default=0.0175, ge=0.0, le=0.2)
+    untold_width: float = Field(default=0.3, ge=0.0, le=1.0)
+    width_error: float = Field(default=0.02, ge=0.0, le=0.3)
     draw: Literal["even", "limit"] = "even"
 
     @model_validator(mode="after")
@@ -95,6 +99,8 @@ class NetworkSettings(Settings):
         channels: Output channels of the convolutions: the first divides rows and columns by four, each other
             one by two. None takes those of the kind.
         hidden: Width of the fully connected layer before the outputs; None takes that of the kind.
+        takes_width: The network can be told the lane's width beside the raster. Where lanes of many widths
+            are learned together, that is what tells the lane from two lanes, or from half of one.
         weights: File with pretrained weights of AlexNet as torchvision names them; None starts from random
             ones.
     """
@@ -102,6 +108,7 @@ class NetworkSettings(Settings):
     kind: Literal["nano", "small", "base", "alexnet"] = "small"
     channels: tuple[int, ...] | None = None
     hidden: int | None = Field(default=None, ge=4, le=1024)
+    takes_width: bool = False
     weights: Path | None = None
 
     @field_validator("channels")
@@ -115,6 +122,8 @@ class NetworkSettings(Settings):
     def _check_kind(self) -> NetworkSettings:
         if self.kind == "alexnet" and (self.channels is not None or self.hidden is not None):
             raise ValueError("alexnet has a size of its own: expected neither channels nor hidden")
+        if self.kind == "alexnet" and self.takes_width:
+            raise ValueError("alexnet takes a raster alone: expected takes_width: false")
         if self.kind != "alexnet" and self.weights is not None:
             raise ValueError(f"weights are for alexnet; {self.kind} starts from random ones")
         return self

@@ -87,6 +87,7 @@ class LaneSamples:
             [labels.lines[i] for labels, i in pairs],
             self.points_cm,
             np.array([labels.meta.camera_cm or TYPICAL_CAMERA_CM for labels, _ in pairs]),
+            np.array([labels.meta.lane_width_cm for labels, _ in pairs]),
         )
 
     def __len__(self) -> int:
@@ -98,7 +99,7 @@ class LaneSamples:
         return self.camera_hashes == [ANY_CAMERA]
 
     def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
-        """Return rasters, labels and seen lines of frames as they are."""
+        """Return frames as they are, with the lane's width told."""
         return plain_batch(self.frames, indices, self.window)
 
     def augmented_batch(
@@ -109,7 +110,7 @@ class LaneSamples:
         epoch: int,
         streams: Int[np.ndarray, "b"] | None = None,
     ) -> Batch:
-        """Return rasters, labels and seen lines of frames, each changed by its own draw.
+        """Return frames, each changed by its own draw.
 
         The draw depends on ``seed``, ``epoch`` and the index of the frame alone (or on its number in
         ``streams``), so a sample is the same whatever the batch, the order and the number of workers.

@@ -13,7 +13,7 @@ from lanenet.data.label_set import LabelSet
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES
-from lanenet.perception.network import INPUT_NAME, open_model
+from lanenet.perception.model_file import INPUT_NAME, WIDTH_NAME, open_model
 
 #: From a label set to the six points of each of its frames, [cm], NaN where it has no answer.
 Predictor = Callable[[LabelSet], Float[np.ndarray, "n 6"]]
@@ -157,18 +157,26 @@ class RasterModel:
                 f"{self.path}: made for the window {self.meta.window}, but the label set has {window}"
             )
 
-    def answer(self, rasters: UInt8[np.ndarray, "n 1 r c"]) -> RasterAnswers:
-        """Answer rasters of 0 and 255."""
+    def answer(
+        self, rasters: UInt8[np.ndarray, "n 1 r c"], lane_cm: Float[np.ndarray, "n"] | None = None
+    ) -> RasterAnswers:
+        """Answer rasters of 0 and 255.
+
+        Args:
+            rasters: Bird's-eye rasters.
+            lane_cm: Width of the lane of each, for a model that can be told it; None keeps it from it.
+        """
         n = len(rasters)
         found = {"points_cm": N_POINTS, "sigma_cm": N_POINTS, "presence": len(SIDES)}
         values = {name: np.full((n, width), np.nan) for name, width in found.items()}
         for start in range(0, n, _CHUNK):
             part = rasters[start : start + _CHUNK]
+            feed = {INPUT_NAME: part}
+            if self.meta.takes_width and lane_cm is not None:
+                feed[WIDTH_NAME] = lane_cm[start : start + _CHUNK].astype(np.float32)
             # As on the car: where nothing is seen there is no answer.
             seen = np.asarray(part.any(axis=(1, 2, 3)))[:, None]
-            for name, answer in zip(
-                self._names, self._session.run(self._names, {INPUT_NAME: part}), strict=True
-            ):
+            for name, answer in zip(self._names, self._session.run(self._names, feed), strict=True):
                 values[name][start : start + _CHUNK] = np.where(seen, answer, np.nan)
         if "presence" in self._names:
             # An empty raster shows no line; that is an answer.
@@ -176,14 +184,15 @@ class RasterModel:
         return RasterAnswers(**values)
 
     def answer_labels(self, labels: LabelSet) -> RasterAnswers:
-        """Answer the frames of a label set.
+        """Answer the frames of a label set, whose lane's width is known.
 
         Raises:
             ModelMismatchError: If it has another window.
         """
         self.check_window(labels.meta.window)
         rasters = [labels.raster(i)[None] for i in range(len(labels.points_cm))]
-        return self.answer(np.array(rasters, np.uint8).reshape(-1, 1, *self._shape))
+        lane_cm = np.full(len(rasters), labels.meta.lane_width_cm)
+        return self.answer(np.array(rasters, np.uint8).reshape(-1, 1, *self._shape), lane_cm)
 
     @property
     def _shape(self) -> tuple[int, int]:

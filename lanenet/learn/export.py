@@ -25,7 +25,7 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
-from lanenet.perception.model_file import BATCH_NAME
+from lanenet.perception.model_file import BATCH_NAME, WIDTH_NAME
 from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 
 #: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
@@ -33,6 +33,8 @@ OPSET = 18
 IR_VERSION = 9
 #: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
 TOLERANCE = 1e-3
+#: Widths of the lane that the check tells a network that can be told, after a run without any.
+_CHECKED_WIDTHS_CM = (0.0, 30.0, 60.0)
 #: Rasters that the check takes at a time.
 _BATCH = 256
 
@@ -213,18 +215,24 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
 
 
 def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
-    example = torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)
+    example = [torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)]
+    inputs, shapes = [INPUT_NAME], [{0: torch.export.Dim(BATCH_NAME, min=1)}]
+    if meta.takes_width:
+        # Not one wide: the exporter would take a dimension of one for a constant.
+        example.append(torch.zeros(2))
+        inputs.append(WIDTH_NAME)
+        shapes.append(shapes[0])
     with quiet():
         program = torch.onnx.export(
             deployed,
-            (example,),
+            tuple(example),
             dynamo=True,
             verbose=False,
             external_data=False,
             opset_version=OPSET,
-            input_names=[INPUT_NAME],
+            input_names=inputs,
             output_names=list(OUTPUT_NAMES),
-            dynamic_shapes={INPUT_NAME: {0: torch.export.Dim(BATCH_NAME, min=1)}},
+            dynamic_shapes=tuple(shapes),
         )
     if program is None:
         raise CheckpointError("torch.onnx.export answered nothing, expected a program")
@@ -238,6 +246,8 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
         if "metadata_props" in owner.DESCRIPTOR.fields_by_name:
             owner.ClearField("metadata_props")
     del model.graph.value_info[:]
+    if meta.takes_width:
+        _make_optional(model.graph)
     model.ir_version = IR_VERSION
     model.producer_name = "lanenet"
     model.producer_version = ""
@@ -246,16 +256,27 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
     return model
 
 
+def _make_optional(graph: onnx.GraphProto) -> None:
+    """Let the lane's width be left out of a run, which is to say that it is unknown: 0."""
+    width = next(value for value in graph.input if value.name == WIDTH_NAME)
+    # One for all rasters, or one for each.
+    width.type.tensor_type.shape.dim[0].dim_param = "w"
+    graph.initializer.append(onnx.numpy_helper.from_array(np.zeros(1, np.float32), WIDTH_NAME))
+
+
 def _largest_difference(
     deployed: DeployedLaneNet, session: onnxruntime.InferenceSession, rasters: UInt8[np.ndarray, "n 1 r c"]
 ) -> float:
     off = []
+    widths_cm = _CHECKED_WIDTHS_CM if deployed.network.width_bias is not None else ()
+    feeds: list[dict[str, np.ndarray]] = [{}, *({WIDTH_NAME: np.array([w], np.float32)} for w in widths_cm)]
     for begin in range(0, len(rasters), _BATCH):
         some = rasters[begin : begin + _BATCH]
-        with torch.inference_mode():
-            expected = deployed(torch.from_numpy(some))
-        found = session.run(OUTPUT_NAMES, {INPUT_NAME: some})
-        off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
+        for told in feeds:
+            with torch.inference_mode():
+                expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in told.values()))
+            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | told)
+            off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
     # Not Python's max(), which passes over what is no number.
     return float(np.max(off))
 

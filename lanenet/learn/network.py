@@ -15,9 +15,13 @@ from lanenet.learn.config import NetworkSettings
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]
+#: Widths of a lane that a network tells apart, [cm]: the middles of its bells, evenly spaced by ratio.
+_WIDTHS_CM = (15.0, 20.0, 27.0, 36.0, 48.0, 64.0, 85.0, 114.0)
 #: The predicted standard deviation stays within these, [cm], before it is calibrated.
 SIGMA_RANGE_CM = (0.05, 50.0)
 
+#: Width of a bell, in logarithms of the width: about the distance of two.
+_BELL = 0.25
 _N_OUTPUTS = 2 * N_POINTS + len(SIDES)
 _LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
 
@@ -49,6 +53,10 @@ class LaneNet(nn.Module):
         rows: Rows of the raster.
         columns: Columns of the raster.
 
+    Attributes:
+        width_bias: What the width of the lane adds to the channels of each convolution but the first and to
+            the hidden layer; None if the network is not told it.
+
     Source:
         Kozlowski et al. 2024, section 2.4: AlexNet with its last layers replaced by a regression layer.
     """
@@ -58,6 +66,7 @@ class LaneNet(nn.Module):
         self.rows, self.columns = rows, columns
         self.trunk: nn.Module
         self.head: nn.Module
+        self.width_bias: nn.ModuleList | None = None
         if settings.kind == "alexnet":
             self.trunk, self.head = AlexNetTrunk(), nn.Linear(N_FEATURES, _N_OUTPUTS)
         else:
@@ -66,6 +75,9 @@ class LaneNet(nn.Module):
             self.head = nn.Sequential(
                 nn.Linear(n_features, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, _N_OUTPUTS)
             )
+            if settings.takes_width:
+                told = [nn.Linear(len(_WIDTHS_CM), n, bias=False) for n in (*channels[1:], hidden)]
+                self.width_bias = nn.ModuleList(told)
         # The layers predict (x - mean) / scale, so that all six outputs are of order one.
         self.mean_cm: Tensor
         self.scale_cm: Tensor
@@ -74,17 +86,51 @@ class LaneNet(nn.Module):
         self.register_buffer("mean_cm", torch.zeros(N_POINTS))
         self.register_buffer("scale_cm", torch.ones(N_POINTS))
         self.register_buffer("sigma_factor", torch.ones(N_POINTS))
+        self.log_widths: Tensor
+        self.register_buffer("log_widths", torch.log(torch.tensor(_WIDTHS_CM)), persistent=False)
         # Convolutions of few channels are up to twice as fast on a CPU with the channels side by side.
         self.to(memory_format=torch.channels_last)
 
-    def forward(self, raster: Float[Tensor, "n 1 r c"]) -> LaneOutput:
-        """Find the lane in rasters with values 0..1."""
-        outputs: Tensor = self.head(self.trunk(raster))
+    def forward(
+        self, raster: Float[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"] | None = None
+    ) -> LaneOutput:
+        """Find the lane in rasters with values 0..1.
+
+        Args:
+            raster: Bird's-eye rasters.
+            lane_cm: Width of the lane of each, or of all; 0 where it is not known. None is not known for all.
+        """
+        if self.width_bias is None or lane_cm is None:
+            outputs: Tensor = self.head(self.trunk(raster))
+        else:
+            outputs = self._of_width(raster, lane_cm)
         points, spread, presence = torch.split(outputs, [N_POINTS, N_POINTS, len(SIDES)], dim=1)
         middle, half = 0.5 * (_LOG_LOW + _LOG_HIGH), 0.5 * (_LOG_HIGH - _LOG_LOW)
         # A soft limit: a hard one has no gradient beyond it.
         sigma = torch.exp(middle + half * torch.tanh(spread / half)) * self.sigma_factor
         return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
+
+    def _of_width(
+        self, raster: Float[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"]
+    ) -> Float[Tensor, "n k"]:
+        """Pass through the layers, each with the bias that the width gives it."""
+        assert self.width_bias is not None
+        assert isinstance(self.trunk, nn.Sequential)
+        assert isinstance(self.head, nn.Sequential)
+        bells = torch.log(lane_cm.clamp(min=1.0)[:, None]) - self.log_widths
+        code = torch.exp(-0.5 * (bells / _BELL) ** 2) * (lane_cm > 0.0)[:, None]
+        x, biases = raster, [layer(code) for layer in self.width_bias]
+        n_norms = 0
+        for layer in self.trunk:
+            x = layer(x)
+            if isinstance(layer, nn.BatchNorm2d):
+                if n_norms:
+                    x = x + biases[n_norms - 1][:, :, None, None]
+                n_norms += 1
+        hidden = self.head[0](x) + biases[-1]
+        for layer in self.head[1:]:
+            hidden = layer(hidden)
+        return hidden
 
     @torch.no_grad()
     def lower_presence(self, by: float) -> None:
@@ -110,7 +156,7 @@ class DeployedLaneNet(nn.Module):
         self.register_buffer("parabola_from_points", matrix)
 
     def forward(
-        self, raster: UInt8[Tensor, "n 1 r c"]
+        self, raster: UInt8[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"] | None = None
     ) -> tuple[
         Float[Tensor, "n 6"],
         Float[Tensor, "n 6"],
@@ -123,6 +169,7 @@ class DeployedLaneNet(nn.Module):
 
         Args:
             raster: Bird's-eye rasters, 255 where there is an edge, 0 elsewhere.
+            lane_cm: As in :meth:`LaneNet.forward`.
 
         Returns:
             The six points, [cm]; their standard deviations, [cm]; probability that the left and the right
@@ -132,7 +179,7 @@ class DeployedLaneNet(nn.Module):
         Source:
             Steering: Kozlowski et al. 2024, eq. 3. The centre is ahead, so atan equals atan2 here.
         """
-        output: LaneOutput = self.network(raster.to(torch.float32) * (1.0 / 255.0))
+        output: LaneOutput = self.network(raster.to(torch.float32) * (1.0 / 255.0), lane_cm)
         lines = output.points_cm.reshape(-1, 2, len(ROWS_CM))
         middle_row = ROWS_CM.index(LOOKAHEAD_CM)
         centre = lines[:, :, middle_row].mean(dim=1, keepdim=True)

@@ -41,13 +41,18 @@ class Answers:
         return point_errors(self.points_cm, self.truth_cm, self.reference)
 
 
-def answer_rasters(network: LaneNet, rasters: UInt8[np.ndarray, "n 1 r c"]) -> LaneOutput:
-    """Run a network over rasters of 0 and 255; it is left in the mode in which it was."""
+def answer_rasters(
+    network: LaneNet, rasters: UInt8[np.ndarray, "n 1 r c"], lane_cm: Float[np.ndarray, "n"]
+) -> LaneOutput:
+    """Run a network over rasters of 0 and 255, of lanes so wide; it is left in the mode in which it was."""
     was_training, device = network.training, network.mean_cm.device
     network.eval()
     with torch.inference_mode():
         parts = [
-            network(input_of_rasters(torch.from_numpy(rasters[start : start + _BATCH]).to(device)))
+            network(
+                input_of_rasters(torch.from_numpy(rasters[start : start + _BATCH]).to(device)),
+                torch.from_numpy(lane_cm[start : start + _BATCH]).to(device),
+            )
             for start in range(0, len(rasters), _BATCH)
         ]
     network.train(was_training)
@@ -59,9 +64,10 @@ def predict(network: LaneNet, samples: LaneSamples) -> Answers:
     parts: list[tuple[np.ndarray, ...]] = []
     for start in range(0, len(samples), _BATCH):
         # A batch at a time: the rasters of many frames take more memory than the frames.
-        rasters, _, present = samples.plain_batch(np.arange(start, min(start + _BATCH, len(samples))))
-        output = answer_rasters(network, rasters)
+        batch = samples.plain_batch(np.arange(start, min(start + _BATCH, len(samples))))
+        output = answer_rasters(network, batch.rasters, batch.lane_cm)
         values = (output.points_cm, output.sigma_cm, torch.sigmoid(output.presence_logit))
-        parts.append((*(v.cpu().numpy().astype(np.float64) for v in values), present.astype(np.float64)))
+        present = batch.present.astype(np.float64)
+        parts.append((*(v.cpu().numpy().astype(np.float64) for v in values), present))
     points, sigma, presence, present = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Answers(points, sigma, presence, samples.points_cm, present, samples.reference)

@@ -74,6 +74,7 @@ def write_checkpoint(
         reference=errors.reference,
         perception=samples.perception,
         lane_width_range_cm=samples.lane_widths_cm,
+        takes_width=settings.network.takes_width,
     )
     rasters = _spread_rasters(val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
@@ -107,7 +108,7 @@ def write_checkpoint(
 def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:
     """Return rasters of frames that are spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
-    return samples.plain_batch(chosen)[0]
+    return samples.plain_batch(chosen).rasters
 
 
 def presence_figures(answers: Answers) -> dict[str, float]:

@@ -104,10 +104,10 @@ def measure_robustness(
     widths_cm = np.repeat([labels.meta.lane_width_cm for labels in label_sets], np.diff(samples.set_start))
     rows = []
     for done, change in enumerate(CHANGES, start=1):
-        rasters, truth, visible = samples.augmented_batch(indices, change_settings(change), _SEED, 0)
-        truth_cm = truth.astype(np.float64)
+        batch = samples.augmented_batch(indices, change_settings(change), _SEED, 0)
+        truth_cm, visible = batch.points_cm.astype(np.float64), batch.present
         for name, model in models.items():
-            answers = model.answer(rasters)
+            answers = model.answer(batch.rasters, batch.lane_cm)
             if change in _WIDTH_KNOWN:
                 answers = _with_width(answers, widths_cm)
             errors: Float[np.ndarray, "n 6"] = np.abs(answers.points_cm - truth_cm)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lanenet.data.label_set import read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
+from lanenet.learn.augment import Batch
 from lanenet.learn.calibrate import calibrate_presence, calibrate_sigma
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
@@ -170,14 +171,14 @@ class TrainingRun:
             settings.augment, settings.seed, epoch, settings.batch_size, balance=settings.balance
         )
         with _random_numbers(settings.seed, epoch, self.device):
-            for rasters, labels, present in batches:
+            for batch in batches:
                 rate = learning_rate_at(self.step, self.total, settings)
-                targets = torch.from_numpy(labels).to(self.device)
-                points = self._step(rasters, targets, torch.from_numpy(present).to(self.device), rate)
+                targets = torch.from_numpy(batch.points_cm).to(self.device)
+                points = self._step(batch, targets, rate)
                 error = (points - targets)[torch.isfinite(targets)]
                 squares += float((error * error).sum())
                 count += error.numel()
-                n_samples += len(rasters)
+                n_samples += len(targets)
                 if not math.isfinite(squares):
                     raise LanenetError(
                         f"training diverged in epoch {epoch + 1}: the error is not finite; lower "
@@ -197,10 +198,13 @@ class TrainingRun:
         self.history.append(record)
         return record
 
-    def _step(self, rasters: np.ndarray, targets: Tensor, present: Tensor, rate: float) -> Tensor:
+    def _step(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:
         """Take one step; answers the points that it started from."""
         set_learning_rate(self.optimizer, rate)
-        output = self.network(input_of_rasters(torch.from_numpy(rasters).to(self.device)))
+        rasters, present, lane_cm = (
+            torch.from_numpy(part).to(self.device) for part in (batch.rasters, batch.present, batch.lane_cm)
+        )
+        output = self.network(input_of_rasters(rasters), lane_cm)
         self.optimizer.zero_grad(set_to_none=True)
         loss = lane_loss(output, targets, present, self.settings.loss)
         loss.backward()  # type: ignore[no-untyped-call]

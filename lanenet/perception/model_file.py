@@ -21,6 +21,8 @@ FORMAT = "lanenet-model/2"
 #: Of models from before the network told its uncertainty; they are still read.
 FORMAT_WITHOUT_SIGMA = "lanenet-model/1"
 INPUT_NAME = "raster"
+#: Input of a network that can be told the lane's width, [cm]; it may be left out, and 0 is unknown.
+WIDTH_NAME = "lane_width_cm"
 #: The dimension of inputs and outputs that counts the rasters.
 BATCH_NAME = "n"
 OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
@@ -56,6 +58,7 @@ class ModelMeta:
         lane_width_range_cm: The narrowest and the widest lane of its training data; None if all had the mean
             width.
         tells_sigma: False for a model of the older format, which has no outputs for spread and presence.
+        takes_width: It can be told the lane's width beside the raster.
     """
 
     window: BirdseyeWindow
@@ -68,6 +71,7 @@ class ModelMeta:
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
     lane_width_range_cm: tuple[float, float] | None = None
     tells_sigma: bool = True
+    takes_width: bool = False
 
     @property
     def any_camera(self) -> bool:
@@ -97,6 +101,7 @@ class ModelMeta:
             "rmse_cm": json.dumps(errors),
             "reference": self.reference,
             "perception": self.perception.model_dump_json(),
+            "takes_width": json.dumps(self.takes_width),
         }
 
     @staticmethod
@@ -140,6 +145,7 @@ class ModelMeta:
                 perception=check_settings(PerceptionSettings, value("perception"), "perception"),
                 lane_width_range_cm=None if widths is None else (float(widths[0]), float(widths[1])),
                 tells_sigma=found == FORMAT,
+                takes_width="takes_width" in properties and value("takes_width") is True,
             )
         except (TypeError, ValueError, IndexError, ConfigError) as error:
             raise ModelMismatchError(f"{where}: unreadable description ({error})") from None
@@ -180,6 +186,12 @@ def open_model(
     expected = {INPUT_NAME: ("tensor(uint8)", [1, meta.window.rows, meta.window.columns])}
     if inputs != expected:
         raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
+    may_be_told = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
+    if may_be_told != meta.takes_width:
+        has = "has an" if may_be_told else "has no"
+        raise ModelMismatchError(
+            f"{path}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
+        )
     outputs = [o.name for o in session.get_outputs()]
     wanted = [name for name in OUTPUT_NAMES if meta.tells_sigma or name not in _NEW_OUTPUTS]
     if not set(wanted) <= set(outputs):

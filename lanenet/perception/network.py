@@ -20,6 +20,7 @@ from lanenet.perception.model_file import (
     ANY_CAMERA,
     INPUT_NAME,
     OUTPUT_NAMES,
+    WIDTH_NAME,
     ModelMeta,
     open_model,
     read_model_meta,
@@ -75,7 +76,8 @@ class NetworkDetector:
             mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
                 leave out.
             memory: Rebuild the line that a frame lacks from the other one and the lane's width.
-            lane_width_cm: That width, if it is known; None takes it from the frames that show both lines.
+            lane_width_cm: That width, if it is known, which a network that can be told it is told; None takes
+                it from the frames that show both lines.
 
         Raises:
             CalibrationError: If the mask's size is not the camera's.
@@ -93,6 +95,9 @@ class NetworkDetector:
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
+        self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster}
+        if self.meta.takes_width and lane_width_cm is not None:
+            self._feed[WIDTH_NAME] = np.array([lane_width_cm], np.float32)
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
         """Find the lane in one frame.
@@ -117,10 +122,10 @@ class NetworkDetector:
         if raster.base is not self._raster and raster is not self._raster:
             self._raster[0, 0] = raster
         if self.meta.tells_sigma:
-            found = self._session.run(("points_cm", "sigma_cm", "presence"), {INPUT_NAME: self._raster})
+            found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
             points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         else:
-            (points,) = self._session.run(("points_cm",), {INPUT_NAME: self._raster})
+            (points,) = self._session.run(("points_cm",), self._feed)
             points_cm, sigma_cm = np.asarray(points[0], np.float64), np.array(self.meta.rmse_cm)
             presence = np.full(len(SIDES), min(1.0, n_cells / _ENOUGH_CELLS))
         if self.memory is not None:

@@ -39,6 +39,8 @@ NOTHING = AugmentSettings(
     height=0.0,
     pitch_rad=0.0,
     roll_rad=0.0,
+    untold_width=0.0,
+    width_error=0.0,
 )
 LABELS = make_label_set(12, seed=5)
 EDGES = LABELS.edges
@@ -178,7 +180,7 @@ def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
     fine, seen = BirdseyeWindow(), set()
     for seed in range(8):
         gone = NOTHING.model_copy(update={"missing_line": 1.0})
-        rasters, _, present = augment_batch(frames, ALL[:1], fine, gone, seed, 0)
+        rasters, _, present, _ = augment_batch(frames, ALL[:1], fine, gone, seed, 0)
         kept = [parts[2], right] if present[0, 0] == 0.0 else parts
         np.testing.assert_array_equal(rasters[0, 0], fine.rasterise(np.concatenate(kept)[:, :2]))
         seen.add(tuple(present[0].tolist()))
@@ -263,7 +265,9 @@ def test_doubled_points_lie_beside_the_others():
 def test_missing_lines_are_not_present_and_the_labels_stay():
     fine = BirdseyeWindow()
     for changes, expected in (({}, [2.0]), ({"missing_line": 1.0}, [1.0]), ({"missing_both": 1.0}, [0.0])):
-        rasters, points, present = augment_batch(FRAMES, ALL, fine, NOTHING.model_copy(update=changes), 0, 0)
+        rasters, points, present, _ = augment_batch(
+            FRAMES, ALL, fine, NOTHING.model_copy(update=changes), 0, 0
+        )
         np.testing.assert_array_equal(np.unique(present.sum(axis=1)), expected)
         assert np.isfinite(points).all()
         if changes == {"missing_both": 1.0}:
@@ -335,10 +339,34 @@ def test_an_empty_frame_can_be_augmented():
     frames = join_frames([edges], [lines], np.full((1, 6), np.nan))
     changes = {"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0, "clutter_share": 1.0}
     one = np.array([0])
-    rasters, points, present = augment_batch(frames, one, WINDOW, NOTHING.model_copy(update=changes), 0, 0)
+    rasters, points, present, _ = augment_batch(frames, one, WINDOW, NOTHING.model_copy(update=changes), 0, 0)
     assert not rasters.any() and np.isnan(points).all() and np.isnan(present).all()
 
 
 def test_lines_cannot_be_missing_more_than_always():
     with pytest.raises(ValidationError, match="sum to at most 1"):
         AugmentSettings(missing_line=0.8, missing_both=0.3)
+
+
+def test_the_width_to_tell_grows_with_the_scale_and_is_kept_from_some():
+    frames = join_frames(EDGES, LABELS.lines, LABELS.points_cm, lane_cm=np.full(len(EDGES), 40.0))
+    assert (plain_batch(frames, ALL, WINDOW).lane_cm == 40.0).all()
+    wide = augment_batch(
+        frames, ALL, WINDOW, NOTHING.model_copy(update={"scale": 0.2, "draw": "limit"}), 0, 0
+    )
+    # Lanes of 40 cm that have become wider or narrower: what is told is what the labels show.
+    np.testing.assert_allclose(np.unique(wide.lane_cm), (40.0 / 1.2, 48.0), rtol=1e-5)
+    for told, points in zip(wide.lane_cm, wide.points_cm, strict=True):
+        assert points[4] - points[1] == pytest.approx(told * lane_over_cosine(points), rel=0.02)
+    many = np.zeros(4000, np.int64)
+    changed = NOTHING.model_copy(update={"untold_width": 0.3, "width_error": 0.05})
+    told = augment_batch(frames, many, WINDOW, changed, 0, 0, streams=np.arange(4000)).lane_cm
+    assert (told == 0.0).mean() == pytest.approx(0.3, abs=0.03)
+    assert told[told > 0.0].min() == pytest.approx(38.0, abs=0.1)
+    assert told.max() == pytest.approx(42.0, abs=0.1)
+
+
+def lane_over_cosine(points):
+    """How much longer the way across a lane along x is than its width, from the slope of its middle."""
+    slope = (points[2] + points[5] - points[0] - points[3]) / 60.0
+    return np.hypot(1.0, slope)

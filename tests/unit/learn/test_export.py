@@ -16,8 +16,8 @@ from lanenet.data.label_set import write_labels
 from lanenet.errors import CheckpointError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
-from lanenet.learn.config import LearnSettings
-from lanenet.learn.evaluate import network_predictor
+from lanenet.learn.config import LearnSettings, NetworkSettings
+from lanenet.learn.evaluate import RasterModel, network_predictor
 from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
 from lanenet.perception.network import ModelMeta, read_model_meta
@@ -156,3 +156,37 @@ def test_an_output_that_is_no_number_is_a_difference(tmp_path):
     network.mean_cm[0] = math.nan
     with pytest.raises(CheckpointError, match="differs from PyTorch by nan"):
         export_onnx(network, META, RASTERS, tmp_path / "m.onnx")
+
+
+def test_the_width_of_the_lane_may_be_told_to_all_or_to_each_or_left_out(tmp_path):
+    settings = NetworkSettings(channels=(4, 8), hidden=8, takes_width=True)
+    network = new_network(settings, WINDOW.rows, WINDOW.columns, 1).eval()
+    meta = replace(META, takes_width=True)
+    assert export_onnx(network, meta, RASTERS, tmp_path / "m.onnx") < 1e-3
+    assert read_model_meta(tmp_path / "m.onnx").takes_width
+    session = onnxruntime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
+    # Who knows of rasters only is not asked for more.
+    assert [i.name for i in session.get_inputs()] == ["raster"]
+    deployed = DeployedLaneNet(network).eval()
+    for widths in (None, [30.0], [0.0], [30.0, 0.0, 60.0, 45.0, 25.0]):
+        told = None if widths is None else np.array(widths, np.float32)
+        feed = {"raster": RASTERS} | ({} if told is None else {"lane_width_cm": told})
+        with torch.inference_mode():
+            expected = deployed(torch.from_numpy(RASTERS), None if told is None else torch.from_numpy(told))
+        np.testing.assert_allclose(session.run(["points_cm"], feed)[0], expected[0].numpy(), atol=1e-3)
+    labels = make_label_set(3, 3)
+    found = RasterModel(tmp_path / "m.onnx").answer_labels(labels).points_cm
+    with torch.inference_mode():
+        expected = network(
+            input_of_rasters(torch.from_numpy(RASTERS[:3])), torch.tensor([labels.meta.lane_width_cm])
+        )
+    np.testing.assert_allclose(found, expected.points_cm.numpy(), atol=1e-3)
+
+
+def test_a_description_that_does_not_fit_the_width_is_refused(tmp_path):
+    export_onnx(make_network(), META, RASTERS, tmp_path / "m.onnx")
+    model = onnx.load(tmp_path / "m.onnx")
+    onnx.helper.set_model_props(model, replace(META, takes_width=True).to_properties())
+    onnx.save(model, tmp_path / "m.onnx")
+    with pytest.raises(ModelMismatchError, match=r"has no input lane_width_cm, .* takes_width: True"):
+        read_model_meta(tmp_path / "m.onnx")

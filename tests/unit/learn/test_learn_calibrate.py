@@ -15,8 +15,8 @@ SAMPLES = LaneSamples([make_label_set(400, 3)], ["set"])
 def network_that_says(odds):
     """Of random weights, but for the mean of what it says of the lines."""
     network = new_network(NetworkSettings(kind="nano"), WINDOW.rows, WINDOW.columns, seed=0).eval()
-    rasters = SAMPLES.plain_batch(np.arange(len(SAMPLES)))[0]
-    found = answer_rasters(network, rasters).presence_logit.mean(dim=0)
+    batch = SAMPLES.plain_batch(np.arange(len(SAMPLES)))
+    found = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.mean(dim=0)
     with torch.no_grad():
         network.head[-1].bias[-2:] += odds - found
     return network
@@ -24,9 +24,9 @@ def network_that_says(odds):
 
 def absent_found(network):
     gone = AugmentSettings.only(missing_line=0.8, missing_both=0.2)
-    rasters, _, present = SAMPLES.augmented_batch(np.arange(len(SAMPLES)), gone, seed=8, epoch=0)
+    rasters, _, present, lane_cm = SAMPLES.augmented_batch(np.arange(len(SAMPLES)), gone, seed=8, epoch=0)
     assert (present == 0.0).any(axis=1).all()
-    said = answer_rasters(network, rasters).presence_logit.numpy() >= 0.0
+    said = answer_rasters(network, rasters, lane_cm).presence_logit.numpy() >= 0.0
     return 1.0 - said[present == 0.0].mean()
 
 

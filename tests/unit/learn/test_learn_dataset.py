@@ -29,7 +29,7 @@ def test_frames_of_two_sets_stay_in_order(tmp_path):
     assert len(both) == 7
     assert both.camera_hashes == ["cam0", "cam1"]
     assert both.reference == "map and truth"
-    rasters, points, present = both.plain_batch(np.array([5, 0]))
+    rasters, points, present, _ = both.plain_batch(np.array([5, 0]))
     np.testing.assert_array_equal(rasters[0, 0], b.raster(2))
     np.testing.assert_allclose(points[1], a.points_cm[0], atol=1e-4)
     np.testing.assert_array_equal(present, np.ones((2, 2)))
@@ -87,7 +87,7 @@ def test_an_epoch_shows_each_sample_once_in_an_order_of_its_own():
     data = samples(49)
     plain = AugmentSettings(mirror=0.0, shift_cm=0.0, rotate_rad=0.0)
     first, second = (
-        np.concatenate([points for _, points, _ in data.epoch(plain, 0, epoch, 8)]) for epoch in (0, 1)
+        np.concatenate([batch.points_cm for batch in data.epoch(plain, 0, epoch, 8)]) for epoch in (0, 1)
     )
     # 49 = 6 x 8 + 1: the single last sample is left out.
     assert len(first) == 48 and data.steps_per_epoch(8) == 6
@@ -102,6 +102,7 @@ def test_cars_and_their_rows_may_differ():
     both = LaneSamples([a, b], ["a", "b"])
     assert both.wheelbase_cm == pytest.approx(22.0) and both.lane_width_cm == pytest.approx(45.0)
     assert both.lane_widths_cm == (40.0, 60.0)
+    np.testing.assert_array_equal(both.plain_batch(np.array([0, 3])).lane_cm, (40.0, 60.0))
     # Only where all leave out the same rows the network may, too.
     assert both.perception.range.bottom_rows == 0
     assert LaneSamples([b, b], ["b", "b"]).perception.range.bottom_rows == 12

@@ -141,3 +141,29 @@ def test_deployed_outputs_follow_from_the_points():
     np.testing.assert_allclose(steering[:, 0], expected, atol=1e-6)
     # The lane lies to the right here (centre 1.5 cm), and right is negative.
     assert (centre > 0).all() and (steering < 0).all()
+
+
+def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
+    network = new_network(NetworkSettings(channels=(4, 8), hidden=8, takes_width=True), 24, 32, 0).eval()
+    raster = torch.rand(3, 1, 24, 32)
+    with torch.inference_mode():
+        unknown, zero = network(raster), network(raster, torch.zeros(1))
+        narrow, mixed = (
+            network(raster, torch.full((3,), 25.0)),
+            network(raster, torch.tensor([25.0, 0.0, 50.0])),
+        )
+    assert torch.equal(unknown.points_cm, zero.points_cm)
+    assert not torch.allclose(narrow.points_cm, unknown.points_cm)
+    torch.testing.assert_close(mixed.points_cm[0], narrow.points_cm[0])
+    torch.testing.assert_close(mixed.points_cm[1], unknown.points_cm[1])
+    # Widths that differ by a tenth are told apart, all over the range, and it ends softly.
+    widths = torch.arange(10.0, 150.0, 1.0)
+    with torch.inference_mode():
+        hidden = torch.stack([network(raster[:1], w.reshape(1)).points_cm[0] for w in widths])
+    assert torch.isfinite(hidden).all()
+    assert (hidden[1:] - hidden[:-1]).norm(dim=1)[5:100].min() > 0.0
+    plain = new_network(NetworkSettings(channels=(4, 8), hidden=8), 24, 32, 0).eval()
+    with torch.inference_mode():
+        assert torch.equal(plain(raster).points_cm, plain(raster, torch.full((3,), 25.0)).points_cm)
+    with pytest.raises(ValueError, match="takes a raster alone"):
+        NetworkSettings(kind="alexnet", takes_width=True)

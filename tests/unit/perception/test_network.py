@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
@@ -42,6 +43,15 @@ def model_path(tmp_path_factory):
     network.mean_cm.copy_(torch.from_numpy(LANE))
     raster = np.where(np.random.default_rng(0).random((2, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
     export_onnx(network, META, raster, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def width_model_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("width_model") / "model.onnx"
+    network = new_network(NetworkSettings(channels=(4, 8), hidden=8, takes_width=True), 24, 32, 0).eval()
+    raster = np.where(np.random.default_rng(0).random((2, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
+    export_onnx(network, replace(META, takes_width=True), raster, path)
     return path
 
 
@@ -250,3 +260,17 @@ def test_a_frame_of_noise_gives_no_lane(model_path):
     noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
     estimate = NetworkDetector(model_path, CAMERA).detect(noise)
     assert not estimate.mask.any() and estimate.confidence == 0.0
+
+
+def test_a_network_that_can_be_told_the_width_is_told_it(width_model_path):
+    frame = striped_frame()
+    answers = [
+        NetworkDetector(width_model_path, CAMERA, memory=False, lane_width_cm=width).detect(frame).points_cm
+        for width in (None, 25.0, 60.0)
+    ]
+    session = onnxruntime.InferenceSession(width_model_path, providers=["CPUExecutionProvider"])
+    raster = WINDOW.rasterise(make_extractor().extract(frame).points_cm)[None, None]
+    for found, width in zip(answers, (0.0, 25.0, 60.0), strict=True):
+        told = {"raster": raster, "lane_width_cm": np.array([width], np.float32)}
+        np.testing.assert_allclose(found, session.run(["points_cm"], told)[0][0], atol=1e-5)
+    assert not np.allclose(answers[0], answers[1]) and not np.allclose(answers[1], answers[2])
