@@ -17,6 +17,10 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
         "radius of the lane at y = 15 cm",
         (("over 3 m", 0.0), ("1 to 3 m", 1.0 / 300.0), ("under 1 m", 0.01)),
     ),
+    "lines": (
+        "lines of the lane that the frame shows",
+        (("none", 0.0), ("partly", 0.5), ("one", 1.0), ("both", 2.0)),
+    ),
     "light": (
         "mean grey level of the frame, 0 to 255",
         (("under 60", 0.0), ("60 to 140", 60.0), ("over 140", 140.0)),
@@ -99,6 +103,12 @@ def lane_curvature(points_cm: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n"
     total = np.where(known, curvature, 0.0).sum(axis=1)
     with np.errstate(invalid="ignore"):
         return np.abs(np.where(known.any(axis=1), total / known.sum(axis=1), np.nan))
+
+
+def lines_shown(visible: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    """Return how many lines frames show: a piece that is too short to count as seen is half of one."""
+    shown: Float[np.ndarray, "n"] = np.where(np.isfinite(visible), visible, 0.5).sum(axis=1)
+    return np.where(np.isfinite(visible).any(axis=1), shown, np.nan)
 
 
 def errors_by_group(

@@ -16,6 +16,7 @@ from lanenet.learn.breakdown import (
     doubt_of,
     errors_by_group,
     lane_curvature,
+    lines_shown,
     presence_of,
     rmse_interval_cm,
 )
@@ -204,12 +205,14 @@ def _break_down(
             unknown = [np.full(len(source.truth_cm), np.nan) for source in sources]
             parts = [s.conditions.get(condition, u) for s, u in zip(sources, unknown, strict=True)]
             values[condition] = np.concatenate(parts)
+    ends = np.cumsum([len(source.truth_cm) for source in sources])[:-1]
+    visible = _joined(sources, [s.visible for s in sources], 2)
+    if np.isfinite(visible).any():
+        values["lines"] = lines_shown(visible)
     groups = {
         condition: {n: errors_by_group(condition, value, errors_cm[n], labelled) for n in names}
         for condition, value in values.items()
     }
-    ends = np.cumsum([len(source.truth_cm) for source in sources])[:-1]
-    visible = _joined(sources, [s.visible for s in sources], 2)
     doubt, presence, interval = {}, {}, {}
     for name in names:
         # The same drives are drawn for every detector.

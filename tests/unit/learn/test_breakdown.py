@@ -14,6 +14,7 @@ from lanenet.learn.breakdown import (
     doubt_of,
     errors_by_group,
     lane_curvature,
+    lines_shown,
     nearest_pose_cm,
     presence_of,
     rmse_interval_cm,
@@ -49,6 +50,14 @@ def test_groups_take_the_frames_between_their_limits():
     assert [g.truth_count for g in groups.values()] == [12, 6, 6]
     assert [g.worst_cm for g in groups.values()] == [1.0, 2.0, 4.0]
     assert groups["over 140"].coverage == 0.5
+
+
+def test_a_frame_shows_none_one_or_both_lines():
+    visible = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [NAN, 0.0], [1.0, NAN], [NAN, NAN]])
+    shown = lines_shown(visible)
+    np.testing.assert_array_equal(shown, [0.0, 1.0, 2.0, 0.5, 1.5, NAN])
+    groups = errors_by_group("lines", shown, np.tile(np.arange(6.0)[:, None], (1, 6)), np.ones((6, 6), bool))
+    assert [(g.count, g.worst_cm) for g in groups.values()] == [(6, 0.0), (6, 3.0), (12, 4.0), (6, 2.0)]
 
 
 def test_the_interval_is_over_drives_and_not_over_frames():
