@@ -92,7 +92,7 @@ def judge(
     speed: Annotated[float | None, typer.Option(min=1.0, help="Speed, cm/s; default 60.")] = None,
     law: Annotated[
         str | None,
-        typer.Option(help="pure-pursuit (default), proportional, or own: the detector's own steering."),
+        typer.Option(help="proportional (default), pure-pursuit, or own: the detector's own steering."),
     ] = None,
     put_back: Annotated[
         bool | None,

@@ -28,7 +28,7 @@ class PilotSettings(Settings):
         then: Afterwards the wheels go straight, or the car stops, until the lane is found again.
     """
 
-    law: Literal["pure-pursuit", "proportional", "own"] = "pure-pursuit"
+    law: Literal["pure-pursuit", "proportional", "own"] = "proportional"
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
     keep_s: float = Field(default=0.5, ge=0.0)
     then: Literal["straight", "stop"] = "straight"
@@ -164,7 +164,7 @@ def steering_settings(
 ) -> SteeringSettings:
     """Return the settings of :mod:`lanenet.control` for a car and a lane."""
     return SteeringSettings(
-        law="proportional" if pilot.law == "proportional" else "pure-pursuit",
+        law="pure-pursuit" if pilot.law == "pure-pursuit" else "proportional",
         look_ahead_cm=pilot.look_ahead_cm,
         wheelbase_cm=wheelbase_cm,
         max_steering_rad=max_steering_rad,

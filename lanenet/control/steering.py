@@ -19,15 +19,16 @@ class SteeringSettings(Settings):
     """How the lane's centre becomes a steering angle.
 
     Attributes:
-        law: ``pure-pursuit`` steers the rear axle onto the circle through the aim point; ``proportional`` is
-            the paper's: the front wheels point at it.
+        law: ``proportional`` is the paper's: the front wheels point at the aim point, so that the front axle
+            keeps to the lane's centre. ``pure-pursuit`` steers the rear axle onto the circle through it; in
+            bends the front axle then runs outside.
         look_ahead_cm: Distance of the aim point ahead of the front axle.
         wheelbase_cm: Distance between the axles.
         max_steering_rad: The target stays within plus and minus this.
         lane_width_cm: Distance between the two lines; with it one line is enough. None: both are needed.
     """
 
-    law: Literal["pure-pursuit", "proportional"] = "pure-pursuit"
+    law: Literal["pure-pursuit", "proportional"] = "proportional"
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
     wheelbase_cm: float = Field(gt=0.0)
     max_steering_rad: float = Field(default=0.45, gt=0.0, lt=math.pi / 2.0)

@@ -85,9 +85,9 @@ class AugmentSettings(Settings):
 
 #: Channels of the convolutions and width of the fully connected layer of the compact family.
 _SIZES: dict[str, tuple[tuple[int, ...], int]] = {
-    "nano": ((8, 16, 24, 32), 32),
-    "small": ((16, 32, 48, 64), 64),
-    "base": ((24, 48, 96, 128), 96),
+    "nano": ((8, 16, 24, 32, 40), 32),
+    "small": ((16, 32, 48, 64, 80), 64),
+    "base": ((24, 48, 72, 96, 120), 96),
 }
 
 

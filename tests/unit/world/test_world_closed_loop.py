@@ -74,9 +74,10 @@ def test_a_lost_lane_keeps_the_steering_then_goes_straight_or_stops():
 
 def test_a_detector_steers_by_its_points_or_by_its_own_target():
     sight = Sight(np.zeros((4, 4, 3), np.uint8), np.zeros(3), 0.0)
-    pursuit = DetectorPilot(Recorder(_lane(-5.0)), PilotSettings(), STEERING)
+    circle = PilotSettings(law="pure-pursuit")
+    pursuit = DetectorPilot(Recorder(_lane(-5.0)), circle, steering_settings(circle, 26.0, 0.45, 40.0))
     assert pursuit.steer(sight) == pytest.approx(math.atan(26.0 * 10.0 / (41.0**2 + 25.0)))
-    paper = PilotSettings(law="proportional")
+    paper = PilotSettings()
     proportional = DetectorPilot(Recorder(_lane(-5.0)), paper, steering_settings(paper, 26.0, 0.45, 40.0))
     assert proportional.steer(sight) == pytest.approx(math.atan(5.0 / 15.0))
     own = DetectorPilot(Recorder(_lane(-5.0)), PilotSettings(law="own"), STEERING)
