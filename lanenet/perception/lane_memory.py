@@ -18,6 +18,8 @@ _LENGTH, _ENOUGH = 100, 10
 #: By how much the distance of two lines may differ from a width that was given, as a share of it: more, and
 #: one of them belongs to another lane, or is the border of the road.
 _OTHER_LANE = 0.15
+#: Of two lines that contradict a given width, one is given up only if it is so many times as doubtful as the other.
+_MORE_DOUBTFUL = 2.0
 #: Standard deviation of a remembered width, as a share of it: no road keeps its width better.
 _WIDTH_SIGMA = 0.02
 
@@ -76,7 +78,9 @@ class LaneMemory:
 
         The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
         it is surer of itself. Two lines that are not as far apart as a given width says are not those of one
-        lane: the surer one stays, and the other is rebuilt.
+        lane: if one of them is much surer, it stays, and the other is rebuilt. A line that is not seen is never
+        the one that stays, however sure its points are: of a line beside the window a network has learned
+        nothing.
 
         Args:
             points_cm: The six points, frame car.
@@ -86,16 +90,18 @@ class LaneMemory:
         Returns:
             Points and standard deviations, changed for the missing line only.
         """
-        width_cm, sure = self.width_cm, self.learn(points_cm, presence)
+        width_cm = self.width_cm
+        self.learn(points_cm, presence)
         if width_cm is None:
             return points_cm, sigma_cm
         contradicts = self._contradicts(points_cm)
-        if contradicts:
-            missing = int(np.argmax(sigma_cm.reshape(2, 3).mean(axis=1)))
-        elif sure or (presence < _SEEN).sum() != 1:
-            return points_cm, sigma_cm
-        else:
+        doubt_cm = sigma_cm.reshape(2, 3).mean(axis=1)
+        if (presence < _SEEN).sum() == 1:
             missing = int(np.argmin(presence))
+        elif contradicts and doubt_cm.max() >= _MORE_DOUBTFUL * doubt_cm.min():
+            missing = int(np.argmax(doubt_cm))
+        else:
+            return points_cm, sigma_cm
         # The left line is 0: the missing right line lies to the right of it, and the other way round.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
