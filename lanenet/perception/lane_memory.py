@@ -18,8 +18,6 @@ _LENGTH, _ENOUGH = 100, 10
 #: By how much the distance of two lines may differ from a width that was given, as a share of it: more, and
 #: one of them belongs to another lane, or is the border of the road.
 _OTHER_LANE = 0.15
-#: Of two lines that contradict a given width, one is given up only if it is so many times as doubtful as the other.
-_MORE_DOUBTFUL = 2.0
 #: Standard deviation of a remembered width, as a share of it: no road keeps its width better.
 _WIDTH_SIGMA = 0.02
 
@@ -78,9 +76,8 @@ class LaneMemory:
 
         The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
         it is surer of itself. Two lines that are not as far apart as a given width says are not those of one
-        lane: if one of them is much surer, it stays, and the other is rebuilt. A line that is not seen is never
-        the one that stays, however sure its points are: of a line beside the window a network has learned
-        nothing.
+        lane: the surer one stays, and the other is rebuilt. A line that is not seen never replaces one that is,
+        however sure its points are: of lines beside its window a network has learned nothing.
 
         Args:
             points_cm: The six points, frame car.
@@ -94,20 +91,18 @@ class LaneMemory:
         self.learn(points_cm, presence)
         if width_cm is None:
             return points_cm, sigma_cm
-        contradicts = self._contradicts(points_cm)
         doubt_cm = sigma_cm.reshape(2, 3).mean(axis=1)
-        if (presence < _SEEN).sum() == 1:
-            missing = int(np.argmin(presence))
-        elif contradicts and doubt_cm.max() >= _MORE_DOUBTFUL * doubt_cm.min():
-            missing = int(np.argmax(doubt_cm))
-        else:
+        one_is_absent = (presence < _SEEN).sum() == 1
+        if not one_is_absent and not self._contradicts(points_cm):
             return points_cm, sigma_cm
+        missing = int(np.argmin(presence) if one_is_absent else np.argmax(doubt_cm))
         # The left line is 0: the missing right line lies to the right of it, and the other way round.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
         rebuilt = parallel_points(lines[1 - missing], side * width_cm)
         rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
-        if np.isfinite(rebuilt).all() and (contradicts or rebuilt_sigma.mean() < sigmas[missing].mean()):
+        surer = rebuilt_sigma.mean() < doubt_cm[missing]
+        if np.isfinite(rebuilt).all() and (surer or not one_is_absent):
             lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
         return lines.reshape(6), sigmas.reshape(6)
 
