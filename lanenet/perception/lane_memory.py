@@ -76,8 +76,8 @@ class LaneMemory:
 
         The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
         it is surer of itself. Two lines that are not as far apart as a given width says are not those of one
-        lane: the surer one stays, and the other is rebuilt. A line that is not seen never replaces one that is,
-        however sure its points are: of lines beside its window a network has learned nothing.
+        lane: the surer one stays, and the other is rebuilt. A line that is not seen never replaces one that
+        is, however sure its points are: of lines beside its window a network has learned nothing.
 
         Args:
             points_cm: The six points, frame car.
