@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
 from lanenet.learn.evaluate import ErrorStats, error_stats
@@ -36,7 +36,11 @@ INTERVALS = {"68": 1.0, "95": 1.959964}
 RELIABILITY_SIGMAS = (0.1257, 0.2533, 0.3853, 0.5244, 0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758)
 RELIABILITY_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
+#: Frames of a stretch, where there are too few drives to draw from: two seconds of a usual recording.
+STRETCH_FRAMES = 40
 _RESAMPLES = 2000
+#: Fewer drives or stretches give no interval.
+_FEWEST = 3
 _LIKELY = 0.5
 _MIDDLE_ROW = 1
 
@@ -135,12 +139,12 @@ def errors_by_group(
 def rmse_interval_cm(
     errors_cm: Sequence[Float[np.ndarray, "_ 6"]], rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return the 95 % interval of the RMSE over drives like these, by bootstrap over drives.
+    """Return the 95 % interval of the RMSE over drives like these, by bootstrap over drives or stretches.
 
-    Frames of one drive are alike, so that drawing frames would promise far too much.
+    Neighbouring frames are alike, so that drawing frames would promise far too much.
 
     Args:
-        errors_cm: Absolute errors of each drive.
+        errors_cm: Absolute errors of each drive or stretch, see :func:`drawn_parts`.
         rng: Source of randomness.
 
     Returns:
@@ -150,11 +154,33 @@ def rmse_interval_cm(
     counts = np.array([np.isfinite(e).sum() for e in errors_cm])
     squares, counts = squares[counts > 0], counts[counts > 0]
     n = len(counts)
-    if n < 3:
+    if n < _FEWEST:
         return None
     times = rng.multinomial(n, np.full(n, 1.0 / n), _RESAMPLES)
     low, high = np.percentile(np.sqrt((times @ squares) / (times @ counts)), [2.5, 97.5])
     return float(low), float(high)
+
+
+def drawn_parts(frames: Sequence[int]) -> tuple[Int[np.ndarray, "_"], str]:
+    """Say what the bootstrap draws: whole drives, or where there are too few of them, stretches of these.
+
+    Stretches of a single drive tell how far chance on this road reaches, not what another road would bring.
+
+    Args:
+        frames: Number of frames of each drive, in their order.
+
+    Returns:
+        Where to cut between the parts, by frame, and what the parts are called.
+    """
+    ends = np.cumsum(np.asarray(frames, np.int64))
+    if len(ends) >= _FEWEST:
+        return ends[:-1], "drives like these"
+    starts = ends - np.asarray(frames, np.int64)
+    cuts = [
+        np.append(np.arange(a + STRETCH_FRAMES, b - STRETCH_FRAMES // 2, STRETCH_FRAMES), b)
+        for a, b in zip(starts, ends, strict=True)
+    ]
+    return np.concatenate(cuts)[:-1], f"stretches of {STRETCH_FRAMES} frames"
 
 
 def doubt_of(errors_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]) -> Doubt | None:
@@ -210,13 +236,15 @@ class Breakdown:
 
     Attributes:
         groups: By condition and detector, the errors of each group of frames.
-        interval_cm: By detector, the 95 % interval of its RMSE over drives; None where they are too few.
+        interval_cm: By detector, the 95 % interval of its RMSE; None where the frames are too few.
+        interval_over: What the intervals are over, in words: drives, or stretches of one or two drives.
         doubt: By detector that tells standard deviations.
         presence: By detector that tells which lines are there.
     """
 
     groups: Mapping[str, Mapping[str, Mapping[str, ErrorStats]]]
     interval_cm: Mapping[str, tuple[float, float] | None]
+    interval_over: str
     doubt: Mapping[str, Doubt]
     presence: Mapping[str, PresenceStats]
 
@@ -226,6 +254,7 @@ class Breakdown:
         interval = self.interval_cm[detector]
         return {
             "rmse_95_interval_cm": None if interval is None else list(interval),
+            "rmse_95_interval_over": self.interval_over,
             "doubt": None if doubt is None else doubt.as_dict(),
             "presence": None if presence is None else presence.as_dict(),
             "conditions": {

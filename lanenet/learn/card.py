@@ -83,9 +83,9 @@ def _errors(comparison: Comparison) -> str:
     name, rest = comparison.first, comparison.breakdown
     stats, interval = comparison.tables[name].all, rest.interval_cm[name]
     frames = sum(source.frames for source in comparison.sources)
-    spread = (
-        "" if interval is None else f" ({show_cm(interval[0])} to {show_cm(interval[1])} over such drives)"
-    )
+    spread = ""
+    if interval is not None:
+        spread = f" ({show_cm(interval[0])} to {show_cm(interval[1])} over {rest.interval_over})"
     lines = [
         f"On {frames} frames of {_plural(len(comparison.sources), 'test drive')} that it has not seen, "
         f"against the {comparison.reference}: RMSE {show_cm(stats.rmse_cm)} cm{spread}, median "

@@ -14,6 +14,7 @@ from lanenet.learn.breakdown import (
     GROUPS,
     Breakdown,
     doubt_of,
+    drawn_parts,
     errors_by_group,
     lane_curvature,
     lines_shown,
@@ -205,7 +206,6 @@ def _break_down(
             unknown = [np.full(len(source.truth_cm), np.nan) for source in sources]
             parts = [s.conditions.get(condition, u) for s, u in zip(sources, unknown, strict=True)]
             values[condition] = np.concatenate(parts)
-    ends = np.cumsum([len(source.truth_cm) for source in sources])[:-1]
     visible = _joined(sources, [s.visible for s in sources], 2)
     if np.isfinite(visible).any():
         values["lines"] = lines_shown(visible)
@@ -213,17 +213,18 @@ def _break_down(
         condition: {n: errors_by_group(condition, value, errors_cm[n], labelled) for n in names}
         for condition, value in values.items()
     }
+    cuts, interval_over = drawn_parts([len(source.truth_cm) for source in sources])
     doubt, presence, interval = {}, {}, {}
     for name in names:
-        # The same drives are drawn for every detector.
-        interval[name] = rmse_interval_cm(np.split(errors_cm[name], ends), np.random.default_rng(0))
+        # The same parts are drawn for every detector.
+        interval[name] = rmse_interval_cm(np.split(errors_cm[name], cuts), np.random.default_rng(0))
         own = doubt_of(errors_cm[name], _joined(sources, [s.sigma_cm.get(name) for s in sources], 6))
         if own is not None:
             doubt[name] = own
         told = presence_of(_joined(sources, [s.presence.get(name) for s in sources], 2), visible)
         if told is not None:
             presence[name] = told
-    return Breakdown(groups, interval, doubt, presence)
+    return Breakdown(groups, interval, interval_over, doubt, presence)
 
 
 def _joined(

@@ -102,7 +102,8 @@ def _by_point(comparison: Comparison) -> TextTable:
         if ends is not None
     ]
     if intervals:
-        note += f". 95 % intervals of the RMSE over drives like these: {', '.join(intervals)}"
+        over = comparison.breakdown.interval_over
+        note += f". 95 % intervals of the RMSE over {over}: {', '.join(intervals)}"
     return TextTable(
         title=f"Errors in cm against the {comparison.reference}",
         header=["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)],

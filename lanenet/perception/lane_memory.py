@@ -15,9 +15,6 @@ from lanenet.geometry.parallel import parallel_points
 _SEEN, _SURE = 0.5, 0.9
 #: Frames whose widths are remembered, and how many are needed.
 _LENGTH, _ENOUGH = 100, 10
-#: By how much the distance of two lines may differ from a width that was given, as a share of it: more, and
-#: one of them belongs to another lane, or is the border of the road.
-_OTHER_LANE = 0.15
 #: Standard deviation of a remembered width, as a share of it: no road keeps its width better.
 _WIDTH_SIGMA = 0.02
 
@@ -43,24 +40,20 @@ class LaneMemory:
             return self.given_cm
         return statistics.median(self._widths_cm) if len(self._widths_cm) >= _ENOUGH else None
 
-    def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> bool:
-        """Take the width of a frame that shows both lines; any other frame teaches nothing.
+    def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> None:
+        """Take the width of a frame that shows both lines beyond doubt; any other frame teaches nothing.
 
         Args:
             points_cm: The six points, frame car; NaN where unknown.
             presence: Probability that each line can be seen; NaN of a detector that gives the points of the
                 lines that it sees and no others.
-
-        Returns:
-            True if both lines are seen beyond doubt.
         """
         left, right = presence.tolist()
         if left <= _SURE or right <= _SURE:
-            return False
+            return
         width_cm = lane_width_cm(points_cm)
         if width_cm > 0.0:
             self._widths_cm.append(width_cm)
-        return True
 
     def reset(self) -> None:
         """Forget the frames; a given width stays."""
@@ -75,8 +68,8 @@ class LaneMemory:
         """Learn from a frame with both lines; rebuild the missing line of a frame with one.
 
         The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
-        it is surer of itself. Two lines that are not as far apart as a given width says are not those of one
-        lane: the surer one stays, and the other is rebuilt.
+        it is surer of itself. A line that is not seen never replaces one that is, however sure its points
+        are: of lines beside its window a network has learned nothing.
 
         Args:
             points_cm: The six points, frame car.
@@ -86,28 +79,16 @@ class LaneMemory:
         Returns:
             Points and standard deviations, changed for the missing line only.
         """
-        width_cm, sure = self.width_cm, self.learn(points_cm, presence)
-        if width_cm is None:
+        width_cm = self.width_cm
+        self.learn(points_cm, presence)
+        if width_cm is None or (presence < _SEEN).sum() != 1:
             return points_cm, sigma_cm
-        contradicts = self._contradicts(points_cm)
-        if contradicts:
-            missing = int(np.argmax(sigma_cm.reshape(2, 3).mean(axis=1)))
-        elif sure or (presence < _SEEN).sum() != 1:
-            return points_cm, sigma_cm
-        else:
-            missing = int(np.argmin(presence))
+        missing = int(np.argmin(presence))
         # The left line is 0: the missing right line lies to the right of it, and the other way round.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
         rebuilt = parallel_points(lines[1 - missing], side * width_cm)
         rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
-        if np.isfinite(rebuilt).all() and (contradicts or rebuilt_sigma.mean() < sigmas[missing].mean()):
+        if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
             lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
         return lines.reshape(6), sigmas.reshape(6)
-
-    def _contradicts(self, points_cm: Float[np.ndarray, "6"]) -> bool:
-        """Whether two lines cannot be those of a lane whose width was given."""
-        if self.given_cm is None:
-            return False
-        width_cm = lane_width_cm(points_cm)
-        return abs(width_cm / self.given_cm - 1.0) > _OTHER_LANE

@@ -12,6 +12,7 @@ from lanenet.geometry.lane import points_from_parabolas
 from lanenet.learn.breakdown import (
     RELIABILITY_SHARES,
     doubt_of,
+    drawn_parts,
     errors_by_group,
     lane_curvature,
     lines_shown,
@@ -75,6 +76,20 @@ def test_the_interval_is_over_drives_and_not_over_frames():
     assert rmse_interval_cm(drives[:2], rng) is None
     # A drive without an answer is no drive.
     assert rmse_interval_cm([*drives[:2], np.full((5, 6), NAN)], rng) is None
+
+
+def test_of_few_drives_stretches_are_drawn():
+    cuts, over = drawn_parts([100, 7, 30])
+    assert cuts.tolist() == [100, 107] and over == "drives like these"
+    # A rest of less than half a stretch belongs to the one before; no stretch reaches into another drive.
+    cuts, over = drawn_parts([115, 70])
+    assert cuts.tolist() == [40, 80, 115, 155] and over == "stretches of 40 frames"
+    assert drawn_parts([99])[0].tolist() == [40]
+    assert drawn_parts([10])[0].tolist() == []
+    alike = np.repeat([1.0, 3.0], 60)[:, None] * np.ones((1, 6))
+    low, high = rmse_interval_cm(np.split(alike, drawn_parts([120])[0]), np.random.default_rng(0))
+    # Three stretches, of mean squares 1, 5 and 9, drawn three at a time.
+    assert low == pytest.approx(1.0) and high == pytest.approx(3.0)
 
 
 def test_honest_doubt_is_on_the_diagonal():
