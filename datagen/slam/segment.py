@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
+from datagen.slam.far_view import far_turns
 from datagen.slam.filter import Trajectory
 from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
 from datagen.slam.mutual import with_supported
@@ -130,8 +131,9 @@ def solve_segment(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(
-        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress
-    )
+        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress,
+        far_turns(drive, camera),
+    )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
     expected = relative_ways(commands)
     opened = adjust(
