@@ -17,6 +17,7 @@ from datagen.map_settings import MapSettings
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
+from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import commands_of
 from datagen.slam.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
 from datagen.slam.places import (
@@ -34,10 +35,8 @@ from datagen.slam.segment import (
     MAX_MISFIT,
     MAX_MISSED,
     SolvedSegment,
-    loop_pairs,
     relative_ways,
     road_edges,
-    side_by_side,
 )
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle

@@ -26,7 +26,7 @@ _AROUND = 2
 _STEERING_TEMPER, _STEERING_FLOOR = 0.3, 0.02
 #: What the distance shows wrongly it shows wrongly for a while, so that each frame counts for a ninth of one;
 #: and it may be wrong altogether.
-_SEEN_WIDER, _SEEN_FLOOR = 3.0, 0.02
+_SEEN_WIDER, _SEEN_FLOOR = 1.5, 0.005
 
 
 @dataclass(frozen=True)

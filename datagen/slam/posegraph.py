@@ -15,6 +15,9 @@ from lanenet.geometry.frames import wrap_angle
 _ITERATIONS = 12
 #: Weight of the motion across a break, which is known from nothing; not zero, so that all stays determined.
 _ACROSS_BREAK = 1e-4
+#: What a revisit may miss in a closed map, in camera heights and heading: the next dash of a dashed line is
+#: not much further.
+_BORNE_OUT_HEIGHTS, _BORNE_OUT_RAD = 1.0, 0.2
 
 
 def close_loops(
@@ -50,6 +53,17 @@ def close_loops(
             if step < 1e-4 * camera_height_cm:
                 break
     return closed, _residuals(closed, revisits)
+
+
+def borne_out(missed: Float[np.ndarray, "r 3"], camera_height_cm: float) -> Bool[np.ndarray, "r"]:
+    """Tell which revisits a closed map bears out: what others outvote shows another place.
+
+    Args:
+        missed: What each revisit misses, as :func:`close_loops` returns it.
+        camera_height_cm: Sets the scale.
+    """
+    near = np.hypot(missed[:, 0], missed[:, 1]) < _BORNE_OUT_HEIGHTS * camera_height_cm
+    return np.asarray(near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD))
 
 
 def _solve_headings(
