@@ -29,7 +29,7 @@ from datagen.slam.places import (
     relative_pose,
     thumbnails,
 )
-from datagen.slam.posegraph import close_loops
+from datagen.slam.posegraph import borne_out, close_loops
 from datagen.slam.scans import Scans, scans_of
 from datagen.slam.segment import (
     MAX_MISFIT,
@@ -137,7 +137,7 @@ def _join(
             edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks, expected=expected
         )
         poses, tilt = bundle.poses, bundle.tilt
-        loops = loop_pairs(revisits, breaks) + side_by_side(poses, height, s)
+        loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)
     before = np.average(
         [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
     )

@@ -55,15 +55,22 @@ def close_loops(
     return closed, _residuals(closed, revisits)
 
 
-def borne_out(missed: Float[np.ndarray, "r 3"], camera_height_cm: float) -> Bool[np.ndarray, "r"]:
-    """Tell which revisits a closed map bears out: what others outvote shows another place.
+def borne_out(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
+) -> list[Revisit]:
+    """Return the revisits that an adjusted map bears out: what the pictures outvoted shows another place.
 
     Args:
-        missed: What each revisit misses, as :func:`close_loops` returns it.
+        poses: Poses after closing loops and adjusting all frames.
+        revisits: What the loops were closed with.
         camera_height_cm: Sets the scale.
     """
+    if not revisits:
+        return []
+    missed = _residuals(poses, revisits)
     near = np.hypot(missed[:, 0], missed[:, 1]) < _BORNE_OUT_HEIGHTS * camera_height_cm
-    return np.asarray(near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD))
+    true = near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD)
+    return [revisit for revisit, kept in zip(revisits, true, strict=True) if kept]
 
 
 def _solve_headings(

@@ -148,7 +148,8 @@ def solve_segment(
             edges = road_edges(drive, bundle.camera, limits, settings)
             before = bundle.camera.K[0, 0]
             none = np.zeros(len(drive), dtype=bool)
-            loops = loop_pairs(closure.revisits, none) + side_by_side(bundle.poses, height, settings.revisits)
+            true = borne_out(bundle.poses, closure.revisits, height)
+            loops = loop_pairs(true, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=believed,
@@ -231,12 +232,6 @@ def _closed_by(
     along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
     if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
         return None
-    true = borne_out(missed, height)
-    if not true.all():
-        revisits = [revisit for revisit, kept in zip(revisits, true, strict=True) if kept]
-        if len(revisits) < settings.revisits.min_revisits:
-            return None
-        poses, missed = close_loops(opened.poses, revisits, height)
     loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
     closed = adjust(
         edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,

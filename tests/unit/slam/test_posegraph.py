@@ -91,9 +91,10 @@ def test_a_revisit_that_shows_the_next_dash_is_not_borne_out(dashes):
     revisits = _revisits(true, range(5, 96, 10))
     revisits[4] = replace(revisits[4], relative=revisits[4].relative + [dashes * HEIGHT_CM, 0.0, 0.0])
     revisits[7] = replace(revisits[7], relative=revisits[7].relative + [0.0, 0.0, 0.4])
-    _, missed = close_loops(drifted, revisits, HEIGHT_CM)
-    np.testing.assert_array_equal(np.flatnonzero(~borne_out(missed, HEIGHT_CM)), [4, 7])
-    assert borne_out(np.empty((0, 3)), HEIGHT_CM).shape == (0,)
+    closed, _ = close_loops(drifted, revisits, HEIGHT_CM)
+    kept = borne_out(closed, revisits, HEIGHT_CM)
+    assert kept == revisits[:4] + revisits[5:7] + revisits[8:]
+    assert borne_out(closed, [], HEIGHT_CM) == []
 
 
 def test_without_revisits_nothing_moves():
