@@ -10,9 +10,11 @@ from lanenet.geometry.frames import wrap_angle
 
 #: Where around a revisit more pairs of frames show the same place, in frames.
 _BESIDE_REVISIT = range(-12, 13, 4)
-#: Every so many frames one is compared with the nearest one of an earlier lap, if that is no further away, in
-#: camera heights and in heading.
-_BESIDE_EVERY, _BESIDE_HEIGHTS, _BESIDE_RAD = 5, 1.0, 0.3
+#: Every so many frames one is compared with the nearest ones of so many earlier laps, if they are no further
+#: away, in camera heights and in heading.
+_BESIDE_EVERY, _BESIDE_LAPS, _BESIDE_HEIGHTS, _BESIDE_RAD = 3, 3, 1.5, 0.3
+#: Way before the last frame of a lap that is near within which the nearest one of it lies, in camera heights.
+_PASSING_HEIGHTS = 10.0
 
 
 def loop_pairs(revisits: list[Revisit], breaks: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
@@ -32,7 +34,7 @@ def side_by_side(
     """Pairs of frames of different laps that a closed map has at about the same place and heading.
 
     Revisits are too few to hold all of one lap on the others; between them every lap would have lines of its
-    own.
+    own. Laps that hang on one other lap each may still lie apart from the rest.
 
     Args:
         poses: Rear-axle poses after closing loops.
@@ -42,12 +44,15 @@ def side_by_side(
     path = path_lengths(poses)
     pairs = []
     for later in range(0, len(poses), _BESIDE_EVERY):
-        before = int(np.searchsorted(path, path[later] - settings.min_gap_heights * camera_height_cm))
-        if not before:
-            continue
-        apart = np.hypot(*(poses[:before, :2] - poses[later, :2]).T)
-        turned = np.abs(wrap_angle(poses[:before, 2] - poses[later, 2]))
-        earlier = int(np.argmin(np.where(turned < _BESIDE_RAD, apart, np.inf)))
-        if turned[earlier] < _BESIDE_RAD and apart[earlier] < _BESIDE_HEIGHTS * camera_height_cm:
-            pairs.append((earlier, later))
+        apart = np.hypot(*(poses[:later, :2] - poses[later, :2]).T)
+        turned = np.abs(wrap_angle(poses[:later, 2] - poses[later, 2]))
+        near = np.flatnonzero((turned < _BESIDE_RAD) & (apart < _BESIDE_HEIGHTS * camera_height_cm))
+        visit = later
+        for _ in range(_BESIDE_LAPS):
+            near = near[path[near] <= path[visit] - settings.min_gap_heights * camera_height_cm]
+            if not near.size:
+                break
+            passing = near[path[near] > path[near[-1]] - _PASSING_HEIGHTS * camera_height_cm]
+            visit = int(passing[np.argmin(apart[passing])])
+            pairs.append((visit, later))
     return pairs
