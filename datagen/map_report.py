@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
@@ -127,8 +127,34 @@ def map_figures(
     }
 
 
-def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[str, Any]) -> MapEvidence:
-    """Collect what the verdict rests on; ``figures`` are those of the map and of its quality."""
+def contradicted_share(contradicted: Bool[np.ndarray, "n"] | None, deleted: Bool[np.ndarray, "n"]) -> float:
+    """Share of the frames around which the pictures disagree with the map.
+
+    Frames that the driver deleted get no labels: where the car leaves the road, it says nothing of the map.
+
+    Args:
+        contradicted: Frames of the map; None where nobody has looked.
+        deleted: Which of them the driver deleted.
+    """
+    if contradicted is None or deleted.all():
+        return 0.0
+    return float(contradicted[~deleted].mean())
+
+
+def map_evidence(
+    drive_map: DriveMap,
+    parts: list[MappedSegment],
+    figures: dict[str, Any],
+    deleted: Bool[np.ndarray, "n"],
+) -> MapEvidence:
+    """Collect what the verdict rests on.
+
+    Args:
+        drive_map: The map.
+        parts: Its segments.
+        figures: Those of the map and of its quality.
+        deleted: Which frames of the map the driver deleted.
+    """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
     both = figures["held_out"]["both_lines"]
     across = [
@@ -145,7 +171,7 @@ def map_evidence(drive_map: DriveMap, parts: list[MappedSegment], figures: dict[
         p95_px=both["p95_px_at_160"],
         coverage=both["coverage"],
         labelled_share=figures["labelled"]["share"],
-        contradicted_share=0.0 if drive_map.contradicted is None else float(drive_map.contradicted.mean()),
+        contradicted_share=contradicted_share(drive_map.contradicted, deleted),
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm

@@ -127,7 +127,8 @@ def _map_drive(
     quality = measure_map(mapped, ResidualSettings())
     check_lines_seen(quality, drive)
     figures |= quality_figures(quality, drive.width, ResidualSettings())
-    verdict = judge(map_evidence(drive_map, parts, figures), settings.verdict)
+    evidence = map_evidence(drive_map, parts, figures, drive.deleted[rows_of_map])
+    verdict = judge(evidence, settings.verdict)
     drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))
     figures["verdict"] = asdict(verdict)
     figures["notes"] = notes

@@ -59,7 +59,7 @@ class MapEvidence:
         p95_px: Likewise.
         coverage: Share of the borders in view that met an edge; NaN where nothing was held out.
         labelled_share: Of the frames that the driver did not delete.
-        contradicted_share: Of all frames: those around which the pictures disagree with the map.
+        contradicted_share: Of these frames: those around which the pictures disagree with the map.
         not_labelled: Why the others have none, and how many.
         revisits: Places seen twice.
         closure_across_heights: What the revisits miss across the road, as median; None without any.

@@ -17,6 +17,7 @@ from datagen.map_settings import MapSettings
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
+from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import commands_of
 from datagen.slam.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
 from datagen.slam.places import (
@@ -28,16 +29,14 @@ from datagen.slam.places import (
     relative_pose,
     thumbnails,
 )
-from datagen.slam.posegraph import close_loops
+from datagen.slam.posegraph import borne_out, close_loops
 from datagen.slam.scans import Scans, scans_of
 from datagen.slam.segment import (
     MAX_MISFIT,
     MAX_MISSED,
     SolvedSegment,
-    loop_pairs,
     relative_ways,
     road_edges,
-    side_by_side,
 )
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
@@ -138,7 +137,7 @@ def _join(
             edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks, expected=expected
         )
         poses, tilt = bundle.poses, bundle.tilt
-        loops = loop_pairs(revisits, breaks) + side_by_side(poses, height, s)
+        loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)
     before = np.average(
         [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
     )

@@ -136,6 +136,7 @@ def track(
     odometry_settings: OdometrySettings,
     rng: np.random.Generator,
     progress: Progress | None = None,
+    far_rad: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Trajectory, SteeringFit | None]:
     """Estimate all poses without closing loops.
 
@@ -153,11 +154,12 @@ def track(
         odometry_settings: How pictures are compared.
         rng: Source of randomness.
         progress: Called with (done, total).
+        far_rad: Turn of each frame as the distance shows it, see :func:`datagen.slam.far_view.far_turns`.
     """
     height, n = camera.mounting.height_cm, len(scans)
     compared = None if progress is None else lambda k, _: progress(k, 2 * n)
     pictures = Pictures(edges, camera, odometry_settings, rng)
-    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height, compared)
+    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height, compared, far_rad)
     odometry = evidence.motion()
     fit = fit_steering(odometry.poses, commands, height)
     if fit is not None and commands.turn is not None:

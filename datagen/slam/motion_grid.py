@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from datagen.slam.far_view import SeenTurns
+
 #: Spacing of the steps, as a logarithm, and how many spreads they reach to either side, at least so far.
 _SPACING, _SPREADS, _LEAST_REACH = 0.056, 2.8, 0.3
 #: Variance per step of the chain, in cells, beyond which it would have to step further than one.
@@ -22,6 +24,9 @@ _AROUND = 2
 #: Prediction by the steering: its misses last, so that neighbouring frames count for less than one each; and
 #: it may be wrong altogether.
 _STEERING_TEMPER, _STEERING_FLOOR = 0.3, 0.02
+#: What the distance shows wrongly it shows wrongly for a while, so that each frame counts for a ninth of one;
+#: and it may be wrong altogether.
+_SEEN_WIDER, _SEEN_FLOOR = 1.5, 0.005
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,7 @@ def follow_motion(
     turn_walk_rad: float,
     curvature: Float[np.ndarray, "n"],
     curvature_sigma: float,
+    seen: SeenTurns | None = None,
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Find each frame's step and turn, given all frames.
 
@@ -106,6 +112,7 @@ def follow_motion(
         turn_walk_rad: Change of turn from frame to frame.
         curvature: Predicted turn per way.
         curvature_sigma: Standard deviation of the prediction.
+        seen: Turns as seen in the distance, where they are.
 
     Returns:
         Steps (per frame of usual length) and turns: the mean over the states around the likeliest one.
@@ -118,12 +125,16 @@ def follow_motion(
     steps, turns_rad = grid.steps, grid.turns_rad
 
     def likelihood(k: int) -> Float[np.ndarray, "w t"]:
-        seen: Float[np.ndarray, "w t"] = np.exp(log_likelihood[k].astype(np.float64))
+        likely: Float[np.ndarray, "w t"] = np.exp(log_likelihood[k].astype(np.float64))
         ways = steps[:, None] * relative[k]
         # The same for all steps: a prediction of the turn is none of the step.
         sigma = max(curvature_sigma * grid.usual * relative[k], 0.5 * turn_walk_rad)
         miss = (turns_rad[None, :] - curvature[k] * ways) / sigma
-        return seen * (np.exp(-0.5 * miss**2) + _STEERING_FLOOR) ** _STEERING_TEMPER
+        likely = likely * (np.exp(-0.5 * miss**2) + _STEERING_FLOOR) ** _STEERING_TEMPER
+        if seen is not None and np.isfinite(seen.turns_rad[k]):
+            off = (turns_rad - seen.turns_rad[k]) / (_SEEN_WIDER * seen.sigma_rad)
+            likely = likely * (np.exp(-0.5 * off**2) + _SEEN_FLOOR)
+        return likely
 
     forward = np.empty(log_likelihood.shape, np.float32)
     # The first frame's motion is any that the car may be found in.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float16, Float32
 
+from datagen.slam.far_view import SeenTurns, seen_turns
 from datagen.slam.motion_grid import MotionGrid, follow_motion
 from datagen.slam.picture_pairs import Pictures, turns_up_to
 from datagen.slam.scans import Progress
@@ -172,6 +173,7 @@ class Evidence:
 
     Attributes:
         usual: What the commands mean in centimetres.
+        seen: Turns as seen in the distance; None where they tell nothing.
     """
 
     def __init__(
@@ -181,6 +183,7 @@ class Evidence:
         speed_known: bool,
         height_cm: float,
         progress: Progress | None = None,
+        far_rad: Float[np.ndarray, "n"] | None = None,
     ) -> None:
         """Compare all pictures.
 
@@ -190,9 +193,11 @@ class Evidence:
             speed_known: Whether that is in centimetres.
             height_cm: Of the camera.
             progress: Called with (done, total).
+            far_rad: Turn of each frame as the distance shows it, see :func:`datagen.slam.far_view.far_turns`.
         """
         s, n = pictures.settings, len(pictures)
         self.settings, self.height_cm = s, height_cm
+        self.seen: SeenTurns | None = None
         self.usual = usual_way(pictures, distance_cm, speed_known, height_cm)
         self.relative, step = self.usual.relative, self.usual.step
         spread, keep = s.unknown_spread, s.unknown_keep
@@ -216,6 +221,10 @@ class Evidence:
                 # As strong as all pairs together.
                 self.log_likelihood = _likelihood(fits, s.temper * len(s.lags))
                 turns = self.motion().turns_rad
+                if far_rad is not None:
+                    self.seen = seen_turns(far_rad, turns)
+                if self.seen is not None:
+                    turns = self.motion().turns_rad
         self.log_likelihood = _likelihood(fits, s.temper)
 
     def motion(self, curvature_per_cm: Float[np.ndarray, "n"] | None = None) -> Odometry:
@@ -231,7 +240,7 @@ class Evidence:
         else:
             curvature, sigma = curvature_per_cm * self.height_cm, s.steering_heights
         steps, turns = follow_motion(
-            self.grid, self.log_likelihood, self.relative, s.turn_walk_rad, curvature, sigma
+            self.grid, self.log_likelihood, self.relative, s.turn_walk_rad, curvature, sigma, self.seen
         )
         ways = steps * self.relative * self.height_cm
         ways[0] = turns[0] = 0.0

@@ -30,13 +30,13 @@ class RevisitSettings(Settings):
     Attributes:
         min_gap_heights: Path between the two visits at least.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
-        max_drift_rad: Heading that the open loop may miss in one lap. Revisits
-            that no common drift per length explains are not believed: rooms repeat, and one false revisit
-            bends a whole map.
+        max_drift_rad: Heading that the open loop may miss in one lap. Revisits that no common drift per
+            length explains are not believed: rooms repeat, and one false revisit bends a whole map.
         drift_tolerance_rad: What a revisit may miss of the common drift, one lap later.
         min_revisits: Fewer revisits than this are not believed.
         min_match: Matched share of the edges once aligned.
         max_pairs: Pairs to verify at most, spread over the drive.
+        pair_heights: A long drive may get more than these: one on so long a way.
         along_heights: Offset along the road between the two visits at most: the pictures are alike only
             within a fraction of a camera height, and the next dash of a dashed line is not much further.
         sideways_heights: Offset across the road at most.
@@ -50,6 +50,7 @@ class RevisitSettings(Settings):
     min_revisits: int = Field(default=3, ge=1)
     min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
     max_pairs: int = Field(default=60, ge=1)
+    pair_heights: float = Field(default=4.0, gt=0.0)
     along_heights: float = Field(default=0.9, gt=0.0)
     sideways_heights: float = Field(default=2.0, gt=0.0)
     search_rad: float = Field(default=0.45, gt=0.0)
@@ -103,8 +104,7 @@ def propose_revisits(
         camera_height_cm: Sets the scale.
         settings: Bounds.
     """
-    n = len(thumbs)
-    path = path_lengths(poses)
+    n, path = len(thumbs), path_lengths(poses)
     before, after = np.zeros(n, np.int64), np.zeros(n, np.int64)
     score, score_after = np.full(n, -1.0, np.float32), np.full(n, -1.0, np.float32)
     for start in range(0, n, _BLOCK):
@@ -125,7 +125,7 @@ def propose_revisits(
         if score[later] >= settings.min_similarity and later == after[before[later]]
     ]
     # The best of each stretch of the drive, so that no corner takes all the pairs.
-    stretch = max(1.0, n / settings.max_pairs)
+    stretch = max(1.0, n / max(settings.max_pairs, path[-1] / (settings.pair_heights * camera_height_cm)))
     best: dict[int, tuple[float, int, int]] = {}
     for pair in pairs:
         key = int(pair[2] / stretch)

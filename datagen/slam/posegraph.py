@@ -15,6 +15,9 @@ from lanenet.geometry.frames import wrap_angle
 _ITERATIONS = 12
 #: Weight of the motion across a break, which is known from nothing; not zero, so that all stays determined.
 _ACROSS_BREAK = 1e-4
+#: What a revisit may miss in a closed map, in camera heights and heading: the next dash of a dashed line is
+#: not much further.
+_BORNE_OUT_HEIGHTS, _BORNE_OUT_RAD = 1.0, 0.2
 
 
 def close_loops(
@@ -50,6 +53,24 @@ def close_loops(
             if step < 1e-4 * camera_height_cm:
                 break
     return closed, _residuals(closed, revisits)
+
+
+def borne_out(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
+) -> list[Revisit]:
+    """Return the revisits that an adjusted map bears out: what the pictures outvoted shows another place.
+
+    Args:
+        poses: Poses after closing loops and adjusting all frames.
+        revisits: What the loops were closed with.
+        camera_height_cm: Sets the scale.
+    """
+    if not revisits:
+        return []
+    missed = _residuals(poses, revisits)
+    near = np.hypot(missed[:, 0], missed[:, 1]) < _BORNE_OUT_HEIGHTS * camera_height_cm
+    true = near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD)
+    return [revisit for revisit, kept in zip(revisits, true, strict=True) if kept]
 
 
 def _solve_headings(

@@ -11,35 +11,30 @@ from jaxtyping import Bool, Float, Int
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
 from datagen.slam.calibrate import mapping_range
+from datagen.slam.far_view import far_turns
 from datagen.slam.filter import Trajectory
+from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
 from datagen.slam.mutual import with_supported
 from datagen.slam.places import (
     Revisit,
-    RevisitSettings,
     consistent_revisits,
     match_places,
     path_lengths,
     propose_revisits,
     thumbnails,
 )
-from datagen.slam.posegraph import close_loops
+from datagen.slam.posegraph import borne_out, close_loops
 from datagen.slam.reflections import without_reflections
 from datagen.slam.scans import Progress, Scans, edges_of_drive, scans_of
 from lanenet.data.drive import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.frames import wrap_angle
 from lanenet.perception.birdseye import RangeSettings, RoadTable
 from lanenet.perception.edges import EdgePixels
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
-#: Where around a revisit more pairs of frames show the same place, in frames.
-_BESIDE_REVISIT = range(-12, 13, 4)
-#: Every so many frames one is compared with the nearest one of an earlier lap, if that is no further away, in
-#: camera heights and in heading.
-_BESIDE_EVERY, _BESIDE_HEIGHTS, _BESIDE_RAD = 5, 1.0, 0.3
 #: What revisits may miss once closed (medians along and across the road, in camera heights), and how much
 #: worse frames may agree than before: places that only look alike, as on an open road, miss more.
 MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.1
@@ -130,8 +125,9 @@ def solve_segment(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(
-        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress
-    )
+        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress,
+        far_turns(drive, camera),
+    )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
     expected = relative_ways(commands)
     opened = adjust(
@@ -152,7 +148,8 @@ def solve_segment(
             edges = road_edges(drive, bundle.camera, limits, settings)
             before = bundle.camera.K[0, 0]
             none = np.zeros(len(drive), dtype=bool)
-            loops = loop_pairs(closure.revisits, none) + side_by_side(bundle.poses, height, settings.revisits)
+            true = borne_out(bundle.poses, closure.revisits, height)
+            loops = loop_pairs(true, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=believed,
@@ -247,44 +244,6 @@ def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
     """Commanded way per frame relative to the usual one; 0 where the car was told to stand."""
     moving = commands.distance_cm[commands.distance_cm > 0.0]
     return commands.distance_cm / (float(np.median(moving)) if moving.size else 1.0)
-
-
-def loop_pairs(revisits: list[Revisit], breaks: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
-    """Pairs of frames around each revisit that show the same place, not beyond a break of the drive."""
-    stretch = np.cumsum(breaks)
-    pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
-    return [
-        (a, b)
-        for r, a, b in pairs
-        if a >= 0 and b < len(breaks) and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
-    ]
-
-
-def side_by_side(
-    poses: Float[np.ndarray, "n 3"], camera_height_cm: float, settings: RevisitSettings
-) -> list[tuple[int, int]]:
-    """Pairs of frames of different laps that a closed map has at about the same place and heading.
-
-    Revisits are too few to hold all of one lap on the others; between them every lap would have lines of its
-    own.
-
-    Args:
-        poses: Rear-axle poses after closing loops.
-        camera_height_cm: Sets the scale.
-        settings: What counts as another visit.
-    """
-    path = path_lengths(poses)
-    pairs = []
-    for later in range(0, len(poses), _BESIDE_EVERY):
-        before = int(np.searchsorted(path, path[later] - settings.min_gap_heights * camera_height_cm))
-        if not before:
-            continue
-        apart = np.hypot(*(poses[:before, :2] - poses[later, :2]).T)
-        turned = np.abs(wrap_angle(poses[:before, 2] - poses[later, 2]))
-        earlier = int(np.argmin(np.where(turned < _BESIDE_RAD, apart, np.inf)))
-        if turned[earlier] < _BESIDE_RAD and apart[earlier] < _BESIDE_HEIGHTS * camera_height_cm:
-            pairs.append((earlier, later))
-    return pairs
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:

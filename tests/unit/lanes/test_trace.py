@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,21 +115,68 @@ def test_the_lane_width_is_found(lane_cm):
     assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
 
 
-@pytest.mark.parametrize(("dashed", "specks", "lane_cm"), [(False, 250, 60.0), (True, 120, 30.0)])
-@pytest.mark.parametrize("seed", range(2))
-def test_specks_on_the_floor_are_no_line_in_the_middle(seed, dashed, specks, lane_cm):
-    """Two lines 60 cm apart: a line between them makes two lanes, a mottled floor does not."""
+def _road_of_two_lanes(seed: int, middle: np.ndarray, dashed: bool = True, specks: int = 120) -> TracedLane:
+    """Two lines 60 cm apart, with dashes in the middle or none, on a mottled floor; nobody says how wide."""
     rng = np.random.default_rng(seed)
     path = _path()
-    centre, everywhere = _wandering(path), np.ones(len(path.s_cm), dtype=bool)
-    parts = [_tape(rng, centre + side, everywhere) for side in (30.0, -30.0)]
+    everywhere = np.ones(len(path.s_cm), dtype=bool)
+    parts = [_tape(rng, middle + side, everywhere) for side in (30.0, -30.0)]
     parts.append(_clutter(rng, 1500))
     if dashed:
-        parts.append(_tape(rng, centre, _dashed(path, 22.0)))
+        parts.append(_tape(rng, middle, _dashed(path, 22.0)))
     places = zip(rng.uniform(0.0, path.s_cm[-1], specks), rng.uniform(-27.0, 27.0, specks), strict=True)
-    parts += [_tape(rng, centre + d, np.abs(path.s_cm - s) < 2.5) for s, d in places]
-    lane = trace_lane(path, _edges(*parts), HEIGHT_CM, None, SETTINGS)
-    assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
+    parts += [_tape(rng, middle + d, np.abs(path.s_cm - s) < 2.5) for s, d in places]
+    return trace_lane(path, _edges(*parts), HEIGHT_CM, None, SETTINGS)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_specks_on_the_floor_are_no_line_in_the_middle(seed):
+    """Three lines make two lanes, two lines on a mottled floor do not."""
+    lane = _road_of_two_lanes(seed, _wandering(_path()), dashed=False, specks=250)
+    assert lane.lane_cm == pytest.approx(60.0, abs=2.0 * CELL_CM)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_car_that_keeps_to_one_half_of_a_road_has_it_for_its_lane(seed, side):
+    # Once it swerves over the middle line.
+    swerve = -25.0 * np.exp(-0.5 * ((_path().s_cm - 200.0) / 25.0) ** 2)
+    middle = side * (15.0 + _wandering(_path(), 3.0) + swerve)
+    lane = _road_of_two_lanes(seed, middle)
+    assert lane.lane_cm == pytest.approx(30.0, abs=1.5)
+    assert np.median(np.abs(lane.centre_cm - (middle - side * 15.0))) < 1.0
+
+
+@pytest.mark.parametrize("amplitude_cm", [0.0, 12.0, 25.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_car_that_drives_on_the_middle_line_has_the_whole_road_for_its_lane(seed, amplitude_cm):
+    middle = amplitude_cm * np.sin(2.0 * np.pi * _path().s_cm / 300.0)
+    lane = _road_of_two_lanes(seed, middle)
+    assert lane.lane_cm == pytest.approx(60.0, abs=1.5)
+    # The dashes bound nothing.
+    for line, off in ((lane.left_cm, 30.0), (lane.right_cm, -30.0)):
+        assert np.isfinite(line).mean() > 0.95
+        assert np.nanmedian(np.abs(line - middle - off)) < 0.3
+    assert lane.beside_cm == {}
+
+
+@pytest.mark.parametrize(("backward", "lane_cm"), [(True, 30.0), (False, 60.0)])
+def test_a_half_is_on_the_side_on_which_the_car_drives_there_and_back(backward, lane_cm):
+    """Keeping to the right there and back is keeping to a lane; changing sides in one direction is not."""
+    rng = np.random.default_rng(0)
+    straight = _path()
+    everywhere, middle = np.ones(len(straight.s_cm), dtype=bool), np.full(len(straight.s_cm), 15.0)
+    first = np.arange(FRAMES) < FRAMES // 2
+    path = replace(
+        straight,
+        s_frames_cm=6.0 * np.concatenate([np.arange(FRAMES // 2), np.arange(FRAMES // 2)[::-1]]),
+        d_frames_cm=np.where(first, 0.0, 30.0),
+        forward=first if backward else np.ones(FRAMES, dtype=bool),
+        closed=True,
+    )
+    parts = [_tape(rng, middle + side, everywhere) for side in (30.0, -30.0)]
+    edges = _edges(*parts, _tape(rng, middle, _dashed(path, 22.0)))
+    assert trace_lane(path, edges, HEIGHT_CM, None, SETTINGS).lane_cm == pytest.approx(lane_cm, abs=1.0)
 
 
 def test_left_and_right_are_mirror_images():

@@ -131,6 +131,35 @@ def test_a_slide_that_is_caught_is_followed(road):
     assert odometry.turns_rad[28:34].min() < -0.05
 
 
+def test_turns_that_the_distance_shows_are_followed_where_the_road_shows_nothing(road):
+    # For a quarter of a second all is blurred, while the car swings round.
+    turns = _true_turns(road)
+    turns[25:30] += 0.1
+    heading = np.cumsum(turns)
+    middle = heading - 0.5 * turns
+    steps = STEP_CM * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    steps[0] = 0.0
+    poses = np.column_stack([np.cumsum(steps, axis=0), heading])
+    edges = pixels(TapeRoad(road.points_cm, road.normals, poses), fisheye())
+    edges = [e if not 23 <= k < 31 else EdgePixels(e.uv_px[:3], e.normals[:3]) for k, e in enumerate(edges)]
+    far = 0.8 * turns + np.random.default_rng(0).normal(0.0, 0.003, 60)
+    far[0] = np.nan
+    without, with_far = (
+        Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM, None, seen).motion() for seen in (None, far)
+    )
+    off = [np.abs(o.poses[:, 2] - heading).max() for o in (without, with_far)]
+    assert off[0] > np.deg2rad(15.0)
+    assert off[1] < np.deg2rad(5.0)
+
+
+def test_a_distance_that_shows_something_else_changes_nothing(edges):
+    far = np.random.default_rng(1).normal(0.0, 0.05, 60)
+    plain, other = (
+        Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM, None, seen).motion() for seen in (None, far)
+    )
+    np.testing.assert_array_equal(other.poses, plain.poses)
+
+
 def test_pictures_that_are_further_apart_meet_where_the_turns_between_them_are_known(road):
     turns = np.where(np.arange(60) % 12 < 6, 0.06, -0.03)
     middle = np.cumsum(turns) - 0.5 * turns

@@ -110,8 +110,20 @@ def test_one_lap_has_no_revisits():
 
 def test_fewer_pairs_are_asked_for_than_found():
     thumbs = _pictures(np.random.default_rng(0), 2 * LAP)
-    pairs = propose_revisits(thumbs, _circle(2 * LAP, 0.1), HEIGHT_CM, RevisitSettings(max_pairs=8))
-    assert 3 <= len(pairs) <= 8
+    few = RevisitSettings(max_pairs=8, pair_heights=50.0)
+    assert 3 <= len(propose_revisits(thumbs, _circle(2 * LAP, 0.1), HEIGHT_CM, few)) <= 8
+
+
+def test_a_long_drive_gets_as_many_pairs_per_way_as_a_short_one():
+    bounds = RevisitSettings(max_pairs=4, pair_heights=4.0)
+    counts = []
+    for laps in (2, 4):
+        thumbs, poses = _pictures(np.random.default_rng(0), laps * LAP), _circle(laps * LAP, 0.1)
+        pairs = propose_revisits(thumbs, poses, HEIGHT_CM, bounds)
+        counts.append(len(pairs))
+        assert len(pairs) <= path_lengths(poses)[-1] / (4.0 * HEIGHT_CM) + 1.0
+    assert counts[0] > 4
+    assert counts[1] > 1.5 * counts[0]
 
 
 def test_likeness_is_averaged_over_neighbours_of_both_frames():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from datagen.slam.places import Revisit, relative_pose
-from datagen.slam.posegraph import close_loops
+from datagen.slam.posegraph import borne_out, close_loops
 
 HEIGHT_CM = 15.0
 LAP = 100
@@ -81,6 +83,18 @@ def test_one_wrong_revisit_among_ten_is_left_unsatisfied(wrong):
     # Between the good revisits both laps lie on each other; beyond the last one the drift goes on.
     apart = np.linalg.norm(closed[:LAP, :2] - closed[LAP:-1, :2], axis=1)
     assert apart[15:86].max() < 1.5
+
+
+@pytest.mark.parametrize("dashes", [2.0, -2.0])
+def test_a_revisit_that_shows_the_next_dash_is_not_borne_out(dashes):
+    true, drifted = _laps(np.deg2rad(20.0))
+    revisits = _revisits(true, range(5, 96, 10))
+    revisits[4] = replace(revisits[4], relative=revisits[4].relative + [dashes * HEIGHT_CM, 0.0, 0.0])
+    revisits[7] = replace(revisits[7], relative=revisits[7].relative + [0.0, 0.0, 0.4])
+    closed, _ = close_loops(drifted, revisits, HEIGHT_CM)
+    kept = borne_out(closed, revisits, HEIGHT_CM)
+    assert kept == revisits[:4] + revisits[5:7] + revisits[8:]
+    assert borne_out(closed, [], HEIGHT_CM) == []
 
 
 def test_without_revisits_nothing_moves():

@@ -14,9 +14,10 @@ from datagen.map_settings import MapSettings
 from datagen.self_calibration import SIGMA_FACTOR
 from datagen.slam.bundle import BundleSettings
 from datagen.slam.filter import FilterSettings
+from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.segment import SolvedSegment, loop_pairs, relative_ways, side_by_side, solve_segment
+from datagen.slam.segment import SolvedSegment, relative_ways, solve_segment
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.recording import Commands, Drive
@@ -63,12 +64,24 @@ def test_laps_side_by_side_are_paired_once_each():
     radius = 64.0 + np.repeat([0.0, 5.0, 30.0], 90)
     poses = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), angle])
     pairs = side_by_side(poses, 15.0, RevisitSettings())
-    assert {later for _, later in pairs} == set(range(90, 180, 5))
-    assert all(later - earlier == 90 for earlier, later in pairs)
+    lap_apart = {(later - 90, later) for later in range(90, 180, 3)}
+    assert lap_apart <= set(pairs)
+    # The third lap is too far away. Where one lap goes over into the next, both are near.
+    assert set(pairs) - lap_apart <= {(0, 87), (0, 177), (180, 267)}
     # Driven the other way round, no picture shows the same.
     back = poses.copy()
     back[90:, 2] += np.pi
-    assert not side_by_side(back[:180], 15.0, RevisitSettings())
+    turned = side_by_side(back[:180], 15.0, RevisitSettings())
+    assert all((earlier < 90) == (later < 90) for earlier, later in turned)
+
+
+def test_a_lap_is_held_on_each_of_the_three_before_it():
+    angle = 2.0 * np.pi * np.arange(450) / 90
+    poses = np.column_stack([64.0 * np.sin(angle), -64.0 * np.cos(angle), angle])
+    pairs = side_by_side(poses, 15.0, RevisitSettings())
+    for later, laps in ((60, 0), (150, 1), (240, 2), (330, 3), (420, 3)):
+        expected = [later - 90 * back for back in range(1, laps + 1)]
+        assert [earlier for earlier, frame in pairs if frame == later] == expected
 
 
 def test_two_laps_of_pictures_give_the_true_path(solved):
