@@ -94,7 +94,8 @@ def _map_drive(
     notes: list[str] = list(recorded.problems)
     drive = following_frames(recorded, notes)
     segments = split_segments(drive)
-    held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed)
+    # What the driver deleted gets no labels, and where the car leaves the road it tells nothing of them.
+    held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
     known = read_camera(camera_path) if camera_path is not None else drive.camera
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
