@@ -26,8 +26,9 @@ class VerdictSettings(Settings):
             map may leave out ``usable`` times as many.
         min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; a map
             below it may be right, but the frames do not show that it is.
-        max_contradicted: Share of the frames around which the pictures disagree with the map. A map that is
-            bent in one place is not to be trusted in others.
+        max_contradicted: Share of the frames around which the pictures disagree with the map, which get no
+            labels: half of what may go without. A map that is bent in many places is not to be trusted in
+            others.
         max_focal_sigma: Relative uncertainty of the focal length, where the drive had to tell it.
         max_pitch_sigma_rad: Uncertainty of the camera's pitch, likewise.
         max_closure_heights: What a revisit misses across the road, in camera heights, as median.
@@ -41,7 +42,7 @@ class VerdictSettings(Settings):
     max_p95_px: float = Field(default=1.5, gt=0.0)
     min_labelled: float = Field(default=0.85, gt=0.0, lt=1.0)
     min_coverage: float = Field(default=0.3, gt=0.0, lt=1.0)
-    max_contradicted: float = Field(default=0.06, gt=0.0, lt=1.0)
+    max_contradicted: float = Field(default=0.075, gt=0.0, lt=1.0)
     max_focal_sigma: float = Field(default=0.05, gt=0.0)
     max_pitch_sigma_rad: float = Field(default=0.02, gt=0.0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)

@@ -13,6 +13,7 @@ from pydantic import Field
 from datagen.world.driver import Driver
 from datagen.world.track import Track
 from lanenet.config import Settings
+from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.perception.estimate import Detector, LaneEstimate
 
@@ -24,12 +25,14 @@ class PilotSettings(Settings):
         law: ``pure-pursuit`` and ``proportional`` steer by the points (see :mod:`lanenet.control.steering`),
             ``own`` follows the detector's own steering target.
         look_ahead_cm: Distance of the aim point ahead of the front axle.
+        smoothing: Of a detector's points over the frames, as on the car; the own target is not smoothed.
         keep_s: How long the last steering stays when the lane is lost.
         then: Afterwards the wheels go straight, or the car stops, until the lane is found again.
     """
 
     law: Literal["pure-pursuit", "proportional", "own"] = "proportional"
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
+    smoothing: SmoothingSettings = SmoothingSettings()
     keep_s: float = Field(default=0.5, ge=0.0)
     then: Literal["straight", "stop"] = "straight"
 
@@ -42,11 +45,17 @@ class Sight:
         image_bgr: What the camera sees; None for a pilot that needs no image.
         pose: True rear-axle centre x, y and heading, frame map; for pilots that are given the truth.
         s_cm: True place of the front axle along the road.
+        interval_s: Time since the frame before; 0 for the first one.
+        travel_cm: Way since then, as commanded.
+        steering_rad: Steering on that way, as commanded, positive left.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] | None
     pose: Float[np.ndarray, "3"]
     s_cm: float
+    interval_s: float = 0.0
+    travel_cm: float = 0.0
+    steering_rad: float = 0.0
 
 
 @runtime_checkable
@@ -69,16 +78,17 @@ class Pilot(Protocol):
 
 
 class DetectorPilot:
-    """Steers by what a detector sees."""
+    """Steers by what a detector sees, smoothed over the frames as on the car."""
 
     needs_image = True
 
     def __init__(self, detector: Detector, settings: PilotSettings, steering: SteeringSettings) -> None:
         """Take a detector and the law to steer by."""
         self._detector, self._own, self._steering = detector, settings.law == "own", steering
+        self._smoother = LaneSmoother(settings.smoothing, steering.wheelbase_cm)
 
     def steer(self, sight: Sight) -> float:
-        """See :class:`Pilot`; only the image is looked at.
+        """See :class:`Pilot`; the truth is not looked at.
 
         Raises:
             ValueError: If there is none.
@@ -87,13 +97,17 @@ class DetectorPilot:
             raise ValueError("a detector needs an image")
         estimate = self._detector.detect(sight.image_bgr)
         if not self._own:
-            return steering_target_rad(estimate, self._steering)
+            smooth = self._smoother.update(estimate, sight.interval_s, sight.travel_cm, sight.steering_rad)
+            # Smoothing carries one line on, and never a frame that shows none.
+            seen = bool(np.isfinite(estimate.points_cm).any())
+            return steering_target_rad(smooth, self._steering) if seen else math.nan
         limit, wished = self._steering.max_steering_rad, estimate.steering_rad
         return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
 
     def reset(self) -> None:
-        """Reset the detector."""
+        """Reset the detector and forget earlier frames."""
         self._detector.reset()
+        self._smoother.reset()
 
 
 class TruePointsPilot:

@@ -94,7 +94,7 @@ def test_the_worst_reason_comes_first_and_none_is_lost():
 
 
 @pytest.mark.parametrize(
-    ("share", "grade"), [(0.0, "good"), (0.06, "good"), (0.1, "usable"), (0.13, "reject")]
+    ("share", "grade"), [(0.0, "good"), (0.06, "good"), (0.1, "usable"), (0.16, "reject")]
 )
 def test_pictures_that_disagree_with_the_map_count(share, grade):
     found = judge(replace(GOOD, contradicted_share=share), VerdictSettings())

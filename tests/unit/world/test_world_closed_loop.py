@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,21 @@ def test_a_detector_steers_by_its_points_or_by_its_own_target():
     )
     with pytest.raises(ValueError, match="needs an image"):
         pursuit.steer(Sight(None, np.zeros(3), 0.0))
+
+
+def test_a_doubtful_frame_moves_the_wheels_less_than_a_sure_one():
+    image = np.zeros((4, 4, 3), np.uint8)
+
+    def steered(sigma_cm: float, **changes: object) -> float:
+        detector = Recorder(replace(_lane(0.0), sigma_cm=np.full(6, 0.5), confidence=1.0))
+        pilot = DetectorPilot(detector, PilotSettings.model_validate(changes), STEERING)
+        pilot.steer(Sight(image, np.zeros(3), 0.0))
+        detector.estimate = replace(_lane(-5.0), sigma_cm=np.full(6, sigma_cm), confidence=1.0)
+        return pilot.steer(Sight(image, np.zeros(3), 3.0, 0.05, 3.0, 0.0))
+
+    at_once = math.atan(5.0 / 15.0)
+    assert steered(8.0) < 0.1 * at_once < 0.4 * at_once < steered(0.5) < at_once
+    assert steered(8.0, smoothing={"enabled": False}) == pytest.approx(at_once)
 
 
 def test_a_perfect_detector_stays_in_the_lane():
