@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.follow import best_lane, follow_line
 from datagen.lanes.line import Side
@@ -22,6 +22,11 @@ from datagen.lanes.width import find_lane_width, find_tape_width
 from lanenet.errors import TrackingLostError
 
 __all__ = ["TraceSettings", "TracedLane", "trace_lane"]
+
+
+#: How far a line may lie beside its usual offset, as a share of the lane's width: beyond the first, what is
+#: off by the second goes as well; and how far around the usual offset is looked for, in lane widths.
+_STRAY, _BESIDE, _STRAY_REACH_LANES = 0.08, 0.04, 1.5
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,10 @@ def trace_lane(
     band = settings.width_share * lane
     left = follow_line(path, tapes, profile, centre + 0.5 * lane, band, settings)
     right = follow_line(path, tapes, profile, centre - 0.5 * lane, band, settings)
-    left, right = (_known_middle(profile, line, tape, settings) for line in (left, right))
+    left, right = (
+        _without_strays(path, _known_middle(profile, line, tape, settings), centre, lane)
+        for line in (left, right)
+    )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
         raise TrackingLostError(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
@@ -110,6 +118,37 @@ def _known_middle(
     return np.where(np.minimum(*edges) >= settings.min_support, line_cm, np.nan)
 
 
+def _without_strays(
+    path: Path, line_cm: Float[np.ndarray, "m"], centre_cm: Float[np.ndarray, "m"], lane_cm: float
+) -> Float[np.ndarray, "m"]:
+    """Drop short stretches that bulge out of the way of the line before and after them.
+
+    Where a line is hidden or worn away, a strip of tape on the floor is followed instead. Dashes lie on one
+    way, all of them, and a lane becomes wider over more than its own width.
+    """
+    offset, m = line_cm - centre_cm, len(line_cm)
+    reach = round(_STRAY_REACH_LANES * lane_cm / path.step_cm)
+    index = np.arange(m)[:, None] + np.arange(-reach, reach + 1)
+    around = offset[index % m]
+    if not path.closed:
+        around[(index < 0) | (index >= m)] = np.nan
+    usual = np.full(m, np.nan)
+    some = np.isfinite(around).any(axis=1)
+    usual[some] = np.nanmedian(around[some], axis=1)
+    off = np.nan_to_num(np.abs(offset - usual)) / lane_cm
+    kept = line_cm.copy()
+    for piece in _pieces(off > _BESIDE):
+        if off[piece].max() > _STRAY:
+            kept[piece] = np.nan
+    return kept
+
+
+def _pieces(known: Bool[np.ndarray, "m"]) -> list[Int[np.ndarray, "_"]]:
+    """Return the indices of each run of known samples."""
+    runs = np.split(np.arange(len(known)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
+    return [run for run in runs if known[run[0]]]
+
+
 def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settings: TraceSettings) -> bool:
     """Tell a painted line from clutter: enough of it, in runs rather than in specks."""
     seen = _in_runs(np.isfinite(line_cm), max(2, int(0.1 * lane_cm / path.step_cm)))
@@ -120,6 +159,6 @@ def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settin
 def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int) -> Bool[np.ndarray, "m"]:
     """Drop runs of fewer samples."""
     kept = np.zeros(len(seen), dtype=bool)
-    for run in np.split(np.arange(len(seen)), np.flatnonzero(np.diff(seen.astype(np.int8))) + 1):
-        kept[run] = seen[run[0]] and len(run) >= shortest
+    for run in _pieces(seen):
+        kept[run] = len(run) >= shortest
     return kept
