@@ -26,7 +26,7 @@ class ColumnModel(RasterModel):
         if window != self.window:
             raise ModelMismatchError("another window")
 
-    def answer(self, rasters):
+    def answer(self, rasters, lane_cm=None):
         n = len(rasters)
         points, presence = np.full((n, 6), np.nan), np.zeros((n, 2))
         for i, raster in enumerate(rasters[:, 0]):

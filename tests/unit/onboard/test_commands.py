@@ -280,7 +280,7 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
         def check_window(self, window: BirdseyeWindow) -> None:
             assert window == BirdseyeWindow()
 
-        def answer(self, rasters: np.ndarray) -> RasterAnswers:
+        def answer(self, rasters: np.ndarray, lane_cm: np.ndarray | None = None) -> RasterAnswers:
             n = len(rasters)
             return RasterAnswers(np.zeros((n, 6)), np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
