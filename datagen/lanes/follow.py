@@ -61,11 +61,10 @@ def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.n
     """How far outside a lane centred at each offset the car is, 1 from a lane away, mean of all visits."""
     m, columns = profile.left.shape
     at = (np.arange(columns) - profile.half_cells) * profile.cell_cm
-    d = np.zeros(len(path.s_frames_cm)) if path.d_frames_cm is None else path.d_frames_cm
-    forward = np.ones(len(d), dtype=bool) if path.forward is None else path.forward
+    forward = path.drives_forward
     rows = np.rint(path.s_frames_cm / path.step_cm).astype(np.intp) % m
     total, visits = np.zeros((m, columns)), np.zeros(m)
-    for row, offset in zip(rows[forward], d[forward], strict=True):
+    for row, offset in zip(rows[forward], path.offsets_cm[forward], strict=True):
         total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0) ** 2
         visits[row] += 1.0
     near = max(1.0, 0.25 * lane_cm / path.step_cm)

@@ -45,6 +45,16 @@ class Path:
         return len(self.xy_cm) * self.step_cm if self.closed else None
 
     @property
+    def offsets_cm(self) -> Float[np.ndarray, "n"]:
+        """Offset of each frame's rear axle."""
+        return np.zeros(len(self.s_frames_cm)) if self.d_frames_cm is None else self.d_frames_cm
+
+    @property
+    def drives_forward(self) -> Bool[np.ndarray, "n"]:
+        """Whether each frame drives in the path's direction."""
+        return np.ones(len(self.s_frames_cm), dtype=bool) if self.forward is None else self.forward
+
+    @property
     def s_cm(self) -> Float[np.ndarray, "m"]:
         """Position of the samples along the path."""
         return np.arange(len(self.xy_cm)) * self.step_cm
@@ -149,7 +159,7 @@ def edges_along_path(
     distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
     keep = distance <= reach_cm
     frame = scans.frame_of_point[keep]
-    forward = np.ones(len(poses), dtype=bool) if path.forward is None else path.forward
+    forward = path.drives_forward
     s, d, side, along = _project(
         path.xy_cm,
         path.left,

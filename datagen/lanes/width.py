@@ -111,10 +111,9 @@ def _has_middle_line(
 
 def _keeps_to_a_half(path: Path, middle_cm: Float[np.ndarray, "m"], whole_cm: float) -> bool:
     """Whether the car is in the same half of the road, as it drives, most of the time."""
-    offset = np.zeros(len(path.s_frames_cm)) if path.d_frames_cm is None else path.d_frames_cm
-    forward = np.ones(len(offset), dtype=bool) if path.forward is None else path.forward
     middle = np.interp(path.s_frames_cm, path.s_cm, middle_cm, period=path.period_cm)
-    left = np.where(forward, offset - middle, middle - offset) / whole_cm
+    beside = path.offsets_cm - middle
+    left = np.where(path.drives_forward, beside, -beside) / whole_cm
     left = left[np.abs(left) < _ON_ROAD]
     return bool(max(np.sum(left > _IN_HALF), np.sum(left < -_IN_HALF)) > _MOST * len(left))
 
