@@ -72,6 +72,15 @@ def test_train_leaves_a_checkpoint_that_is_complete(finished):
         assert figures["rmse_cm"] <= figures["worst_cm"] and figures["count"] > 0
 
 
+def test_no_json_has_words_that_json_does_not_know(finished):
+    folder, _, _ = finished
+    written = {path.name: path.read_text() for path in (folder / "ck" / "tiny").glob("*.json")}
+    assert written.keys() >= {"metrics.json", "results.json", "robustness.json"}
+    for name, text in written.items():
+        for word in ("NaN", "Infinity"):
+            assert word not in text, name
+
+
 def test_labels_come_from_the_map_and_are_close_to_the_truth(finished):
     folder, _, _ = finished
     synthetic = folder / "work" / "synthetic"
