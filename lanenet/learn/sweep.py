@@ -31,7 +31,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "far_cm": (72.0, 48.0, 96.0),
     "half_width_cm": (48.0, 36.0, 60.0),
     "first_channels": (16, 8, 12, 24),
-    "layers": (4, 3, 5),
+    "layers": (5, 4, 3),
     "hidden": (64, 32, 128),
     "loss": ("student", "laplace", "gaussian"),
     "evenness": (0.5, 0.0, 1.0, 2.0),
@@ -138,7 +138,7 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
     )
     # As in the family: each layer has as many channels more as the first one has.
     channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
-    network = {"kind": "small", "channels": channels, "hidden": drawn["hidden"]}
+    network = {"channels": channels, "hidden": drawn["hidden"], "takes_width": settings.network.takes_width}
     loss = {"kind": drawn["loss"], "evenness": drawn["evenness"], "presence": settings.loss.presence}
     rate = trial.suggest_float("learning_rate", *LEARNING_RATE, log=True)
     data = settings.model_dump() | {"network": network, "loss": loss, "learning_rate": rate}
@@ -182,7 +182,7 @@ def _write_tables(study: Any, out: Path) -> str:
         }
         for trial in done
     ]
-    table = trials_table(rows)
+    table = trials_table(rows, tuple(CHOICES))
     write_text(out / "trials.csv", trials_csv(rows))
     write_text(out / "sweep.md", table)
     return table

@@ -25,8 +25,6 @@ _NAMES = {
     "epochs": "epochs",
     "cpu_s": "CPU, s",
 }
-#: Of these every value is one of a few.
-_CHOICES = ("cell_cm", "far_cm", "half_width_cm", "first_channels", "layers", "hidden", "loss", "evenness")
 
 
 def trials_csv(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -38,12 +36,13 @@ def trials_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def trials_table(rows: Sequence[Mapping[str, Any]]) -> str:
+def trials_table(rows: Sequence[Mapping[str, Any]], choices: Sequence[str]) -> str:
     """Return the best trials, and for each choice the errors of the trials that made it, as Markdown.
 
     Args:
         rows: Trials by the names of the CSV; ``state`` is ``complete``, or ``pruned`` for those that were
             given up early, which do not count.
+        choices: Names of what was chosen from a few values.
     """
     whole = sorted((row for row in rows if row["state"] == "complete"), key=lambda row: row["val_rmse_cm"])
     lines = [
@@ -55,7 +54,7 @@ def trials_table(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     lines += ["| " + " | ".join(_shown(row[key]) for key in _NAMES) + " |" for row in whole[:_BEST]]
     lines += ["", "| choice | value | trials | best RMSE, cm | median RMSE, cm |", "|---|---|---|---|---|"]
-    for key in _CHOICES:
+    for key in choices:
         for value in sorted({row[key] for row in whole}, key=str):
             errors = [row["val_rmse_cm"] for row in whole if row[key] == value]
             figures = f"{len(errors)} | {min(errors):.3f} | {np.median(errors):.3f}"

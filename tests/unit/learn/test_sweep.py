@@ -7,8 +7,9 @@ from synthetic_labels import make_label_set
 
 from lanenet.data.label_set import write_labels
 from lanenet.errors import LanenetError
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
-from lanenet.learn.config import LearnSettings
+from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.sweep import sweep
 from lanenet.learn.sweep_table import trials_csv, trials_table
 
@@ -67,6 +68,19 @@ def test_the_network_as_it_is_comes_first_and_a_later_call_goes_on(quick, paths,
     assert len(read(tmp_path)) == 1
 
 
+def test_the_first_of_all_choices_is_the_small_network_in_the_usual_window():
+    optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
+    first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
+    trial = optuna.trial.FixedTrial(first | {"learning_rate": LearnSettings().learning_rate})
+    told = LearnSettings(network=NetworkSettings(takes_width=True))
+    for settings in (LearnSettings(), told):
+        window, chosen = sweep_module._draw(trial, settings)
+        assert window == BirdseyeWindow()
+        assert chosen.network.size == settings.network.size
+        assert chosen.network.takes_width == settings.network.takes_width
+        assert chosen.model_copy(update={"network": settings.network}) == settings
+
+
 def test_a_trial_that_time_cut_off_is_tried_again(quick, paths, tmp_path, monkeypatch):
     clock = iter([0.0, 0.0])
     with monkeypatch.context() as patch:
@@ -108,7 +122,7 @@ def test_tables():
         {"trial": 2, "state": "complete", "val_rmse_cm": 1.1, **ROW},
         {"trial": 3, "state": "pruned", "val_rmse_cm": None, **ROW, "epochs": 3},
     ]
-    lines = trials_table(rows).splitlines()
+    lines = trials_table(rows, ("loss", "cell_cm")).splitlines()
     assert lines[0].startswith("3 trials to the end, 1 given up early")
     assert lines[4].startswith("| 0.8 | 0.75 | 72 | 48 | 16 | 4 | 64 | laplace | 1 | 0.003 | 97310 | 8 |")
     assert (
@@ -121,4 +135,4 @@ def test_tables():
 
 
 def test_without_trials_there_is_a_table_without_rows():
-    assert trials_table([]).startswith("0 trials to the end, 0 given up early")
+    assert trials_table([], ("loss",)).startswith("0 trials to the end, 0 given up early")
