@@ -31,7 +31,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "far_cm": (72.0, 48.0, 96.0),
     "half_width_cm": (48.0, 36.0, 60.0),
     "first_channels": (16, 8, 12, 24),
-    "layers": (4, 3, 5),
+    "layers": (5, 4, 3),
     "hidden": (64, 32, 128),
     "loss": ("student", "laplace", "gaussian"),
     "evenness": (0.5, 0.0, 1.0, 2.0),

@@ -7,8 +7,9 @@ from synthetic_labels import make_label_set
 
 from lanenet.data.label_set import write_labels
 from lanenet.errors import LanenetError
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
-from lanenet.learn.config import LearnSettings
+from lanenet.learn.config import LearnSettings, LossSettings, NetworkSettings
 from lanenet.learn.sweep import sweep
 from lanenet.learn.sweep_table import trials_csv, trials_table
 
@@ -44,6 +45,20 @@ def quick(monkeypatch):
     pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
     small = {"cell_cm": (3.0, 4.0), "first_channels": (4, 2), "layers": (2, 1), "hidden": (8, 4)}
     monkeypatch.setattr(sweep_module, "CHOICES", sweep_module.CHOICES | small)
+
+
+def test_what_is_tried_first_is_the_small_network_as_it_is():
+    first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
+    channels, hidden = NetworkSettings(kind="small").size
+    assert [first["first_channels"] * k for k in range(1, first["layers"] + 1)] == list(channels)
+    assert first["hidden"] == hidden
+    assert (first["loss"], first["evenness"]) == (LossSettings().kind, LossSettings().evenness)
+    window = BirdseyeWindow()
+    assert (first["cell_cm"], first["far_cm"], first["half_width_cm"]) == (
+        window.cell_cm,
+        window.far_cm,
+        -window.left_cm,
+    )
 
 
 def read(folder):
