@@ -18,7 +18,7 @@ from datagen.world.pilot import (
     Pilot,
     PilotSettings,
     TruePointsPilot,
-    steering_settings,
+    control_settings,
 )
 from datagen.world.world import SimulationSettings, World, assemble_world
 from lanenet.geometry.camera import Camera
@@ -228,12 +228,12 @@ class _Referee:
 def build_pilot(world: World, entrant: Entrant, settings: PilotSettings) -> Pilot:
     """Return who steers in a world."""
     car, track = world.settings.car, world.track
-    steering = steering_settings(settings, car.wheelbase_cm, car.max_steering_rad, track.lane_width_cm)
+    control = control_settings(settings, car.wheelbase_cm, car.max_steering_rad, track.lane_width_cm)
     if entrant.build is not None:
         marking_cm = track.markings[0].width_cm if track.markings else None
         detector = entrant.build(world.camera, track.lane_width_cm, marking_cm)
-        return DetectorPilot(detector, settings, steering)
-    return DriverPilot(world.driver) if entrant.name == TRUTH else TruePointsPilot(track, steering)
+        return DetectorPilot(detector, control)
+    return DriverPilot(world.driver) if entrant.name == TRUTH else TruePointsPilot(track, control.steering)
 
 
 def _steering_rms_rad_s(trajectory: Trajectory, rate_hz: float) -> float:

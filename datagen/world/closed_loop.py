@@ -63,7 +63,7 @@ class ClosedLoop:
         self._world, self._pilot, self._speed_cm_s = world, pilot, speed_cm_s
         self._lost = LostLane(settings, world.settings.rate_hz)
         self._jpeg_quality = jpeg_quality
-        self._frame, self._since = 0, (0.0, 0.0, 0.0)
+        self._frame, self._told = 0, (0.0, 0.0)
         self._wheelbase_cm = world.settings.car.wheelbase_cm
         self.s_cm = world.driver.s_cm
         world.car.place(world.car.pose, speed_cm_s)
@@ -78,12 +78,13 @@ class ClosedLoop:
         if self._pilot.needs_image:
             image = world.renderer.render(pose, frame, *moving)
         seen = image if image is None or self._jpeg_quality is None else as_jpeg(image, self._jpeg_quality)
-        wished_rad = self._pilot.steer(Sight(seen, pose, self.s_cm, *self._since))
+        interval_s = 1.0 / world.settings.rate_hz
+        t_s = frame * interval_s
+        wished_rad = self._pilot.steer(Sight(seen, pose, self.s_cm, t_s, *self._told))
         speed_cm_s, steering_rad = obeyed(world, *self._lost.command(wished_rad, self._speed_cm_s))
         points_cm = world.track.truth(pose, self._wheelbase_cm, self.s_cm)
-        interval_s = 1.0 / world.settings.rate_hz
-        self._since = (interval_s, speed_cm_s * interval_s, steering_rad)
-        state = DriveState(frame, frame * interval_s, pose, *moving, points_cm, speed_cm_s, steering_rad)
+        self._told = (speed_cm_s, steering_rad)
+        state = DriveState(frame, t_s, pose, *moving, points_cm, speed_cm_s, steering_rad)
         car.step(speed_cm_s, steering_rad, interval_s)
         self._frame += 1
         return LoopFrame(state, image, math.isfinite(wished_rad), self.s_cm, offset_cm)
@@ -96,6 +97,6 @@ class ClosedLoop:
         """
         self.s_cm += ahead_cm
         self._world.car.place(self._world.driver.pose_at(self.s_cm), self._speed_cm_s)
-        self._since = (0.0, 0.0, 0.0)
+        self._told = (0.0, 0.0)
         self._pilot.reset()
         self._lost.reset()

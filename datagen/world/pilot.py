@@ -1,4 +1,4 @@
-"""Whoever steers in closed loop: a detector with a steering law, the truth, or the scripted driver."""
+"""Whoever steers in closed loop: a detector with the car's own controller, the truth, the scripted driver."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pydantic import Field
 from datagen.world.driver import Driver
 from datagen.world.track import Track
 from lanenet.config import Settings
-from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
+from lanenet.control.controller import ControlSettings, LaneController
+from lanenet.control.smoothing import SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.perception.estimate import Detector, LaneEstimate
 
@@ -45,16 +46,16 @@ class Sight:
         image_bgr: What the camera sees; None for a pilot that needs no image.
         pose: True rear-axle centre x, y and heading, frame map; for pilots that are given the truth.
         s_cm: True place of the front axle along the road.
-        interval_s: Time since the frame before; 0 for the first one.
-        travel_cm: Way since then, as commanded.
-        steering_rad: Steering on that way, as commanded, positive left.
+        t_s: Time of the frame.
+        speed_cm_s: Commanded speed since the frame before; 0 for the first one.
+        steering_rad: Commanded steering since then, positive left.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] | None
     pose: Float[np.ndarray, "3"]
     s_cm: float
-    interval_s: float = 0.0
-    travel_cm: float = 0.0
+    t_s: float = 0.0
+    speed_cm_s: float = 0.0
     steering_rad: float = 0.0
 
 
@@ -78,36 +79,29 @@ class Pilot(Protocol):
 
 
 class DetectorPilot:
-    """Steers by what a detector sees, smoothed over the frames as on the car."""
+    """Steers by what a detector sees, with the controller of the car."""
 
     needs_image = True
 
-    def __init__(self, detector: Detector, settings: PilotSettings, steering: SteeringSettings) -> None:
-        """Take a detector and the law to steer by."""
-        self._detector, self._own, self._steering = detector, settings.law == "own", steering
-        self._smoother = LaneSmoother(settings.smoothing, steering.wheelbase_cm)
+    def __init__(self, detector: Detector, control: ControlSettings) -> None:
+        """Take a detector and how its lane becomes steering."""
+        self._detector, self._controller = detector, LaneController(control)
 
     def steer(self, sight: Sight) -> float:
-        """See :class:`Pilot`; the truth is not looked at.
+        """See :class:`Pilot`; the truth is not looked at, and the speed is not the pilot's to choose.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If there is no image.
         """
         if sight.image_bgr is None:
             raise ValueError("a detector needs an image")
         estimate = self._detector.detect(sight.image_bgr)
-        if not self._own:
-            smooth = self._smoother.update(estimate, sight.interval_s, sight.travel_cm, sight.steering_rad)
-            # Smoothing carries one line on, and never a frame that shows none.
-            seen = bool(np.isfinite(estimate.points_cm).any())
-            return steering_target_rad(smooth, self._steering) if seen else math.nan
-        limit, wished = self._steering.max_steering_rad, estimate.steering_rad
-        return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
+        return self._controller.wish(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
 
     def reset(self) -> None:
         """Reset the detector and forget earlier frames."""
         self._detector.reset()
-        self._smoother.reset()
+        self._controller.reset()
 
 
 class TruePointsPilot:
@@ -173,14 +167,15 @@ class LostLane:
         self._kept_rad, self._missed = 0.0, 0
 
 
-def steering_settings(
+def control_settings(
     pilot: PilotSettings, wheelbase_cm: float, max_steering_rad: float, lane_width_cm: float
-) -> SteeringSettings:
+) -> ControlSettings:
     """Return the settings of :mod:`lanenet.control` for a car and a lane."""
-    return SteeringSettings(
+    steering = SteeringSettings(
         law="pure-pursuit" if pilot.law == "pure-pursuit" else "proportional",
         look_ahead_cm=pilot.look_ahead_cm,
         wheelbase_cm=wheelbase_cm,
         max_steering_rad=max_steering_rad,
         lane_width_cm=lane_width_cm,
     )
+    return ControlSettings(steering=steering, smoothing=pilot.smoothing, own_target=pilot.law == "own")

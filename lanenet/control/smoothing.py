@@ -19,6 +19,8 @@ _MIN_CONFIDENCE = 0.05
 _MIN_SIGMA_CM = 1e-3
 #: Rows that come nearer together belong to a line that runs across the way.
 _MIN_STEP_CM = 1.0
+#: Of times of frames, so that a line is held for the same number of them whatever the time of day.
+_ROUNDING_S = 1e-6
 
 
 class SmoothingSettings(Settings):
@@ -95,7 +97,7 @@ class LaneSmoother:
         for i in range(N_POINTS):
             self._unseen_s[i] += dt_s
             self._variance[i] += growth
-            if self._unseen_s[i] > self._settings.hold_s:
+            if self._unseen_s[i] > self._settings.hold_s + _ROUNDING_S:
                 self._points_cm[i], self._variance[i] = math.nan, math.inf
         if travel_cm != 0.0:
             turn_rad = travel_cm * math.tan(steering_rad) / self._wheelbase_cm

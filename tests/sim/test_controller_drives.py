@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +32,7 @@ class NoisyEyes:
             )
         )
         self._rng = np.random.default_rng(seed)
-        self._frame, self._steering_rad = 0, 0.0
+        self._frame = 0
 
     def steer(self, sight: Sight) -> float:
         points_cm = self._track.truth(sight.pose, self._wheelbase_cm, sight.s_cm)
@@ -41,11 +40,8 @@ class NoisyEyes:
         if self._frame % 40 >= 30:
             points_cm[3:] = np.nan
         estimate = LaneEstimate(points_cm, np.full(6, NOISE_CM), confidence=1.0)
-        wish = self._controller.wish(estimate, self._frame / RATE_HZ, SPEED_CM_S, self._steering_rad)
         self._frame += 1
-        if math.isfinite(wish.steering_rad):
-            self._steering_rad = wish.steering_rad
-        return wish.steering_rad
+        return self._controller.wish(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
 
     def reset(self) -> None:
         self._controller.reset()

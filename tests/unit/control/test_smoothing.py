@@ -93,6 +93,17 @@ def test_a_lost_line_is_carried_on_for_a_while() -> None:
     assert np.isnan(gone.points_cm[3:]).all() and np.isfinite(gone.points_cm[:3]).all()
 
 
+@pytest.mark.parametrize("first", [0, 7, 19, 638])
+def test_a_lost_line_is_carried_on_for_as_many_frames_at_any_time(first: int) -> None:
+    smoother = LaneSmoother(SmoothingSettings(hold_s=0.25), WHEELBASE_CM)
+    times_s = (first + np.arange(10)) * 0.05
+    smoother.update(LaneEstimate(lane(0.0), confidence=1.0), 0.0)
+    left_only = lane(0.0)
+    left_only[3:] = np.nan
+    seen = [smoother.update(LaneEstimate(left_only), dt_s).mask[3] for dt_s in np.diff(times_s)]
+    assert seen == [True] * 5 + [False] * 4
+
+
 def test_it_can_be_switched_off_and_reset() -> None:
     estimate = LaneEstimate(lane(4.0), confidence=0.3)
     off = LaneSmoother(SmoothingSettings(enabled=False), WHEELBASE_CM)

@@ -18,17 +18,21 @@ from datagen.world.pilot import (
     PilotSettings,
     Sight,
     TruePointsPilot,
-    steering_settings,
+    control_settings,
 )
 from datagen.world.rig import CameraSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.track import TrackSettings
 from datagen.world.world import SimulationSettings, World, assemble_world
+from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.data.drive import open_drive
 from lanenet.perception.estimate import LaneEstimate
 
 SMALL = CameraSettings(width=64, height=48)
-STEERING = steering_settings(PilotSettings(), 26.0, 0.45, 40.0)
+
+
+def _control(**changes: object) -> ControlSettings:
+    return control_settings(PilotSettings.model_validate(changes), 26.0, 0.45, 40.0)
 
 
 class Recorder:
@@ -75,17 +79,13 @@ def test_a_lost_lane_keeps_the_steering_then_goes_straight_or_stops():
 
 def test_a_detector_steers_by_its_points_or_by_its_own_target():
     sight = Sight(np.zeros((4, 4, 3), np.uint8), np.zeros(3), 0.0)
-    circle = PilotSettings(law="pure-pursuit")
-    pursuit = DetectorPilot(Recorder(_lane(-5.0)), circle, steering_settings(circle, 26.0, 0.45, 40.0))
+    pursuit = DetectorPilot(Recorder(_lane(-5.0)), _control(law="pure-pursuit"))
     assert pursuit.steer(sight) == pytest.approx(math.atan(26.0 * 10.0 / (41.0**2 + 25.0)))
-    paper = PilotSettings()
-    proportional = DetectorPilot(Recorder(_lane(-5.0)), paper, steering_settings(paper, 26.0, 0.45, 40.0))
+    proportional = DetectorPilot(Recorder(_lane(-5.0)), _control())
     assert proportional.steer(sight) == pytest.approx(math.atan(5.0 / 15.0))
-    own = DetectorPilot(Recorder(_lane(-5.0)), PilotSettings(law="own"), STEERING)
+    own = DetectorPilot(Recorder(_lane(-5.0)), _control(law="own"))
     assert own.steer(sight) == 0.45  # 0.7 is more than the servo can
-    assert math.isnan(
-        DetectorPilot(Recorder(LaneEstimate()), PilotSettings(law="own"), STEERING).steer(sight)
-    )
+    assert math.isnan(DetectorPilot(Recorder(LaneEstimate()), _control(law="own")).steer(sight))
     with pytest.raises(ValueError, match="needs an image"):
         pursuit.steer(Sight(None, np.zeros(3), 0.0))
 
@@ -95,19 +95,56 @@ def test_a_doubtful_frame_moves_the_wheels_less_than_a_sure_one():
 
     def steered(sigma_cm: float, **changes: object) -> float:
         detector = Recorder(replace(_lane(0.0), sigma_cm=np.full(6, 0.5), confidence=1.0))
-        pilot = DetectorPilot(detector, PilotSettings.model_validate(changes), STEERING)
+        pilot = DetectorPilot(detector, _control(**changes))
         pilot.steer(Sight(image, np.zeros(3), 0.0))
         detector.estimate = replace(_lane(-5.0), sigma_cm=np.full(6, sigma_cm), confidence=1.0)
-        return pilot.steer(Sight(image, np.zeros(3), 3.0, 0.05, 3.0, 0.0))
+        return pilot.steer(Sight(image, np.zeros(3), 3.0, 0.05, 60.0, 0.0))
 
     at_once = math.atan(5.0 / 15.0)
     assert steered(8.0) < 0.1 * at_once < 0.4 * at_once < steered(0.5) < at_once
     assert steered(8.0, smoothing={"enabled": False}) == pytest.approx(at_once)
 
 
+def test_a_detector_steers_as_the_controller_of_the_car_does():
+    rng = np.random.default_rng(5)
+    image, detector = np.zeros((4, 4, 3), np.uint8), Recorder(_lane(0.0))
+    pilot, controller = DetectorPilot(detector, _control()), LaneController(_control())
+    steered, wished = [], []
+    for frame in range(30):
+        points_cm = _lane(rng.normal()).points_cm
+        points_cm[3:] = np.nan if frame % 3 == 2 else points_cm[3:]
+        detector.estimate = LaneEstimate(points_cm, np.full(6, 0.5), confidence=rng.uniform())
+        told = (60.0 * (frame > 0), rng.normal(0.0, 0.1))
+        steered.append(pilot.steer(Sight(image, np.zeros(3), 3.0 * frame, 0.05 * frame, *told)))
+        wished.append(controller.wish(detector.estimate, 0.05 * frame, *told).steering_rad)
+        if frame == 20:
+            pilot.reset()
+            controller.reset()
+    assert steered == wished
+    assert np.isfinite(steered).all()
+    assert np.std(steered) > 0.01
+
+
+def test_the_loop_tells_the_pilot_when_it_looks_and_what_was_commanded():
+    world, sights = _world(), []
+
+    class Watcher(TruePointsPilot):
+        def steer(self, sight: Sight) -> float:
+            sights.append(sight)
+            return super().steer(sight)
+
+    loop = _loop(Watcher(world.track, _control().steering), world)
+    states = [loop.next_frame().state for _ in range(3)]
+    loop.put_back()
+    states.append(loop.next_frame().state)
+    assert [sight.t_s for sight in sights] == [state.t_s for state in states]
+    commanded = [(0.0, 0.0), *((state.speed_cm_s, state.steering_rad) for state in states[:2]), (0.0, 0.0)]
+    assert [(sight.speed_cm_s, sight.steering_rad) for sight in sights] == commanded
+
+
 def test_a_perfect_detector_stays_in_the_lane():
     world = _world()
-    loop = _loop(TruePointsPilot(world.track, STEERING), world)
+    loop = _loop(TruePointsPilot(world.track, _control().steering), world)
     frames = [loop.next_frame() for _ in range(200)]
     assert all(frame.answered and frame.image_bgr is None for frame in frames)
     assert max(abs(frame.offset_cm) for frame in frames) < 8.0
@@ -116,7 +153,7 @@ def test_a_perfect_detector_stays_in_the_lane():
 
 def test_a_detector_that_sees_the_lane_on_the_left_leaves_it_there():
     world = _world()
-    loop = _loop(DetectorPilot(Recorder(_lane(-15.0)), PilotSettings(), STEERING), world)
+    loop = _loop(DetectorPilot(Recorder(_lane(-15.0)), _control()), world)
     offsets_cm = [loop.next_frame().offset_cm for _ in range(24)]
     assert offsets_cm[-1] > 15.0
     loop.put_back()
@@ -125,7 +162,7 @@ def test_a_detector_that_sees_the_lane_on_the_left_leaves_it_there():
 
 def test_putting_back_resets_the_detector_and_keeps_the_place():
     world, detector = _world(), Recorder(_lane(-15.0))
-    loop = _loop(DetectorPilot(detector, PilotSettings(), STEERING), world)
+    loop = _loop(DetectorPilot(detector, _control()), world)
     for _ in range(15):
         before = loop.next_frame()
     loop.put_back(ahead_cm=30.0)
@@ -141,9 +178,7 @@ def test_the_pilot_sees_what_the_file_holds(tmp_path: Path):
     settings = SimulationSettings(
         seed=1, frames=5, camera=SMALL, random_look=False, look=LookSettings(noise_level=6.0, jpeg_quality=60)
     )
-    out = simulate_drive(
-        settings, tmp_path / "d", pilot=lambda world: DetectorPilot(detector, PilotSettings(), STEERING)
-    )
+    out = simulate_drive(settings, tmp_path / "d", pilot=lambda world: DetectorPilot(detector, _control()))
     drive = open_drive(out)
     assert len(drive) == len(detector.seen) == 5
     for i, seen in enumerate(detector.seen):
