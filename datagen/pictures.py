@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from datagen.labels.project import FrameLines
 from datagen.map_folder import DriveMap
+from datagen.runs import true_runs
 from datagen.slam.places import path_lengths
 from datagen.slam.scans import Scans
 from lanenet.errors import LanenetError
@@ -85,9 +86,8 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
 
 
 def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]
-    known = np.isfinite(points[:, 0])
-    for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(known.astype(int)) != 0) + 1):
-        if len(run) > 1 and known[run[0]]:
+    for run in true_runs(np.isfinite(points[:, 0])):
+        if len(run) > 1:
             cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
 
 

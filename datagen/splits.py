@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from datagen.runs import equal_runs
 from lanenet.data.label_set import LabelSet
 from lanenet.data.pieces import map_pieces
 from lanenet.errors import ConfigError
@@ -57,9 +58,9 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
     Raises:
         ConfigError: If there are fewer than three laps, or a part would be empty.
     """
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(labels.lap) != 0) + 1])
-    counts = np.diff(np.append(starts, len(labels)))
-    starts = starts[counts >= _WHOLE_LAP * np.median(counts)]
+    laps = equal_runs(labels.lap)
+    usual = np.median([len(lap) for lap in laps]) if laps else 0.0
+    starts = [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * usual]
     if len(starts) < 3:
         raise ConfigError(
             f"split by lap: found {len(starts)} laps driven to their end, expected at least 3; split along "

@@ -216,33 +216,32 @@ def _answer(
         return _answer_labels(name, labels, names, models, training, marking_cm)
     detectors: dict[str, Detector] = {}
     for key in _in_order(names, models):
-        kind: Any = "network" if key in models else key
+        detector: Any = "network" if key in models else key
         built = build_compared(
-            [kind], frames, model=models.get(key), marking_cm=marking_cm, any_camera=any_camera
+            [detector], frames, model=models.get(key), marking_cm=marking_cm, any_camera=any_camera
         )
-        detectors[key] = built[kind]
+        detectors[key] = built[detector]
 
     def report(done: int, total: int) -> None:
         if progress is not None:
             progress(source.path.name, done, total)
 
     answers = answer_frames(frames, detectors, report)
-    kind = "simulated drive" if frames.reference == "truth" else "map"
     conditions, visible = {"light": answers.brightness}, None
     if labels is not None:
         visible = at_frames(lines_seen(labels), labels.frame, frames.frames)
         way = way_to_training_cm(labels, training)
         conditions["place"] = at_frames(way, labels.frame, frames.frames)
     return SourceAnswers(
-        name,
-        kind,
-        frames.reference,
-        frames.points_cm,
-        answers.points_cm,
-        answers.sigma_cm,
-        answers.presence,
-        visible,
-        conditions,
+        name=name,
+        kind="simulated drive" if frames.reference == "truth" else "map",
+        reference=frames.reference,
+        truth_cm=frames.points_cm,
+        answers_cm=answers.points_cm,
+        sigma_cm=answers.sigma_cm,
+        presence=answers.presence,
+        visible=visible,
+        conditions=conditions,
     )
 
 
@@ -271,13 +270,13 @@ def _answer_labels(
             settings = filter_settings(meta.lane_width_cm, meta.marking_cm, marking_cm)
             points[key] = lane_filter_points_cm(labels, settings)
     return SourceAnswers(
-        name,
-        "label set",
-        labels.meta.source,
-        labels.points_cm,
-        points,
-        sigma,
-        presence,
-        lines_seen(labels),
-        {"place": way_to_training_cm(labels, training)},
+        name=name,
+        kind="label set",
+        reference=labels.meta.source,
+        truth_cm=labels.points_cm,
+        answers_cm=points,
+        sigma_cm=sigma,
+        presence=presence,
+        visible=lines_seen(labels),
+        conditions={"place": way_to_training_cm(labels, training)},
     )

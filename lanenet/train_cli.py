@@ -73,6 +73,7 @@ def train(
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
     from datagen.datasets import prepare
+    from lanenet.data.files import json_text
     from lanenet.data.label_set import read_labels
     from lanenet.evaluation import default_names, evaluate, open_tests
     from lanenet.learn.card import CARD_NAME, model_card
@@ -92,7 +93,7 @@ def train(
     run_hash = hash_run(settings.learn, data.train, data.validation)
     run_folder = settings.work_folder / f"train-{run_hash}"
     with console.training_bar() as progress:
-        train_network(settings.learn, data.train, data.validation, run_folder, progress)
+        model = train_network(settings.learn, data.train, data.validation, run_folder, progress).model_path
     if not data.test:
         console.show_problems(["the data has no test part: the table is over the validation labels"])
     sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
@@ -101,7 +102,7 @@ def train(
         evaluation = evaluate(
             sources,
             default_names(sources, with_model=True),
-            run_folder / "model.onnx",
+            model,
             training=training,
             marking_cm=marking,
             # Which camera made which test drive is settled by the config.
@@ -109,10 +110,10 @@ def train(
             progress=progress,
         )
     val_cli.show(evaluation.comparison)
-    robustness = _robustness(run_folder / "model.onnx", sources)
+    robustness = _robustness(model, sources)
     card = model_card(
         settings.name,
-        read_model_meta(run_folder / "model.onnx"),
+        read_model_meta(model),
         json.loads((run_folder / METRICS_NAME).read_text(encoding="utf-8")),
         training,
         evaluation.comparison,
@@ -121,15 +122,14 @@ def train(
     files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card}
     files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
     if robustness:
-        files["robustness.json"] = json.dumps(as_dict(robustness), indent=2) + "\n"
+        files["robustness.json"] = json_text(as_dict(robustness))
     if data.camera is not None:
         files["camera.yaml"] = data.camera.read_bytes()
     if data.example is not None:
         files[f"example{data.example.suffix}"] = data.example.read_bytes()
     publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
-    model = checkpoint / "model.onnx"
     console.wrote(checkpoint)
-    words = ["detect", "SOURCE", "--detector", "network", "--model", model]
+    words = ["detect", "SOURCE", "--detector", "network", "--model", checkpoint / model.name]
     words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
     console.next_command(*words, "--out", "lanes.csv")
 

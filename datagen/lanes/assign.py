@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.line import LaneLine
+from datagen.runs import equal_runs
 
 #: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
 _BEYOND = 0.1
@@ -82,7 +83,7 @@ def _without_swerves(
 ) -> Int[np.ndarray, "n"]:
     """Give frames back to the lane before and after them where the car hardly got into the other one."""
     lane = lane.copy()
-    runs = np.split(np.arange(len(lane)), np.flatnonzero(np.diff(lane)) + 1)
+    runs = equal_runs(lane)
     for before, run, after in zip(runs[:-2], runs[1:-1], runs[2:], strict=True):
         home, away = lane[before[-1]], lane[run[0]]
         inside = left_of[home][run] if away < home else -left_of[away][run]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from datagen.lanes.follow import best_lane, follow_line
 from datagen.lanes.line import Side
@@ -19,6 +19,7 @@ from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.profile import EdgeProfile, edge_profile
 from datagen.lanes.trace_settings import TraceSettings
 from datagen.lanes.width import find_lane_width, find_tape_width
+from datagen.runs import true_runs
 from lanenet.errors import TrackingLostError
 
 __all__ = ["TraceSettings", "TracedLane", "trace_lane"]
@@ -137,16 +138,10 @@ def _without_strays(
     usual[some] = np.nanmedian(around[some], axis=1)
     off = np.nan_to_num(np.abs(offset - usual)) / lane_cm
     kept = line_cm.copy()
-    for piece in _pieces(off > _BESIDE):
+    for piece in true_runs(off > _BESIDE):
         if off[piece].max() > _STRAY:
             kept[piece] = np.nan
     return kept
-
-
-def _pieces(known: Bool[np.ndarray, "m"]) -> list[Int[np.ndarray, "_"]]:
-    """Return the indices of each run of known samples."""
-    runs = np.split(np.arange(len(known)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
-    return [run for run in runs if known[run[0]]]
 
 
 def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settings: TraceSettings) -> bool:
@@ -159,6 +154,6 @@ def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settin
 def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int) -> Bool[np.ndarray, "m"]:
     """Drop runs of fewer samples."""
     kept = np.zeros(len(seen), dtype=bool)
-    for run in _pieces(seen):
+    for run in true_runs(seen):
         kept[run] = len(run) >= shortest
     return kept

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.map_settings import MapSettings
+from datagen.runs import equal_runs
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
@@ -89,7 +90,7 @@ def join_stretches(
 
 def frames_text(drive: Drive, rows: Int[np.ndarray, "n"]) -> str:
     """Name rows of a drive by the frame numbers of their first and last ones, run by run."""
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    runs = [rows[run] for run in equal_runs(rows - np.arange(len(rows)))]
     return "frames " + ", ".join(f"{drive.frames[run[0]]}-{drive.frames[run[-1]]}" for run in runs)
 
 

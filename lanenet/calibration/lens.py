@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
+from lanenet.geometry.fisheye import fisheye_radius, fisheye_slope
+from lanenet.geometry.pinhole import distort_pinhole
 
 #: Numbers in D.
 N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}
@@ -89,8 +91,7 @@ def _fisheye(
     theta = np.arctan2(r, z)
     t2 = theta * theta
     powers = theta[:, None] * np.stack([t2, t2**2, t2**3, t2**4], axis=1)
-    radius = theta + powers @ D
-    slope = 1.0 + np.stack([3.0 * t2, 5.0 * t2**2, 7.0 * t2**3, 9.0 * t2**4], axis=1) @ D
+    radius, slope = fisheye_radius(theta, D), fisheye_slope(theta, D)
     length2 = r * r + z * z
     azimuth = np.stack([x, y], axis=1) / r[:, None]
     scale = radius / r
@@ -113,13 +114,7 @@ def _pinhole(
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     d_radial = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
-    flat = np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=1,
-    )
+    flat = distort_pinhole(np.stack([x, y], axis=1), D)
     cross = 2.0 * x * y * d_radial + 2.0 * p1 * x + 2.0 * p2 * y
     xx = radial + 2.0 * x * x * d_radial + 2.0 * p1 * y + 6.0 * p2 * x
     yy = radial + 2.0 * y * y * d_radial + 6.0 * p1 * y + 2.0 * p2 * x

@@ -140,13 +140,18 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: Path, obj: Any) -> None:
-    """Write JSON atomically, indented.
+def json_text(obj: Any) -> str:
+    """Return indented JSON.
 
     NumPy arrays and numbers, paths, tuples and nested containers are accepted. Floats that are not finite
     become null, because JSON has no word for them.
     """
-    write_text(path, json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def write_json(path: Path, obj: Any) -> None:
+    """Write :func:`json_text` atomically."""
+    write_text(path, json_text(obj))
 
 
 def sync_path(path: Path) -> None:

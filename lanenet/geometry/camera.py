@@ -1,7 +1,7 @@
-"""Camera models: fisheye (Kannala-Brandt) and pinhole, and how they see the ground plane.
+"""A camera on a car, fisheye or pinhole: which pixel sees which point of the ground plane.
 
-Both use OpenCV's parameters, so that a camera calibrated elsewhere can be used as it is. Rays that a lens
-cannot see, and pixels whose ray misses the ground, are NaN, never a guess.
+Both lenses use OpenCV's parameters, so that a camera calibrated elsewhere can be used as it is. Rays that a
+lens cannot see, and pixels whose ray misses the ground, are NaN, never a guess.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from lanenet.geometry.fisheye import fisheye_radius, fisheye_slope, invert_fisheye
+from lanenet.geometry.pinhole import distort_pinhole, invert_pinhole, pinhole_radius
+
 CameraModel = Literal["fisheye", "pinhole"]
 
-_NEWTON_STEPS = 30
-#: Newton's method squares its error: after a step as short as this there is nothing left to gain.
-_LAST_STEP_RAD = 1e-12
 _MAX_RESIDUAL_PX = 1e-6
 
 
@@ -98,10 +98,10 @@ class Camera:
         n = 4096
         if self.model == "fisheye":
             theta = np.linspace(0.0, np.pi, n)
-            slope = _fisheye_slope(theta, self.D)
+            slope = fisheye_slope(theta, self.D)
         else:
             theta = np.linspace(0.0, np.deg2rad(89.0), n)
-            slope = np.gradient(_pinhole_radius(np.tan(theta), self.D), theta)
+            slope = np.gradient(pinhole_radius(np.tan(theta), self.D), theta)
         falling = np.flatnonzero(slope <= 0.0)
         return float(theta[falling[0] - 1]) if falling.size else float(theta[-1])
 
@@ -124,10 +124,10 @@ class Camera:
         visible = theta <= self.max_angle_rad
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.model == "fisheye":
-                scale = np.where(r > 1e-12, _fisheye_radius(theta, self.D) / r, 1.0 / z)
+                scale = np.where(r > 1e-12, fisheye_radius(theta, self.D) / r, 1.0 / z)
                 normalised = np.stack([x * scale, y * scale], axis=1)
             else:
-                normalised = _pinhole_distort(np.stack([x / z, y / z], axis=1), self.D)
+                normalised = distort_pinhole(np.stack([x / z, y / z], axis=1), self.D)
             pixels = np.stack(
                 [
                     self.K[0, 0] * normalised[:, 0] + self.K[0, 1] * normalised[:, 1] + self.K[0, 2],
@@ -148,12 +148,12 @@ class Camera:
         u = (pixels_px[:, 0] - self.K[0, 2] - self.K[0, 1] * v) / self.K[0, 0]
         if self.model == "fisheye":
             radius = np.hypot(u, v)
-            theta = _invert_fisheye(radius, self.D, self.max_angle_rad)
+            theta = invert_fisheye(radius, self.D, self.max_angle_rad)
             with np.errstate(divide="ignore", invalid="ignore"):
                 sine = np.where(radius > 1e-12, np.sin(theta) / radius, 1.0)
             rays = np.stack([u * sine, v * sine, np.cos(theta)], axis=1)
         else:
-            flat = _invert_pinhole(np.stack([u, v], axis=1), self.D)
+            flat = invert_pinhole(np.stack([u, v], axis=1), self.D)
             rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
@@ -217,86 +217,3 @@ class Camera:
         ]
         text = f"{self.model} {self.width} {self.height} " + " ".join(f"{float(v):.9g}" for v in numbers)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _fisheye_radius(theta: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
-    t2 = theta * theta
-    return theta * (1.0 + t2 * (D[0] + t2 * (D[1] + t2 * (D[2] + t2 * D[3]))))
-
-
-def _fisheye_slope(theta: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
-    t2 = theta * theta
-    return 1.0 + t2 * (3.0 * D[0] + t2 * (5.0 * D[1] + t2 * (7.0 * D[2] + t2 * 9.0 * D[3])))
-
-
-def _invert_fisheye(
-    radius: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"], max_angle_rad: float
-) -> Float[np.ndarray, "*n"]:
-    """Solve radius(theta) = r; the radius grows on [0, max angle], so Newton kept in a bracket converges."""
-    low = np.zeros_like(radius)
-    high = np.full_like(radius, max_angle_rad)
-    theta = np.clip(radius, 0.0, max_angle_rad)
-    seen = radius <= _fisheye_radius(np.array([max_angle_rad]), D)
-    for _ in range(_NEWTON_STEPS):
-        error = _fisheye_radius(theta, D) - radius
-        low = np.where(error < 0.0, theta, low)
-        high = np.where(error > 0.0, theta, high)
-        slope = _fisheye_slope(theta, D)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            step = theta - error / slope
-        inside = (step >= low) & (step <= high)
-        before, theta = theta, np.where(inside, step, 0.5 * (low + high))
-        if np.max(np.abs(theta - before), where=seen, initial=0.0) <= _LAST_STEP_RAD:
-            break
-    return np.where(seen, theta, np.nan)
-
-
-def _pinhole_coefficients(D: Float[np.ndarray, "_"]) -> tuple[float, float, float, float, float]:
-    k1, k2, p1, p2, k3 = (float(v) for v in np.concatenate([D, np.zeros(5)])[:5])
-    return k1, k2, p1, p2, k3
-
-
-def _pinhole_radius(r: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
-    k1, k2, _, _, k3 = _pinhole_coefficients(D)
-    r2 = r * r
-    return r * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
-
-
-def _pinhole_distort(xy: Float[np.ndarray, "n 2"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "n 2"]:
-    k1, k2, p1, p2, k3 = _pinhole_coefficients(D)
-    x, y = xy[:, 0], xy[:, 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=1,
-    )
-
-
-def _invert_pinhole(target: Float[np.ndarray, "n 2"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "n 2"]:
-    """Solve distort(xy) = target by damped Newton steps with a numerical Jacobian."""
-    xy = target.copy()
-    if not np.any(D):
-        return xy
-    eps = 1e-7
-    for _ in range(_NEWTON_STEPS):
-        base = _pinhole_distort(xy, D)
-        dx = (_pinhole_distort(xy + [eps, 0.0], D) - base) / eps
-        dy = (_pinhole_distort(xy + [0.0, eps], D) - base) / eps
-        error = base - target
-        det = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            step = np.stack(
-                [
-                    (dy[:, 1] * error[:, 0] - dy[:, 0] * error[:, 1]) / det,
-                    (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / det,
-                ],
-                axis=1,
-            )
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-12))
-        xy = xy - np.nan_to_num(step)
-    return xy

@@ -166,27 +166,6 @@ def augment_batch(
     return Batch(rasters, labels, present, told)
 
 
-def lines_present(
-    edges: Float[np.ndarray, "m 4"], lines_cm: Lines, window: BirdseyeWindow
-) -> Float[np.ndarray, "2"]:
-    """Say which lines of the lane a raster of edge points shows.
-
-    A line is there if the edge points within 4 cm of its polyline that run along it, by up to 30 degrees,
-    mark cells of the raster over a length of at least 9 cm (both edges of a tape count), and not there if
-    they do so over less than 3 cm.
-
-    Args:
-        edges: Edge points, [cm], and their normals, frame car.
-        lines_cm: Left and right lane line, frame car; NaN rows break them.
-        window: Grid of the raster.
-
-    Returns:
-        Left and right: 1 there, 0 not there; NaN in between, and where the place of the line is unknown.
-    """
-    frames = join_frames([np.asarray(edges, np.float32)], [lines_cm], np.full((1, 6), np.nan))
-    return plain_batch(frames, np.zeros(1, np.int64), window).present[0]
-
-
 def misplaced(
     points_cm: Float[np.ndarray, "n 2"],
     camera_cm: Float[np.ndarray, "3"],

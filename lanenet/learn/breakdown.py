@@ -218,18 +218,6 @@ def presence_of(
     )
 
 
-def nearest_pose_cm(
-    poses: Float[np.ndarray, "n 3"], training_poses: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, "n"]:
-    """Return the distance of each place to the nearest of others, [cm], frame map; headings do not count."""
-    if not len(training_poses):
-        return np.full(len(poses), np.nan)
-    result = np.empty(len(poses))
-    for k, pose in enumerate(poses):
-        result[k] = np.sqrt(((training_poses[:, :2] - pose[:2]) ** 2).sum(axis=1).min())
-    return result
-
-
 @dataclass(frozen=True)
 class Breakdown:
     """What a comparison says beyond its errors.

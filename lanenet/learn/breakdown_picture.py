@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
-
 from lanenet.learn.breakdown import GROUPS, RELIABILITY_SHARES
 from lanenet.learn.compare import Comparison
+from lanenet.learn.figure import new_figure, png_bytes
 
 
 def breakdown_picture(comparison: Comparison) -> bytes | None:
@@ -14,14 +13,9 @@ def breakdown_picture(comparison: Comparison) -> bytes | None:
     Returns:
         A PNG, or None where Matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
+    figure = new_figure(10.0, 4.5)
+    if figure is None:
         return None
-    # The figure is made without pyplot, which would pick a window system and keep global state.
-    figure = Figure(figsize=(10.0, 4.5), dpi=100)
-    FigureCanvasAgg(figure)
     bend, doubt = figure.subplots(1, 2)
     names = list(comparison.tables)
     groups = [name for name, _ in GROUPS["bend"][1]]
@@ -47,6 +41,4 @@ def breakdown_picture(comparison: Comparison) -> bytes | None:
     doubt.set_ylim(0.0, 1.0)
     doubt.grid(True, alpha=0.3)
     doubt.legend(fontsize=8)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
-    return picture.getvalue()
+    return png_bytes(figure)

@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 from lanenet.data.label_set import LabelSet
 from lanenet.data.pieces import map_pieces
 from lanenet.learn.augment import join_frames, plain_batch
-from lanenet.learn.breakdown import nearest_pose_cm
 
 
 def lines_seen(labels: LabelSet) -> Float[np.ndarray, "n 2"]:
@@ -43,6 +42,18 @@ def way_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[
     for piece in np.unique(pieces[~learned]):
         mine = pieces[~learned] == piece
         result[mine] = nearest_pose_cm(labels.poses[mine], poses[learned & (pieces == piece)])
+    return result
+
+
+def nearest_pose_cm(
+    poses: Float[np.ndarray, "n 3"], training_poses: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "n"]:
+    """Return the distance of each place to the nearest of others, [cm], frame map; headings do not count."""
+    if not len(training_poses):
+        return np.full(len(poses), np.nan)
+    result = np.empty(len(poses))
+    for k, pose in enumerate(poses):
+        result[k] = np.sqrt(((training_poses[:, :2] - pose[:2]) ** 2).sum(axis=1).min())
     return result
 
 

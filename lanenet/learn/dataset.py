@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
+from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
@@ -207,15 +207,6 @@ class LaneSamples:
         mean = clipped.sum(axis=0) / count
         variance = (np.where(known, clipped - mean, 0.0) ** 2).sum(axis=0) / count
         return mean, np.maximum(np.sqrt(variance), 2.0)
-
-
-def read_samples(paths: Sequence[Path], min_quality: float = 0.0) -> LaneSamples:
-    """Read label sets into memory.
-
-    Raises:
-        LabelFormatError: If a file cannot be read, or two files cannot be learned together (names both).
-    """
-    return LaneSamples([read_labels(p) for p in paths], [str(p) for p in paths], min_quality)
 
 
 def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:

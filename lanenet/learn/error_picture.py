@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 from jaxtyping import Float
 
 from lanenet.geometry.lane import ROWS_CM, SIDES
 from lanenet.learn.compare import Comparison
+from lanenet.learn.figure import new_figure, png_bytes
 
 #: Below this the simulator's own rounding shows; on a logarithmic axis it would only stretch the picture.
 _LEAST_CM = 0.01
@@ -22,16 +21,12 @@ def error_picture(comparison: Comparison) -> bytes | None:
     Returns:
         A PNG, or None where Matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Patch
-    except ImportError:
+    figure = new_figure(9.0, 5.0)
+    if figure is None:
         return None
+    from matplotlib.patches import Patch
+
     names = list(comparison.tables)
-    # The figure is made without pyplot, which would pick a window system and keep global state.
-    figure = Figure(figsize=(9.0, 5.0), dpi=100)
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for i, name in enumerate(names):
         for k in range(len(ROWS_CM)):
@@ -70,9 +65,7 @@ def error_picture(comparison: Comparison) -> bytes | None:
     axes.legend(
         handles=handles, fontsize=9, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, -0.07)
     )
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
-    return picture.getvalue()
+    return png_bytes(figure)
 
 
 def _row_errors(errors_cm: Float[np.ndarray, "n 6"], row: int) -> Float[np.ndarray, "_"]:

@@ -29,7 +29,7 @@ class TextTable:
         lines: Cells.
         note: What has to be known to read it.
         texts: How many columns, from the left, are text and not figures.
-        last_of_group: A line whose cell in the second column is this ends a group; empty for no groups.
+        grouped: Set lines apart where the first cell changes; an empty cell goes on with the group.
     """
 
     title: str
@@ -37,7 +37,7 @@ class TextTable:
     lines: Sequence[Sequence[str]]
     note: str
     texts: int = 1
-    last_of_group: str = ""
+    grouped: bool = False
 
     def as_markdown(self) -> str:
         """Return title, table and note as Markdown."""
@@ -54,9 +54,9 @@ class TextTable:
         for i, name in enumerate(self.header):
             justify = "left" if i < self.texts else "right"
             table.add_column(name.replace(" ", "\n"), justify=justify, no_wrap=True)  # type: ignore[arg-type]
-        for line in self.lines:
-            ends = self.last_of_group and line[1] == self.last_of_group
-            table.add_row(*line, end_section=bool(ends))
+        nexts = [line[0] for line in self.lines[1:]]
+        for line, following in zip(self.lines, [*nexts, ""], strict=True):
+            table.add_row(*line, end_section=self.grouped and following not in ("", line[0]))
         return table
 
 
@@ -110,7 +110,7 @@ def _by_point(comparison: Comparison) -> TextTable:
         lines=lines,
         note=note,
         texts=2,
-        last_of_group="answered",
+        grouped=True,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +13,6 @@ from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES
 from lanenet.perception.model_file import INPUT_NAME, WIDTH_NAME, open_model
-
-#: From a label set to the six points of each of its frames, [cm], NaN where it has no answer.
-Predictor = Callable[[LabelSet], Float[np.ndarray, "n 6"]]
 
 _CHUNK = 64
 
@@ -197,16 +193,6 @@ class RasterModel:
     @property
     def _shape(self) -> tuple[int, int]:
         return self.meta.window.rows, self.meta.window.columns
-
-
-def network_predictor(onnx_path: Path, threads: int = 1) -> Predictor:
-    """Return a model file as a predictor for label sets.
-
-    Raises:
-        ModelMismatchError: If the file cannot be used; when called, if a label set has another window.
-    """
-    model = RasterModel(onnx_path, threads)
-    return lambda labels: model.answer_labels(labels).points_cm
 
 
 def _row_names() -> list[str]:

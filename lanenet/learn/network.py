@@ -179,7 +179,7 @@ class DeployedLaneNet(nn.Module):
         Source:
             Steering: Kozlowski et al. 2024, eq. 3. The centre is ahead, so atan equals atan2 here.
         """
-        output: LaneOutput = self.network(raster.to(torch.float32) * (1.0 / 255.0), lane_cm)
+        output: LaneOutput = self.network(input_of_rasters(raster), lane_cm)
         lines = output.points_cm.reshape(-1, 2, len(ROWS_CM))
         middle_row = ROWS_CM.index(LOOKAHEAD_CM)
         centre = lines[:, :, middle_row].mean(dim=1, keepdim=True)

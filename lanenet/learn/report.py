@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from jaxtyping import UInt8
 
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_file, write_json, write_text
+from lanenet.learn.breakdown import presence_of
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.export import (
@@ -26,9 +26,10 @@ from lanenet.learn.export import (
     write_rasters,
     write_weights,
 )
+from lanenet.learn.figure import new_figure, png_bytes
 from lanenet.learn.network import LaneNet
 from lanenet.learn.predict import Answers
-from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord
+from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord, best_record
 from lanenet.perception.network import ModelMeta
 
 CURVE_NAME = "curve"
@@ -83,19 +84,19 @@ def write_checkpoint(
     write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
     write_curve(folder, history)
-    best = min(history, key=lambda record: record.val_rmse_cm)
+    presence = presence_of(answers.presence, answers.present)
     metrics: dict[str, Any] = {
         "format": METRICS_FORMAT,
         "run_hash": run_hash,
         "units": {"*_cm": "centimetres", "samples_per_s": "training samples per second"},
         "val_rmse_cm": errors.all.rmse_cm,
-        "best_epoch": best.epoch,
+        "best_epoch": best_record(history).epoch,
         "epochs": len(history),
         "train_frames": len(samples),
         "val_frames": len(val),
         "parameters": network.n_parameters,
         "sigma_factors": network.sigma_factor.tolist(),
-        "val_presence": presence_figures(answers),
+        "val_presence": None if presence is None else presence.as_dict(),
         "onnx_difference_cm": difference,
         "median_samples_per_s": float(np.median([record.samples_per_s for record in history])),
         "seed": settings.seed,
@@ -109,18 +110,6 @@ def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 
     """Return rasters of frames that are spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
     return samples.plain_batch(chosen).rasters
-
-
-def presence_figures(answers: Answers) -> dict[str, float]:
-    """Return how often lines that can be seen, and lines that cannot, are told rightly; NaN without any."""
-    told = np.isfinite(answers.present)
-    said, there = answers.presence[told] >= 0.5, answers.present[told] == 1.0
-    return {
-        "visible_found": float(said[there].mean()) if there.any() else float("nan"),
-        "absent_found": float((~said[~there]).mean()) if (~there).any() else float("nan"),
-        "visible_lines": int(there.sum()),
-        "absent_lines": int((~there).sum()),
-    }
 
 
 @contextmanager
@@ -158,14 +147,9 @@ def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:
     names = list(vars(history[0]))
     lines = [",".join(f"{value:.9g}" for value in vars(record).values()) for record in history]
     write_text(folder / f"{CURVE_NAME}.csv", "\n".join([",".join(names), *lines]) + "\n")
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
+    figure = new_figure(6.0, 4.0)
+    if figure is None:
         return
-    # The figure is made without pyplot, which would pick a window system and keep global state.
-    figure = Figure(figsize=(6.0, 4.0), dpi=100)
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     epochs = [record.epoch for record in history]
     axes.plot(epochs, [record.train_rmse_cm for record in history], label="training (augmented)")
@@ -175,10 +159,8 @@ def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:
     axes.set_yscale("log")
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
     with atomic_file(folder / f"{CURVE_NAME}.png") as temporary:
-        temporary.write_bytes(picture.getvalue())
+        temporary.write_bytes(png_bytes(figure))
 
 
 def _version(package: str) -> str | None:

@@ -68,10 +68,10 @@ class RunState:
     history: list[EpochRecord]
     best: dict[str, Tensor] | None
 
-    @property
-    def best_record(self) -> EpochRecord:
-        """The epoch of the lowest validation error; the first of equals."""
-        return min(self.history, key=lambda record: record.val_rmse_cm)
+
+def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
+    """Return the epoch of the lowest validation error; the first of equals."""
+    return min(history, key=lambda record: record.val_rmse_cm)
 
 
 def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:

@@ -16,7 +16,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
-from lanenet.learn.run_state import hash_run
+from lanenet.learn.run_state import best_record, hash_run
 from lanenet.learn.sweep_table import trials_csv, trials_table
 from lanenet.learn.train import TrainingRun, torch_threads
 
@@ -167,7 +167,7 @@ def _try(trial: Any, run: TrainingRun, val: LaneSamples, deadline: float) -> flo
             return _OUT_OF_TIME
         if not run.ended and trial.should_prune():
             return None
-    return min(record.val_rmse_cm for record in run.history)
+    return best_record(run.history).val_rmse_cm
 
 
 def _write_tables(study: Any, out: Path) -> str:

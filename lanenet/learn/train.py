@@ -29,6 +29,7 @@ from lanenet.learn.run_state import (
     STATE_NAME,
     EpochRecord,
     RunState,
+    best_record,
     hash_run,
     read_finished,
     read_state,
@@ -115,7 +116,7 @@ def train(
         calibrate_sigma(network, val)
         calibrate_presence(network, val)
         answers = predict(network, val)
-        best = run.state().best_record
+        best = best_record(run.history)
         write_checkpoint(out, settings, network, samples, val, answers, run.history, run_hash)
     return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
 
@@ -159,7 +160,7 @@ class TrainingRun:
         done, patience = len(self.history), self.settings.patience
         if done >= self.settings.epochs:
             return True
-        return 0 < patience <= done and done - self.state().best_record.epoch >= patience
+        return 0 < patience <= done and done - best_record(self.history).epoch >= patience
 
     def run_epoch(self, val: LaneSamples) -> EpochRecord:
         """Train one epoch and evaluate it."""
@@ -193,7 +194,7 @@ class TrainingRun:
             learning_rate=rate,
             samples_per_s=n_samples / seconds,
         )
-        if not self.history or val_rmse_cm < min(r.val_rmse_cm for r in self.history):
+        if not self.history or val_rmse_cm < best_record(self.history).val_rmse_cm:
             self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
         self.history.append(record)
         return record

@@ -37,7 +37,7 @@ class Tap:
 
 def test_the_car_shows_the_network_what_training_showed_it(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from lanenet.learn.dataset import read_samples
+    from lanenet.learn.dataset import LaneSamples
 
     path = simulate_drive(SimulationSettings(seed=4, frames=12), tmp_path / "drive")
     camera = open_drive(path).camera
@@ -62,7 +62,7 @@ def test_the_car_shows_the_network_what_training_showed_it(tmp_path: Path) -> No
     report = loop.run()
     labels = read_labels(tmp_path / "labels.parquet")
     assert report.frames == len(tap.rasters) == len(labels) == 12
-    trained_on = read_samples([tmp_path / "labels.parquet"]).plain_batch(np.arange(12))[0]
+    trained_on = LaneSamples([labels], ["labels"]).plain_batch(np.arange(12))[0]
     column = ParquetTable(tmp_path / "labels.parquet").raw("image")
     for i, raster in enumerate(tap.rasters):
         assert np.count_nonzero(raster) > 50

@@ -14,34 +14,13 @@ from lanenet.geometry.lane import mirror_points, rows_of_polyline
 from lanenet.learn.augment import (
     augment_batch,
     join_frames,
-    lines_present,
     make_view,
     misplaced,
     plain_batch,
 )
 from lanenet.learn.config import AugmentSettings
 
-NOTHING = AugmentSettings(
-    mirror=0.0,
-    shift_cm=0.0,
-    rotate_rad=0.0,
-    scale=0.0,
-    drop_points=0.0,
-    double_points=0.0,
-    jitter_cm=0.0,
-    missing_stretch=0.0,
-    missing_line=0.0,
-    missing_both=0.0,
-    objects=0,
-    clutter_segments=0,
-    clutter_points=0,
-    clutter_share=0.0,
-    height=0.0,
-    pitch_rad=0.0,
-    roll_rad=0.0,
-    untold_width=0.0,
-    width_error=0.0,
-)
+NOTHING = AugmentSettings.only()
 LABELS = make_label_set(12, seed=5)
 EDGES = LABELS.edges
 FRAMES = join_frames(EDGES, LABELS.lines, LABELS.points_cm)
@@ -50,6 +29,11 @@ ALL = np.arange(12)
 
 def augment(changes, window=WINDOW, seed=0):
     return augment_batch(FRAMES, ALL, window, NOTHING.model_copy(update=changes), seed, 0)[:2]
+
+
+def lines_present(edges, lines_cm, window):
+    frames = join_frames([np.asarray(edges, np.float32)], [lines_cm], np.full((1, 6), np.nan))
+    return plain_batch(frames, np.zeros(1, np.int64), window).present[0]
 
 
 def labels_of_view(points, lines, view):

@@ -16,7 +16,6 @@ from lanenet.learn.breakdown import (
     errors_by_group,
     lane_curvature,
     lines_shown,
-    nearest_pose_cm,
     presence_of,
     rmse_interval_cm,
 )
@@ -116,13 +115,6 @@ def test_presence_is_counted_both_ways():
     assert presence_of(said, np.full_like(there, NAN)) is None
     everywhere = presence_of(np.ones((4, 2)), np.ones((4, 2)))
     assert everywhere.recall == 1.0 and np.isnan(everywhere.absent_recall)
-
-
-def test_the_nearest_place_counts():
-    poses = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 2.0]])
-    training = np.array([[3.0, 4.0, 0.0], [10.0, 1.0, -2.0]])
-    np.testing.assert_allclose(nearest_pose_cm(poses, training), [5.0, 1.0])
-    assert np.isnan(nearest_pose_cm(poses, np.empty((0, 3)))).all()
 
 
 def sources():

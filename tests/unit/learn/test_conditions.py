@@ -4,7 +4,7 @@ import numpy as np
 from synthetic_labels import make_label_set
 
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.conditions import at_frames, lines_seen, way_to_training_cm
+from lanenet.learn.conditions import at_frames, lines_seen, nearest_pose_cm, way_to_training_cm
 
 
 def test_lines_are_seen_where_their_edges_are():
@@ -39,3 +39,10 @@ def test_values_are_looked_up_by_frame_number():
     np.testing.assert_array_equal(found[[1, 3]], values)
     assert np.isnan(found[[0, 2, 4]]).all()
     assert np.isnan(at_frames(np.empty(0), np.empty(0, int), np.array([1]))).all()
+
+
+def test_the_nearest_place_counts():
+    poses = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 2.0]])
+    training = np.array([[3.0, 4.0, 0.0], [10.0, 1.0, -2.0]])
+    np.testing.assert_allclose(nearest_pose_cm(poses, training), [5.0, 1.0])
+    assert np.isnan(nearest_pose_cm(poses, np.empty((0, 3)))).all()

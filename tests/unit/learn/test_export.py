@@ -17,7 +17,7 @@ from lanenet.errors import CheckpointError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
-from lanenet.learn.evaluate import RasterModel, network_predictor
+from lanenet.learn.evaluate import RasterModel
 from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
 from lanenet.perception.network import ModelMeta, read_model_meta
@@ -93,16 +93,17 @@ def test_export_is_silent(tmp_path, capfd, caplog):
     assert not [r for r in caplog.records if r.levelno >= logging.INFO]
 
 
-def test_predictor_answers_as_the_network_and_not_for_empty_rasters(checkpoint):
+def test_the_file_answers_as_the_network_and_not_for_empty_rasters(checkpoint):
     labels = make_label_set(3, 3)
     labels.edges[1] = labels.edges[1][:0]
-    found = network_predictor(checkpoint / "model.onnx")(labels)
+    model = RasterModel(checkpoint / "model.onnx")
+    found = model.answer_labels(labels).points_cm
     with torch.inference_mode():
         expected = make_network()(input_of_rasters(torch.from_numpy(RASTERS[:3]))).points_cm.numpy()
     np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], atol=1e-3)
     assert np.isnan(found[1]).all()
     with pytest.raises(ModelMismatchError, match="window"):
-        network_predictor(checkpoint / "model.onnx")(make_label_set(1, 0, window=BirdseyeWindow()))
+        model.answer_labels(make_label_set(1, 0, window=BirdseyeWindow()))
 
 
 def test_a_file_that_differs_never_appears(tmp_path, monkeypatch):

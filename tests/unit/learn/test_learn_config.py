@@ -1,9 +1,10 @@
 import pytest
+import yaml
 from pydantic import ValidationError
 
-from lanenet.config import check_settings
+from lanenet.config import check_settings, dump_settings
 from lanenet.errors import ConfigError
-from lanenet.learn.config import LearnSettings, NetworkSettings
+from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 
 
 def test_hash_ignores_what_does_not_decide_the_result():
@@ -31,3 +32,29 @@ def test_alexnet_has_its_own_size_and_the_others_no_pretrained_weights():
 def test_misspelt_nested_key_is_named():
     with pytest.raises(ConfigError, match=r"augment\.miror.*mirror"):
         check_settings(LearnSettings, {"augment": {"miror": 0.5}}, "x.yaml")
+
+
+def test_a_preset_is_changed_by_the_keys_beside_it_and_written_out_as_values():
+    data = {"augment": {"preset": "own_road", "objects": 3, "shift_cm": 1.0}}
+    settings = check_settings(LearnSettings, data, "x.yaml")
+    found, own = settings.augment, AugmentSettings.model_validate({"preset": "own_road"})
+    assert (found.objects, found.shift_cm) == (3, 1.0) and (own.objects, own.shift_cm) == (0, 8.0)
+    assert found.mirror == own.mirror == 0.0 and found.clutter_points == own.clutter_points == 10
+    # What it does not name is as without it.
+    assert own.jitter_cm == AugmentSettings().jitter_cm
+    written = yaml.safe_load(dump_settings(settings))
+    assert "preset" not in written["augment"] and written["augment"]["pitch_rad"] == 0.005
+    again = check_settings(LearnSettings, written, "run.yaml")
+    assert again == settings and again.hash == settings.hash
+    assert data == {"augment": {"preset": "own_road", "objects": 3, "shift_cm": 1.0}}
+
+
+@pytest.mark.parametrize("name", ["own_raod", None, ["own_road"]])
+def test_an_unknown_preset_is_named_with_those_that_there_are(name):
+    with pytest.raises(ConfigError, match=r"x\.yaml: key 'augment': .*no preset .*expected one of own_road"):
+        check_settings(LearnSettings, {"augment": {"preset": name}}, "x.yaml")
+
+
+def test_a_preset_is_checked_with_what_stands_beside_it():
+    with pytest.raises(ConfigError, match="sum to at most 1"):
+        check_settings(LearnSettings, {"augment": {"preset": "own_road", "missing_both": 0.96}}, "x.yaml")

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from synthetic_labels import WINDOW, make_label_set
 
-from lanenet.data.label_set import write_labels
 from lanenet.errors import LabelFormatError
 from lanenet.learn.config import AugmentSettings
-from lanenet.learn.dataset import LaneSamples, hash_files, read_samples
+from lanenet.learn.dataset import LaneSamples, hash_files
 from lanenet.perception.birdseye import PerceptionSettings
 
 
@@ -21,11 +20,9 @@ def samples(n=50, seed=0):
     return LaneSamples([make_label_set(n, seed)], ["a.parquet"])
 
 
-def test_frames_of_two_sets_stay_in_order(tmp_path):
+def test_frames_of_two_sets_stay_in_order():
     a, b = make_label_set(3, 0, source="truth"), make_label_set(4, 1, camera_hash="cam1", source="map")
-    write_labels(tmp_path / "a.parquet", a)
-    write_labels(tmp_path / "b.parquet", b)
-    both = read_samples([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+    both = LaneSamples([a, b], ["a", "b"])
     assert len(both) == 7
     assert both.camera_hashes == ["cam0", "cam1"]
     assert both.reference == "map and truth"

@@ -18,7 +18,7 @@ from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, Lanen
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
 from lanenet.learn.dataset import LaneSamples
-from lanenet.learn.evaluate import network_predictor, point_errors
+from lanenet.learn.evaluate import RasterModel, point_errors
 from lanenet.learn.network import new_network
 from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
 from lanenet.learn.quantise import Int8Report, export_int8
@@ -78,7 +78,7 @@ def test_learns_far_better_than_a_constant(data, tmp_path):
     result = run(data, tmp_path / "learned", settings, name="big")
     val = read_labels(data / "val.parquet")
     answers = {
-        "network": network_predictor(result.model_path)(val),
+        "network": RasterModel(result.model_path).answer_labels(val).points_cm,
         "constant": np.tile(val.points_cm.mean(axis=0), (len(val), 1)),
     }
     tables = {name: point_errors(answer, val.points_cm) for name, answer in answers.items()}
@@ -104,7 +104,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     metrics = json.loads((finished.folder / "metrics.json").read_text())
     assert metrics["val_rmse_cm"] == finished.val_rmse_cm
     assert metrics["val"]["reference"] == "map"
-    assert len(metrics["sigma_factors"]) == 6 and metrics["val_presence"]["visible_lines"] == 80
+    assert len(metrics["sigma_factors"]) == 6 and metrics["val_presence"]["there"] == 80
     with (finished.folder / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["epoch"]) for row in rows] == [1, 2, 3]

@@ -273,9 +273,15 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
     (folder / "model.onnx").write_bytes(b"")
     opened: list[Path] = []
 
+    @dataclass(frozen=True)
+    class Meta:
+        window: BirdseyeWindow
+        takes_width: bool = False
+
     class OneOff(RasterModel):
         def __init__(self, path: Path) -> None:
             opened.append(path)
+            self.meta = Meta(BirdseyeWindow())
 
         def check_window(self, window: BirdseyeWindow) -> None:
             assert window == BirdseyeWindow()
@@ -287,10 +293,6 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
         def answer_labels(self, labels: LabelSet) -> RasterAnswers:
             n = len(labels)
             return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
-
-    @dataclass(frozen=True)
-    class Meta:
-        window: BirdseyeWindow
 
     monkeypatch.setattr("lanenet.learn.evaluate.RasterModel", OneOff)
     monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: Meta(BirdseyeWindow()))

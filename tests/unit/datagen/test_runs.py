@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from datagen.runs import equal_runs, true_runs
+
+
+def plain(runs: list[np.ndarray]) -> list[list[int]]:
+    return [run.tolist() for run in runs]
+
+
+def test_runs_of_known_values():
+    assert plain(equal_runs(np.array([4, 4, 7, 4, 4, 4]))) == [[0, 1], [2], [3, 4, 5]]
+    assert plain(true_runs(np.array([True, False, False, True, True]))) == [[0], [3, 4]]
+    assert plain(true_runs(np.array([False, True, False]))) == [[1]]
+    assert true_runs(np.zeros(3, bool)) == []
+
+
+def test_of_nothing_there_are_no_runs():
+    assert equal_runs(np.empty(0, int)) == [] and true_runs(np.empty(0, bool)) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_runs_are_all_of_it_in_order_and_none_can_be_longer(seed: int):
+    values = np.random.default_rng(seed).integers(-1, 2, 40)
+    runs = equal_runs(values)
+    np.testing.assert_array_equal(np.concatenate(runs), np.arange(40))
+    assert all(len(set(values[run])) == 1 for run in runs)
+    assert all(values[a[-1]] != values[b[0]] for a, b in pairwise(runs))
+    flags = values > 0
+    kept = np.concatenate([*true_runs(flags), np.empty(0, int)])
+    np.testing.assert_array_equal(kept, np.flatnonzero(flags))
