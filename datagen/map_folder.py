@@ -263,7 +263,11 @@ def _line(item: dict[str, Any]) -> LaneLine:
     )
     if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape or not np.isfinite([*sigma_s, *sigma_at]).all():
         raise ValueError(f"uncertainty of shape {sigma_at.shape} at places of shape {sigma_s.shape}")
-    known = (_optional(item["residual_cm"]), _optional(item.get("marking_cm")), _optional(item.get("bare_share")))
+    known = (
+        _optional(item["residual_cm"]),
+        _optional(item.get("marking_cm")),
+        _optional(item.get("bare_share")),
+    )
     residual, marking, bare = (float("nan") if number is None else number for number in known)
     return LaneLine(
         item["side"],

@@ -1,8 +1,8 @@
 """The lines of the lanes beside the driven one, looked for from there outwards, one after the other.
 
-From its own lane a car sees the far line of the next one only from afar, or not at all. Where it drives in that
-lane itself, it sees the line as well as any: a line that is seen there is one, however little of it is seen
-along the rest of the way.
+From its own lane a car sees the far line of the next one only from afar, or not at all. Where it drives in
+that lane itself, it sees the line as well as any: a line that is seen there is one, however little of it is
+seen along the rest of the way.
 """
 
 from __future__ import annotations
