@@ -60,7 +60,7 @@ def test_without_a_lamp_hardly_anything_is_dropped():
 @pytest.mark.parametrize("dash_cm", [4.5, 9.0, 14.0])
 @pytest.mark.parametrize("curvature_per_cm", [0.0, 0.01])
 def test_dashes_that_pass_beside_the_car_stay(monkeypatch, dash_cm, curvature_per_cm):
-    """Their sides face the camera, and one follows on the other at the same place; their ends tell the way."""
+    """Their sides face the camera, one follows on the other in one place, and their ends tell the way."""
     monkeypatch.setattr(tape_road_module, "LINES", ((18.0, dash_cm, 2.0 * dash_cm, 0.0),))
     dashes = pixels(tape_road(60, curvature_per_cm, 0.0), CAMERA)
     kept = without_reflections(dashes, CAMERA, TABLE)
