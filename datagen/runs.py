@@ -14,7 +14,7 @@ def equal_runs(values: Int[np.ndarray, "n"] | Bool[np.ndarray, "n"]) -> list[Int
 
 
 def true_runs(flags: Bool[np.ndarray, "n"], closed: bool = False) -> list[Int[np.ndarray, "_"]]:
-    """Return the indices of each longest run of True, in order; in a closed row one may go on over the seam."""
+    """Return the indices of each longest run of True, in order; in a closed row one may cross the seam."""
     runs = equal_runs(flags)
     if closed and len(runs) > 2 and flags[0] and flags[-1]:
         runs = [*runs[1:-1], np.concatenate([runs[-1], runs[0]])]

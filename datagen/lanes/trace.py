@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from datagen.lanes.follow import best_lane, follow_line
 from datagen.lanes.line import Side
