@@ -151,6 +151,7 @@ def write_map(
             "supported_cm": line.supported_cm,
             "residual_cm": line.residual_cm,
             "marking_cm": line.marking_cm,
+            "bare_share": line.bare,
             "sigma_s_cm": line.sigma_s_cm,
             "sigma_at_cm": line.sigma_at_cm,
         }
@@ -262,18 +263,24 @@ def _line(item: dict[str, Any]) -> LaneLine:
     )
     if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape or not np.isfinite([*sigma_s, *sigma_at]).all():
         raise ValueError(f"uncertainty of shape {sigma_at.shape} at places of shape {sigma_s.shape}")
-    residual, marking = _optional(item["residual_cm"]), _optional(item.get("marking_cm"))
+    known = (
+        _optional(item["residual_cm"]),
+        _optional(item.get("marking_cm")),
+        _optional(item.get("bare_share")),
+    )
+    residual, marking, bare = (float("nan") if number is None else number for number in known)
     return LaneLine(
         item["side"],
         knots,
         coefficients,
         supported.reshape(-1, 2),
-        float("nan") if residual is None else residual,
+        residual,
         rank,
         period,
         sigma_s,
         sigma_at,
-        float("nan") if marking is None else marking,
+        marking,
+        bare,
     )
 
 

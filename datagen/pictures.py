@@ -47,7 +47,16 @@ def draw_map(
             seen = points[scans.frame(k)]
             seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach]
             clouds.append(map_from_car(seen, poses[k], drive_map.camera.wheelbase_cm))
-    xy = np.concatenate([*clouds, drive_map.poses[:, :2]])
+    lanes = []
+    for segment, lines in drive_map.lines.items():
+        s = drive_map.s_cm[drive_map.segment == segment]
+        for line in lines:
+            end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
+            colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
+            lanes.append((line.points(np.arange(s.min(), end, 2.0)), colour))
+    # A line of the next lane may lie beyond all edges that are drawn.
+    known = [points[np.isfinite(points[:, 0])] for points, _ in lanes]
+    xy = np.concatenate([*clouds, *known, drive_map.poses[:, :2]])
     low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
     scale = size_px / float((high - low).max())
     width, height = ((high - low) * scale).astype(int) + 1
@@ -66,12 +75,8 @@ def draw_map(
     for cloud, colour in zip(clouds, hues, strict=True):
         at = pixels(cloud)
         image[at[:, 1], at[:, 0]] = colour
-    for segment, lines in drive_map.lines.items():
-        s = drive_map.s_cm[drive_map.segment == segment]
-        for line in lines:
-            end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
-            colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
-            _polyline(image, pixels, line.points(np.arange(s.min(), end, 2.0)), colour)
+    for points, colour in lanes:
+        _polyline(image, pixels, points, colour)
     for stretch in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
         _polyline(image, pixels, stretch, (255, 255, 255))
     draw_metre(image, scale)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from datagen.lane_scale import STEP_HEIGHTS, edges_beside
+from datagen.lanes.beside import trace_beside
 from datagen.lanes.crossing import without_crossings
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
@@ -95,12 +96,17 @@ def _find_lane(
     lap = lap_path(solved.poses, revisits, STEP_HEIGHTS * height, height)
     # In a wide lane the further line only comes into view a lane's width ahead.
     least_reach_cm = 1.2 * (lane_width_cm or 0.0)
-    path, edges = edges_beside(solved, without_frames(solved.scans, held_out), lap, least_reach_cm)
-    edges = without_crossings(path, edges, height, settings.trace.side_heights * height)
+    scans, side_cm = without_frames(solved.scans, held_out), settings.trace.side_heights * height
+    path, edges = edges_beside(solved, scans, lap, least_reach_cm)
+    edges = without_crossings(path, edges, height, side_cm)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, settings.trace)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, settings.trace)
-    lines = fit_lines(path, edges, lane, height, settings.fit)
+    # The far line of the next lane does so further ahead, also where the car drives near the line between.
+    _, beside = edges_beside(solved, scans, path, 1.6 * lane.lane_cm)
+    beside = without_crossings(path, beside, height, side_cm)
+    lane = trace_beside(path, beside, lane, height, settings.trace)
+    lines = fit_lines(path, edges, lane, height, settings.fit, beside)
     return MappedSegment(stretch.rows, solved, path.s_frames_cm, lane, lines, free_cm)

@@ -52,7 +52,7 @@ def lines_of_frame(
     """Project the stretch of lane around a frame into its car frame.
 
     Args:
-        lines: Lines of the segment.
+        lines: Lines of the segment; where the far line of a lane is not among them, it is not known.
         pose: Rear-axle pose of the frame, frame map.
         s_cm: Position of the rear axle along the path.
         wheelbase_cm: Distance between the axles.
@@ -64,10 +64,12 @@ def lines_of_frame(
     s = s_cm + (along if forward else -along)
     by_index = {line.index: line for line in lines}
     pair = (lane, lane + 1) if forward else (lane + 1, lane)
-    left, right = (_polyline(by_index[i], s, pose, wheelbase_cm, max_sigma_cm) for i in pair)
+    bounds = [by_index.get(i) for i in pair]
+    left, right = (_polyline(line, s, pose, wheelbase_cm, max_sigma_cm) for line in bounds)
     points = np.concatenate([label_rows(left), label_rows(right)])
     assert points.shape == (N_POINTS,)
-    return FrameLines(left, right, points, (by_index[pair[0]].marking_cm, by_index[pair[1]].marking_cm))
+    of_left, of_right = (float("nan") if line is None else line.marking_cm for line in bounds)
+    return FrameLines(left, right, points, (of_left, of_right))
 
 
 def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
@@ -88,13 +90,15 @@ def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
 
 
 def _polyline(
-    line: LaneLine,
+    line: LaneLine | None,
     s_cm: Float[np.ndarray, "m"],
     pose: Float[np.ndarray, "3"],
     wheelbase_cm: float,
     max_sigma_cm: float,
 ) -> Float[np.ndarray, "m 2"]:
     """Express a stretch of line in the car frame; NaN where it cannot be relied on."""
+    if line is None:
+        return np.full((len(s_cm), 2), np.nan)
     polyline = car_from_map(line.points(s_cm), pose, wheelbase_cm)
     # Maps of the first version know no uncertainty.
     polyline[np.nan_to_num(line.sigma_cm(s_cm), nan=0.0) > max_sigma_cm] = np.nan

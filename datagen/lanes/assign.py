@@ -13,7 +13,7 @@ from datagen.runs import equal_runs
 #: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
 _BEYOND = 0.1
 #: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
-_ENTERED = 0.3
+_ENTERED = 0.2
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
 _WIDTHS = (0.6, 1.5)
 
@@ -38,8 +38,9 @@ def assign_lanes(
     """Find the lane of each frame of a segment, in the order in which they were driven.
 
     The lane is the one in which the middle of the front axle is; it changes when that is clearly beyond a
-    line that has a lane behind it. Beside the road the car keeps the lane that it left, and so it does where
-    it comes back before it is well inside the other one.
+    line that has a lane behind it: one of which the far line is seen there, or any behind dashes. Beside the
+    road the car keeps the lane that it left, and so it does where it comes back before it is well inside the
+    other one.
 
     Args:
         lines: Lines of the segment.
@@ -52,30 +53,44 @@ def assign_lanes(
     direction = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     tangent = sum(by_index[i].everywhere(s_cm, 1) for i in (0, 1))
     forward = np.sum(direction * tangent, axis=1) >= 0.0
-    inner = range(min(by_index), max(by_index))
-    if len(inner) == 1:
-        return FrameLanes(np.zeros(n, dtype=np.int64), forward)
     front = poses[:, :2] + wheelbase_cm * direction
     s_front = s_cm + np.where(forward, wheelbase_cm, -wheelbase_cm)
     # How far the front axle's middle is to the left of each line.
     left_of = {i: _left_of(line, s_front, front) for i, line in by_index.items()}
     usual = float(np.nanmedian(left_of[1] - left_of[0]))
-    exists = {}
-    for i in inner:
-        width = left_of[i + 1] - left_of[i]
-        known = by_index[i].supported(s_front) & by_index[i + 1].supported(s_front)
-        exists[i] = known & (width > _WIDTHS[0] * usual) & (width < _WIDTHS[1] * usual)
+    exists = _lanes(by_index, left_of, s_front, usual)
     lane = np.zeros(n, dtype=np.int64)
-    margin = _BEYOND * usual
-    # On a road of two lanes the first frame may be in either.
-    current = _lane_of_start(left_of, exists, inner)
-    for k in range(n):
+    margin, current = _BEYOND * usual, 0
+    # The first frame may be in any lane.
+    for k in [0] * min(n, len(exists)) + list(range(n)):
         if current - 1 in exists and left_of[current][k] > margin and exists[current - 1][k]:
             current -= 1
         elif current + 1 in exists and left_of[current + 1][k] < -margin and exists[current + 1][k]:
             current += 1
         lane[k] = current
     return FrameLanes(_without_swerves(lane, left_of, _ENTERED * usual), forward)
+
+
+def _lanes(
+    by_index: dict[int, LaneLine],
+    left_of: dict[int, Float[np.ndarray, "n"]],
+    s_cm: Float[np.ndarray, "n"],
+    usual_cm: float,
+) -> dict[int, Bool[np.ndarray, "n"]]:
+    """Tell beside which frames there is each lane: its left line's index, and where it is."""
+    everywhere = np.ones(len(s_cm), dtype=bool)
+    lanes = {0: everywhere}
+    for i in range(min(by_index) - 1, max(by_index) + 1):
+        near, far = (i + 1, i) if i < 0 else (i, i + 1)
+        if i == 0 or (far not in by_index and not by_index[near].dashed):
+            continue
+        lanes[i] = everywhere
+        if far in by_index:
+            width = left_of[i + 1] - left_of[i]
+            fits = (width > _WIDTHS[0] * usual_cm) & (width < _WIDTHS[1] * usual_cm)
+            known = by_index[i].supported(s_cm) & by_index[i + 1].supported(s_cm)
+            lanes[i] = np.where(known, fits, by_index[near].dashed)
+    return lanes
 
 
 def _without_swerves(
@@ -100,12 +115,3 @@ def _left_of(
     apart = points_cm - line.everywhere(s_cm)
     cross = tangent[:, 0] * apart[:, 1] - tangent[:, 1] * apart[:, 0]
     return cross / np.maximum(np.linalg.norm(tangent, axis=1), 1e-9)
-
-
-def _lane_of_start(
-    left_of: dict[int, Float[np.ndarray, "n"]], exists: dict[int, Bool[np.ndarray, "n"]], inner: range
-) -> int:
-    for i in inner:
-        if exists[i][0] and left_of[i][0] <= 0.0 <= left_of[i + 1][0]:
-            return i
-    return 0

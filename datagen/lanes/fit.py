@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -57,7 +57,12 @@ class FitSettings(Settings):
 
 
 def fit_lines(
-    path: Path, edges: PathEdges, lane: TracedLane, camera_height_cm: float, settings: FitSettings
+    path: Path,
+    edges: PathEdges,
+    lane: TracedLane,
+    camera_height_cm: float,
+    settings: FitSettings,
+    beside: PathEdges | None = None,
 ) -> list[LaneLine]:
     """Fit the lines of the driven lane, then those beside it.
 
@@ -70,6 +75,7 @@ def fit_lines(
         lane: The traced lines.
         camera_height_cm: Sets the scale of knots and bounds.
         settings: Spacing and bounds.
+        beside: Edge points that show the lines beside the lane; None takes those that show its own.
 
     Returns:
         Left and right line of the driven lane, then the ones found beside it.
@@ -96,6 +102,7 @@ def fit_lines(
     for side, own in alone.items():
         start = np.where(own.seen, own.d_cm, np.nan)
         fitted[side, 0] = fitter.beside(start, alone[_OTHER[side]], _SIGN[side], apart, own.marking_cm)
+    fitter = fitter if beside is None else replace(fitter, edges=beside)
     for side, rank in sorted(lane.beside_cm, key=lambda name: name[1]):
         inner, known = fitted[side, rank - 1], np.isfinite(traced[side, rank])
         apart = fitter.apart(inner.d_cm, np.where(known, traced[side, rank], inner.d_cm), known)
@@ -251,4 +258,5 @@ def _line(
         path.s_cm,
         offset.sigma_cm,
         offset.marking_cm,
+        offset.bare,
     )

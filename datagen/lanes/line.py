@@ -11,6 +11,10 @@ from scipy.interpolate import BSpline
 
 Side = Literal["left", "right"]
 
+#: Share of a line that is bare from which it is dashed. Of ten simulated drives and three real ones, 0.18 to
+#: 0.47 of every dashed line and no more than 0.06 of every solid one, worn or not, is bare.
+_DASHED = 0.12
+
 
 def _none() -> Float[np.ndarray, "0"]:
     return np.empty(0)
@@ -32,6 +36,8 @@ class LaneLine:
         sigma_s_cm: Places at which the uncertainty is given; empty where it is not known.
         sigma_at_cm: Standard deviation of the line's position across the path there.
         marking_cm: Width of the marking as measured; NaN where it is not known.
+        bare: Share of the line that is bare between pieces of paint, where frames see it from near; NaN
+            where it is not known.
     """
 
     side: Side
@@ -44,11 +50,17 @@ class LaneLine:
     sigma_s_cm: Float[np.ndarray, "u"] = field(default_factory=_none)
     sigma_at_cm: Float[np.ndarray, "u"] = field(default_factory=_none)
     marking_cm: float = float("nan")
+    bare: float = float("nan")
 
     @property
     def index(self) -> int:
         """Number of the line from left to right; 0 and 1 bound the driven lane."""
         return -self.rank if self.side == "left" else 1 + self.rank
+
+    @property
+    def dashed(self) -> bool:
+        """Whether it is a line of dashes, which may be crossed: there is a lane on either side of it."""
+        return self.bare > _DASHED
 
     def points(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
         """Evaluate the line or a derivative of it along s, frame map; NaN where it is not supported."""

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from datagen.lanes.path import Path
 from datagen.lanes.spline import CubicBasis
-from datagen.lanes.support import seen_samples, stretches, within
+from datagen.lanes.support import bare_share, seen_samples, stretches, within
 
 _ROUNDS = 5
 #: Frames whose errors count as one: their poses hang together.
@@ -24,8 +24,10 @@ _FRAMES_TOGETHER = 10
 _CHUNK = 256
 #: What is left however often a line is seen, in camera heights: paint and lens are not perfect.
 _FLOOR = 0.005
-#: Precision of the edge points that tell a marking's width.
-_NEAR = 0.2
+#: Precision of the edge points that tell a marking's width, and of those that tell dashes from a solid line.
+_NEAR, _TELLS_DASHES = 0.2, 0.04
+#: Length without edges that counts as bare, and what one frame sees of a line at most, in camera heights.
+_BARE, _IN_FRAME = 0.1, 4.0
 #: How far from both borders of a marking one alone is believed, in camera heights: next to a gap it may be
 #: the border of something else.
 _ALONE = 1.0
@@ -87,6 +89,7 @@ class FittedOffset:
         seen: Where the marking was seen.
         marking_cm: Width of the marking; what was given where it was never seen.
         residual_cm: Robust standard deviation of the borders about the fit; NaN where it was never seen.
+        bare: Share of it that is bare between pieces of paint, see :func:`datagen.lanes.support.bare_share`.
     """
 
     d_cm: Float[np.ndarray, "m"]
@@ -94,6 +97,7 @@ class FittedOffset:
     seen: Bool[np.ndarray, "m"]
     marking_cm: float
     residual_cm: float
+    bare: float
 
 
 def fit_offset(
@@ -160,7 +164,10 @@ def fit_offset(
     near = trust > 0.5 * points.precision
     robust_sd = 1.4826 * float(np.median(np.abs(residual[near]))) if near.any() else float("nan")
     sigma = np.sqrt(_variance(factor, at_samples) + (_FLOOR * prior.height_cm) ** 2)
-    return FittedOffset(np.asarray(at_samples @ solution), sigma, seen, marking, robust_sd)
+    near = points.precision > _TELLS_DASHES
+    height_cm = prior.height_cm
+    bare = bare_share(points.s_cm[near], points.frame[near], _BARE * height_cm, _IN_FRAME * height_cm)
+    return FittedOffset(np.asarray(at_samples @ solution), sigma, seen, marking, robust_sd, bare)
 
 
 def _before_ends(path: Path, seen: Bool[np.ndarray, "m"], height_cm: float) -> Bool[np.ndarray, "m"]:

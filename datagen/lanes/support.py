@@ -1,11 +1,11 @@
-"""Where a line was seen, and which gaps in its paint are bridged."""
+"""Where a line was seen, which gaps in its paint are bridged, and whether it is one of dashes."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from datagen.lanes.path import Path
@@ -15,6 +15,8 @@ from datagen.lanes.path import Path
 _SEEN, _SEEN_SHARE = 0.5, 0.15
 #: What a gap counts where a parallel line is seen.
 _HELD = 0.4
+#: Cells with paint from which a frame tells what there is between them.
+_TELLING = 4
 
 
 def seen_samples(
@@ -98,6 +100,33 @@ def stretches(
         found = np.stack([at[first], at[first] + np.mod(at[last] - at[first], period)], axis=1)
     found = found[found[:, 1] - found[:, 0] > extend_cm] + [-extend_cm, extend_cm]
     return found if period is not None else np.clip(found, 0.0, path.s_cm[-1])
+
+
+def bare_share(
+    s_cm: Float[np.ndarray, "n"], frame: Int[np.ndarray, "n"], cell_cm: float, reach_cm: float
+) -> float:
+    """Share of a line that is bare between pieces of paint, as single frames see it.
+
+    On the map, the dashes of several laps need not lie on one another; in a frame they do not move.
+
+    Args:
+        s_cm: Position of the line's edge points along the path.
+        frame: Frame that saw each.
+        cell_cm: Length without edge points that counts as bare.
+        reach_cm: Length that a frame sees at most.
+
+    Returns:
+        0..1; NaN where no frame sees enough of the line.
+    """
+    seen = np.unique(np.stack([frame, np.floor(s_cm / cell_cm).astype(np.int64)], axis=1), axis=0)
+    if not len(seen):
+        return float("nan")
+    first = np.flatnonzero(np.diff(seen[:, 0], prepend=seen[0, 0] - 1))
+    cells = np.diff(first, append=len(seen))
+    length = seen[first + cells - 1, 1] - seen[first, 1] + 1
+    # What a frame sees on both sides of a lap's seam seems to be a lap long.
+    told = (cells >= _TELLING) & (length * cell_cm <= reach_cm)
+    return 1.0 - float(cells[told].sum() / length[told].sum()) if told.any() else float("nan")
 
 
 def within(path: Path, parts_cm: Float[np.ndarray, "g 2"]) -> Bool[np.ndarray, "m"]:

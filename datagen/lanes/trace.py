@@ -3,7 +3,7 @@
 A marking shows as two edges of opposite direction, a tape's width apart. The driven lane is the pair of
 markings a lane's width apart that runs along the whole path, with the car inside it most of the way; both are
 found together by dynamic programming, so that a dashed line and an interrupted one are carried by the other.
-The lines of the neighbouring lanes are looked for from there outwards, one after the other.
+The lines of the neighbouring lanes follow in :mod:`datagen.lanes.beside`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from datagen.lanes.follow import best_lane, follow_line
 from datagen.lanes.line import Side
@@ -58,7 +58,7 @@ def trace_lane(
     lane_width_cm: float | None,
     settings: TraceSettings,
 ) -> TracedLane:
-    """Find the lines that bound the driven lane, and those of the lanes beside it.
+    """Find the lines that bound the driven lane.
 
     Args:
         path: The driven path.
@@ -85,7 +85,7 @@ def trace_lane(
     left = follow_line(path, tapes, profile, centre + 0.5 * lane, band, settings)
     right = follow_line(path, tapes, profile, centre - 0.5 * lane, band, settings)
     left, right = (
-        _without_strays(path, _known_middle(profile, line, tape, settings), centre, lane)
+        _without_strays(path, known_middle(profile, line, tape, settings), centre, lane)
         for line in (left, right)
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
@@ -93,21 +93,10 @@ def trace_lane(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
             "and the camera's height, and look at the map's picture"
         )
-    beside: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
-    sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [("left", 1.0, left), ("right", -1.0, right)]
-    for side, sign, line in sides:
-        guess = np.where(np.isfinite(line), line, centre + 0.5 * sign * lane)
-        for rank in range(1, settings.neighbours + 1):
-            found = follow_line(path, tapes, profile, guess + sign * lane, 2.0 * band, settings)
-            known = _known_middle(profile, found, tape, settings)
-            if not _is_line(path, known, lane, settings):
-                break
-            beside[side, rank] = known
-            guess = np.where(np.isfinite(known), known, found)
-    return TracedLane(left, right, centre, lane, tape, beside)
+    return TracedLane(left, right, centre, lane, tape)
 
 
-def _known_middle(
+def known_middle(
     profile: EdgeProfile, line_cm: Float[np.ndarray, "m"], tape_cm: float, settings: TraceSettings
 ) -> Float[np.ndarray, "m"]:
     """Keep a followed line where both edges of its marking are seen; NaN elsewhere."""
@@ -138,22 +127,7 @@ def _without_strays(
     usual[some] = np.nanmedian(around[some], axis=1)
     off = np.nan_to_num(np.abs(offset - usual)) / lane_cm
     kept = line_cm.copy()
-    for piece in true_runs(off > _BESIDE):
+    for piece in true_runs(off > _BESIDE, path.closed):
         if off[piece].max() > _STRAY:
             kept[piece] = np.nan
-    return kept
-
-
-def _is_line(path: Path, line_cm: Float[np.ndarray, "m"], lane_cm: float, settings: TraceSettings) -> bool:
-    """Tell a painted line from clutter: enough of it, in runs rather than in specks."""
-    seen = _in_runs(np.isfinite(line_cm), max(2, int(0.1 * lane_cm / path.step_cm)))
-    length = float(seen.sum()) * path.step_cm
-    return length >= settings.neighbour_lanes * lane_cm and float(seen.mean()) >= settings.neighbour_share
-
-
-def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int) -> Bool[np.ndarray, "m"]:
-    """Drop runs of fewer samples."""
-    kept = np.zeros(len(seen), dtype=bool)
-    for run in true_runs(seen):
-        kept[run] = len(run) >= shortest
     return kept

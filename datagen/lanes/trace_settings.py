@@ -25,7 +25,9 @@ class TraceSettings(Settings):
         width_share: How much the lane's width may vary along the road.
         neighbours: Lines to look for on each side beyond those of the driven lane.
         neighbour_lanes: Length of paint that makes a neighbouring line, in lane widths.
-        neighbour_share: Share of the path along which a neighbouring line must be seen.
+        neighbour_share: Share of the path along which a neighbouring line must be seen,
+        visit_share: or of the way that the car drives in the lane before it,
+        visit_lanes: where that is so long at least, in lane widths.
     """
 
     cell_heights: float = Field(default=0.03, gt=0.0)
@@ -42,3 +44,5 @@ class TraceSettings(Settings):
     neighbours: int = Field(default=1, ge=0)
     neighbour_lanes: float = Field(default=4.0, gt=0.0)
     neighbour_share: float = Field(default=0.35, ge=0.0, le=1.0)
+    visit_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    visit_lanes: float = Field(default=2.0, gt=0.0)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from datagen.slam.bundle_problem import BundleProblem
 from datagen.slam.bundle_settings import BundleSettings
@@ -67,6 +67,7 @@ def adjust(
     breaks: Bool[np.ndarray, "n"] | None = None,
     expected: Float[np.ndarray, "n"] | None = None,
     believed: Camera | None = None,
+    keep: UInt8[np.ndarray, "h w"] | None = None,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
@@ -83,11 +84,12 @@ def adjust(
         expected: Commanded way from the frame before, 1 where it is usual; None for the same all along.
         believed: Camera about which the priors lie; None for the start. Rounds that each begin where the one
             before ended would walk away from it otherwise.
+        keep: Pixels in which edges were looked for; None for all.
 
     Returns:
         The adjusted drive.
     """
-    problem = BundleProblem(edges, camera, settings, rng, free, loops, breaks, expected, believed)
+    problem = BundleProblem(edges, camera, settings, rng, free, loops, breaks, expected, believed, keep)
     height = camera.mounting.height_cm
     state = start_state(poses, tilt, camera)
     for gate_px in settings.gates_px:

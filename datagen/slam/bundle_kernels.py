@@ -91,8 +91,7 @@ def associate(
     edge_normals,
     gate_px,
     min_dot,
-    width,
-    height,
+    inner,
     in_view,
     matched,
     out_point,
@@ -102,15 +101,18 @@ def associate(
 ):
     """Find for every point of frame i the nearest edge of frame j that brightens the same way.
 
-    The edges of each frame stand in the order of their rows. ``out_sigma`` is the standard deviation of the
+    The edges of each frame stand in the order of their rows. Only what falls into ``inner`` looks for an
+    edge: at the rim of what is seen, a point whose edge lies beyond would take one on this side for it, all
+    along the rim, and what is seen would seem to stay. ``out_sigma`` is the standard deviation of the
     residual to come, in that of an edge's place in its own picture: an edge seen far ahead is a wide band
-    where the road is near. ``in_view`` and ``matched`` count how often each point fell into the other
-    picture, and met an edge there.
+    where the road is near. ``in_view`` and ``matched`` count how often each point fell into ``inner`` of the
+    other picture, and met an edge there.
 
     Returns:
         Number of associations written.
     """
     view = np.empty(N_VIEW)
+    height, width = inner.shape
     count = 0
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -135,8 +137,11 @@ def associate(
             stretch = 2.0 * length
             if not 1e-9 < stretch < _MAX_STRETCH:
                 continue
-            if 0.0 <= u < width and 0.0 <= v < height:
-                in_view[p] += 1
+            if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+                continue
+            if not inner[int(v + 0.5), int(u + 0.5)]:
+                continue
+            in_view[p] += 1
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
             q, stop = _first_row(edge_uv, edge_starts[j], edge_starts[j + 1], v - gate_px), edge_starts[j + 1]

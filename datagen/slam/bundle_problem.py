@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.slam.bundle_kernels import N_FRAME, accumulate, associate, lift_points
 from datagen.slam.bundle_priors import frame_priors
@@ -21,6 +22,8 @@ from lanenet.perception.edges import EdgePixels
 _CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
 #: Cosine of the angle by which a moved edge and the one that it meets may differ.
 _LEAST_COSINE = 0.8
+#: Pixels from the rim of what is seen, in images of 160 px, over which a point may be misplaced beyond it.
+_RIM_PX = 1.0
 
 _Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
 
@@ -56,6 +59,7 @@ class BundleProblem:
         breaks: Bool[np.ndarray, "n"] | None = None,
         expected: Float[np.ndarray, "n"] | None = None,
         believed: Camera | None = None,
+        keep: UInt8[np.ndarray, "h w"] | None = None,
     ) -> None:
         self.settings, self.camera, self.n = settings, camera, len(edges)
         self.believed = camera if believed is None else believed
@@ -77,6 +81,7 @@ class BundleProblem:
         self.edge_uv, self.edge_normals = edge_uv[by_row], edge_normals[by_row]
         segment = np.zeros(self.n, int) if breaks is None else np.cumsum(breaks)
         self.pairs = _pairs(settings.lags, segment, loops, rng)
+        self.inner = inner_pixels(camera, keep)
         self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         self.weight = np.full(len(self.uv), 1.0 / settings.pixel_sigma**2)
@@ -132,8 +137,7 @@ class BundleProblem:
             self.edge_normals,
             gate_px * self.camera.width / 160.0,
             _LEAST_COSINE,
-            self.camera.width,
-            self.camera.height,
+            self.inner,
             in_view,
             matched,
             point,
@@ -211,6 +215,19 @@ def _pairs(
     both = [(a, b) for a, b in loops] + [(b, a) for a, b in loops]
     pairs.append(np.array(both, dtype=np.int64).reshape(-1, 2))
     return np.concatenate(pairs).astype(np.int64)
+
+
+def inner_pixels(camera: Camera, keep: UInt8[np.ndarray, "h w"] | None) -> Bool[np.ndarray, "h w"]:
+    """True for pixels around which edges were looked for on all sides.
+
+    Args:
+        camera: For the size of its images.
+        keep: Pixels in which edges were looked for; None for all.
+    """
+    seen = np.zeros((camera.height + 2, camera.width + 2), np.uint8)
+    seen[1:-1, 1:-1] = 1 if keep is None else keep > 0
+    rim_px = cv2.distanceTransform(seen, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    return np.asarray(rim_px > _RIM_PX * camera.width / 160.0)
 
 
 def point_trust(in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:

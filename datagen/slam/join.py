@@ -129,14 +129,16 @@ def _join(
     if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
         return None
     limits = mapping_range(height, settings.perception.range)
-    edges = [pixels for part in drives for pixels in road_edges(part, camera, limits, settings)]
+    roads = [road_edges(part, camera, limits, settings) for part in drives]
+    edges = [pixels for road in roads for pixels in road.edges]
     expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     loops = loop_pairs(revisits, breaks)
     for _ in range(2):
         bundle = adjust(
-            edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks, expected=expected
-        )
+            edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks,
+            expected=expected, keep=roads[0].keep,
+        )  # fmt: skip
         poses, tilt = bundle.poses, bundle.tilt
         loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)
     before = np.average(

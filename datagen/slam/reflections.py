@@ -3,7 +3,8 @@
 The mirror image of a lamp lies as far below the floor as the lamp hangs above it, so that it hardly moves
 while the road runs by, and only turns with the car. To a matcher that asks how far the car drove, its rim
 says "not at all", and on a road without dashes nothing contradicts. A line that runs along with the car
-stands still in the same way, but it goes on straight where a rim bends away.
+stands still in the same way, but it goes on straight where a rim bends away; and a side of a dash, or of
+anything else that lies along the way, stands still without saying a word of it.
 """
 
 from __future__ import annotations
@@ -26,8 +27,14 @@ _BEARING_RAD, _BEARINGS = 0.04, 80
 _TURN_CELLS = 3
 #: Frames for which an edge keeps its distance before it counts as standing still.
 _LIFE = 8
-#: An edge faces the camera, or away from it, where this is the least share of its normal along the ray.
+#: An edge faces the camera, or away from it, where this is the least share of its normal along the ray, and
+#: of its normal along the way of the car. With the former alone, dashes beside the car were taken for lamps:
+#: their sides face the camera from there, and one follows on the other. Their ends, which tell the way best,
+#: went with them.
 _FACING = 0.6
+#: Frames that one without the edge takes from those for which it has been there: of a row of dashes that
+#: passes by, a place sees one, then a gap.
+_MISSED = 2
 #: Cells of the road in which an edge is looked for further on, in camera heights, and directions told apart.
 _CELL_HEIGHTS, _SECTORS = 0.05, 8
 _AHEAD_CELLS, _SIDE_CELLS = 180, 120
@@ -46,7 +53,7 @@ class _View:
         normals: Towards the brighter side.
         cell: Ring and bearing of each point, clipped to the grid.
         side: 0 where the brighter side is the farther one, 1 where the nearer one is.
-        faces: True for points inside the grid whose normal is along the ray.
+        faces: True for points inside the grid whose normal is along the ray and along the way.
     """
 
     points: Float[np.ndarray, "n 2"]
@@ -96,25 +103,25 @@ def _view(road: RoadEdges, camera: Camera) -> _View:
     along = np.sum(points * road.normals, axis=1) / np.maximum(distance, 1e-9)
     inside = (ring < _RINGS) & (bearing >= 0) & (bearing < _BEARINGS)
     cell = np.stack([np.clip(ring, 0, _RINGS - 1), np.clip(bearing, 0, _BEARINGS - 1)], axis=1)
-    return _View(
-        points, road.normals, cell, (along < 0.0).astype(np.int64), inside & (np.abs(along) > _FACING)
-    )
+    faces = inside & (np.abs(along) > _FACING) & (np.abs(road.normals[:, 1]) > _FACING)
+    return _View(points, road.normals, cell, (along < 0.0).astype(np.int64), faces)
 
 
 def _lives(views: Sequence[_View]) -> list[UInt8[np.ndarray, "r b 2"]]:
     """For how many frames, up to each frame, a facing edge has been in a ring, wherever the car turned.
 
-    One frame in which it was not found is forgiven.
+    One frame in which it was not found is forgiven, at a cost.
     """
     turn = np.ones((1, 2 * _TURN_CELLS + 1), np.uint8)
     thick = np.ones((3, 1), np.uint8)
     lives: list[np.ndarray] = []
     last = one_before = np.zeros((_RINGS, _BEARINGS, 2), np.uint8)
+    missed = np.full_like(last, _MISSED)
     for view in views:
         there = np.zeros((_RINGS, _BEARINGS, 2), np.uint8)
         ring, bearing = view.cell[view.faces].T
         there[ring, bearing, view.side[view.faces]] = 1
-        known = cv2.dilate(np.maximum(last, cv2.dilate(one_before, turn)), turn)
+        known = cv2.dilate(np.maximum(last, cv2.dilate(cv2.subtract(one_before, missed), turn)), turn)
         life = cv2.dilate(there, thick) * np.minimum(known + 1, _LIFE)
         lives.append(life)
         last, one_before = life, last

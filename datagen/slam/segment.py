@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
@@ -116,8 +116,8 @@ def solve_segment(
     believed = camera if believed is None else believed
     height = camera.mounting.height_cm
     limits = mapping_range(height, settings.perception.range)
-    edges = road_edges(drive, camera, limits, settings)
-    scans = scans_of(edges, camera, limits)
+    road = road_edges(drive, camera, limits, settings)
+    scans = scans_of(road.edges, camera, limits)
     if len(scans.points_cm) < 20 * len(scans):
         raise TrackingLostError(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
@@ -125,39 +125,40 @@ def solve_segment(
         )
     commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(
-        edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng, progress,
-        far_turns(drive, camera),
+        road.edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng,
+        progress, far_turns(drive, camera),
     )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
     expected = relative_ways(commands)
     opened = adjust(
-        edges, trajectory.poses, camera, settings.bundle, rng, free, expected=expected, believed=believed
-    )
-    scans = scans_of(edges, opened.camera, limits, opened.tilt)
+        road.edges, trajectory.poses, camera, settings.bundle, rng, free,
+        expected=expected, believed=believed, keep=road.keep,
+    )  # fmt: skip
+    scans = scans_of(road.edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
     found = [
         match_places(scans, opened.poses, pair, height, camera.wheelbase_cm, settings.revisits, rng)
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    closure = _close(edges, opened, matched, settings, rng, free, expected, believed)
+    closure = _close(road, opened, matched, settings, rng, free, expected, believed)
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
-            edges = road_edges(drive, bundle.camera, limits, settings)
+            road = road_edges(drive, bundle.camera, limits, settings)
             before = bundle.camera.K[0, 0]
             none = np.zeros(len(drive), dtype=bool)
             true = borne_out(bundle.poses, closure.revisits, height)
             loops = loop_pairs(true, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
-                edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=expected, believed=believed,
+                road.edges, bundle.poses, bundle.camera, settings.bundle, rng,
+                loops=loops, tilt=bundle.tilt, expected=expected, believed=believed, keep=road.keep,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
     if closure is not None:
-        scans = scans_of(edges, bundle.camera, limits, bundle.tilt)
+        scans = scans_of(road.edges, bundle.camera, limits, bundle.tilt)
     return SolvedSegment(
         camera=bundle.camera,
         scans=scans,
@@ -172,12 +173,24 @@ def solve_segment(
     )
 
 
-def road_edges(
-    drive: Drive, camera: Camera, limits: RangeSettings, settings: MapSettings
-) -> list[EdgePixels]:
+@dataclass(frozen=True)
+class SeenRoad:
+    """Edges of the road in every frame.
+
+    Attributes:
+        edges: Per frame.
+        keep: Pixels in which they were looked for, 0 elsewhere.
+    """
+
+    edges: list[EdgePixels]
+    keep: UInt8[np.ndarray, "h w"]
+
+
+def road_edges(drive: Drive, camera: Camera, limits: RangeSettings, settings: MapSettings) -> SeenRoad:
     """Edges of the road in every frame, without those of lamps that are mirrored in it."""
     table = RoadTable(camera, limits)
-    return without_reflections(edges_of_drive(drive, settings.perception.edges, table), camera, table)
+    edges = edges_of_drive(drive, settings.perception.edges, table)
+    return SeenRoad(without_reflections(edges, camera, table), table.keep)
 
 
 @dataclass(frozen=True)
@@ -191,7 +204,7 @@ class _Closure:
 
 
 def _close(
-    edges: list[EdgePixels],
+    road: SeenRoad,
     opened: BundleResult,
     matched: list[Revisit],
     settings: MapSettings,
@@ -207,7 +220,7 @@ def _close(
         supported = with_supported(opened.poses, explained, matched, height, settings.revisits)
         # Those that a drift explains are enough where the others do not fit.
         for revisits in [supported, explained][: 1 + (len(supported) > len(explained))]:
-            closure = _closed_by(revisits, drift, edges, opened, settings, rng, free, expected, believed)
+            closure = _closed_by(revisits, drift, road, opened, settings, rng, free, expected, believed)
             if closure is not None:
                 if best is None or closure.bundle.misfit < best.bundle.misfit:
                     best = closure
@@ -218,7 +231,7 @@ def _close(
 def _closed_by(
     revisits: list[Revisit],
     drift: float,
-    edges: list[EdgePixels],
+    road: SeenRoad,
     opened: BundleResult,
     settings: MapSettings,
     rng: np.random.Generator,
@@ -234,8 +247,8 @@ def _closed_by(
         return None
     loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
     closed = adjust(
-        edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-        expected=expected, believed=believed,
+        road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
+        expected=expected, believed=believed, keep=road.keep,
     )  # fmt: skip
     return _Closure(revisits, missed, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 

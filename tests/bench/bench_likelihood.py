@@ -86,7 +86,7 @@ def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tu
     """Run the filter alone over the frames of the map; its trajectory, and processor time per frame, [ms]."""
     drive, camera = mapped.drive.subset(mapped.rows[rows]), mapped.drive_map.camera
     limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
-    edges = road_edges(drive, camera, limits, settings)
+    edges = road_edges(drive, camera, limits, settings).edges
     scans = scans_of(edges, camera, limits)
     commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)

@@ -143,6 +143,7 @@ def _closed_map() -> DriveMap:
             np.linspace(0.0, 295.0, 60),
             np.linspace(0.05, 0.4, 60),
             2.0,
+            0.3,
         )
 
     plain = _drive_map()
@@ -163,6 +164,7 @@ def test_closed_lines_and_lines_beside_the_lane_are_read_back(tmp_path):
             300.0,
         )
         assert again.marking_cm == 2.0
+        assert again.bare == 0.3 and again.dashed
         np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
         np.testing.assert_allclose(again.sigma_cm(s), line.sigma_cm(s), atol=1e-9)
     assert [line.index for line in found.lines[0]] == [0, 1, 2]
@@ -175,7 +177,7 @@ def test_lines_of_the_first_version_are_read(folder):
     path = folder / "lanes.json"
     plain = json.loads(path.read_text())
     for line in plain["lines"]:
-        for name in ("rank", "period_cm", "marking_cm", "sigma_s_cm", "sigma_at_cm"):
+        for name in ("rank", "period_cm", "marking_cm", "bare_share", "sigma_s_cm", "sigma_at_cm"):
             del line[name]
     plain["format"] = "lanenet-lanes/1"
     path.write_text(json.dumps(plain))
@@ -186,6 +188,7 @@ def test_lines_of_the_first_version_are_read(folder):
             assert (again.side, again.rank, again.period_cm) == (line.side, 0, None)
             np.testing.assert_allclose(again.points(s), line.points(s), atol=1e-9)
             assert np.isnan(again.sigma_cm(s)).all()
+            assert not again.dashed
     assert not found.lanes.lane.any()
 
 

@@ -19,6 +19,14 @@ def test_runs_of_known_values():
     assert true_runs(np.zeros(3, bool)) == []
 
 
+def test_in_a_closed_row_a_run_may_cross_the_seam():
+    flags = np.array([True, False, True, False, True, True])
+    assert plain(true_runs(flags, closed=True)) == [[2], [4, 5, 0]]
+    assert plain(true_runs(flags)) == [[0], [2], [4, 5]]
+    assert plain(true_runs(~flags, closed=True)) == [[1], [3]]
+    assert plain(true_runs(np.ones(3, bool), closed=True)) == [[0, 1, 2]]
+
+
 def test_of_nothing_there_are_no_runs():
     assert equal_runs(np.empty(0, int)) == [] and true_runs(np.empty(0, bool)) == []
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -175,7 +177,7 @@ def test_straddling_a_line_does_not_flicker():
     assert not assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM).lane.any()
 
 
-@pytest.mark.parametrize(("reach", "changes"), [(0.2, False), (0.4, True)])
+@pytest.mark.parametrize(("reach", "changes"), [(0.15, False), (0.4, True)])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_swerve_across_a_line_is_no_lane_change(reach, changes, side):
     lines = _straight_lines(TWO_LANES)
@@ -196,6 +198,25 @@ def test_beyond_the_outer_line_the_car_keeps_its_lane():
     poses, s = _drive(np.full(50, 36.0))
     gone = assign_lanes(_straight_lines(TWO_LANES, until_cm=5.0), poses, s, WHEELBASE_CM)
     assert not gone.lane.any()
+
+
+@pytest.mark.parametrize("offsets", [TWO_LANES, {0: 18.0, 1: -18.0}])
+@pytest.mark.parametrize("start_cm", [0.0, 36.0])
+def test_behind_dashes_there_is_a_lane_whether_its_far_line_is_known_or_not(offsets, start_cm):
+    lines = _straight_lines(offsets, until_cm=5.0)
+    dashed = [replace(line, bare=0.4) if line.index == 0 else line for line in lines]
+    poses, s = _drive(np.concatenate([np.full(20, start_cm), np.full(20, 36.0), np.full(20, 0.0)]))
+    lane = assign_lanes(dashed, poses, s, WHEELBASE_CM).lane
+    np.testing.assert_array_equal(lane, np.where(poses[:, 1] > 18.0, -1, 0))
+    solid = [replace(line, bare=0.05) for line in lines]
+    assert not assign_lanes(solid, poses, s, WHEELBASE_CM).lane.any()
+
+
+def test_dashes_on_the_right_have_a_lane_behind_them_too():
+    lines = [replace(line, bare=0.3 * line.index) for line in _straight_lines({0: 18.0, 1: -18.0})]
+    poses, s = _drive(np.concatenate([np.zeros(20), np.full(20, -36.0), np.zeros(20), np.full(20, 36.0)]))
+    lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
+    np.testing.assert_array_equal(lane, np.where(poses[:, 1] < -18.0, 1, 0))
 
 
 def test_the_other_way_in_the_other_lane():

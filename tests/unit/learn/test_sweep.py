@@ -9,7 +9,7 @@ from lanenet.data.label_set import write_labels
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
-from lanenet.learn.config import LearnSettings, NetworkSettings
+from lanenet.learn.config import LearnSettings, LossSettings, NetworkSettings
 from lanenet.learn.sweep import sweep
 from lanenet.learn.sweep_table import trials_csv, trials_table
 
@@ -47,6 +47,20 @@ def quick(monkeypatch):
     monkeypatch.setattr(sweep_module, "CHOICES", sweep_module.CHOICES | small)
 
 
+def test_what_is_tried_first_is_the_small_network_as_it_is():
+    first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
+    channels, hidden = NetworkSettings(kind="small").size
+    assert [first["first_channels"] * k for k in range(1, first["layers"] + 1)] == list(channels)
+    assert first["hidden"] == hidden
+    assert (first["loss"], first["evenness"]) == (LossSettings().kind, LossSettings().evenness)
+    window = BirdseyeWindow()
+    assert (first["cell_cm"], first["far_cm"], first["half_width_cm"]) == (
+        window.cell_cm,
+        window.far_cm,
+        -window.left_cm,
+    )
+
+
 def read(folder):
     with (folder / "trials.csv").open() as file:
         return list(csv.DictReader(file))
@@ -68,16 +82,16 @@ def test_the_network_as_it_is_comes_first_and_a_later_call_goes_on(quick, paths,
     assert len(read(tmp_path)) == 1
 
 
-def test_the_first_of_all_choices_is_the_small_network_in_the_usual_window():
+def test_a_network_that_is_told_the_width_is_told_it_in_every_trial():
     optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
     first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
-    trial = optuna.trial.FixedTrial(first | {"learning_rate": LearnSettings().learning_rate})
-    told = LearnSettings(network=NetworkSettings(takes_width=True))
-    for settings in (LearnSettings(), told):
-        window, chosen = sweep_module._draw(trial, settings)
-        assert window == BirdseyeWindow()
+    trial = optuna.trial.FixedTrial(first | {"learning_rate": SETTINGS.learning_rate})
+    for takes_width in (True, False):
+        settings = SETTINGS.model_copy(update={"network": NetworkSettings(takes_width=takes_width)})
+        _, chosen = sweep_module._draw(trial, settings)
+        assert chosen.network.takes_width == takes_width
+        # What is tried is all that is changed.
         assert chosen.network.size == settings.network.size
-        assert chosen.network.takes_width == settings.network.takes_width
         assert chosen.model_copy(update={"network": settings.network}) == settings
 
 

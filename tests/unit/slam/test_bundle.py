@@ -9,7 +9,8 @@ from tape_road import tape_road
 
 from datagen.slam import bundle_problem
 from datagen.slam.bundle import BundleSettings, adjust
-from datagen.slam.bundle_problem import BundleProblem, point_trust
+from datagen.slam.bundle_problem import BundleProblem, inner_pixels, point_trust
+from datagen.slam.bundle_state import start_state
 from datagen.slam.places import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
@@ -111,6 +112,34 @@ def test_noise_that_stays_in_the_picture_does_not_hold_the_car_back(monkeypatch,
     assert trusting_some < 3e-3
     monkeypatch.setattr(bundle_problem, "point_trust", lambda in_view, matched: np.ones(len(in_view)))
     assert error() > 1.5 * trusting_some
+
+
+def test_what_falls_on_the_rim_of_what_is_seen_looks_for_no_edge():
+    """Its own edge may lie beyond, and the nearest one on this side is another."""
+    camera, road = fisheye(), tape_road(2)
+    keep = np.zeros((camera.height, camera.width), np.uint8)
+    keep[55:95] = 255
+    # The car stands, so that every point falls on its own pixel.
+    edges = pixels(road, camera)[:1] * 2
+    where = []
+    for known in (keep, None):
+        problem = BundleProblem(edges, camera, SMALL, _rng(), keep=known)
+        state = start_state(road.poses[[0, 0]], None, camera)
+        where.append(problem.uv[problem.associate(state, 5.0).point, 1])
+    assert len(where[0]) > 10 and where[0].min() > 55.5 and where[0].max() < 93.5
+    assert len(where[1]) > len(where[0])
+    met = [len(w[(w > 56.5) & (w < 92.5)]) for w in where]
+    assert met[0] == met[1]
+
+
+def test_pixels_at_the_rim_are_no_inner_ones():
+    camera = fisheye()
+    whole = inner_pixels(camera, None)
+    assert not whole[[0, -1]].any() and not whole[:, [0, -1]].any() and whole[1:-1, 1:-1].all()
+    keep = np.full((camera.height, camera.width), 255, np.uint8)
+    keep[:30] = 0
+    inner = inner_pixels(camera, keep)
+    assert not inner[:31].any() and inner[31:-1, 1:-1].all()
 
 
 def test_the_same_seed_gives_the_same_and_another_nearly():

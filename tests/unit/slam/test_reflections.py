@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tape_road as tape_road_module
 from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
@@ -54,6 +55,16 @@ def test_without_a_lamp_hardly_anything_is_dropped():
     tapes = pixels(tape_road(60), CAMERA)
     kept = without_reflections(tapes, CAMERA, TABLE)
     assert sum(len(e.uv_px) for e in kept) > 0.97 * sum(len(e.uv_px) for e in tapes)
+
+
+@pytest.mark.parametrize("dash_cm", [4.5, 9.0, 14.0])
+@pytest.mark.parametrize("curvature_per_cm", [0.0, 0.01])
+def test_dashes_that_pass_beside_the_car_stay(monkeypatch, dash_cm, curvature_per_cm):
+    """Their sides face the camera, one follows on the other in one place, and their ends tell the way."""
+    monkeypatch.setattr(tape_road_module, "LINES", ((18.0, dash_cm, 2.0 * dash_cm, 0.0),))
+    dashes = pixels(tape_road(60, curvature_per_cm, 0.0), CAMERA)
+    kept = without_reflections(dashes, CAMERA, TABLE)
+    assert sum(len(e.uv_px) for e in kept) > 0.95 * sum(len(e.uv_px) for e in dashes)
 
 
 def test_a_glare_for_a_few_frames_could_be_anything():
