@@ -11,8 +11,8 @@ from scipy.interpolate import BSpline
 
 Side = Literal["left", "right"]
 
-#: Share of a line that is bare from which it is dashed. Of ten simulated drives and three real ones, 0.18 to
-#: 0.47 of every dashed line and no more than 0.06 of every solid one, worn or not, is bare.
+#: Share of a line that is bare from which it is dashed. On ten simulated drives and three real ones, 0.18 to
+#: 0.47 of every dashed line and no more than 0.09 of every solid one, worn or not, was bare.
 _DASHED = 0.12
 
 

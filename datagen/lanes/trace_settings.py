@@ -20,7 +20,8 @@ class TraceSettings(Settings):
         sideways: Cost of a step of one cell where no paint is.
         second_line: What the weaker one of the two lines counts beside the stronger one.
         inside: What it costs per sample when the car is a lane further, less when it is only just outside:
-            more than a second line brings, so that a lane beside it with two solid lines does not take over.
+            more than a second line brings, so that a lane beside it with two solid lines does not take over;
+            not much more, or the lane changes sides with a car that does.
         min_support: Density of edges from which a marking counts as seen, 0..1.
         width_share: How much the lane's width may vary along the road.
         neighbours: Lines to look for on each side beyond those of the driven lane.
@@ -38,7 +39,7 @@ class TraceSettings(Settings):
     smoothness: float = Field(default=0.04, gt=0.0)
     sideways: float = Field(default=0.3, ge=0.0)
     second_line: float = Field(default=0.08, gt=0.0, le=1.0)
-    inside: float = Field(default=0.17, ge=0.0)
+    inside: float = Field(default=0.12, ge=0.0)
     min_support: float = Field(default=0.4, gt=0.0)
     width_share: float = Field(default=0.15, gt=0.0, lt=0.5)
     neighbours: int = Field(default=1, ge=0)

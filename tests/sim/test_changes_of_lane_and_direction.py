@@ -77,6 +77,33 @@ def test_labels_before_during_and_after_changes_of_lane(tmp_path, seed, directio
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("seed", "direction"), [(4, "forward"), (5, "backward")])
+def test_an_edge_of_the_road_without_paint_is_masked(tmp_path, seed, direction):
+    """Two lanes, dashes between them, and nothing on one side of the road: its left, or its right there."""
+    track = {"lanes": 2, "lane_width_cm": LANE_CM, "interruptions_per_m": 0.0, "far": {"kind": "none"}}
+    driver = {"change_lanes_every_cm": 300.0, "direction": direction}
+    drive = simulated(tmp_path / "drive", seed, 300, track, driver)
+    map_drive(drive, LANE_CM, None, MapSettings(), tmp_path / "map")
+    found = read_map_frames(tmp_path / "map")
+    exact = true_points(drive)[found.frames]
+    error = found.points_cm - labelled(exact)
+    there, back = np.flatnonzero(np.abs(np.diff(exact[:, 1])) > 0.6 * LANE_CM) + 1
+    frame = np.arange(len(error))
+    inside = (np.abs(frame - there) > 10) & (np.abs(frame - back) > 10)
+    other = inside & (frame >= there) & (frame < back)
+    own = inside & ~other
+    # Driven backward, the side without paint is on the right of the driver's own lane.
+    bare_lane, painted_lane, bare = (
+        (other, own, slice(0, 3)) if direction == "forward" else (own, other, slice(3, 6))
+    )
+    assert not np.isfinite(found.points_cm[bare_lane, bare]).any()
+    check(error[painted_lane], labelled(exact)[painted_lane], 0.5, 0.9)
+    dashes = np.delete(error[bare_lane], np.arange(6)[bare], axis=1)
+    truth = np.delete(labelled(exact)[bare_lane], np.arange(6)[bare], axis=1)
+    check(dashes, truth, 0.5, 0.95)
+
+
+@pytest.mark.slow
 def test_labels_of_a_road_driven_both_ways(tmp_path):
     """There, a pause, and back on the same road: the dashed line is on the left, and then on the right."""
     track = {"left": {"kind": "dashed"}, "right": {"kind": "solid"}, "interruptions_per_m": 0.0}
