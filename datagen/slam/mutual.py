@@ -4,6 +4,9 @@ Where a car slides, or its pictures are blurred, the open loop loses heading at 
 misses more than any steady drift would. Such revisits still agree with those beside them: between the earlier
 visits of two of them it is the same way as between the later ones. Several places in a row do not agree by
 chance, while a single place that looks like another one has no witness.
+
+By the same measure, but a narrower one, a revisit stands against those beside it where it takes one dash of a
+row for the next: the common drift does not mind a dash, and the map would be bent to make them meet.
 """
 
 from __future__ import annotations
@@ -14,10 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths, relative_pose
+from lanenet.geometry.frames import wrap_angle
 
 #: What two revisits may miss of each other: in camera heights, as a share of the way between them, which the
 #: open loop drifts over, and in heading.
 AGREE_HEIGHTS, AGREE_WAY, AGREE_RAD = 0.6, 0.06, 0.2
+#: The same for a revisit that is not to be contradicted; in heading, also for each camera height of way. Over
+#: a way that two laps have in common the open loop misses about the same, so that little of its drift counts.
+_SAME_HEIGHTS, _SAME_WAY, _SAME_RAD, _SAME_RAD_HEIGHT = 0.25, 0.02, 0.05, 0.002
 #: Way over which revisits are compared, camera heights: further on, the open loop has drifted too much.
 _NEAR_HEIGHTS = 20.0
 #: Way between two places that count as two, camera heights: on a road that repeats itself, neighbouring
@@ -73,6 +80,39 @@ def with_supported(
     return kept
 
 
+def without_contradicted(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
+) -> list[Revisit]:
+    """Leave out the revisits that more of those beside them stand against than agree with, the worst first.
+
+    Args:
+        poses: Open-loop trajectory.
+        revisits: Revisits.
+        camera_height_cm: Sets the scale.
+
+    Returns:
+        Those that are left, in the same order.
+    """
+    path, count = path_lengths(poses), len(revisits)
+    votes = np.zeros((count, count), np.int64)
+    for i, a in enumerate(revisits):
+        for j in range(i):
+            between = _between(path, a, revisits[j])
+            if between > _NEAR_HEIGHTS * camera_height_cm:
+                continue
+            off_cm, off_rad = _off(poses, a, revisits[j])
+            near = off_cm < _SAME_HEIGHTS * camera_height_cm + _SAME_WAY * between
+            same = near and off_rad < _SAME_RAD + _SAME_RAD_HEIGHT * between / camera_height_cm
+            votes[i, j] = votes[j, i] = 1 if same else -1
+    kept = list(range(count))
+    while kept:
+        sums = votes[np.ix_(kept, kept)].sum(axis=1)
+        if sums.min() >= 0:
+            break
+        del kept[int(sums.argmin())]
+    return [revisits[k] for k in kept]
+
+
 def separate_places(ways_cm: Float[np.ndarray, "r"], camera_height_cm: float) -> int:
     """Number of separate places among some that lie so far along a drive."""
     count, last = 0, -np.inf
@@ -87,19 +127,30 @@ def _missed_rad(poses: Float[np.ndarray, "n 3"], r: Revisit) -> float:
     return float(poses[r.later, 2] - poses[r.earlier, 2] - r.relative[2] - 2.0 * np.pi * r.turns)
 
 
+def _between(path_cm: Float[np.ndarray, "n"], a: Revisit, b: Revisit) -> float:
+    """Longer one of the ways between the earlier, and between the later visits of two revisits."""
+    return float(max(abs(path_cm[b.earlier] - path_cm[a.earlier]), abs(path_cm[b.later] - path_cm[a.later])))
+
+
 def _agree(
     poses: Float[np.ndarray, "n 3"], path: Float[np.ndarray, "n"], a: Revisit, b: Revisit, height_cm: float
 ) -> bool:
     """Whether it is the same way between the earlier visits of two revisits as between the later ones."""
-    between = max(abs(path[b.earlier] - path[a.earlier]), abs(path[b.later] - path[a.later]))
+    between = _between(path, a, b)
     if between > _NEAR_HEIGHTS * height_cm:
         return False
     if abs(_missed_rad(poses, a) - _missed_rad(poses, b)) > AGREE_RAD:
         return False
+    off_cm, _ = _off(poses, a, b)
+    return bool(off_cm < AGREE_HEIGHTS * height_cm + AGREE_WAY * between)
+
+
+def _off(poses: Float[np.ndarray, "n 3"], a: Revisit, b: Revisit) -> tuple[float, float]:
+    """What the ways between the visits of two revisits miss of each other: distance, and angle."""
     first = compose(relative_pose(poses[a.earlier], poses[b.earlier]), b.relative)
     second = compose(a.relative, relative_pose(poses[a.later], poses[b.later]))
-    off_cm = float(np.hypot(*(first - second)[:2]))
-    return bool(off_cm < AGREE_HEIGHTS * height_cm + AGREE_WAY * between)
+    x, y, turn = first - second
+    return float(np.hypot(x, y)), abs(float(wrap_angle(np.array([turn]))[0]))
 
 
 def compose(pose: Float[np.ndarray, "3"], relative: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

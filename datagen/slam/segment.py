@@ -15,7 +15,7 @@ from datagen.slam.far_view import far_turns
 from datagen.slam.filter import Trajectory
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
-from datagen.slam.mutual import with_supported
+from datagen.slam.mutual import with_supported, without_contradicted
 from datagen.slam.places import (
     Revisit,
     consistent_revisits,
@@ -142,6 +142,14 @@ def solve_segment(
     ]
     matched = [revisit for revisit in found if revisit is not None]
     closure = _close(road, opened, matched, settings, rng, free, expected, believed)
+    if closure is not None and not find_camera:
+        # Pictures that outvote a revisit are still pulled by it.
+        true = borne_out(closure.bundle.poses, closure.revisits, height)
+        if settings.revisits.min_revisits <= len(true) < len(closure.revisits):
+            again = _closed_by(
+                true, closure.drift_rad_per_cm, road, opened, settings, rng, free, expected, believed
+            )
+            closure = again or closure
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
@@ -219,7 +227,9 @@ def _close(
     for explained, drift in consistent_revisits(opened.poses, matched, settings.revisits):
         supported = with_supported(opened.poses, explained, matched, height, settings.revisits)
         # Those that a drift explains are enough where the others do not fit.
-        for revisits in [supported, explained][: 1 + (len(supported) > len(explained))]:
+        for group in [supported, explained][: 1 + (len(supported) > len(explained))]:
+            left = without_contradicted(opened.poses, group, height)
+            revisits = left if len(left) >= settings.revisits.min_revisits else group
             closure = _closed_by(revisits, drift, road, opened, settings, rng, free, expected, believed)
             if closure is not None:
                 if best is None or closure.bundle.misfit < best.bundle.misfit:
