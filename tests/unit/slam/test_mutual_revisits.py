@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.mutual import compose, separate_places, with_supported
+from datagen.slam.mutual import compose, separate_places, with_supported, without_contradicted
 from datagen.slam.places import Revisit, RevisitSettings, consistent_revisits, relative_pose
 
 HEIGHT_CM, LAP = 15.0, 90
@@ -93,3 +93,40 @@ def test_composing_undoes_seeing_from():
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(2, 3))
     np.testing.assert_allclose(compose(a, relative_pose(a, b)), b, atol=1e-12)
+
+
+def _along(pose: np.ndarray, ahead_cm: float) -> np.ndarray:
+    """The pose further ahead on the circle: what is seen where one dash is taken for the next."""
+    angle = ahead_cm / 64.0
+    return compose(pose, np.array([64.0 * np.sin(angle), 64.0 * (1.0 - np.cos(angle)), angle]))
+
+
+@pytest.mark.parametrize("dash_cm", [9.0, -32.0])
+def test_a_revisit_that_takes_one_dash_for_the_next_is_contradicted(dash_cm):
+    true = _circuit(3)
+    # The open loop misses way and heading alike on every lap, by more than a dash.
+    angle = 1.05 * true[:, 2]
+    bent = 64.0 * 1.04 / 1.05
+    drifted = np.column_stack([bent * np.sin(angle), bent * (1.0 - np.cos(angle)), angle])
+    revisits = _revisits(true, 6)
+    wrong = {5, 12, 13}
+    for k in wrong:
+        revisits[k] = replace(revisits[k], relative=_along(revisits[k].relative, dash_cm))
+    for poses in (true, drifted):
+        kept = without_contradicted(poses, revisits, HEIGHT_CM)
+        assert kept == [r for k, r in enumerate(revisits) if k not in wrong]
+
+
+def test_nobody_is_contradicted_without_a_neighbour():
+    true = _circuit(3)
+    lonely = _revisits(true, 6)[::10]
+    lonely[1] = replace(lonely[1], relative=_along(lonely[1].relative, 9.0))
+    assert without_contradicted(true, lonely, 2.0) == lonely
+    assert without_contradicted(true, [], HEIGHT_CM) == []
+
+
+def test_one_against_two_goes_and_the_two_stay():
+    true = _circuit(2)
+    three = _revisits(true, 6)[:3]
+    three[1] = replace(three[1], relative=_along(three[1].relative, 9.0))
+    assert without_contradicted(true, three, HEIGHT_CM) == [three[0], three[2]]
