@@ -68,6 +68,7 @@ def adjust(
     expected: Float[np.ndarray, "n"] | None = None,
     believed: Camera | None = None,
     keep: UInt8[np.ndarray, "h w"] | None = None,
+    recorded: bool = False,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
@@ -85,11 +86,14 @@ def adjust(
         believed: Camera about which the priors lie; None for the start. Rounds that each begin where the one
             before ended would walk away from it otherwise.
         keep: Pixels in which edges were looked for; None for all.
+        recorded: Whether the commanded ways come from a recorded speed.
 
     Returns:
         The adjusted drive.
     """
-    problem = BundleProblem(edges, camera, settings, rng, free, loops, breaks, expected, believed, keep)
+    problem = BundleProblem(
+        edges, camera, settings, rng, free, loops, breaks, expected, believed, keep, recorded
+    )
     height = camera.mounting.height_cm
     state = start_state(poses, tilt, camera)
     for gate_px in settings.gates_px:

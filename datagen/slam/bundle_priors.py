@@ -16,6 +16,7 @@ def frame_priors(
     settings: BundleSettings,
     joined: Int[np.ndarray, "m"],
     expected: Float[np.ndarray, "n"],
+    recorded: bool = False,
 ) -> tuple[float, csc_matrix, Float[np.ndarray, "u"]]:
     """Cost, normal matrix and downhill slope of the priors of all frames.
 
@@ -24,6 +25,7 @@ def frame_priors(
         settings: Standard deviations.
         joined: Frames that the next one follows.
         expected: Commanded way from the frame before, 1 where it is usual.
+        recorded: Whether these come from a recorded speed; else they only say how ways change.
     """
     s, n = settings, len(state.poses)
     rows: list[np.ndarray] = []
@@ -76,6 +78,20 @@ def frame_priors(
         *((k, 0.5 * per_b * across[b]) for k in (ti[b], tj[b])),
         *((k, -0.5 * per_a * across[a]) for k in (ti[a], tj[a])),
     )
+    told = np.flatnonzero(per > 0.0) if recorded else np.zeros(0, np.int64)
+    if told.size:
+        # Of the gain the ways themselves are asked: what all have in common is left to the pictures.
+        usual = max(float(np.median(per[told] * along[told])), 1e-6)
+        by = per[told] / usual
+        add(
+            by * along[told] - 1.0,
+            s.recorded_speed,
+            (xj[told], by * cm[told]),
+            (yj[told], by * sm[told]),
+            (xi[told], -by * cm[told]),
+            (yi[told], -by * sm[told]),
+            *((k[told], 0.5 * by * across[told]) for k in (ti, tj)),
+        )
     add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
     # The first pose stays.
     add(np.zeros(3), 1e-6, (np.arange(3), np.ones(3)))

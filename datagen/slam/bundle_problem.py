@@ -60,6 +60,7 @@ class BundleProblem:
         expected: Float[np.ndarray, "n"] | None = None,
         believed: Camera | None = None,
         keep: UInt8[np.ndarray, "h w"] | None = None,
+        recorded: bool = False,
     ) -> None:
         self.settings, self.camera, self.n = settings, camera, len(edges)
         self.believed = camera if believed is None else believed
@@ -85,6 +86,7 @@ class BundleProblem:
         self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         self.weight = np.full(len(self.uv), 1.0 / settings.pixel_sigma**2)
+        self.recorded = recorded
         self.expected = np.ones(self.n) if expected is None else expected
         self._lifted: tuple[BundleState, _Lifted] | None = None
         self.pattern = FramePattern(self.pairs, self.n)
@@ -182,7 +184,9 @@ class BundleProblem:
             np.bincount(where, blocks[:, :both, both + k].ravel(), minlength=count)
             for k in np.flatnonzero(self.free)
         ]
-        prior_cost, prior, downhill = frame_priors(state, self.settings, self.joined, self.expected)
+        prior_cost, prior, downhill = frame_priors(
+            state, self.settings, self.joined, self.expected, self.recorded
+        )
         off = (state.camera_off(self.believed) / self.camera_sigmas)[self.free]
         camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(self.free, self.free)]
         camera_rhs = rhs[:, both:].sum(axis=0)[self.free] - off / self.camera_sigmas[self.free]

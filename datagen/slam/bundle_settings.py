@@ -28,6 +28,8 @@ class BundleSettings(Settings):
         frame_roll: Of each frame's roll.
         slip: Of the rear axle's sideways motion per frame.
         speed_change: Of the change of the way per frame, from one frame to the next, against the commanded.
+        recorded_speed: Of the way per frame about the recorded speed times its gain, as a share of it: errors
+            of a few per cent that last for some frames. Only where a speed was recorded.
         turn_change: Of the change of turn per frame, from one frame to the next.
     """
 
@@ -48,4 +50,5 @@ class BundleSettings(Settings):
     frame_roll: float = Field(default=0.006, gt=0.0)
     slip: float = Field(default=0.004, gt=0.0)
     speed_change: float = Field(default=0.003, gt=0.0)
+    recorded_speed: float = Field(default=0.2, gt=0.0)
     turn_change: float = Field(default=0.01, gt=0.0)

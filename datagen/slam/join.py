@@ -131,13 +131,14 @@ def _join(
     limits = mapping_range(height, settings.perception.range)
     roads = [road_edges(part, camera, limits, settings) for part in drives]
     edges = [pixels for road in roads for pixels in road.edges]
-    expected = np.concatenate([relative_ways(commands_of(part, camera.wheelbase_cm)) for part in drives])
+    commands = [commands_of(part, camera.wheelbase_cm) for part in drives]
+    expected = np.concatenate([relative_ways(part) for part in commands])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     loops = loop_pairs(revisits, breaks)
     for _ in range(2):
         bundle = adjust(
             edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks,
-            expected=expected, keep=roads[0].keep,
+            expected=expected, keep=roads[0].keep, recorded=commands[0].speed_known,
         )  # fmt: skip
         poses, tilt = bundle.poses, bundle.tilt
         loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)

@@ -132,7 +132,7 @@ def solve_segment(
     expected = relative_ways(commands)
     opened = adjust(
         road.edges, trajectory.poses, camera, settings.bundle, rng, free,
-        expected=expected, believed=believed, keep=road.keep,
+        expected=expected, believed=believed, keep=road.keep, recorded=commands.speed_known,
     )  # fmt: skip
     scans = scans_of(road.edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
@@ -141,13 +141,21 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
+<<<<<<< HEAD
     closure = _close(road, opened, matched, settings, rng, free, expected, believed)
+=======
+    closure = _close(road, opened, matched, settings, rng, free, commands, believed)
+>>>>>>> odo
     if closure is not None and not find_camera:
         # Pictures that outvote a revisit are still pulled by it.
         true = borne_out(closure.bundle.poses, closure.revisits, height)
         if settings.revisits.min_revisits <= len(true) < len(closure.revisits):
             again = _closed_by(
+<<<<<<< HEAD
                 true, closure.drift_rad_per_cm, road, opened, settings, rng, free, expected, believed
+=======
+                true, closure.drift_rad_per_cm, road, opened, settings, rng, free, commands, believed
+>>>>>>> odo
             )
             closure = again or closure
     bundle = opened if closure is None else closure.bundle
@@ -162,6 +170,7 @@ def solve_segment(
             bundle = adjust(
                 road.edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=expected, believed=believed, keep=road.keep,
+                recorded=commands.speed_known,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
@@ -218,7 +227,7 @@ def _close(
     settings: MapSettings,
     rng: np.random.Generator,
     free: Sequence[str],
-    expected: Float[np.ndarray, "n"],
+    commands: CommandedMotion,
     believed: Camera,
 ) -> _Closure | None:
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
@@ -230,7 +239,11 @@ def _close(
         for group in [supported, explained][: 1 + (len(supported) > len(explained))]:
             left = without_contradicted(opened.poses, group, height)
             revisits = left if len(left) >= settings.revisits.min_revisits else group
+<<<<<<< HEAD
             closure = _closed_by(revisits, drift, road, opened, settings, rng, free, expected, believed)
+=======
+            closure = _closed_by(revisits, drift, road, opened, settings, rng, free, commands, believed)
+>>>>>>> odo
             if closure is not None:
                 if best is None or closure.bundle.misfit < best.bundle.misfit:
                     best = closure
@@ -246,7 +259,7 @@ def _closed_by(
     settings: MapSettings,
     rng: np.random.Generator,
     free: Sequence[str],
-    expected: Float[np.ndarray, "n"],
+    commands: CommandedMotion,
     believed: Camera,
 ) -> _Closure | None:
     """Close the loops with these revisits; None where they do not meet, or frames agree less with them."""
@@ -258,7 +271,7 @@ def _closed_by(
     loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
     closed = adjust(
         road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-        expected=expected, believed=believed, keep=road.keep,
+        expected=relative_ways(commands), believed=believed, keep=road.keep, recorded=commands.speed_known,
     )  # fmt: skip
     return _Closure(revisits, missed, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 

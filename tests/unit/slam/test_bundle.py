@@ -9,6 +9,7 @@ from tape_road import tape_road
 
 from datagen.slam import bundle_problem
 from datagen.slam.bundle import BundleSettings, adjust
+from datagen.slam.bundle_priors import frame_priors
 from datagen.slam.bundle_problem import BundleProblem, inner_pixels, point_trust
 from datagen.slam.bundle_state import start_state
 from datagen.slam.places import path_lengths
@@ -183,3 +184,53 @@ def test_ways_follow_the_commands_where_the_pictures_are_silent(command):
     found = adjust(edges, road.poses, camera, settings, _rng(), free=(), expected=expected)
     way = np.diff(path_lengths(found.poses))
     np.testing.assert_allclose(way[14:17] / np.median(way[:12]), command, rtol=0.02)
+
+
+def _prior(poses: np.ndarray, expected: np.ndarray, recorded: bool) -> tuple[float, np.ndarray]:
+    """Cost of what is believed of the frames, and its downhill slope by their numbers."""
+    state = start_state(poses, None, fisheye())
+    cost, _, downhill = frame_priors(state, BundleSettings(), np.arange(len(poses) - 1), expected, recorded)
+    return cost, downhill
+
+
+def test_a_recorded_speed_tells_each_way_about_its_gain():
+    road = tape_road(30)
+    expected = np.ones(30)
+    expected[12] = 0.0
+    # Whatever the gain, ways in proportion to the speed cost nothing more; one that is a fifth longer does.
+    for gain in (1.0, 1.3):
+        even = road.poses * [gain, gain, 1.0]
+        off = [_prior(even, expected, recorded)[0] for recorded in (False, True)]
+        assert off[1] - off[0] < 1e-3
+        longer = even.copy()
+        longer[20:, :2] += 0.2 * (even[20, :2] - even[19, :2])
+        off = [_prior(longer, expected, recorded)[0] for recorded in (False, True)]
+        assert off[1] - off[0] == pytest.approx(0.5 * (0.2 / BundleSettings().recorded_speed) ** 2, rel=0.05)
+
+
+def test_the_slope_of_the_prior_of_a_recorded_speed():
+    rng = _rng(1)
+    road = tape_road(30)
+    poses = road.poses + rng.normal(size=(30, 3)) * [0.2, 0.2, 0.01]
+    expected = rng.uniform(0.7, 1.3, 30)
+    slope = _prior(poses, expected, True)[1] - _prior(poses, expected, False)[1]
+    height = fisheye().mounting.height_cm
+    # The way in the middle of all is what the others are measured by, and taken as it is.
+    ratio = np.diff(path_lengths(poses)) / expected[1:]
+    middle = int(np.argsort(ratio)[len(ratio) // 2])
+    frames = [k for k in range(2, 28) if k not in (middle, middle + 1)][::5]
+    for frame, number in zip(frames, (0, 1, 2, 0, 1, 2), strict=False):
+        step = np.zeros_like(poses)
+        step[frame, number] = 1e-4 * (1.0 if number == 2 else height)
+        ends = [
+            _prior(poses + sign * step, expected, True)[0] - _prior(poses + sign * step, expected, False)[0]
+            for sign in (1.0, -1.0)
+        ]
+        assert -slope[5 * frame + number] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-3, abs=1e-3)
+
+
+def test_the_gain_of_a_recorded_speed_is_left_to_the_pictures():
+    camera, road = fisheye(), tape_road(60)
+    start = drifted(road.poses, 0.03, 0.0)
+    found = adjust(pixels(road, camera), start, camera, SMALL, _rng(), free=(), recorded=True)
+    assert _error(found.poses, road.poses) < 1e-3
