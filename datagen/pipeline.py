@@ -12,13 +12,21 @@ from jaxtyping import Int
 
 from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import MappedDrive, lines_at
+from datagen.labels.mapped_drive import MappedDrive, lines_at, points_text
 from datagen.lane_scale import fitted_width_cm
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
-from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
+from datagen.map_report import (
+    MappedSegment,
+    Report,
+    free_lane_cm,
+    map_edges,
+    map_evidence,
+    map_figures,
+    map_notes,
+)
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
-from datagen.report.agreement import contradicted_frames
+from datagen.report.agreement import contradicted_lines
 from datagen.report.held_out import held_out_frames
 from datagen.report.mappable import check_edges, check_lines_seen, check_moving
 from datagen.report.page import PAGE_NAME, report_page
@@ -123,11 +131,13 @@ def _map_drive(
     figures |= map_figures(drive_map, parts, drive.frames, factor)
     notes += map_notes(drive_map, figures, known is not None)
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
-    drive_map = replace(drive_map, contradicted=contradicted_frames(mapped))
+    drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
     mapped = replace(mapped, drive_map=drive_map)
     quality = measure_map(mapped, ResidualSettings())
-    check_lines_seen(quality, drive)
+    check_lines_seen(quality, drive, lane_width_cm, free_lane_cm(parts))
     figures |= quality_figures(quality, drive.width, ResidualSettings())
+    frames = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
+    notes.append(f"{frames}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, parts, figures, drive.deleted[rows_of_map])
     verdict = judge(evidence, settings.verdict)
     drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))

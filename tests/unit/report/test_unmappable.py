@@ -11,7 +11,9 @@ import pytest
 
 from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.report.mappable import check_edges, check_moving
+from datagen.report.mappable import check_edges, check_lines_seen, check_moving
+from datagen.report.quality import MapQuality
+from datagen.report.residuals import BorderSamples, join_samples
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drive import open_drive
@@ -93,6 +95,52 @@ def test_one_line_only(tmp_path):
     drive = simulated(tmp_path / "drive", 80, left="none", right="solid")
     message = refusal(drive, tmp_path / "map")
     assert "one line only" in message and "right one along 9" in message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "frames"), [(7, 300), (9, 200)])
+def test_one_line_beside_which_a_streak_or_bare_floor_is_traced(tmp_path, seed, frames):
+    """Where a second line is traced that is none, held-out frames tell."""
+    settings = {"seed": seed, "frames": frames, "track": {"left": {"kind": "none"}}}
+    drive = simulate_drive(SimulationSettings.model_validate(settings), tmp_path / "drive")
+    assert "one line only" in refusal(drive, tmp_path / "map")
+
+
+def border(right: bool, met: float, spread_px: float, seed: int) -> BorderSamples:
+    """Places on a line, of which a share met edges this far off."""
+    rng, n = np.random.default_rng(seed), 2000
+    off = np.where(rng.random(n) < met, rng.uniform(-spread_px, spread_px, n), np.nan)
+    return BorderSamples(np.full(n, right), rng.uniform(0.0, 45.0, n), off)
+
+
+def shown(*lines: BorderSamples) -> MapQuality:
+    none = np.empty((0, 6))
+    every, nothing = join_samples(list(lines)), join_samples([])
+    return MapQuality(np.arange(1), [every], nothing, [], none, none.astype(bool))
+
+
+def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
+    drive = open_drive(both_lines)
+    left, right = (border(right, 0.97, 0.3, 0) for right in (False, True))
+    check_lines_seen(shown(left, right), drive, 40.0, None)
+    # A worn line is found along little of its length, but where it is.
+    check_lines_seen(shown(border(False, 0.1, 1.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    # A map that is bent is looked at, and rejected.
+    check_lines_seen(shown(border(False, 0.9, 4.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    with pytest.raises(
+        TrackingLostError, match=r"one line only .* left one 2\d % to 2.\d px.*for the left one"
+    ):
+        check_lines_seen(shown(border(False, 0.25, 4.0, 1), right), drive, 40.0, None)
+    with pytest.raises(TrackingLostError, match=r"no lane: .*for the left and the right one"):
+        check_lines_seen(shown(border(False, 0.25, 4.0, 1), border(True, 0.3, 4.0, 2)), drive, 40.0, None)
+    with pytest.raises(TrackingLostError, match=r"no lane: .*along 1. %"):
+        check_lines_seen(shown(border(False, 0.15, 4.0, 1), border(True, 0.15, 4.0, 2)), drive, 40.0, None)
+
+
+def test_a_line_that_meets_edges_by_chance_where_a_lane_of_another_width_is(both_lines):
+    lines = shown(border(False, 0.25, 4.0, 1), border(True, 0.97, 0.3, 0))
+    with pytest.raises(CalibrationError, match=r"no two lines 20 cm apart .* 40 cm apart"):
+        check_lines_seen(lines, open_drive(both_lines), 20.0, 40.2)
 
 
 def test_no_line_at_all(tmp_path):
