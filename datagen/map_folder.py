@@ -57,6 +57,11 @@ class MapMeta(Settings):
     laps: int
     verdict: Literal["good", "usable", "reject"] | None = None
 
+    @property
+    def lane_cm(self) -> float:
+        """Width of the lane: as measured where the camera sets the scale, else what sets it."""
+        return self.mapped_lane_cm if self.scale_from == "camera" else self.lane_width_cm
+
 
 @dataclass(frozen=True)
 class DriveMap:

@@ -12,6 +12,7 @@ from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_folder import DriveMap
 from datagen.report.evidence import LineEvidence, MapEvidence
+from datagen.slam.posegraph import missed_by
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -87,7 +88,7 @@ def map_figures(
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
-        residual = np.abs(solved.residuals)
+        residual = np.abs(missed_by(solved.poses, solved.revisits))
         segments.append(
             {
                 "first_frame": int(numbers[part.rows[0]]),
@@ -205,17 +206,28 @@ def map_evidence(
     )
 
 
-def map_notes(drive_map: DriveMap, figures: dict[str, Any], camera_known: bool) -> list[str]:
-    """Say what was mapped, in sentences."""
+def map_notes(
+    drive_map: DriveMap, figures: dict[str, Any], camera_known: bool, free_cm: float | None
+) -> list[str]:
+    """Say what was mapped, in sentences.
+
+    Args:
+        drive_map: The map.
+        figures: Its figures.
+        camera_known: Whether the camera was given.
+        free_cm: See :func:`free_lane_cm`; where there is such a lane, that of the map is not the road's.
+    """
     meta = drive_map.meta
     revisits = sum(segment["revisits"] for segment in figures["segments_mapped"])
     path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
+    lane = "lane" if free_cm is None else "mapped lines, apart by"
     notes = [
         f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
         f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, nothing to close"),
-        f"lane {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, scale from the {meta.scale_from}",
+        f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
+        f"scale from the {meta.scale_from}",
     ]
-    if camera_known and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
+    if camera_known and free_cm is None and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
         notes.append(
             f"the lane measures {meta.mapped_lane_cm:.1f} cm with this camera, "
             f"{meta.lane_width_cm:.1f} cm was given"

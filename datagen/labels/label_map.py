@@ -90,7 +90,7 @@ def label_map(
             window=window,
             camera_hash=drive_map.camera.hash,
             wheelbase_cm=drive_map.camera.wheelbase_cm,
-            lane_width_cm=drive_map.meta.lane_width_cm,
+            lane_width_cm=drive_map.meta.lane_cm,
             source="map",
             perception=perception,
             marking_cm=drive_map.meta.tape_cm,

@@ -199,7 +199,7 @@ def read_map_frames(
         name=str(map_folder),
         reference="map",
         camera=drive_map.camera,
-        lane_width_cm=drive_map.meta.lane_width_cm,
+        lane_width_cm=drive_map.meta.lane_cm,
         marking_cm=drive_map.meta.tape_cm,
         perception=mapped.perception,
         frames=drive_map.frames,

@@ -209,18 +209,19 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
         )
     if e.camera_known:
         return found
+    bounds = {"focal": ("focal length", s.max_focal_sigma), "pitch": ("pitch", s.max_pitch_sigma_rad)}
     if not e.revisits:
+        _, bound = bounds.pop("focal")
+        sigma = e.sigma["focal"]
         found.append(
             (
-                "usable",
+                max("usable", _bounded(sigma, bound, s), key=_ORDER.index),
                 "the camera was found from the drive, but no place was seen twice, without which its focal "
-                "length is a guess: drive two laps of a closed road, or calibrate the camera",
+                f"length is a guess, here to {100.0 * sigma:.0f} %: drive two laps of a closed road, so that "
+                "the second one passes where the first did, or calibrate the camera and give it",
             )
         )
-    for name, what, bound in (
-        ("focal", "focal length", s.max_focal_sigma),
-        ("pitch", "pitch", s.max_pitch_sigma_rad),
-    ):
+    for name, (what, bound) in bounds.items():
         sigma = e.sigma.get(name, 0.0)
         if sigma > bound:
             unit = f"{100.0 * sigma:.1f} %" if name == "focal" else f"{sigma:.3f} rad"

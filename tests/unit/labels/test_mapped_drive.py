@@ -90,7 +90,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_map_gives_labels_and_keeps_the_frames_without(folder):
     frames = read_map_frames(folder)
-    assert (frames.reference, frames.lane_width_cm, frames.marking_cm) == ("map", 40.0, 2.3)
+    assert (frames.reference, frames.lane_width_cm, frames.marking_cm) == ("map", 40.1, 2.3)
     # The rows in which the car sees itself stay hidden.
     assert frames.perception == HIDDEN and frames.camera.hash == CAMERA.hash
     np.testing.assert_array_equal(frames.frames, MAPPED)
@@ -113,6 +113,8 @@ def test_frames_after_an_unmapped_stretch_start_afresh(folder):
 def test_labels_are_those_of_the_label_set(folder, tmp_path):
     label_map(folder, tmp_path / "l.parquet")
     labels, frames = read_labels(tmp_path / "l.parquet"), read_map_frames(folder)
+    # As measured, 40.0 cm were given: the camera sets the scale of this map.
+    assert labels.meta.lane_width_cm == frames.lane_width_cm == 40.1
     rows = np.searchsorted(frames.frames, labels.frame)
     np.testing.assert_array_equal(frames.points_cm[rows], labels.points_cm)
     left_out = np.delete(frames.points_cm, rows, axis=0)

@@ -25,6 +25,7 @@ GOOD = MapEvidence(
     given_lane_cm=40.0,
     found_lane_cm=None,
 )
+OPEN = {"revisits": 0, "closure_across_heights": None}
 KNOWN = replace(GOOD, camera_known=True, sigma={}, found_lane_cm=40.5)
 NAN = float("nan")
 
@@ -76,7 +77,9 @@ def test_what_sets_the_scale_is_named():
         ({"coverage": 0.1}, "reject", "10 %"),
         ({"coverage": 0.0, "p95_px": NAN}, "reject", "no edge"),
         ({"coverage": NAN, "p95_px": NAN}, "usable", "no frame was held out"),
-        ({"revisits": 0, "closure_across_heights": None}, "usable", "drive two laps"),
+        (OPEN | {"sigma": {"focal": 0.3}}, "reject", "no place was seen twice.* 30 %: drive two laps"),
+        # Only where the focal length is known closely beforehand.
+        (OPEN | {"sigma": {"focal": 0.04}}, "usable", "no place was seen twice.* 4 %: drive two laps"),
         ({"sigma": {"focal": 0.07}}, "usable", "focal length open by 7.0 %"),
         ({"sigma": {"focal": 0.12}}, "reject", "focal"),
         ({"sigma": {"pitch": 0.03}}, "usable", "pitch open by 0.030 rad"),
@@ -102,7 +105,7 @@ def test_the_lane_width_is_checked_where_the_camera_sets_the_scale(found_cm, gra
 
 
 def test_a_known_camera_needs_no_loop():
-    assert graded(KNOWN, revisits=0, closure_across_heights=None).grade == "good"
+    assert graded(KNOWN, **OPEN).grade == "good"
 
 
 def test_the_worst_reason_comes_first_and_none_is_lost():
