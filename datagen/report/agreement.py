@@ -23,8 +23,9 @@ _EVERY = 3
 #: A frame disagrees where the edges lie further off than this as median, in pixels of an image 160 px wide,
 #: or where less than this share of the borders in view met any: both lines are seldom interrupted at once.
 _OFF_PX, _LEAST_MET = 1.0, 0.15
-#: The same for one line where both together agree. Edges met by chance lie 2 px off as median: half the gate.
-_ALONE_PX = 1.5
+#: The same for one line where both together agree. Edges met by chance lie 2 px off as median, half the gate,
+#: so that every other frame speaks against a line that is none; a lower bound masks lines that are right.
+_ALONE_PX = 2.0
 #: Lines that are less certain than this, in lane widths, bridge gaps: no paint is expected there.
 _KNOWN_LANES = 0.02
 #: Samples that tell it at least: in view, and met.

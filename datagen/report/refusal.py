@@ -1,4 +1,4 @@
-"""What is refused: a rejected map is kept to be looked at but gives no labels, and no map replaces an older one."""
+"""Refusals: of labels of a rejected map, which is kept to be looked at, and beside an older map."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def check_destination(path: Path) -> None:
 
 
 def check_replaceable(path: Path, kind: str | None = None) -> None:
-    """Refuse a folder that :func:`atomic_folder` would not replace, before the work whose result it is to hold.
+    """Refuse a folder that :func:`atomic_folder` would not replace, before the work that is to fill it.
 
     Args:
         path: Destination; it need not exist.
