@@ -16,7 +16,7 @@ from lanenet.data.drive import Drive, open_drive
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS, SIDES
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES
 from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
@@ -139,8 +139,16 @@ def points_in_window(drive_map: DriveMap, k: int, window: BirdseyeWindow) -> Boo
         )
     ]
     points = window.labelled(np.concatenate([label_rows(line) for line in sides]))
-    unknown = np.repeat([not np.isfinite(line).all() for line in sides], N_POINTS // 2)
+    unknown = np.concatenate([_rows_in_gaps(line) for line in sides])
     return np.asarray(np.isfinite(points) | unknown)
+
+
+def _rows_in_gaps(line_car_cm: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, "3"]:
+    """Tell at which label rows a line may be where nothing is known of it."""
+    y_cm, known = line_car_cm[:, 1], np.isfinite(line_car_cm).all(axis=1)
+    joined = known[:-1] & known[1:]
+    met = [bool((joined & ((y_cm[:-1] <= row) != (y_cm[1:] <= row))).any()) for row in ROWS_CM]
+    return np.array([not (known.all() or row_is_met) for row_is_met in met])
 
 
 def labelled_points(
