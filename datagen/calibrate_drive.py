@@ -13,6 +13,7 @@ from datagen.lane_scale import LaneScale, measure_lane
 from datagen.map_settings import MapSettings
 from datagen.pictures import straight_frames
 from datagen.pipeline import hide_bumper, split_segments
+from datagen.report.mappable import check_moving
 from datagen.self_calibration import (
     DRIVE_INSTEAD,
     MIN_FRAMES,
@@ -222,6 +223,7 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
         )
     _check_count(recorded, len(recorded), "frames")
     try:
+        check_moving(recorded)
         moving = following_frames(recorded, notes)
         _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
         segments = split_segments(moving)

@@ -22,12 +22,15 @@ from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import SIDES
 
 FORMAT = "lanenet-map/1"
 #: The first version has a left and a right line per segment, without period and uncertainty.
 LANES_FORMATS = ("lanenet-lanes/1", "lanenet-lanes/2")
 REPORT_FORMAT = "lanenet-map-report/1"
 EDGES_FORMAT = "lanenet-edges/2"
+#: Columns of ``poses.csv`` that say with which line of a frame the pictures around it disagree.
+_CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
 
 
 class MapMeta(Settings):
@@ -54,6 +57,11 @@ class MapMeta(Settings):
     laps: int
     verdict: Literal["good", "usable", "reject"] | None = None
 
+    @property
+    def lane_cm(self) -> float:
+        """Width of the lane: as measured where the camera sets the scale, else what sets it."""
+        return self.mapped_lane_cm if self.scale_from == "camera" else self.lane_width_cm
+
 
 @dataclass(frozen=True)
 class DriveMap:
@@ -72,7 +80,7 @@ class DriveMap:
         lines: Left and right line of the driven lane of each segment, then those of the lanes beside it.
         tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for level.
         held_out: Frames whose edge points had no say in the lines; None where there were none.
-        contradicted: Frames around which the pictures disagree with the lines, see
+        contradicted: Frames around which the pictures disagree with the left, with the right line, see
             :mod:`datagen.report.agreement`; None where nobody looked.
     """
 
@@ -88,7 +96,7 @@ class DriveMap:
     lines: dict[int, list[LaneLine]]
     tilt_rad: Float[np.ndarray, "n 2"] | None = None
     held_out: Bool[np.ndarray, "n"] | None = None
-    contradicted: Bool[np.ndarray, "n"] | None = None
+    contradicted: Bool[np.ndarray, "n 2"] | None = None
 
     def camera_at(self, k: int) -> Camera:
         """Return the camera as it nodded in the k-th frame."""
@@ -135,7 +143,7 @@ def write_map(
     if m.held_out is not None:
         columns["held_out"] = m.held_out
     if m.contradicted is not None:
-        columns["contradicted"] = m.contradicted
+        columns |= dict(zip(_CONTRADICTED, m.contradicted.T, strict=True))
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -199,12 +207,15 @@ def read_map(folder: Path) -> DriveMap:
             "pitch_rad": ColumnSpec(required=False),
             "roll_rad": ColumnSpec(required=False),
             "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
+            **{name: ColumnSpec("int", required=False, low=0.0, high=1.0) for name in _CONTRADICTED},
+            # Some older maps say it of both lines together.
             "contradicted": ColumnSpec("int", required=False, low=0.0, high=1.0),
         },
         error=MapFormatError,
     )
     n = len(table["frame"])
     tilt = [table.get(name, np.zeros(n)) for name in ("pitch_rad", "roll_rad")]
+    both = table.get("contradicted", np.zeros(n))
     return DriveMap(
         meta=meta,
         camera=read_camera(folder / "camera.yaml"),
@@ -218,7 +229,7 @@ def read_map(folder: Path) -> DriveMap:
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
         tilt_rad=np.stack(tilt, axis=1),
         held_out=table.get("held_out", np.zeros(n)) > 0,
-        contradicted=table.get("contradicted", np.zeros(n)) > 0,
+        contradicted=np.stack([table.get(name, both) for name in _CONTRADICTED], axis=1) > 0,
     )
 
 

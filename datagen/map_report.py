@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_folder import DriveMap
-from datagen.report.verdict import MapEvidence
+from datagen.report.evidence import LineEvidence, MapEvidence
+from datagen.slam.posegraph import missed_by
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -87,7 +88,7 @@ def map_figures(
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
-        residual = np.abs(solved.residuals)
+        residual = np.abs(missed_by(solved.poses, solved.revisits))
         segments.append(
             {
                 "first_frame": int(numbers[part.rows[0]]),
@@ -127,13 +128,19 @@ def map_figures(
     }
 
 
-def contradicted_share(contradicted: Bool[np.ndarray, "n"] | None, deleted: Bool[np.ndarray, "n"]) -> float:
-    """Share of the frames around which the pictures disagree with the map.
+def free_lane_cm(parts: list[MappedSegment]) -> float | None:
+    """Width of the lane as found without the user's number, over all segments; None where there is none."""
+    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    return float(np.median(free)) if free else None
+
+
+def contradicted_share(contradicted: Bool[np.ndarray, "n 2"] | None, deleted: Bool[np.ndarray, "n"]) -> float:
+    """Share of the frames' lines with which the pictures disagree.
 
     Frames that the driver deleted get no labels: where the car leaves the road, it says nothing of the map.
 
     Args:
-        contradicted: Frames of the map; None where nobody has looked.
+        contradicted: Left and right line of the map's frames; None where nobody has looked.
         deleted: Which of them the driver deleted.
     """
     if contradicted is None or deleted.all():
@@ -156,7 +163,8 @@ def map_evidence(
         deleted: Which frames of the map the driver deleted.
     """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
-    both = figures["held_out"]["both_lines"]
+    held = figures["held_out"]
+    both, reach = held["both_lines"], f"0-{held['reach_cm']:g} cm"
     across = [
         (segment["closure_residual_median"]["across_cm"], segment["revisits"])
         for segment in figures["segments_mapped"]
@@ -165,12 +173,21 @@ def map_evidence(
     revisits = sum(count for _, count in across)
     # A camera that was given stays known when the drive has refined it: no search has guessed its lens.
     known = not figures.get("calibration", {}).get("candidates")
-    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    free_cm = free_lane_cm(parts)
     return MapEvidence(
-        robust_sd_px=both["robust_sd_px_at_160"],
+        lines={
+            side: LineEvidence(
+                samples=line[reach]["samples"],
+                coverage=line[reach]["coverage"],
+                robust_sd_px=line[reach]["robust_sd_px_at_160"],
+                p95_px=line[reach]["p95_px_at_160"],
+            )
+            for side, line in held["lines"].items()
+        },
         p95_px=both["p95_px_at_160"],
         coverage=both["coverage"],
         labelled_share=figures["labelled"]["share"],
+        point_shares=figures["labelled"]["points_in_window"],
         contradicted_share=contradicted_share(drive_map.contradicted, deleted),
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
@@ -183,23 +200,34 @@ def map_evidence(
         # Where the free search finds nothing better, the lane that was traced at the given width is it.
         found_lane_cm=None
         if meta.scale_from == "lane width"
-        else float(np.median(free))
-        if free
-        else meta.mapped_lane_cm,
+        else meta.mapped_lane_cm
+        if free_cm is None
+        else free_cm,
     )
 
 
-def map_notes(drive_map: DriveMap, figures: dict[str, Any], camera_known: bool) -> list[str]:
-    """Say what was mapped, in sentences."""
+def map_notes(
+    drive_map: DriveMap, figures: dict[str, Any], camera_known: bool, free_cm: float | None
+) -> list[str]:
+    """Say what was mapped, in sentences.
+
+    Args:
+        drive_map: The map.
+        figures: Its figures.
+        camera_known: Whether the camera was given.
+        free_cm: See :func:`free_lane_cm`; where there is such a lane, that of the map is not the road's.
+    """
     meta = drive_map.meta
     revisits = sum(segment["revisits"] for segment in figures["segments_mapped"])
     path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
+    lane = "lane" if free_cm is None else "mapped lines, apart by"
     notes = [
         f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
         f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, nothing to close"),
-        f"lane {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, scale from the {meta.scale_from}",
+        f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
+        f"scale from the {meta.scale_from}",
     ]
-    if camera_known and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
+    if camera_known and free_cm is None and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
         notes.append(
             f"the lane measures {meta.mapped_lane_cm:.1f} cm with this camera, "
             f"{meta.lane_width_cm:.1f} cm was given"

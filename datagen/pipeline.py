@@ -12,17 +12,26 @@ from jaxtyping import Int
 
 from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import MappedDrive, lines_at
+from datagen.labels.mapped_drive import MappedDrive, lines_at, points_text
 from datagen.lane_scale import fitted_width_cm
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
-from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
+from datagen.map_report import (
+    MappedSegment,
+    Report,
+    free_lane_cm,
+    map_edges,
+    map_evidence,
+    map_figures,
+    map_notes,
+)
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from datagen.pictures import draw_contact_sheet, draw_map
-from datagen.report.agreement import contradicted_frames
+from datagen.report.agreement import contradicted_lines
 from datagen.report.held_out import held_out_frames
 from datagen.report.mappable import check_edges, check_lines_seen, check_moving
 from datagen.report.page import PAGE_NAME, report_page
 from datagen.report.quality import measure_map, quality_figures
+from datagen.report.refusal import kept_map
 from datagen.report.residuals import ResidualSettings
 from datagen.report.verdict import judge
 from datagen.self_calibration import DRIVE_INSTEAD, find_camera
@@ -35,7 +44,7 @@ from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drive import Drive, open_drive
-from lanenet.data.files import atomic_folder, write_text
+from lanenet.data.files import atomic_folder, check_replaceable, write_text
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
@@ -71,12 +80,18 @@ def map_drive(
         TrackingLostError: If the drive is too short or shows no lane.
         CalibrationError: If the camera does not fit the images, or the lane on the road is another one than
             camera and lane width say.
+        LanenetError: If ``out`` is a file, or a folder that holds anything but an older map.
     """
+    # Before the work, and also where nothing comes of it.
+    clear_unfinished(out)
+    check_replaceable(out, "map")
     try:
         return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera)
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}{kept_map(out)}") from error
     except TrackingLostError as error:
         where = "" if str(drive_path) in str(error) else f"{drive_path}: "
-        raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}") from error
+        raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}") from error
 
 
 def _map_drive(
@@ -121,13 +136,15 @@ def _map_drive(
     rows_of_map = _rows_of_map(parts)
     drive_map = replace(drive_map, held_out=held_out[rows_of_map])
     figures |= map_figures(drive_map, parts, drive.frames, factor)
-    notes += map_notes(drive_map, figures, known is not None)
+    notes += map_notes(drive_map, figures, known is not None, free_lane_cm(parts))
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
-    drive_map = replace(drive_map, contradicted=contradicted_frames(mapped))
+    drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
     mapped = replace(mapped, drive_map=drive_map)
     quality = measure_map(mapped, ResidualSettings())
-    check_lines_seen(quality, drive)
+    check_lines_seen(quality, drive, lane_width_cm, free_lane_cm(parts))
     figures |= quality_figures(quality, drive.width, ResidualSettings())
+    frames = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
+    notes.append(f"{frames}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, parts, figures, drive.deleted[rows_of_map])
     verdict = judge(evidence, settings.verdict)
     drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))
@@ -135,7 +152,6 @@ def _map_drive(
     figures["notes"] = notes
     index = {int(frame): i for i, frame in enumerate(drive.frames)}
     shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
-    clear_unfinished(out)
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, drive.frames, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))

@@ -12,8 +12,11 @@ from datagen.labels.mapped_drive import (
     NO_LINE,
     UNCERTAIN,
     label_frame,
+    labelled_points,
     lines_at,
     open_mapped_drive,
+    points_in_window,
+    points_text,
 )
 from datagen.labels.quality import frame_residual_cm, label_report
 from datagen.map_report import Report
@@ -24,6 +27,7 @@ from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import N_POINTS
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 
 
@@ -58,12 +62,16 @@ def label_map(
     window = BirdseyeWindow() if window is None else window
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
     rows: list[int] = []
-    edges, lines, points, residuals = [], [], [], []
+    edges, lines, residuals = [], [], []
     skipped = {DELETED: 0, UNCERTAIN: 0, CONTRADICTED: 0, NO_LINE: 0}
+    kept_points = np.full((len(drive_map.frames), N_POINTS), np.nan)
+    in_window = np.zeros(kept_points.shape, dtype=bool)
     for k in range(len(drive_map.frames)):
         if progress is not None:
             progress(k + 1, len(drive_map.frames))
         labelled = label_frame(mapped, k, window)
+        if labelled != DELETED:
+            in_window[k] = points_in_window(drive_map, k, window)
         if isinstance(labelled, str):
             skipped[labelled] += 1
             continue
@@ -72,7 +80,7 @@ def label_map(
         rows.append(k)
         edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
         lines.append((seen.left_cm, seen.right_cm))
-        points.append(visible)
+        kept_points[k] = visible
         residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
     if not rows:
         raise TrackingLostError(f"{map_folder}: no frame can be labelled ({skipped})")
@@ -82,7 +90,7 @@ def label_map(
             window=window,
             camera_hash=drive_map.camera.hash,
             wheelbase_cm=drive_map.camera.wheelbase_cm,
-            lane_width_cm=drive_map.meta.lane_width_cm,
+            lane_width_cm=drive_map.meta.lane_cm,
             source="map",
             perception=perception,
             marking_cm=drive_map.meta.tape_cm,
@@ -94,12 +102,13 @@ def label_map(
         t_s=drive_map.t_s[rows],
         lap=drive_map.lap[rows],
         poses=drive_map.poses[rows],
-        points_cm=np.array(points),
+        points_cm=kept_points[rows],
         edges=edges,
         lines=lines,
         quality=np.exp(-np.nan_to_num(residual, nan=2.0)),
     )
-    report = label_report(labels, residual, len(drive_map.frames), skipped)
+    shares = labelled_points(kept_points, in_window)
+    report = label_report(labels, residual, len(drive_map.frames), skipped, shares)
     write_labels(out, labels)
     write_json(out.with_suffix(".json"), report)
     order = np.argsort(np.nan_to_num(residual, nan=9.0))
@@ -120,6 +129,7 @@ def label_map(
     share = report["labelled_share"]
     lines_out = [
         f"{len(rows)} of {len(drive_map.frames)} frames labelled ({100 * share:.0f} %)",
+        points_text(shares),
         *(f"{count} frames left out: {reason}" for reason, count in skipped.items() if count),
         f"markings lie {report['residual_cm']['median']:.2f} cm (median), "
         f"{report['residual_cm']['p95']:.2f} cm (p95) from the projected lines",

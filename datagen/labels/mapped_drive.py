@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.labels.project import FrameLines, lines_of_frame
+from datagen.labels.project import FrameLines, beside_line, label_rows, lines_of_frame
 from datagen.map_folder import DriveMap, read_map
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from lanenet.config import load_settings
@@ -16,7 +16,7 @@ from lanenet.data.drive import Drive, open_drive
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES
 from lanenet.perception.birdseye import PerceptionSettings
 
 _MIN_MATCH = 0.15
@@ -105,19 +105,79 @@ def label_frame(
     """Return the lane of the map's k-th frame and its six labels, or why it gets none.
 
     A frame gets no labels where its pose is uncertain (few edges match the map), where the pictures disagree
-    with the map's lines, or where the driver has deleted it; a point is masked where the map does not support
-    the line, or where it lies beside the window.
+    with both of the map's lines, or where the driver has deleted it; a point is masked where they disagree
+    with its line, where the map does not support it, or where it lies beside the window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED
     # The first frame of a segment has no map to match yet, so that its match is NaN.
     if mapped.drive_map.match[k] < _MIN_MATCH:
         return UNCERTAIN
-    if mapped.drive_map.contradicted is not None and mapped.drive_map.contradicted[k]:
-        return CONTRADICTED
     seen = lines_at(mapped.drive_map, k)
     visible = window.labelled(seen.points_cm)
-    return (seen, visible) if np.isfinite(visible).any() else NO_LINE
+    if not np.isfinite(visible).any():
+        return NO_LINE
+    if mapped.drive_map.contradicted is not None:
+        seen = seen.without(mapped.drive_map.contradicted[k])
+        visible = window.labelled(seen.points_cm)
+    return (seen, visible) if np.isfinite(visible).any() else CONTRADICTED
+
+
+def points_in_window(drive_map: DriveMap, k: int, window: BirdseyeWindow) -> Bool[np.ndarray, "6"]:
+    """Tell which of the six points of the map's k-th frame a map that lacks nothing would label.
+
+    Where the map does not know a line, it is expected beside the other one, at the lane's width. A point
+    counts unless its line is known to lie beside the window, or to turn away before the row.
+    """
+    lines = lines_at(drive_map, k, np.inf)
+    lane_cm = drive_map.meta.mapped_lane_cm
+    sides = [
+        np.where(np.isfinite(own), own, beside_line(other, across_cm))
+        for own, other, across_cm in (
+            (lines.left_cm, lines.right_cm, -lane_cm),
+            (lines.right_cm, lines.left_cm, lane_cm),
+        )
+    ]
+    points = window.labelled(np.concatenate([label_rows(line) for line in sides]))
+    unknown = np.concatenate([_rows_in_gaps(line) for line in sides])
+    return np.asarray(np.isfinite(points) | unknown)
+
+
+def _rows_in_gaps(line_car_cm: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, "3"]:
+    """Tell at which label rows a line may be where nothing is known of it."""
+    y_cm, known = line_car_cm[:, 1], np.isfinite(line_car_cm).all(axis=1)
+    joined = known[:-1] & known[1:]
+    met = [bool((joined & ((y_cm[:-1] <= row) != (y_cm[1:] <= row))).any()) for row in ROWS_CM]
+    return np.array([not (known.all() or row_is_met) for row_is_met in met])
+
+
+def labelled_points(
+    points_cm: Float[np.ndarray, "n 6"], in_window: Bool[np.ndarray, "n 6"], not_mapped: int = 0
+) -> dict[str, float]:
+    """Share of each line's points in the window that are labelled.
+
+    Args:
+        points_cm: Labels of the frames that count; NaN where there is none.
+        in_window: See :func:`points_in_window`.
+        not_mapped: Frames beside these of which nothing is known: none of their points is labelled.
+
+    Returns:
+        By side; a line of which no point lies in the window has no share.
+    """
+    half = N_POINTS // 2
+    shares = {}
+    for side, part in zip(SIDES, (slice(half), slice(half, None)), strict=True):
+        wanted = in_window[:, part]
+        count = int(wanted.sum()) + half * not_mapped
+        if count:
+            shares[side] = float((np.isfinite(points_cm[:, part]) & wanted).sum()) / count
+    return shares
+
+
+def points_text(shares: dict[str, float]) -> str:
+    """Say what :func:`labelled_points` found."""
+    said = " and ".join(f"{100.0 * share:.0f} % of the {side} line's" for side, share in shares.items())
+    return f"{said} points in the window have labels"
 
 
 def read_map_frames(
@@ -147,7 +207,7 @@ def read_map_frames(
         name=str(map_folder),
         reference="map",
         camera=drive_map.camera,
-        lane_width_cm=drive_map.meta.lane_width_cm,
+        lane_width_cm=drive_map.meta.lane_cm,
         marking_cm=drive_map.meta.tape_cm,
         perception=mapped.perception,
         frames=drive_map.frames,

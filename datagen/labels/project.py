@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from datagen.lanes.line import LaneLine
 from lanenet.geometry.frames import car_from_map
@@ -33,6 +33,15 @@ class FrameLines:
     right_cm: Float[np.ndarray, "m 2"]
     points_cm: Float[np.ndarray, "6"]
     markings_cm: tuple[float, float] = (float("nan"), float("nan"))
+
+    def without(self, hidden: Bool[np.ndarray, "2"]) -> FrameLines:
+        """Return the lane with its left, its right or both lines masked."""
+        lines = [
+            np.full_like(line, np.nan) if gone else line
+            for line, gone in zip((self.left_cm, self.right_cm), hidden, strict=True)
+        ]
+        points_cm = np.where(np.repeat(hidden, N_POINTS // 2), np.nan, self.points_cm)
+        return replace(self, left_cm=lines[0], right_cm=lines[1], points_cm=points_cm)
 
     def marking_cm(self, side: int, usual_cm: float) -> float:
         """Width of the left (0) or right (1) marking; the usual one where it is not known."""
@@ -87,6 +96,13 @@ def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
         if len(crossed) != 1 or sideways[0] > _STEEPEST * ahead[0]:
             found[i] = np.nan
     return found
+
+
+def beside_line(line_car_cm: Float[np.ndarray, "m 2"], right_cm: float) -> Float[np.ndarray, "m 2"]:
+    """Move a polyline to its right, seen in its direction; NaN rows stay, and so do those next to them."""
+    along = np.gradient(line_car_cm, axis=0)
+    along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    return np.asarray(line_car_cm + right_cm * np.stack([along[:, 1], -along[:, 0]], axis=1))
 
 
 def _polyline(

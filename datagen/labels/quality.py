@@ -53,9 +53,21 @@ def _distance_to_polyline(
 
 
 def label_report(
-    labels: LabelSet, residual_cm: Float[np.ndarray, "n"], mapped_frames: int, skipped: dict[str, int]
+    labels: LabelSet,
+    residual_cm: Float[np.ndarray, "n"],
+    mapped_frames: int,
+    skipped: dict[str, int],
+    point_shares: dict[str, float],
 ) -> dict[str, Any]:
-    """Figures of a label set's quality, for ``report.json`` and the printed summary."""
+    """Figures of a label set's quality, for ``report.json`` and the printed summary.
+
+    Args:
+        labels: The labels.
+        residual_cm: What each frame's markings miss, see :func:`frame_residual_cm`.
+        mapped_frames: Frames of the map.
+        skipped: How many of them have no labels, and why.
+        point_shares: See :func:`datagen.labels.mapped_drive.labelled_points`.
+    """
     known = np.isfinite(labels.points_cm)
     finite = residual_cm[np.isfinite(residual_cm)]
 
@@ -68,6 +80,7 @@ def label_report(
         "frames_labelled": len(labels),
         "labelled_share": len(labels) / max(mapped_frames, 1),
         "frames_left_out": skipped,
+        "points_in_window_labelled_share": point_shares,
         "points_labelled_share": {
             name: float(known[:, i].sum()) / max(mapped_frames, 1) for i, name in enumerate(POINT_NAMES)
         },

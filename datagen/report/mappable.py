@@ -9,7 +9,7 @@ from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
 from datagen.map_report import MappedSegment
 from datagen.report.quality import MapQuality
-from datagen.report.residuals import summarise
+from datagen.report.residuals import REFERENCE_WIDTH, summarise
 from datagen.slam.stillness import small_picture
 from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError, TrackingLostError
@@ -26,8 +26,11 @@ _LEAST_EDGES = 20
 _LEAST_SEEN = 0.2
 #: Dashes and worn lines show at least this share of their borders.
 _LEAST_SHOWN = 0.2
-#: Less than this of one line is clutter that happens to lie along the way.
-_WHOLE_LINE = 0.5
+#: Edges that are met by chance have a robust sd of 3 px, image 160 px wide, those of real lines 0.5 at most.
+#: A line with more than this is clutter, unless so much of it is shown that it is one which the map has bent.
+_CLUTTER_PX, _CLUTTER_SHOWN = 1.5, 0.4
+#: Less than this of one line is clutter that happens to lie along the way, more than that a line.
+_MAYBE_LINE, _WHOLE_LINE = 0.5, 0.9
 #: A line of the given lane that is seen along less than this share of the way along which one of another
 #: width is: gaps between dashes leave more.
 _HARDLY = 0.4
@@ -95,25 +98,52 @@ def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
     if min(share.values()) >= _LEAST_SEEN:
         return
     found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the way" for side in SIDES)
-    what = "no line" if max(share.values()) < _WHOLE_LINE else "one line only"
+    most = max(share.values())
+    what = "no line" if most < _MAYBE_LINE else "one line only" if most > _WHOLE_LINE else "one line at most"
     raise TrackingLostError(
         f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * _LEAST_SEEN:.0f} % for each"
     )
 
 
-def check_lines_seen(quality: MapQuality, drive: Drive) -> None:
+def check_lines_seen(
+    quality: MapQuality, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
+) -> None:
     """Refuse lines that held-out frames do not show: clutter that happened to lie along the way.
 
+    Args:
+        quality: What held-out frames show of the map.
+        drive: The drive.
+        lane_width_cm: Width of the lane that was given.
+        free_lane_cm: Width of the lane that is found without that number, where another one is.
+
     Raises:
-        TrackingLostError: Says how much of the lines the frames show.
+        TrackingLostError: If they show neither line, or one line only; says how much of the lines they show.
+        CalibrationError: If they show one line only, but there is a lane of another width.
     """
-    coverage = summarise(quality.near).coverage
+    near = quality.near
+    coverage = summarise(near).coverage
     if coverage < _LEAST_SHOWN:
         raise TrackingLostError(
             f"{drive.path}: no lane: frames held out from the map show an edge along "
             f"{100.0 * coverage:.0f} % of what would be the borders of its lines, expected "
             f"{100.0 * _LEAST_SHOWN:.0f} %"
         )
+    lines = {side: summarise(near.part(near.right == (side == "right"))) for side in SIDES}
+    sd_px = {side: line.robust_sd_px * REFERENCE_WIDTH / drive.width for side, line in lines.items()}
+    clutter = [side for side in SIDES if lines[side].coverage < _CLUTTER_SHOWN and sd_px[side] > _CLUTTER_PX]
+    if not clutter:
+        return
+    if free_lane_cm is not None:
+        raise _other_lane(lane_width_cm, free_lane_cm)
+    found = ", ".join(
+        f"of the {side} one {100.0 * line.coverage:.0f} % to {sd_px[side]:.1f} px"
+        for side, line in lines.items()
+    )
+    raise TrackingLostError(
+        f"{drive.path}: {'one line only bounds the driven lane' if len(clutter) == 1 else 'no lane'}: frames "
+        f"held out from the map show {found} (robust sd), which for the {' and the '.join(clutter)} one is "
+        "what edges meet by chance"
+    )
 
 
 def trace_known_lane(
@@ -142,16 +172,21 @@ def trace_known_lane(
         lane = None
     if (
         free is not None
-        and min(_seen(free)) >= _LEAST_SEEN
+        # Clutter that lies along the way makes pairs of any width.
+        and min(_seen(free)) >= _MAYBE_LINE
         and (lane is None or min(_seen(lane)) < _LEAST_SEEN)
     ):
-        raise CalibrationError(
-            f"no two lines {lane_width_cm:g} cm apart run along the drive, but two that are "
-            f"{free.lane_cm:.0f} cm apart with this camera: check the lane width and the camera's height"
-        )
+        raise _other_lane(lane_width_cm, free.lane_cm)
     if lane is None:
         raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
     return lane, free.lane_cm if free is not None and _fits_better(free, lane) else None
+
+
+def _other_lane(given_cm: float, found_cm: float) -> CalibrationError:
+    return CalibrationError(
+        f"no two lines {given_cm:g} cm apart run along the drive, but two that are {found_cm:.0f} cm apart "
+        "with this camera: check the lane width and the camera's height"
+    )
 
 
 def _fits_better(free: TracedLane, lane: TracedLane) -> bool:

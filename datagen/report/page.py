@@ -82,7 +82,8 @@ def report_page(
             f"edges in {held['frames']} frames that had no say in the lines; their poses come from the "
             f"chain, as all do. An edge counts within {held['gate_px_at_160']:g} px (of an image 160 px "
             "wide) and if it brightens the same way. “Found” is the share of the borders in view that met "
-            f"one; in the empty middle of the lane it is {_percent(chance)}, which is chance."
+            f"one. In the middle of the lane it is {_percent(chance)}: by chance, or because something is "
+            "painted there."
         ),
         _table(residual_rows(held, drive.width)),
         _picture(plots.residual_plot(quality, drive.width, settings.max_sd_px, settings.max_p95_px)),

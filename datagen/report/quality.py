@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from datagen.labels.mapped_drive import DELETED, MappedDrive, label_frame, lines_at
+from datagen.labels.mapped_drive import (
+    DELETED,
+    MappedDrive,
+    label_frame,
+    labelled_points,
+    lines_at,
+    points_in_window,
+)
 from datagen.report.residuals import (
     BorderSamples,
     ResidualSettings,
@@ -41,6 +48,7 @@ class MapQuality:
         chance: Samples of one line moved into the middle of the lane, where no marking is.
         status: Per frame of the drive: labelled, or why not.
         points_cm: Six labels per frame of the map.
+        in_window: Which of them a map that lacks nothing would give; none where the driver deleted the frame.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -48,6 +56,7 @@ class MapQuality:
     chance: BorderSamples
     status: list[str]
     points_cm: Float[np.ndarray, "n 6"]
+    in_window: Bool[np.ndarray, "n 6"]
 
     @property
     def near(self) -> BorderSamples:
@@ -72,6 +81,11 @@ class MapQuality:
         return sum(status == LABELLED for status in kept) / max(len(kept), 1)
 
     @property
+    def point_shares(self) -> dict[str, float]:
+        """Share of each line's points in the window that are labelled, of the same frames."""
+        return labelled_points(self.points_cm, self.in_window, self.status.count(NOT_MAPPED))
+
+    @property
     def not_labelled(self) -> dict[str, int]:
         """Why frames have no labels, and how many, the most frequent reason first."""
         counts = Counter(status for status in self.status if status != LABELLED)
@@ -93,18 +107,22 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
         edges: EdgePixels = find_edges(image, mapped.perception.edges, table.keep, table.scale)
         lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
         samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep, settings))
-        alone = replace(lines, right_cm=np.full_like(lines.right_cm, np.nan))
+        left = lines.without(np.array([False, True]))
         chance.append(
-            border_samples(edges, alone, tape_cm, nodded, table.keep, settings, aside_cm=0.5 * lane_cm)
+            border_samples(edges, left, tape_cm, nodded, table.keep, settings, aside_cm=0.5 * lane_cm)
         )
     window = BirdseyeWindow()
-    status, points = [NOT_MAPPED] * len(drive), np.full((len(mapped.rows), N_POINTS), np.nan)
+    status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
+    points = np.full((len(mapped.rows), N_POINTS), np.nan)
+    in_window = np.zeros(points.shape, dtype=bool)
     for k, row in enumerate(mapped.rows.tolist()):
         labelled = label_frame(mapped, k, window)
         status[row] = labelled if isinstance(labelled, str) else LABELLED
         if not isinstance(labelled, str):
             points[k] = labelled[1]
-    return MapQuality(rows, samples, join_samples(chance), status, points)
+        if labelled != DELETED:
+            in_window[k] = points_in_window(drive_map, k, window)
+    return MapQuality(rows, samples, join_samples(chance), status, points, in_window)
 
 
 def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings) -> dict[str, Any]:
@@ -143,6 +161,7 @@ def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings)
             "share": quality.labelled_share,
             "share_of_all_frames": quality.status.count(LABELLED) / max(len(quality.status), 1),
             "why_not": quality.not_labelled,
+            "points_in_window": quality.point_shares,
             "points_share": np.isfinite(quality.points_cm).mean(axis=0).tolist(),
         },
     }

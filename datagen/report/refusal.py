@@ -1,4 +1,4 @@
-"""A rejected map is kept to be looked at, but gives no labels unless they are asked for all the same."""
+"""Refusals: of labels of a rejected map, which is kept to be looked at, and beside an older map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,26 @@ import json
 from pathlib import Path
 
 from datagen.map_folder import DriveMap
-from lanenet.errors import TrackingLostError
+from lanenet.config import read_yaml
+from lanenet.errors import ConfigError, TrackingLostError
+
+
+def kept_map(out: Path) -> str:
+    """Say, after a refusal, that the map which lies where the new one was to be written is an older one.
+
+    Args:
+        out: Where the new one was to be written.
+
+    Returns:
+        The end of a sentence; empty where no map lies there.
+    """
+    if not (out / "map.yaml").is_file():
+        return ""
+    try:
+        verdict = read_yaml(out / "map.yaml").get("verdict")
+    except ConfigError:  # it was kept, whatever it is
+        verdict = None
+    return f"; the map at {out} is an older one, which was kept (verdict: {verdict or 'none'})"
 
 
 def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:

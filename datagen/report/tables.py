@@ -44,6 +44,10 @@ def share_rows(labelled: dict[str, Any]) -> list[Row]:
         ("frames", ""),
         ("labelled, of those not deleted", f"{100.0 * labelled['share']:.1f} %"),
         ("labelled, of all", f"{100.0 * labelled['share_of_all_frames']:.1f} %"),
+        *(
+            (f"{side} points labelled, of those in the window", f"{100.0 * share:.1f} %")
+            for side, share in labelled["points_in_window"].items()
+        ),
     ]
     rows += [(f"left out: {reason}", str(count)) for reason, count in labelled["why_not"].items()]
     return rows + [

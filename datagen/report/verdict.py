@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from datagen.report.evidence import LineEvidence, MapEvidence
 from lanenet.config import Settings
 
 Grade = Literal["good", "usable", "reject"]
@@ -20,13 +21,18 @@ class VerdictSettings(Settings):
     Residuals are in pixels of an image 160 px wide, on frames held out from the map, up to 45 cm ahead.
 
     Attributes:
-        max_sd_px: Robust standard deviation of the residuals.
-        max_p95_px: 95th percentile of their size.
-        min_labelled: Share of the frames, without those that the driver deleted, that get labels. A usable
-            map may leave out ``usable`` times as many.
+        max_sd_px: Robust standard deviation of the residuals of each line by itself: one perfect line does
+            not make up for one that is not there. Of 122 lines on 61 maps of simulated drives all keep below
+            0.23 px, of real drives below 0.5; edges met by chance have 3.
+        max_p95_px: 95th percentile of the size of both lines' residuals. A map beyond it is usable: marks
+            beside a line make long tails, also where it is right.
+        min_samples: Places on a line in view, of all held-out frames, that tell whether it is right.
+        min_labelled: Share of the frames, without those that the driver deleted, that get labels: one of six
+            points at least. A usable map may leave out ``usable`` times as many. Where the points of one line
+            have fewer, of those that lie in the window, the map is usable.
         min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; a map
             below it may be right, but the frames do not show that it is.
-        max_contradicted: Share of the frames around which the pictures disagree with the map, which get no
+        max_contradicted: Share of the frames' lines with which the pictures around disagree, which get no
             labels: half of what may go without. A map that is bent in many places is not to be trusted in
             others.
         max_focal_sigma: Relative uncertainty of the focal length, where the drive had to tell it.
@@ -40,6 +46,7 @@ class VerdictSettings(Settings):
 
     max_sd_px: float = Field(default=0.5, gt=0.0)
     max_p95_px: float = Field(default=1.5, gt=0.0)
+    min_samples: int = Field(default=50, ge=1)
     min_labelled: float = Field(default=0.85, gt=0.0, lt=1.0)
     min_coverage: float = Field(default=0.3, gt=0.0, lt=1.0)
     max_contradicted: float = Field(default=0.075, gt=0.0, lt=1.0)
@@ -49,39 +56,6 @@ class VerdictSettings(Settings):
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     lane_reject: float = Field(default=0.6, gt=0.0)
     usable: float = Field(default=2.0, gt=1.0)
-
-
-@dataclass(frozen=True)
-class MapEvidence:
-    """What a verdict rests on.
-
-    Attributes:
-        robust_sd_px: Of the held-out residuals, image 160 px wide; NaN where nothing was held out or found.
-        p95_px: Likewise.
-        coverage: Share of the borders in view that met an edge; NaN where nothing was held out.
-        labelled_share: Of the frames that the driver did not delete.
-        contradicted_share: Of these frames: those around which the pictures disagree with the map.
-        not_labelled: Why the others have none, and how many.
-        revisits: Places seen twice.
-        closure_across_heights: What the revisits miss across the road, as median; None without any.
-        camera_known: Whether the camera was given.
-        sigma: Uncertainty of the camera's numbers where the drive told them (focal length relative, [rad]).
-        given_lane_cm: Lane width that the user gave.
-        found_lane_cm: Lane width on the road as the camera sees it; None where the lane sets the scale.
-    """
-
-    robust_sd_px: float
-    p95_px: float
-    coverage: float
-    labelled_share: float
-    not_labelled: dict[str, int]
-    revisits: int
-    closure_across_heights: float | None
-    camera_known: bool
-    sigma: dict[str, float]
-    given_lane_cm: float
-    found_lane_cm: float | None
-    contradicted_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,8 +86,10 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     grade: Grade = max(grades, key=_ORDER.index, default="good")
     if grade == "good":
         reasons = [
-            f"held-out frames agree with the map to {evidence.robust_sd_px:.2f} px (robust sd), "
-            f"{evidence.p95_px:.2f} px (p95), and {100.0 * evidence.labelled_share:.0f} % have labels"
+            "held-out frames agree with the map to "
+            + ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
+            + f" as robust sd, {evidence.p95_px:.2f} px as p95, and {100.0 * evidence.labelled_share:.0f} % "
+            "of the frames have labels"
         ]
     else:
         # The worst first; the rest of the list says what else to look at.
@@ -133,15 +109,18 @@ def _residuals(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
         return [("usable", "no frame was held out that shows the lines, so that nothing checks the map")]
     if not e.coverage > 0.0:
         return [("reject", "no edge was found where the map expects the borders of its lines")]
-    found: list[tuple[Grade, str]] = []
-    for name, value, bound in (("robust sd", e.robust_sd_px, s.max_sd_px), ("p95", e.p95_px, s.max_p95_px)):
-        grade = _bounded(value, bound, s)
-        if grade != "good":
-            found.append(
-                (grade, f"residual on held-out frames: {name} {value:.2f} px, expected {bound:g} at most")
+    found: list[tuple[Grade, str]] = [
+        reason for side, line in e.lines.items() for reason in _line(side, line, s)
+    ]
+    if e.p95_px > s.max_p95_px:
+        found.append(
+            (
+                "usable",
+                f"residual on held-out frames: p95 {e.p95_px:.2f} px, expected {s.max_p95_px:g} at most",
             )
+        )
     if e.coverage < s.min_coverage:
-        grade = "usable" if e.coverage >= s.min_coverage / s.usable else "reject"
+        grade: Grade = "usable" if e.coverage >= s.min_coverage / s.usable else "reject"
         found.append(
             (
                 grade,
@@ -152,17 +131,59 @@ def _residuals(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
     return found
 
 
-def _labelled(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
-    grade = _bounded(1.0 - e.labelled_share, 1.0 - s.min_labelled, s)
-    if grade == "good":
-        return []
-    causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
-    return [
-        (
-            grade,
-            f"{100.0 * e.labelled_share:.0f} % of the frames have labels, expected "
-            f"{100.0 * s.min_labelled:.0f} % ({causes})",
+def _line(side: str, line: LineEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+    """Judge one line by itself; how much of it met an edge says little, as dashes and worn lines meet few."""
+    if line.samples < s.min_samples:
+        return [
+            (
+                "usable",
+                f"held-out frames show {line.samples} places of the {side} line, expected {s.min_samples}: "
+                "too few to check it",
+            )
+        ]
+    if not line.coverage > 0.0:
+        return [("reject", f"no edge was found where the map expects the borders of its {side} line")]
+    found: list[tuple[Grade, str]] = []
+    grade = _bounded(line.robust_sd_px, s.max_sd_px, s)
+    if grade != "good":
+        found.append(
+            (
+                grade,
+                f"residual of the {side} line on held-out frames: robust sd {line.robust_sd_px:.2f} px, "
+                f"expected {s.max_sd_px:g} at most",
+            )
         )
+    if line.p95_px > s.usable * s.max_p95_px:
+        found.append(
+            (
+                "usable",
+                f"residual of the {side} line on held-out frames: p95 {line.p95_px:.2f} px, expected "
+                f"{s.usable * s.max_p95_px:g} at most of one line",
+            )
+        )
+    return found
+
+
+def _labelled(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+    found: list[tuple[Grade, str]] = []
+    causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
+    grade = _bounded(1.0 - e.labelled_share, 1.0 - s.min_labelled, s)
+    if grade != "good":
+        found.append(
+            (
+                grade,
+                f"{100.0 * e.labelled_share:.0f} % of the frames have labels, expected "
+                f"{100.0 * s.min_labelled:.0f} % ({causes})",
+            )
+        )
+    return found + [
+        (
+            "usable",
+            f"{100.0 * share:.0f} % of the {side} line's points in the window have labels, expected "
+            f"{100.0 * s.min_labelled:.0f} % (frames: {100.0 * e.labelled_share:.0f} %)",
+        )
+        for side, share in e.point_shares.items()
+        if share < s.min_labelled
     ]
 
 
@@ -173,8 +194,8 @@ def _contradicted(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]
     return [
         (
             grade,
-            f"around {100.0 * e.contradicted_share:.0f} % of the frames the pictures disagree with the map, "
-            f"expected {100.0 * s.max_contradicted:.0f} % at most",
+            f"the pictures disagree with {100.0 * e.contradicted_share:.0f} % of the frames' lines on the "
+            f"map, expected {100.0 * s.max_contradicted:.0f} % at most",
         )
     ]
 
@@ -188,18 +209,19 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
         )
     if e.camera_known:
         return found
+    bounds = {"focal": ("focal length", s.max_focal_sigma), "pitch": ("pitch", s.max_pitch_sigma_rad)}
     if not e.revisits:
+        _, bound = bounds.pop("focal")
+        sigma = e.sigma["focal"]
         found.append(
             (
-                "usable",
+                max("usable", _bounded(sigma, bound, s), key=_ORDER.index),
                 "the camera was found from the drive, but no place was seen twice, without which its focal "
-                "length is a guess: drive two laps of a closed road, or calibrate the camera",
+                f"length is a guess, here to {100.0 * sigma:.0f} %: drive two laps of a closed road, so that "
+                "the second one passes where the first did, or calibrate the camera and give it",
             )
         )
-    for name, what, bound in (
-        ("focal", "focal length", s.max_focal_sigma),
-        ("pitch", "pitch", s.max_pitch_sigma_rad),
-    ):
+    for name, (what, bound) in bounds.items():
         sigma = e.sigma.get(name, 0.0)
         if sigma > bound:
             unit = f"{100.0 * sigma:.1f} %" if name == "focal" else f"{sigma:.3f} rad"

@@ -52,7 +52,7 @@ def close_loops(
             closed, step = _gauss_newton(closed, odometry, trust, revisits, camera_height_cm, robust)
             if step < 1e-4 * camera_height_cm:
                 break
-    return closed, _residuals(closed, revisits)
+    return closed, missed_by(closed, revisits)
 
 
 def borne_out(
@@ -65,9 +65,7 @@ def borne_out(
         revisits: What the loops were closed with.
         camera_height_cm: Sets the scale.
     """
-    if not revisits:
-        return []
-    missed = _residuals(poses, revisits)
+    missed = missed_by(poses, revisits)
     near = np.hypot(missed[:, 0], missed[:, 1]) < _BORNE_OUT_HEIGHTS * camera_height_cm
     true = near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD)
     return [revisit for revisit, kept in zip(revisits, true, strict=True) if kept]
@@ -107,7 +105,10 @@ def _integrate(
     return np.concatenate([xy, heading[:, None]], axis=1)
 
 
-def _residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
+def missed_by(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
+    """What each revisit misses with these poses: ahead, left, heading."""
+    if not revisits:
+        return np.empty((0, 3))
     seen = np.array([relative_pose(poses[r.earlier], poses[r.later]) for r in revisits])
     residual = seen - np.array([r.relative for r in revisits])
     residual[:, 2] = wrap_angle(residual[:, 2])

@@ -141,21 +141,13 @@ def solve_segment(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-<<<<<<< HEAD
-    closure = _close(road, opened, matched, settings, rng, free, expected, believed)
-=======
     closure = _close(road, opened, matched, settings, rng, free, commands, believed)
->>>>>>> odo
     if closure is not None and not find_camera:
         # Pictures that outvote a revisit are still pulled by it.
         true = borne_out(closure.bundle.poses, closure.revisits, height)
         if settings.revisits.min_revisits <= len(true) < len(closure.revisits):
             again = _closed_by(
-<<<<<<< HEAD
-                true, closure.drift_rad_per_cm, road, opened, settings, rng, free, expected, believed
-=======
                 true, closure.drift_rad_per_cm, road, opened, settings, rng, free, commands, believed
->>>>>>> odo
             )
             closure = again or closure
     bundle = opened if closure is None else closure.bundle
@@ -239,11 +231,7 @@ def _close(
         for group in [supported, explained][: 1 + (len(supported) > len(explained))]:
             left = without_contradicted(opened.poses, group, height)
             revisits = left if len(left) >= settings.revisits.min_revisits else group
-<<<<<<< HEAD
-            closure = _closed_by(revisits, drift, road, opened, settings, rng, free, expected, believed)
-=======
             closure = _closed_by(revisits, drift, road, opened, settings, rng, free, commands, believed)
->>>>>>> odo
             if closure is not None:
                 if best is None or closure.bundle.misfit < best.bundle.misfit:
                     best = closure

@@ -98,7 +98,7 @@ def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
             written.
     """
     path = Path(path).resolve()
-    _check_replaceable(path, kind)
+    check_replaceable(path, kind)
     _make_parent(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -111,7 +111,7 @@ def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
             if file.is_file():
                 sync_path(file)
         # The destination may have changed while the block ran.
-        _check_replaceable(path, kind)
+        check_replaceable(path, kind)
         _move_folder(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -132,6 +132,32 @@ def check_destination(path: Path) -> None:
         raise LanenetError(f"{path}: cannot be written, {parent} is a file, expected a folder")
     if not os.access(parent, os.W_OK):
         raise LanenetError(f"{path}: cannot be written, the folder {parent} is read-only")
+
+
+def check_replaceable(path: Path, kind: str | None = None) -> None:
+    """Refuse a folder that :func:`atomic_folder` would not replace, before the work that is to fill it.
+
+    Args:
+        path: Destination; it need not exist.
+        kind: What the folder is to be, one of :data:`FOLDER_KINDS`; None accepts an earlier output of any.
+
+    Raises:
+        LanenetError: If the destination is a file or a folder that lanenet did not write.
+    """
+    path = Path(path).resolve()
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise LanenetError(f"{path}: is a file, expected a folder to write")
+    if not any(path.iterdir()):
+        return
+    kinds = FOLDER_KINDS if kind is None else (kind,)
+    if not any(_holds_marker(path, name) for name in kinds):
+        markers = " or ".join(f"{name}.yaml" for name in kinds)
+        raise LanenetError(
+            f"{path}: the folder is not empty and holds no {markers} of lanenet, so it is not replaced; "
+            "choose another name or remove it"
+        )
 
 
 def write_text(path: Path, text: str) -> None:
@@ -186,22 +212,6 @@ def _make_parent(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LanenetError(f"{path.parent}: the folder cannot be made ({error})") from None
-
-
-def _check_replaceable(path: Path, kind: str | None) -> None:
-    if not path.exists():
-        return
-    if not path.is_dir():
-        raise LanenetError(f"{path}: is a file, expected a folder to write")
-    if not any(path.iterdir()):
-        return
-    kinds = FOLDER_KINDS if kind is None else (kind,)
-    if not any(_holds_marker(path, name) for name in kinds):
-        markers = " or ".join(f"{name}.yaml" for name in kinds)
-        raise LanenetError(
-            f"{path}: the folder is not empty and holds no {markers} of lanenet, so it is not replaced; "
-            "choose another name or remove it"
-        )
 
 
 def _holds_marker(path: Path, kind: str) -> bool:

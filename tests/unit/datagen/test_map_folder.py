@@ -73,7 +73,7 @@ def _drive_map() -> DriveMap:
         },
         tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
         held_out=np.arange(N) % 10 == 3,
-        contradicted=np.arange(N) // 4 == 2,
+        contradicted=np.arange(N)[:, None] // 4 == [2, 3],
     )
 
 
@@ -123,6 +123,17 @@ def test_an_older_map_has_no_tilt_no_held_out_frames_and_no_verdict(tmp_path):
     assert not found.tilt_rad.any() and not found.held_out.any()
     assert not found.contradicted.any() and found.meta.verdict is None
     assert found.camera_at(3).hash == found.camera.hash
+
+
+def test_an_older_map_contradicts_both_lines_together(tmp_path):
+    contradicted = np.repeat((np.arange(N) // 4 == 2)[:, None], 2, axis=1)
+    write_map(
+        tmp_path, replace(_drive_map(), contradicted=contradicted), {"frame": np.arange(2)}, {}, "given"
+    )
+    path = tmp_path / "poses.csv"
+    older = path.read_text().replace("contradicted_left", "contradicted")
+    path.write_text(older.replace("contradicted_right", "something_else"))
+    np.testing.assert_array_equal(read_map(tmp_path).contradicted, contradicted)
 
 
 def _closed_map() -> DriveMap:

@@ -15,7 +15,9 @@ from datagen.labels.mapped_drive import (
     DELETED,
     UNCERTAIN,
     label_frame,
+    labelled_points,
     open_mapped_drive,
+    points_in_window,
     read_map_frames,
 )
 from datagen.lanes.line import LaneLine, Side
@@ -88,7 +90,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_map_gives_labels_and_keeps_the_frames_without(folder):
     frames = read_map_frames(folder)
-    assert (frames.reference, frames.lane_width_cm, frames.marking_cm) == ("map", 40.0, 2.3)
+    assert (frames.reference, frames.lane_width_cm, frames.marking_cm) == ("map", 40.1, 2.3)
     # The rows in which the car sees itself stay hidden.
     assert frames.perception == HIDDEN and frames.camera.hash == CAMERA.hash
     np.testing.assert_array_equal(frames.frames, MAPPED)
@@ -111,6 +113,8 @@ def test_frames_after_an_unmapped_stretch_start_afresh(folder):
 def test_labels_are_those_of_the_label_set(folder, tmp_path):
     label_map(folder, tmp_path / "l.parquet")
     labels, frames = read_labels(tmp_path / "l.parquet"), read_map_frames(folder)
+    # As measured, 40.0 cm were given: the camera sets the scale of this map.
+    assert labels.meta.lane_width_cm == frames.lane_width_cm == 40.1
     rows = np.searchsorted(frames.frames, labels.frame)
     np.testing.assert_array_equal(frames.points_cm[rows], labels.points_cm)
     left_out = np.delete(frames.points_cm, rows, axis=0)
@@ -137,7 +141,7 @@ def test_why_a_frame_gets_no_labels(folder):
     window = BirdseyeWindow()
     assert label_frame(mapped, 5, window) == UNCERTAIN
     assert not isinstance(label_frame(mapped, 6, window), str)
-    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED)) == 6)
+    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
     assert label_frame(replace(mapped, drive_map=doubted), 6, window) == CONTRADICTED
     assert not isinstance(label_frame(mapped, 0, window), str)
     assert label_frame(mapped, 3, BirdseyeWindow(left_cm=100.0)) == "no line in the window"
@@ -145,6 +149,55 @@ def test_why_a_frame_gets_no_labels(folder):
     # Frame 16 of the drive is the 12th of the map.
     assert label_frame(replace(mapped, drive=deleted), 12, window) == DELETED
     assert not isinstance(label_frame(replace(mapped, drive=deleted), 13, window), str)
+
+
+def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folder):
+    mapped = open_mapped_drive(folder)
+    whole = label_frame(mapped, 6, BirdseyeWindow())
+    assert not isinstance(whole, str)
+    for side, name in enumerate(("left_cm", "right_cm")):
+        contradicted = np.zeros((len(MAPPED), 2), dtype=bool)
+        contradicted[6, side] = True
+        doubted = replace(mapped, drive_map=replace(mapped.drive_map, contradicted=contradicted))
+        masked = label_frame(doubted, 6, BirdseyeWindow())
+        assert not isinstance(masked, str)
+        own, others = np.split(np.arange(6), 2)[:: 1 - 2 * side]
+        assert np.isnan(masked[1][own]).all()
+        np.testing.assert_array_equal(masked[1][others], whole[1][others])
+        # The whole line goes, or a shifted view would get labels of it.
+        assert np.isnan(getattr(masked[0], name)).all() and np.isfinite(getattr(whole[0], name)).any()
+    # Nothing is left where the other line is not known.
+    far = BirdseyeWindow(left_cm=-48.0, columns=64)
+    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, -1])
+    assert label_frame(replace(mapped, drive_map=doubted), 6, far) == CONTRADICTED
+
+
+def test_points_that_the_map_lacks_are_missed_and_those_beside_the_window_are_not(folder):
+    mapped = open_mapped_drive(folder)
+    drive_map, n = mapped.drive_map, len(MAPPED)
+    labels = read_map_frames(folder).points_cm
+
+    def shares(window: BirdseyeWindow, drive_map: DriveMap = drive_map) -> dict[str, float]:
+        in_window = np.array([points_in_window(drive_map, k, window) for k in range(n)])
+        return labelled_points(window.labelled(labels), in_window)
+
+    # One frame of the map has no labels at all, and the right line ends while the car drives on.
+    whole = BirdseyeWindow()
+    assert shares(whole)["left"] == pytest.approx((n - 1) / n)
+    assert shares(whole)["right"] == pytest.approx(np.isfinite(labels[:, 3:]).mean())
+    assert 0.5 < shares(whole)["right"] < 0.9
+    # Where the map ends the right line is expected beside the left one, 40 cm away: outside this window.
+    assert shares(BirdseyeWindow(columns=90)) == {"left": pytest.approx((n - 1) / n)}
+    points = np.array([points_in_window(drive_map, k, BirdseyeWindow(columns=90)) for k in range(n)])
+    np.testing.assert_array_equal(points, np.tile([True] * 3 + [False] * 3, (n, 1)))
+    # Where neither line is known, all points are missed.
+    gone = [replace(line, supported_cm=np.empty((0, 2))) for line in drive_map.lines[0]]
+    nothing = replace(drive_map, lines={0: gone, 1: gone})
+    assert points_in_window(nothing, 6, whole).all()
+    assert labelled_points(np.zeros((6, 6)), np.ones((6, 6), dtype=bool), not_mapped=2) == {
+        "left": 0.75,
+        "right": 0.75,
+    }
 
 
 def test_a_drive_that_does_not_fit_is_refused(folder, tmp_path):

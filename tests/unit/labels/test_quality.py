@@ -108,7 +108,7 @@ def test_report_gives_shares_of_all_mapped_frames():
     points[:3, 0] = np.nan
     points[:, 5] = np.nan
     residual = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 2.0, np.nan, np.nan])
-    report = label_report(_labels(points), residual, 10, {"deleted": 2})
+    report = label_report(_labels(points), residual, 10, {"deleted": 2}, {"left": 0.9, "right": 0.8})
     assert report["format"] == "lanenet-label-report/1"
     assert report["frames_mapped"] == 10
     assert report["frames_labelled"] == 8
@@ -124,7 +124,9 @@ def test_report_gives_shares_of_all_mapped_frames():
 
 
 def test_report_without_any_residual_is_nan_not_zero():
-    report = label_report(_labels(np.full((2, 6), 1.0)), np.full(2, np.nan), 2, {})
+    report = label_report(
+        _labels(np.full((2, 6), 1.0)), np.full(2, np.nan), 2, {}, {"left": 1.0, "right": 1.0}
+    )
     assert report["residual_cm"]["frames"] == 0
     assert np.isnan(report["residual_cm"]["median"])
     assert np.isnan(report["residual_cm"]["p95"])

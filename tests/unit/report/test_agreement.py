@@ -11,7 +11,7 @@ import pytest
 from datagen.labels.mapped_drive import MappedDrive
 from datagen.lanes.line import LaneLine, Side
 from datagen.map_folder import FORMAT, DriveMap, MapMeta
-from datagen.report.agreement import contradicted_frames
+from datagen.report.agreement import contradicted_lines
 from lanenet.data.recording import Commands, Drive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map
@@ -41,14 +41,14 @@ def _poses() -> np.ndarray:
     return np.column_stack([STEP_CM * np.arange(N), np.zeros(N), np.zeros(N)])
 
 
-def _picture(pose: np.ndarray, aside_cm: float, paint: bool) -> np.ndarray:
-    """Two tapes along the map's x axis, at 18 cm on either side and moved by so much."""
+def _picture(pose: np.ndarray, aside_cm: np.ndarray, paint: np.ndarray) -> np.ndarray:
+    """Two tapes along the map's x axis, at 18 cm on either side and each moved by so much, if it is there."""
     image = np.full((120, 160), 60, np.uint8)
     along = pose[0] + np.arange(10.0, 150.0, 2.0)
-    for y in (18.0, -18.0) if paint else ():
+    for y, moved_cm in zip(np.array([18.0, -18.0])[paint], aside_cm[paint], strict=True):
         borders = []
         for half in (0.5, -0.5):
-            place = np.column_stack([along, np.full(len(along), y + aside_cm + half * TAPE_CM)])
+            place = np.column_stack([along, np.full(len(along), y + moved_cm + half * TAPE_CM)])
             borders.append(CAMERA.project_ground(car_from_map(place, pose, CAMERA.wheelbase_cm)))
         outline = np.concatenate([borders[0], borders[1][::-1]])
         outline = outline[np.isfinite(outline).all(axis=1)]
@@ -63,7 +63,10 @@ def _line(side: Side, y_cm: float) -> LaneLine:
     return LaneLine(side, knots, control, np.array([[-100.0, 500.0]]), 0.1, marking_cm=TAPE_CM)
 
 
-def _mapped(aside_cm: np.ndarray, painted: np.ndarray) -> MappedDrive:
+def _mapped(aside_cm: np.ndarray, painted: np.ndarray | None = None) -> MappedDrive:
+    """A map of two lines; per frame, by how far the left and the right tape lie beside them."""
+    aside_cm = np.broadcast_to(aside_cm.T, (2, N)).T
+    painted = np.ones((N, 2), dtype=bool) if painted is None else painted
     poses, t_s = _poses(), 0.05 * np.arange(N)
     images = [_picture(*shown) for shown in zip(poses, aside_cm, painted, strict=True)]
     none = np.zeros(N, dtype=bool)
@@ -94,18 +97,39 @@ NEAR = (np.arange(N) >= 22) & (np.arange(N) < 53)
 
 
 def test_frames_that_agree_are_left_alone():
-    found = contradicted_frames(_mapped(np.where(WRONG, 0.15, 0.0), np.ones(N, dtype=bool)))
-    assert not found.any()
+    assert not contradicted_lines(_mapped(np.where(WRONG, 0.15, 0.0))).any()
 
 
 @pytest.mark.parametrize("aside_cm", [2.5, -2.5, 7.0])
 def test_lines_that_lie_elsewhere_are_found(aside_cm):
-    found = contradicted_frames(_mapped(np.where(WRONG, aside_cm, 0.0), np.ones(N, dtype=bool)))
+    found = contradicted_lines(_mapped(np.where(WRONG, aside_cm, 0.0)))
     assert found[WRONG].all()
     assert not found[~NEAR].any()
 
 
 def test_lines_that_are_not_there_are_found():
-    found = contradicted_frames(_mapped(np.zeros(N), ~WRONG))
+    found = contradicted_lines(_mapped(np.zeros(N), np.column_stack([~WRONG, ~WRONG])))
     assert found[WRONG].all()
     assert not found[~NEAR].any()
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_one_line_that_lies_elsewhere_is_found_and_the_other_one_is_left_alone(side):
+    aside_cm = np.zeros((N, 2))
+    aside_cm[WRONG, side] = 2.5
+    found = contradicted_lines(_mapped(aside_cm))
+    assert found[WRONG, side].all()
+    assert not found[~NEAR, side].any() and not found[:, 1 - side].any()
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_one_line_may_be_interrupted(side):
+    painted = np.ones((N, 2), dtype=bool)
+    painted[WRONG, side] = False
+    assert not contradicted_lines(_mapped(np.zeros(N), painted)).any()
+
+
+def test_a_line_that_is_not_there_goes_with_the_one_that_lies_elsewhere():
+    painted = np.column_stack([np.ones(N, dtype=bool), ~WRONG])
+    found = contradicted_lines(_mapped(np.where(WRONG, 2.5, 0.0), painted))
+    assert found[WRONG].all()

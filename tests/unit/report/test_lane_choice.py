@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.lanes.trace import TracedLane
-from datagen.report.mappable import _fits_better
+from datagen.lanes.path import PathEdges, path_of_poses
+from datagen.lanes.trace import TracedLane, TraceSettings
+from datagen.report.mappable import _fits_better, trace_known_lane
+from lanenet.errors import CalibrationError, TrackingLostError
 
 
 def traced(lane_cm: float, centre_cm: float, left: float, right: float) -> TracedLane:
@@ -35,3 +37,27 @@ def traced(lane_cm: float, centre_cm: float, left: float, right: float) -> Trace
 )
 def test_which_lane_is_driven(free, lane, better):
     assert _fits_better(free, lane) is better
+
+
+@pytest.mark.parametrize(
+    ("free", "lane", "message"),
+    [
+        # A bare road: pairs of clutter, of any width.
+        (traced(19.0, 0.0, 0.21, 0.74), None, "no two lines 40 cm apart run along the drive$"),
+        (traced(40.0, 0.0, 0.84, 1.0), None, "but two that are 40 cm apart with this camera"),
+        (traced(40.0, 0.0, 0.84, 1.0), traced(36.0, 0.0, 0.05, 1.0), "but two that are 40 cm apart"),
+    ],
+)
+def test_another_width_is_named_where_two_lines_are_seen(monkeypatch, free, lane, message):
+    def trace(path, edges, height_cm, lane_width_cm, settings):
+        found = free if lane_width_cm is None else lane
+        if found is None:
+            raise TrackingLostError("no lane")
+        return found
+
+    monkeypatch.setattr("datagen.report.mappable.trace_lane", trace)
+    path = path_of_poses(np.column_stack([np.arange(0.0, 99.0, 3.0), np.zeros(33), np.zeros(33)]), 2.0, 9.0)
+    none = np.zeros(0, dtype=np.int64)
+    edges = PathEdges(*[np.zeros(0)] * 6, none)
+    with pytest.raises((CalibrationError, TrackingLostError), match=message):
+        trace_known_lane(path, edges, 17.0, 40.0, TraceSettings())

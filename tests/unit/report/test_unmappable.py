@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.calibrate_drive import calibrate_drive
 from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.report.mappable import check_edges, check_moving
+from datagen.report.mappable import check_edges, check_lines_seen, check_moving
+from datagen.report.quality import MapQuality
+from datagen.report.residuals import BorderSamples, join_samples
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drive import open_drive
 from lanenet.data.drive_writer import DriveWriter
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.perception.edges import EdgeSettings
 
 CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
@@ -70,6 +73,52 @@ def test_standing_still(tmp_path, both_lines, noise):
     assert "stands still" in refusal(written(tmp_path / "drive", frames), tmp_path / "map")
 
 
+def test_no_camera_is_found_from_a_drive_that_stands_still(tmp_path, both_lines):
+    """A few frames differ from their neighbours, as with a lamp that is switched."""
+    rng = np.random.default_rng(0)
+    still = open_drive(both_lines).image(20).astype(float)
+    brighter = 20.0 * (np.arange(210) % 9 == 0)
+    frames = [
+        np.clip(still + rng.normal(0.0, 4.0, still.shape) + b, 0, 255).astype(np.uint8) for b in brighter
+    ]
+    drive = written(tmp_path / "drive", frames)
+    with pytest.raises(CalibrationError, match=rf"{drive}: the car stands still.*\. {INSTEAD.capitalize()}"):
+        calibrate_drive(drive, 40.0, None, None, SETTINGS)
+
+
+def older_map(folder: Path, verdict: str) -> Path:
+    folder.mkdir()
+    (folder / "map.yaml").write_text(f"format: lanenet-map/1\nverdict: {verdict}\n")
+    return folder
+
+
+def test_an_older_map_is_kept_and_named_where_the_new_one_is_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
+    drive, out = written(tmp_path / "drive", frames), older_map(tmp_path / "map", "usable")
+    with pytest.raises(TrackingLostError, match=rf"20 frames.*map at {out} is an older one.*verdict: usable"):
+        map_drive(drive, 40.0, None, SETTINGS, out)
+    assert "usable" in (out / "map.yaml").read_text()
+
+
+def test_where_no_map_can_be_written_none_is_made(tmp_path):
+    """Said before the drive is opened."""
+    foreign = tmp_path / "notes"
+    foreign.mkdir()
+    (foreign / "x.txt").write_text("x")
+    with pytest.raises(LanenetError, match=r"notes: the folder is not empty and holds no map.yaml"):
+        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, foreign)
+    with pytest.raises(LanenetError, match=r"x.txt: is a file, expected a folder"):
+        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, foreign / "x.txt")
+
+
+def test_what_a_killed_run_left_goes_also_where_the_new_one_fails(tmp_path):
+    left, other = older_map(tmp_path / ".map.0123abcd.tmp", "good"), older_map(tmp_path / "other", "good")
+    with pytest.raises(DriveFormatError, match="nowhere"):
+        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, tmp_path / "map")
+    assert not left.exists() and other.exists()
+
+
 def test_a_moving_car_does_not_stand_still(both_lines):
     check_moving(open_drive(both_lines))
 
@@ -93,6 +142,52 @@ def test_one_line_only(tmp_path):
     drive = simulated(tmp_path / "drive", 80, left="none", right="solid")
     message = refusal(drive, tmp_path / "map")
     assert "one line only" in message and "right one along 9" in message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "frames"), [(7, 300), (9, 200)])
+def test_one_line_beside_which_a_streak_or_bare_floor_is_traced(tmp_path, seed, frames):
+    """Where a second line is traced that is none, held-out frames tell."""
+    settings = {"seed": seed, "frames": frames, "track": {"left": {"kind": "none"}}}
+    drive = simulate_drive(SimulationSettings.model_validate(settings), tmp_path / "drive")
+    assert "one line only" in refusal(drive, tmp_path / "map")
+
+
+def border(right: bool, met: float, spread_px: float, seed: int) -> BorderSamples:
+    """Places on a line, of which a share met edges this far off."""
+    rng, n = np.random.default_rng(seed), 2000
+    off = np.where(rng.random(n) < met, rng.uniform(-spread_px, spread_px, n), np.nan)
+    return BorderSamples(np.full(n, right), rng.uniform(0.0, 45.0, n), off)
+
+
+def shown(*lines: BorderSamples) -> MapQuality:
+    none = np.empty((0, 6))
+    every, nothing = join_samples(list(lines)), join_samples([])
+    return MapQuality(np.arange(1), [every], nothing, [], none, none.astype(bool))
+
+
+def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
+    drive = open_drive(both_lines)
+    left, right = (border(right, 0.97, 0.3, 0) for right in (False, True))
+    check_lines_seen(shown(left, right), drive, 40.0, None)
+    # A worn line is found along little of its length, but where it is.
+    check_lines_seen(shown(border(False, 0.1, 1.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    # A map that is bent is looked at, and rejected.
+    check_lines_seen(shown(border(False, 0.9, 4.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    with pytest.raises(
+        TrackingLostError, match=r"one line only .* left one 2\d % to 2.\d px.*for the left one"
+    ):
+        check_lines_seen(shown(border(False, 0.25, 4.0, 1), right), drive, 40.0, None)
+    with pytest.raises(TrackingLostError, match=r"no lane: .*for the left and the right one"):
+        check_lines_seen(shown(border(False, 0.25, 4.0, 1), border(True, 0.3, 4.0, 2)), drive, 40.0, None)
+    with pytest.raises(TrackingLostError, match=r"no lane: .*along 1. %"):
+        check_lines_seen(shown(border(False, 0.15, 4.0, 1), border(True, 0.15, 4.0, 2)), drive, 40.0, None)
+
+
+def test_a_line_that_meets_edges_by_chance_where_a_lane_of_another_width_is(both_lines):
+    lines = shown(border(False, 0.25, 4.0, 1), border(True, 0.97, 0.3, 0))
+    with pytest.raises(CalibrationError, match=r"no two lines 20 cm apart .* 40 cm apart"):
+        check_lines_seen(lines, open_drive(both_lines), 20.0, 40.2)
 
 
 def test_no_line_at_all(tmp_path):

@@ -7,13 +7,16 @@ from dataclasses import replace
 
 import pytest
 
-from datagen.report.verdict import MapEvidence, VerdictSettings, judge
+from datagen.report.evidence import LineEvidence, MapEvidence
+from datagen.report.verdict import VerdictSettings, judge
 
+LINE = LineEvidence(samples=2000, coverage=0.8, robust_sd_px=0.4, p95_px=1.2)
 GOOD = MapEvidence(
-    robust_sd_px=0.4,
+    lines={"left": LINE, "right": replace(LINE, robust_sd_px=0.2)},
     p95_px=1.2,
     coverage=0.8,
     labelled_share=0.95,
+    point_shares={"left": 0.95, "right": 0.93},
     not_labelled={"pose uncertain": 5},
     revisits=12,
     closure_across_heights=0.03,
@@ -22,8 +25,14 @@ GOOD = MapEvidence(
     given_lane_cm=40.0,
     found_lane_cm=None,
 )
+OPEN = {"revisits": 0, "closure_across_heights": None}
 KNOWN = replace(GOOD, camera_known=True, sigma={}, found_lane_cm=40.5)
 NAN = float("nan")
+
+
+def left(**changes: float) -> dict[str, dict[str, LineEvidence]]:
+    """Evidence with another left line beside the good right one."""
+    return {"lines": {**GOOD.lines, "left": replace(LINE, **changes)}}
 
 
 def graded(evidence: MapEvidence, **changes):
@@ -33,7 +42,8 @@ def graded(evidence: MapEvidence, **changes):
 def test_a_good_map_says_what_it_rests_on():
     verdict = judge(GOOD, VerdictSettings())
     assert verdict.grade == "good"
-    assert "0.40 px" in verdict.reasons[0] and "95 %" in verdict.reasons[0]
+    for words in ("0.40 px (left line)", "0.20 px (right line)", "1.20 px as p95", "95 %"):
+        assert words in verdict.reasons[0]
 
 
 def test_what_sets_the_scale_is_named():
@@ -47,18 +57,29 @@ def test_what_sets_the_scale_is_named():
 @pytest.mark.parametrize(
     ("changes", "grade", "reason"),
     [
-        ({"robust_sd_px": 0.5, "p95_px": 1.5, "labelled_share": 0.85}, "good", "0.50 px"),
-        ({"robust_sd_px": 0.51}, "usable", "robust sd 0.51 px"),
-        ({"robust_sd_px": 1.01}, "reject", "robust sd 1.01 px"),
+        (left(robust_sd_px=0.5) | {"p95_px": 1.5, "labelled_share": 0.85}, "good", "0.50 px"),
+        (left(robust_sd_px=0.51), "usable", "left line .* robust sd 0.51 px"),
+        (left(robust_sd_px=1.01), "reject", "left line .* robust sd 1.01 px"),
+        (left(robust_sd_px=NAN, p95_px=NAN, coverage=0.0), "reject", "borders of its left line"),
+        # Worn lines of good maps are found along a tenth of their length.
+        (left(coverage=0.1), "good", "0.40 px"),
+        (left(p95_px=2.9), "good", "0.40 px"),
+        (left(p95_px=3.1), "usable", "left line .* p95 3.10 px"),
+        (left(samples=49, robust_sd_px=3.0), "usable", "49 places of the left line, expected 50"),
         ({"p95_px": 1.6}, "usable", "p95 1.60 px"),
-        ({"p95_px": 3.1}, "reject", "p95 3.10 px"),
+        ({"p95_px": 3.1}, "usable", "p95 3.10 px"),
         ({"labelled_share": 0.8}, "usable", r"80 % .*85 % \(5 pose uncertain\)"),
         ({"labelled_share": 0.69}, "reject", "69 %"),
+        # A frame counts with one point; the points of a line may be fewer.
+        ({"point_shares": {"left": 0.95, "right": 0.85}}, "good", "95 %"),
+        ({"point_shares": {"left": 0.2, "right": 1.0}}, "usable", "20 % of the left .*frames: 95 %"),
         ({"coverage": 0.2}, "usable", "20 %"),
         ({"coverage": 0.1}, "reject", "10 %"),
-        ({"coverage": 0.0, "robust_sd_px": NAN, "p95_px": NAN}, "reject", "no edge"),
-        ({"coverage": NAN, "robust_sd_px": NAN, "p95_px": NAN}, "usable", "no frame was held out"),
-        ({"revisits": 0, "closure_across_heights": None}, "usable", "drive two laps"),
+        ({"coverage": 0.0, "p95_px": NAN}, "reject", "no edge"),
+        ({"coverage": NAN, "p95_px": NAN}, "usable", "no frame was held out"),
+        (OPEN | {"sigma": {"focal": 0.3}}, "reject", "no place was seen twice.* 30 %: drive two laps"),
+        # Only where the focal length is known closely beforehand.
+        (OPEN | {"sigma": {"focal": 0.04}}, "usable", "no place was seen twice.* 4 %: drive two laps"),
         ({"sigma": {"focal": 0.07}}, "usable", "focal length open by 7.0 %"),
         ({"sigma": {"focal": 0.12}}, "reject", "focal"),
         ({"sigma": {"pitch": 0.03}}, "usable", "pitch open by 0.030 rad"),
@@ -84,13 +105,22 @@ def test_the_lane_width_is_checked_where_the_camera_sets_the_scale(found_cm, gra
 
 
 def test_a_known_camera_needs_no_loop():
-    assert graded(KNOWN, revisits=0, closure_across_heights=None).grade == "good"
+    assert graded(KNOWN, **OPEN).grade == "good"
 
 
 def test_the_worst_reason_comes_first_and_none_is_lost():
-    verdict = graded(GOOD, robust_sd_px=0.6, p95_px=9.0, labelled_share=0.8)
+    verdict = graded(GOOD, **left(robust_sd_px=1.4), p95_px=2.0, labelled_share=0.8)
     assert verdict.grade == "reject" and len(verdict.reasons) == 3
-    assert verdict.reasons[0].startswith("residual on held-out frames: p95 9.00")
+    assert "robust sd 1.40 px" in verdict.reasons[0]
+
+
+def test_one_perfect_line_does_not_make_up_for_one_that_is_not_there():
+    """Figures of a simulated road with one line, whose map had the other one on bare floor."""
+    floor = LineEvidence(samples=1364, coverage=0.037, robust_sd_px=4.14, p95_px=3.63)
+    painted = LineEvidence(samples=1774, coverage=0.984, robust_sd_px=0.03, p95_px=0.09)
+    for lines in ({"left": floor, "right": painted}, {"left": painted, "right": floor}):
+        verdict = graded(KNOWN, lines=lines, p95_px=0.13, coverage=0.57)
+        assert verdict.grade == "reject" and "robust sd 4.14 px" in verdict.reasons[0]
 
 
 @pytest.mark.parametrize(

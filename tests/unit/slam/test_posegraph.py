@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datagen.slam.places import Revisit, relative_pose
-from datagen.slam.posegraph import borne_out, close_loops
+from datagen.slam.posegraph import borne_out, close_loops, missed_by
 
 HEIGHT_CM = 15.0
 LAP = 100
@@ -140,3 +140,19 @@ def test_motion_across_a_break_is_not_believed():
     # Taken for motion, the jump would bend the road.
     bent, _ = close_loops(moved, revisits, HEIGHT_CM)
     assert np.linalg.norm(bent[:, :2] - true[:, :2], axis=1).max() > 5.0
+
+
+def test_what_revisits_miss_is_measured_in_the_poses_that_are_given():
+    true, _ = _laps(0.0)
+    revisits = _revisits(true, range(5, 96, 10))
+    assert np.abs(missed_by(true, revisits)).max() < 1e-9
+    moved = true.copy()
+    # The later frame of the third revisit: ahead, to its left, and turned by it. A turn moves the axes.
+    heading = true[125, 2]
+    moved[125, :2] += 2.0 * np.array([np.cos(heading), np.sin(heading)])
+    moved[125, :2] += 0.5 * np.array([-np.sin(heading), np.cos(heading)])
+    moved[125, 2] += 0.1 + 2.0 * np.pi
+    missed = missed_by(moved, revisits)
+    np.testing.assert_allclose(missed[2], [2.0, 0.5, 0.1], atol=1e-9)
+    assert np.abs(np.delete(missed, 2, axis=0)).max() < 1e-9
+    assert missed_by(true, []).shape == (0, 3)
