@@ -16,7 +16,7 @@ from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.lane_scale import fitted_width_cm
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import MappedSegment, Report, map_edges, map_evidence, map_figures, map_notes
-from datagen.map_settings import SETTINGS_NAME, MapSettings
+from datagen.map_settings import SETTINGS_NAME, MapSettings, with_wheelbase
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.agreement import contradicted_frames
 from datagen.report.held_out import held_out_frames
@@ -54,6 +54,7 @@ def map_drive(
     out: Path,
     progress: Progress | None = None,
     refine_camera: bool = False,
+    wheelbase_cm: float | None = None,
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
 
@@ -66,6 +67,7 @@ def map_drive(
         out: Map folder to write.
         progress: Called with (done, total).
         refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
+        wheelbase_cm: Distance between the axles; None takes the camera's own, or a nominal one.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -73,7 +75,9 @@ def map_drive(
             camera and lane width say.
     """
     try:
-        return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera)
+        return _map_drive(
+            drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera, wheelbase_cm
+        )
     except TrackingLostError as error:
         where = "" if str(drive_path) in str(error) else f"{drive_path}: "
         raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}") from error
@@ -87,6 +91,7 @@ def _map_drive(
     out: Path,
     progress: Progress | None,
     refine_camera: bool,
+    wheelbase_cm: float | None,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
     recorded = keep_images(open_drive(drive_path))
@@ -97,6 +102,8 @@ def _map_drive(
     # What the driver deleted gets no labels, and where the car leaves the road it tells nothing of them.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
     known = read_camera(camera_path) if camera_path is not None else drive.camera
+    settings, known, nominal = with_wheelbase(settings, known, wheelbase_cm)
+    notes += nominal
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:
