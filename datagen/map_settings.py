@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pydantic import Field, field_validator
 
 from datagen.lanes.fit import FitSettings
@@ -14,6 +16,7 @@ from datagen.slam.mapper import MotionSettings
 from datagen.slam.picture_pairs import OdometrySettings
 from datagen.slam.places import RevisitSettings
 from lanenet.config import Settings
+from lanenet.geometry.camera import Camera
 from lanenet.perception.birdseye import PerceptionSettings
 
 #: The resolved settings in a map's folder.
@@ -61,3 +64,25 @@ class MapSettings(Settings):
         if every == 1:
             raise ValueError("expected 0 or at least 2: every frame held out leaves none for the lines")
         return every
+
+
+def with_wheelbase(
+    settings: MapSettings, camera: Camera | None, wheelbase_cm: float | None
+) -> tuple[MapSettings, Camera | None, list[str]]:
+    """Put the wheelbase where mapping looks for it: poses are of the rear axle, labels of the front.
+
+    Args:
+        settings: Settings; those of a guessed camera name a wheelbase.
+        camera: A known camera, which has one of its own; None for one that is to be found.
+        wheelbase_cm: Distance between the axles; None if nobody said.
+
+    Returns:
+        Settings and camera with it, and a note where it is only nominal.
+    """
+    if wheelbase_cm is None:
+        nominal = camera is None and "wheelbase_cm" not in settings.guess.model_fields_set
+        note = f"the wheelbase is a nominal {settings.guess.wheelbase_cm:g} cm; give --wheelbase"
+        return settings, camera, [note] if nominal else []
+    guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
+    settings = settings.model_copy(update={"guess": guess})
+    return settings, None if camera is None else replace(camera, wheelbase_cm=wheelbase_cm), []

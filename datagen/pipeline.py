@@ -24,7 +24,7 @@ from datagen.map_report import (
     map_figures,
     map_notes,
 )
-from datagen.map_settings import SETTINGS_NAME, MapSettings
+from datagen.map_settings import SETTINGS_NAME, MapSettings, with_wheelbase
 from datagen.pictures import draw_contact_sheet, draw_map
 from datagen.report.agreement import contradicted_lines
 from datagen.report.held_out import held_out_frames
@@ -63,6 +63,7 @@ def map_drive(
     out: Path,
     progress: Progress | None = None,
     refine_camera: bool = False,
+    wheelbase_cm: float | None = None,
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
 
@@ -75,6 +76,7 @@ def map_drive(
         out: Map folder to write.
         progress: Called with (done, total).
         refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
+        wheelbase_cm: Distance between the axles; None takes the camera's own, or a nominal one.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -86,7 +88,9 @@ def map_drive(
     clear_unfinished(out)
     check_replaceable(out, "map")
     try:
-        return _map_drive(drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera)
+        return _map_drive(
+            drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera, wheelbase_cm
+        )
     except CalibrationError as error:
         raise CalibrationError(f"{error}{kept_map(out)}") from error
     except TrackingLostError as error:
@@ -102,6 +106,7 @@ def _map_drive(
     out: Path,
     progress: Progress | None,
     refine_camera: bool,
+    wheelbase_cm: float | None,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
     recorded = keep_images(open_drive(drive_path))
@@ -112,6 +117,8 @@ def _map_drive(
     # What the driver deleted gets no labels, and where the car leaves the road it tells nothing of them.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
     known = read_camera(camera_path) if camera_path is not None else drive.camera
+    settings, known, nominal = with_wheelbase(settings, known, wheelbase_cm)
+    notes += nominal
     settings = hide_bumper(drive, settings, notes)
     figures: dict[str, Any] = {"drive": str(drive_path), "frames": len(drive), "segments": len(segments)}
     if known is not None:

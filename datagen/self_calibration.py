@@ -16,8 +16,9 @@ from jaxtyping import Float
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import CAMERA_NAMES, BundleSettings
 from datagen.slam.calibrate import Candidate, coarse_camera, looking_alike, nudged
+from datagen.slam.crawl import solve_segment
 from datagen.slam.scans import Progress
-from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.segment import SolvedSegment
 from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera

@@ -15,9 +15,10 @@ from datagen.map_report import MappedSegment
 from datagen.map_settings import MapSettings
 from datagen.report.held_out import without_frames
 from datagen.report.mappable import check_lane, trace_known_lane
+from datagen.slam.crawl import solve_segment
 from datagen.slam.join import Stretch, frames_text, join_stretches
 from datagen.slam.scans import Progress
-from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.segment import SolvedSegment
 from lanenet.data.drive import Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera

@@ -17,7 +17,6 @@ from lanenet.errors import CalibrationError, ConfigError
 from lanenet.outputs import check_not_source
 
 if TYPE_CHECKING:
-    from datagen.map_settings import MapSettings
     from lanenet.geometry.camera import Camera
 
 app = typer.Typer(no_args_is_help=True, help="Find the camera: its lens, and where it sits on the car.")
@@ -197,7 +196,7 @@ def drive_(
 ) -> None:
     """Find lens and mounting from two laps alone: no board, no measured points."""
     from datagen.calibrate_drive import calibrate_drive, starting_camera
-    from datagen.map_settings import MapSettings
+    from datagen.map_settings import MapSettings, with_wheelbase
     from lanenet.calibrate_show import drive_pictures, show_drive
     from lanenet.config import load_settings
     from lanenet.data.camera_file import write_camera
@@ -206,7 +205,7 @@ def drive_(
     check_not_source(drive, out)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start, notes = starting_camera(drive, camera, refine)
-    settings, start, note = _with_wheelbase(settings, start, wheelbase)
+    settings, start, note = with_wheelbase(settings, start, wheelbase)
     with console.progress_bar("calibrate") as progress:
         result = calibrate_drive(
             drive, lane_width, camera_height, start, settings, progress, accept_open_loop=accept_open_loop
@@ -219,20 +218,6 @@ def drive_(
     console.wrote(out, *pictures)
     width = "LANE_WIDTH" if lane_width is None else f"{lane_width:g}"
     console.next_command("map", drive, "--lane-width", width, "--camera", out, "--out", "MAP")
-
-
-def _with_wheelbase(
-    settings: MapSettings, start: Camera | None, wheelbase_cm: float | None
-) -> tuple[MapSettings, Camera | None, list[str]]:
-    """Put the wheelbase where the calibration looks for it: poses are those of the rear axle."""
-    from dataclasses import replace
-
-    if wheelbase_cm is None:
-        nominal = f"the wheelbase is a nominal {settings.guess.wheelbase_cm:g} cm; give --wheelbase"
-        return settings, start, [] if start is not None else [nominal]
-    guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
-    settings = settings.model_copy(update={"guess": guess})
-    return settings, None if start is None else replace(start, wheelbase_cm=wheelbase_cm), []
 
 
 def _check_yaml(*paths: Path | None) -> None:

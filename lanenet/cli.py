@@ -146,13 +146,14 @@ def map_(
     refine_camera: Annotated[
         bool, typer.Option("--refine-camera", help="Adjust a known camera to this drive.")
     ] = False,
+    wheelbase: Annotated[float | None, typer.Option(min=0.1, help="Distance of the car's axles, cm.")] = None,
 ) -> None:
     """Find the poses of a drive and one map of its lane lines; without a camera it is calibrated too."""
     from datagen.pipeline import MapSettings, map_drive
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     with console.progress_bar("map") as progress:
-        report = map_drive(drive, lane_width, camera, settings, out, progress, refine_camera)
+        report = map_drive(drive, lane_width, camera, settings, out, progress, refine_camera, wheelbase)
     console.show_lines(report.lines)
     console.wrote(out, out / "report.html")
     if report.figures["verdict"]["grade"] == "reject":

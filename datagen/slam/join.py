@@ -32,12 +32,12 @@ from datagen.slam.places import (
 )
 from datagen.slam.posegraph import borne_out, close_loops
 from datagen.slam.scans import Scans, scans_of
+from datagen.slam.seen import road_edges
 from datagen.slam.segment import (
     MAX_MISFIT,
     MAX_MISSED,
     SolvedSegment,
     relative_ways,
-    road_edges,
 )
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +10,13 @@ from pydantic import Field
 
 from datagen.slam.filter import FilterSettings, Trajectory, run_filter
 from datagen.slam.motion import MotionModel
-from datagen.slam.odometry import Evidence, Odometry
-from datagen.slam.picture_pairs import OdometrySettings, Pictures
+from datagen.slam.odometry import Evidence, Odometry, UsualWay
+from datagen.slam.picture_pairs import Pictures
 from datagen.slam.scans import Progress, Scans
 from lanenet.config import Settings
 from lanenet.data.drive import Commands, Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import left_from_donkey
-from lanenet.perception.edges import EdgePixels
 
 _MAX_LAG = 10  # frames
 _LONGEST_STEP = 3.0  # usual times between frames
@@ -127,13 +125,13 @@ def _held(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def track(
-    edges: Sequence[EdgePixels],
+    pictures: Pictures,
     scans: Scans,
     commands: CommandedMotion,
+    usual: UsualWay,
     camera: Camera,
     filter_settings: FilterSettings,
     motion_settings: MotionSettings,
-    odometry_settings: OdometrySettings,
     rng: np.random.Generator,
     progress: Progress | None = None,
     far_rad: Float[np.ndarray, "n"] | None = None,
@@ -145,21 +143,22 @@ def track(
     steps together.
 
     Args:
-        edges: Edge pixels per frame, only such that see the road.
+        pictures: Edges of the road in every frame.
         scans: The same on the road.
         commands: What was commanded.
+        usual: What that means in centimetres.
         camera: The camera.
         filter_settings: Size of the filter.
         motion_settings: How far it may stray from the odometry.
-        odometry_settings: How pictures are compared.
         rng: Source of randomness.
         progress: Called with (done, total).
         far_rad: Turn of each frame as the distance shows it, see :func:`datagen.slam.far_view.far_turns`.
     """
     height, n = camera.mounting.height_cm, len(scans)
     compared = None if progress is None else lambda k, _: progress(k, 2 * n)
-    pictures = Pictures(edges, camera, odometry_settings, rng)
-    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height, compared, far_rad)
+    evidence = Evidence(
+        pictures, commands.distance_cm, commands.speed_known, height, compared, far_rad, usual
+    )
     odometry = evidence.motion()
     fit = fit_steering(odometry.poses, commands, height)
     if fit is not None and commands.turn is not None:

@@ -184,6 +184,7 @@ class Evidence:
         height_cm: float,
         progress: Progress | None = None,
         far_rad: Float[np.ndarray, "n"] | None = None,
+        usual: UsualWay | None = None,
     ) -> None:
         """Compare all pictures.
 
@@ -194,11 +195,12 @@ class Evidence:
             height_cm: Of the camera.
             progress: Called with (done, total).
             far_rad: Turn of each frame as the distance shows it, see :func:`datagen.slam.far_view.far_turns`.
+            usual: What the commands mean in centimetres; None if that is still to be found.
         """
         s, n = pictures.settings, len(pictures)
         self.settings, self.height_cm = s, height_cm
         self.seen: SeenTurns | None = None
-        self.usual = usual_way(pictures, distance_cm, speed_known, height_cm)
+        self.usual = usual_way(pictures, distance_cm, speed_known, height_cm) if usual is None else usual
         self.relative, step = self.usual.relative, self.usual.step
         spread, keep = s.unknown_spread, s.unknown_keep
         if speed_known:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleResult, adjust
@@ -14,7 +14,7 @@ from datagen.slam.calibrate import mapping_range
 from datagen.slam.far_view import far_turns
 from datagen.slam.filter import Trajectory
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
-from datagen.slam.mapper import CommandedMotion, SteeringFit, commands_of, track
+from datagen.slam.mapper import CommandedMotion, SteeringFit, track
 from datagen.slam.mutual import with_supported, without_contradicted
 from datagen.slam.places import (
     Revisit,
@@ -25,13 +25,9 @@ from datagen.slam.places import (
     thumbnails,
 )
 from datagen.slam.posegraph import borne_out, close_loops
-from datagen.slam.reflections import without_reflections
-from datagen.slam.scans import Progress, Scans, edges_of_drive, scans_of
-from lanenet.data.drive import Drive
-from lanenet.errors import TrackingLostError
+from datagen.slam.scans import Progress, Scans, scans_of
+from datagen.slam.seen import SeenDrive, SeenRoad, road_edges
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import RangeSettings, RoadTable
-from lanenet.perception.edges import EdgePixels
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
@@ -93,9 +89,8 @@ class SolvedSegment:
         return [r for r in self.revisits if stretch[r.earlier] == stretch[r.later]]
 
 
-def solve_segment(
-    drive: Drive,
-    camera: Camera,
+def solve_frames(
+    seen: SeenDrive,
     settings: MapSettings,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -105,27 +100,19 @@ def solve_segment(
     """Track one segment, close its loops, and adjust all of it together.
 
     Args:
-        drive: The segment.
-        camera: Its camera, or a coarse guess of it.
+        seen: The segment; a car that crawls is followed by key frames, see :mod:`datagen.slam.crawl`.
         settings: Settings of all stages.
         rng: Source of randomness.
         progress: Called with (done, total).
         find_camera: Adjust the camera too.
         believed: What is believed of the camera, where that is not the camera to start with.
     """
+    drive, camera, commands, road = seen.drive, seen.camera, seen.commands, seen.road
     believed = camera if believed is None else believed
     height = camera.mounting.height_cm
     limits = mapping_range(height, settings.perception.range)
-    road = road_edges(drive, camera, limits, settings)
-    scans = scans_of(road.edges, camera, limits)
-    if len(scans.points_cm) < 20 * len(scans):
-        raise TrackingLostError(
-            f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
-            "road; mapping needs 20"
-        )
-    commands = commands_of(drive, camera.wheelbase_cm)
     trajectory, steering = track(
-        road.edges, scans, commands, camera, settings.filter, settings.motion, settings.odometry, rng,
+        seen.pictures, seen.scans, commands, seen.usual, camera, settings.filter, settings.motion, rng,
         progress, far_turns(drive, camera),
     )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
@@ -180,26 +167,6 @@ def solve_segment(
         drift_rad_per_cm=None if closure is None else closure.drift_rad_per_cm,
         bundle=bundle,
     )
-
-
-@dataclass(frozen=True)
-class SeenRoad:
-    """Edges of the road in every frame.
-
-    Attributes:
-        edges: Per frame.
-        keep: Pixels in which they were looked for, 0 elsewhere.
-    """
-
-    edges: list[EdgePixels]
-    keep: UInt8[np.ndarray, "h w"]
-
-
-def road_edges(drive: Drive, camera: Camera, limits: RangeSettings, settings: MapSettings) -> SeenRoad:
-    """Edges of the road in every frame, without those of lamps that are mirrored in it."""
-    table = RoadTable(camera, limits)
-    edges = edges_of_drive(drive, settings.perception.edges, table)
-    return SeenRoad(without_reflections(edges, camera, table), table.keep)
 
 
 @dataclass(frozen=True)

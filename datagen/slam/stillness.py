@@ -28,6 +28,9 @@ _BACKWARDS_THROTTLE = -0.05
 #: Frames of one such command in which the car moves: a driver who brakes needs fewer.
 _BACKING = 5
 _EPSILON = 1e-9
+#: How much more a crawl changes over those frames than from one to the next: noise, and an exposure that
+#: drifts, do so by less.
+_GOES_ON = 3.0
 _BACK = 4  # frames that a live car looks back
 _WATCHED = 300  # frames of a live car whose change counts as usual
 
@@ -116,8 +119,9 @@ def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"
     """Find the frames that show the same as those before them: repeated ones, and those of a car that stands.
 
     A frame stands where the picture hardly differs from that of the frame before, nor from that of ten frames
-    on either side of the step, as compared with what the drive's pictures usually change by in ten frames. A
-    crawl changes little from frame to frame, but goes on. The first frame of a stop is kept.
+    on either side of the step, as compared with what the drive's pictures usually change by in ten frames
+    while the car moves. A crawl changes little from frame to frame, but goes on. The first frame of a stop is
+    kept.
 
     Args:
         small: See :func:`small_pictures`.
@@ -131,7 +135,7 @@ def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"
         return standing
     step = _change(flat, 1)
     far = _change(flat, _AHEAD)
-    limit = max(_NOISE, _STILL_SHARE * float(np.median(far)))
+    limit = max(_NOISE, _STILL_SHARE * _usual_change(step, far))
     # The far change before a frame or the one after it is small: at either end of a stop one of them is not.
     before = np.concatenate([np.full(_AHEAD, np.inf), far])
     after = np.concatenate([far, np.full(_AHEAD, np.inf)])
@@ -140,6 +144,20 @@ def standing_frames(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"
     # A picture that was recorded twice: not even the noise differs.
     standing[1:] |= step < _EPSILON
     return standing
+
+
+def _usual_change(step: Float[np.ndarray, "m"], far: Float[np.ndarray, "f"]) -> float:
+    """Usual change in ten frames of a car that moves.
+
+    Args:
+        step: Change of each picture to the next.
+        far: Change of each picture to the one ten frames on.
+    """
+    so_far = np.concatenate([[0.0], np.cumsum(step)])
+    near = (so_far[_AHEAD:] - so_far[:-_AHEAD]) / _AHEAD
+    # Noise is as large from each picture to any other one.
+    moves = (near > _NOISE) | (far > _GOES_ON * near)
+    return float(np.median(far[moves])) if moves.any() else 0.0
 
 
 class StandingWatch:

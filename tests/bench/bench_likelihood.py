@@ -30,7 +30,7 @@ from datagen.slam.odometry import Evidence
 from datagen.slam.picture_pairs import Pictures
 from datagen.slam.places import path_lengths
 from datagen.slam.scans import scans_of
-from datagen.slam.segment import road_edges
+from datagen.slam.seen import road_edges
 from lanenet.config import load_settings
 from lanenet.data.drive import read_truth
 from lanenet.errors import LanenetError

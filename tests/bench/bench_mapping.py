@@ -2,7 +2,9 @@
 
 Random loops of all presets, both directions, every random effect, three cameras, half of them recorded as a
 Donkeycar does (throttle and angle with unknown gains). Each drive is mapped with its camera known and with
-the camera found from the drive. Prints JSON, a line per drive and mode, then medians and worst values.
+the camera found from the drive; the wheelbase is told in either case, as by ``lanenet map --wheelbase``.
+``--extra`` adds drives of another kind, which do not count for the rest: one that crawls, 1 cm per frame, and
+one with pauses. Prints JSON, a line per drive and mode, then medians and worst values.
 """
 
 from __future__ import annotations
@@ -23,10 +25,12 @@ from datagen.labels.mapped_drive import read_map_frames
 from datagen.map_folder import read_map
 from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
+from datagen.slam.places import path_lengths
+from datagen.slam.stillness import following_frames
 from datagen.world.simulate import simulate_drive
 from datagen.world.track_settings import preset_names
 from datagen.world.world import SimulationSettings
-from lanenet.data.drive import read_truth
+from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.trajectory import read_tum
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -41,6 +45,21 @@ CAMERAS: tuple[dict[str, Any], ...] = (
      "roll_rad": -0.015, "yaw_rad": 0.02, "distortion": (-0.02, 0.0, 0.0, 0.0)},
 )  # fmt: skip
 LAPS = 1.6
+#: Drives of another kind, by name.
+EXTRA: dict[str, dict[str, Any]] = {
+    "crawl": {
+        "seed": 91_000,
+        "frames": 1100,
+        "track": {"closed": True, "length_cm": 560.0},
+        "driver": {"style": "crawl"},
+    },
+    "pauses": {
+        "seed": 91_001,
+        "frames": 800,
+        "track": {"closed": True, "length_cm": 900.0},
+        "driver": {"pauses_per_m": 0.3, "pause_s": 4.0},
+    },
+}
 
 
 def drive_settings(number: int) -> SimulationSettings:
@@ -96,25 +115,24 @@ def drift_percent(opened: np.ndarray, true_xy: np.ndarray, way_cm: float = 300.0
     return 100.0 * float(np.mean(misses)) if misses else float("nan")
 
 
-def judge(number: int, folder: Path, known: bool) -> dict[str, Any]:
+def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) -> dict[str, Any]:
     """Map one drive and compare with its truth."""
-    settings = drive_settings(number)
-    drive = folder / f"{number:03d}"
+    drive = folder / name
     if not (drive / "truth.csv").exists():
         simulate_drive(settings, drive)
-    blind = folder / f"{number:03d}_blind"
+    blind = folder / f"{name}_blind"
     if not known and not (blind / "frames.csv").exists():
         shutil.copytree(drive, blind)
         (blind / "drive.yaml").unlink()
         (blind / "camera.yaml").unlink()
     truth = read_truth(drive)
     assert truth is not None
-    name = settings.track.preset
-    row: dict[str, Any] = {"drive": number, "preset": name, "camera": "known" if known else "found"}
+    row: dict[str, Any] = {"drive": name, "preset": settings.track.preset}
+    row["camera"] = "known" if known else "found"
     row |= {"frames": settings.frames, "recording": settings.recording}
     lane_width_cm = settings.track.lane_width_cm
     start = time.process_time()
-    out = folder / f"{number:03d}_map_{row['camera']}"
+    out = folder / f"{name}_map_{row['camera']}"
     shutil.rmtree(out, ignore_errors=True)
     map_settings = MapSettings.model_validate({"guess": {"wheelbase_cm": settings.car.wheelbase_cm}})
     try:
@@ -124,11 +142,13 @@ def judge(number: int, folder: Path, known: bool) -> dict[str, Any]:
     row["cpu_s"] = round(time.process_time() - start, 1)
     drive_map, frames = read_map(out), read_map_frames(out)
     index = drive_map.frames
-    true_points = np.stack([truth[name] for name in POINT_NAMES], axis=1)[index]
+    true_points = np.stack([truth[point] for point in POINT_NAMES], axis=1)
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
-    miss_cm = frames.points_cm - true_points
-    known_truth = np.isfinite(true_points)
-    row["labelled"] = round(float(np.isfinite(miss_cm).sum() / max(known_truth.sum(), 1)), 4)
+    miss_cm = frames.points_cm - true_points[index]
+    # A frame that counts and was not mapped is one without labels; repeated ones and pauses do not count.
+    counted = np.unique(np.concatenate([following_frames(open_drive(drive), []).frames, index]))
+    labelable = np.isfinite(true_points[counted]).sum()
+    row["labelled"] = round(float(np.isfinite(miss_cm).sum() / max(labelable, 1)), 4)
     for k, y_cm in enumerate(ROWS_CM):
         part = miss_cm[:, [k, k + len(ROWS_CM)]]
         part = part[np.isfinite(part)]
@@ -136,6 +156,8 @@ def judge(number: int, folder: Path, known: bool) -> dict[str, Any]:
     part = miss_cm[np.isfinite(miss_cm)]
     row["p95_cm"] = round(float(np.percentile(np.abs(part), 95.0)), 3) if part.size else None
     xy = np.stack([truth["x_cm"], truth["y_cm"]], axis=1)[index]
+    way_cm, true_way_cm = (path_lengths(path)[-1] for path in (drive_map.poses, xy))
+    row["way_error_percent"] = round(100.0 * float(way_cm / true_way_cm - 1.0), 2)
     miss = np.linalg.norm(aligned(drive_map.poses[:, :2], xy) - xy, axis=1)
     lap_cm = settings.track.length_cm or 0.0
     row["ate_cm_per_10_m"] = round(float(np.sqrt(np.mean(miss**2))) * 1000.0 / lap_cm, 3)
@@ -154,21 +176,29 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="drives and maps are kept here")
     parser.add_argument("--drives", default="0:20", help="first:last")
     parser.add_argument("--camera", choices=("known", "found", "both"), default="both")
+    parser.add_argument("--extra", action="store_true", help="also drives that crawl and pause")
     parser.add_argument("--processes", type=int, default=1)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     first, last = map(int, args.drives.split(":"))
     modes = {"known": [True], "found": [False], "both": [True, False]}[args.camera]
+    drives = {f"{number:03d}": drive_settings(number) for number in range(first, last)}
+    if args.extra:
+        drives |= {name: SimulationSettings.model_validate(values) for name, values in EXTRA.items()}
     rows = []
     with ProcessPoolExecutor(args.processes) as pool:
         for known in modes:
-            jobs = [pool.submit(judge, number, args.folder, known) for number in range(first, last)]
+            jobs = [pool.submit(judge, *drive, args.folder, known) for drive in drives.items()]
             for job in jobs:
                 rows.append(job.result())
                 sys.stdout.write(json.dumps(rows[-1]) + "\n")
                 sys.stdout.flush()
     for mode in ("known", "found"):
-        part = [row for row in rows if row["camera"] == mode and "refused" not in row]
+        part = [
+            row
+            for row in rows
+            if row["camera"] == mode and row["drive"] not in EXTRA and "refused" not in row
+        ]
         if not part:
             continue
         summary: dict[str, object] = {"camera": mode, "mapped": len(part)}

@@ -23,7 +23,7 @@ from typing import Any
 
 from datagen import pipeline, self_calibration, stretches
 from datagen.map_settings import MapSettings
-from datagen.slam import mapper, segment
+from datagen.slam import mapper, seen, segment
 
 #: Outermost first.
 STAGES: list[tuple[ModuleType, str]] = [
@@ -31,8 +31,8 @@ STAGES: list[tuple[ModuleType, str]] = [
     (pipeline, "find_camera"),
     (self_calibration, "coarse_camera"),
     (self_calibration, "solve_segment"),
-    (segment, "edges_of_drive"),
-    (segment, "without_reflections"),
+    (seen, "edges_of_drive"),
+    (seen, "without_reflections"),
     (segment, "scans_of"),
     (mapper, "Evidence"),
     (mapper, "run_filter"),

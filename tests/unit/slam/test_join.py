@@ -11,11 +11,11 @@ from pixel_road import fisheye
 
 from datagen.map_settings import MapSettings
 from datagen.slam.bundle import BundleSettings
+from datagen.slam.crawl import solve_segment
 from datagen.slam.filter import FilterSettings
 from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
 from datagen.slam.loop_pairs import loop_pairs
 from datagen.slam.places import Revisit, RevisitSettings, relative_pose
-from datagen.slam.segment import solve_segment
 from lanenet.data.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 

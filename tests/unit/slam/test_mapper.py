@@ -19,8 +19,8 @@ from datagen.slam.mapper import (
     motion_about,
     track,
 )
-from datagen.slam.odometry import Odometry
-from datagen.slam.picture_pairs import OdometrySettings
+from datagen.slam.odometry import Odometry, usual_way
+from datagen.slam.picture_pairs import OdometrySettings, Pictures
 from datagen.slam.scans import scans_of
 from lanenet.data.recording import Commands, Drive
 from lanenet.perception.birdseye import RangeSettings
@@ -178,15 +178,17 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     calls: list[tuple[int, int]] = []
     camera = fisheye()
     edges = pixels(road, camera)
+    rng = np.random.default_rng(0)
+    pictures = Pictures(edges, camera, OdometrySettings(), rng)
     trajectory, fit = track(
-        edges,
+        pictures,
         scans_of(edges, camera, RangeSettings()),
         commands,
+        usual_way(pictures, commands.distance_cm, speed_known, HEIGHT_CM),
         camera,
         FilterSettings(particles=200),
         MotionSettings(),
-        OdometrySettings(),
-        np.random.default_rng(0),
+        rng,
         lambda done, total: calls.append((done, total)),
     )
     assert calls == [(k, 2 * n) for k in range(1, 2 * n + 1)]

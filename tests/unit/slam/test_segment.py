@@ -13,11 +13,12 @@ from pixel_road import camera_numbers, fisheye
 from datagen.map_settings import MapSettings
 from datagen.self_calibration import SIGMA_FACTOR
 from datagen.slam.bundle import BundleSettings
+from datagen.slam.crawl import solve_segment
 from datagen.slam.filter import FilterSettings
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.segment import SolvedSegment, relative_ways, solve_segment
+from datagen.slam.segment import SolvedSegment, relative_ways
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.recording import Commands, Drive

@@ -45,6 +45,25 @@ def test_a_stop_is_found_and_a_crawl_is_not_one(step_px, seed):
     assert not standing[:96].any() and not standing[144:].any()
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.85])
+@pytest.mark.parametrize("step_px", [0.15, 1.5])
+@pytest.mark.parametrize("seed", range(4))
+def test_stops_are_found_however_long_the_car_stands_in_all(share, step_px, seed):
+    # Three stops within 150 frames of driving.
+    still = np.zeros(round(150 / (1.0 - share)), dtype=bool)
+    each = (len(still) - 150) // 3
+    for k in range(3):
+        still[40 + k * (each + 30) :][:each] = True
+    place = np.cumsum(np.where(still, 0.0, step_px))
+    # The light drifts all along.
+    gain = 1.0 + np.cumsum(0.004 * np.random.default_rng(seed).standard_normal(len(still)))
+    small = pictures(place, noise=0.3, seed=seed) * gain[:, None, None].astype(np.float32)
+    found = standing_frames(small)
+    assert found[still].mean() > 0.95
+    # A few frames as the car sets off or comes to rest.
+    assert found[~still].sum() <= 18
+
+
 def test_a_picture_that_was_recorded_twice_is_left_out():
     small = pictures(np.arange(60) * 1.0)
     small[30] = small[29]

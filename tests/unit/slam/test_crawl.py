@@ -1,0 +1,72 @@
+"""A car that crawls for a part of its drive: followed by key frames, every frame on the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from picture_road import loop_drive
+from pixel_road import fisheye
+
+from datagen.map_settings import MapSettings
+from datagen.slam.bundle import BundleSettings
+from datagen.slam.crawl import solve_segment
+from datagen.slam.filter import FilterSettings
+from datagen.slam.places import path_lengths
+from datagen.slam.segment import SolvedSegment
+from lanenet.data.recording import Commands, Drive
+from lanenet.geometry.camera import Camera
+
+SMALL = MapSettings(filter=FilterSettings(particles=80, max_points=80), bundle=BundleSettings(points=40))
+STEP_CM, CRAWLED = 0.6, 180
+
+
+def _camera() -> Camera:
+    """A wide lens that looks well down, so that many of the few dashes are in view."""
+    camera = fisheye(pitch_down_rad=0.42)
+    return replace(camera, K=camera.K * np.array([[0.75, 0.0, 1.0], [0.0, 0.75, 1.0], [0.0, 0.0, 1.0]]))
+
+
+def _drive() -> tuple[Drive, np.ndarray]:
+    """Frames 6 mm apart, then 3 cm, on a loop of 360 cm, most of it driven."""
+    drive, poses = loop_drive(_camera(), 480, 600, 600 * STEP_CM, seed=1)
+    rows = np.r_[0:CRAWLED, CRAWLED:480:5]
+    step_cm = np.where(rows < CRAWLED, STEP_CM, 5.0 * STEP_CM)
+    thinned = replace(drive.subset(rows), t_s=0.05 * np.arange(len(rows)))
+    return replace(thinned, commands=Commands(speed_cm_s=step_cm / 0.05)), poses[rows]
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[SolvedSegment, np.ndarray]:
+    drive, true = _drive()
+    return solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None), true
+
+
+def test_the_way_is_that_of_the_car_crawling_or_not(solved):
+    segment, true = solved
+    assert len(segment.poses) == len(segment.scans) == len(true)
+    found, driven = path_lengths(segment.poses), path_lengths(true)
+    for start, stop in ((0, CRAWLED), (CRAWLED, len(true) - 1)):
+        way = driven[stop] - driven[start]
+        assert found[stop] - found[start] == pytest.approx(way, rel=0.04)
+    assert found[-1] == pytest.approx(driven[-1], rel=0.02)
+    turn = segment.poses[-1, 2] - segment.poses[0, 2]
+    assert turn == pytest.approx(true[-1, 2] - true[0, 2], abs=np.deg2rad(3.0))
+
+
+def test_every_frame_of_the_crawl_moves_on(solved):
+    segment, _ = solved
+    steps_cm = np.diff(path_lengths(segment.poses))[: CRAWLED - 1]
+    assert steps_cm.min() > 0.3 * STEP_CM and steps_cm.max() < 1.8 * STEP_CM
+    assert segment.bundle.robust_sd_px < 0.3
+    # Ways from key frame to key frame are those of a drive.
+    matches = len(np.unique(segment.trajectory.match[1:]))
+    assert matches == pytest.approx(CRAWLED / 4 + 60, abs=8)
+
+
+def test_where_no_speed_was_recorded_a_crawl_shows_by_its_step():
+    drive, poses = loop_drive(_camera(), 130, 600, 600 * STEP_CM, seed=1)
+    segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
+    assert len(np.unique(segment.trajectory.match[1:])) < 50
+    assert path_lengths(segment.poses)[-1] == pytest.approx(path_lengths(poses)[-1], rel=0.1)
