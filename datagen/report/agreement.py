@@ -74,18 +74,19 @@ def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
 def _disagrees(samples: BorderSamples, width: int) -> tuple[bool, bool]:
     """Whether a frame disagrees with its left and with its right line.
 
-    Missing paint speaks against the map only where both lines lack it. A line that met too few edges to speak
-    for itself goes with the other one, as where the frame is lost.
+    Missing paint speaks against the map only where both lines lack it, and a line that met too few edges does
+    not speak for itself.
     """
     met = samples.residual_px[samples.found]
     if met.size < _LEAST_MET * len(samples.residual_px):
         return True, True
-    both = _off_px(met, width) > _OFF_PX
-    alone_px = [
-        _off_px(samples.residual_px[samples.found & (samples.right == side)], width) for side in (False, True)
-    ]
-    bound_px = _OFF_PX if both else _ALONE_PX
-    left, right = (both if off_px != off_px else off_px > bound_px for off_px in alone_px)
+    if _off_px(met, width) > _OFF_PX:
+        # Where the frame is lost, one of its lines may meet something by chance.
+        return True, True
+    left, right = (
+        _off_px(samples.residual_px[samples.found & (samples.right == side)], width) > _ALONE_PX
+        for side in (False, True)
+    )
     return left, right
 
 
