@@ -162,7 +162,6 @@ def _join(
         open_poses=np.concatenate([base.solved.open_poses, opened])[order],
         poses=bundle.poses,
         revisits=[replace(r, earlier=int(place[r.earlier]), later=int(place[r.later])) for r in revisits],
-        residuals=missed,
         bundle=bundle,
         breaks=breaks,
     )

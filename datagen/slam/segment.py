@@ -50,7 +50,6 @@ class SolvedSegment:
         poses: The same after closing loops, frame map.
         steering: How curvature answers to the command, where it does.
         revisits: Places seen twice.
-        residuals: What each revisit misses after closing: ahead, left, heading.
         drift_rad_per_cm: Heading that the open loop missed per length; None without a revisit.
         bundle: The adjustment.
         breaks: Frames that do not follow the one before them; None for an uninterrupted segment.
@@ -63,7 +62,6 @@ class SolvedSegment:
     poses: Float[np.ndarray, "n 3"]
     steering: SteeringFit | None
     revisits: list[Revisit]
-    residuals: Float[np.ndarray, "r 3"]
     drift_rad_per_cm: float | None
     bundle: BundleResult
     breaks: Bool[np.ndarray, "n"] | None = None
@@ -163,7 +161,6 @@ def solve_frames(
         poses=bundle.poses,
         steering=steering,
         revisits=[] if closure is None else closure.revisits,
-        residuals=np.empty((0, 3)) if closure is None else closure.residuals,
         drift_rad_per_cm=None if closure is None else closure.drift_rad_per_cm,
         bundle=bundle,
     )
@@ -171,10 +168,9 @@ def solve_frames(
 
 @dataclass(frozen=True)
 class _Closure:
-    """A way to close the loops: its revisits, what each misses, the drift that it found, and the map."""
+    """A way to close the loops: its revisits, the drift that it found, and the map."""
 
     revisits: list[Revisit]
-    residuals: Float[np.ndarray, "r 3"]
     drift_rad_per_cm: float
     bundle: BundleResult
 
@@ -228,7 +224,7 @@ def _closed_by(
         road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
         expected=relative_ways(commands), believed=believed, keep=road.keep, recorded=commands.speed_known,
     )  # fmt: skip
-    return _Closure(revisits, missed, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
+    return _Closure(revisits, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
 
 def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:

@@ -42,7 +42,6 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
         poses=poses,
         steering=None,
         revisits=[],
-        residuals=np.zeros((0, 3)),
         drift_rad_per_cm=None,
         bundle=BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(1), 0.0, 1),
     )

@@ -18,7 +18,8 @@ from datagen.slam.filter import FilterSettings
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion
 from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.segment import SolvedSegment, relative_ways
+from datagen.slam.posegraph import missed_by
+from datagen.slam.segment import SolvedSegment
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.recording import Commands, Drive
@@ -103,8 +104,7 @@ def test_revisits_are_a_lap_apart_and_meet(solved):
     for revisit in segment.revisits:
         assert abs(revisit.later - revisit.earlier - LAP_FRAMES) <= 2
         assert revisit.turns == 1
-    assert segment.residuals.shape == (len(segment.revisits), 3)
-    missed = np.median(np.abs(segment.residuals), axis=0)
+    missed = np.median(np.abs(missed_by(segment.poses, segment.revisits)), axis=0)
     assert missed[:2].max() < 1.0 and missed[2] < np.deg2rad(1.0)
     assert segment.drift_rad_per_cm is not None
     missed_rad = [
@@ -128,7 +128,7 @@ def test_one_lap_stays_open():
     drive, true = _drive(60)
     segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
     assert segment.revisits == [] and segment.drift_rad_per_cm is None
-    assert segment.residuals.shape == (0, 3) and not segment.laps.any()
+    assert not segment.laps.any()
     np.testing.assert_array_equal(segment.poses, segment.open_poses)
     # Open, and with few dashes in so short a drive, the length is known to a sixth or so, whatever the seed.
     assert segment.path_cm[-1] == pytest.approx(path_lengths(true)[-1], rel=0.2)
