@@ -16,7 +16,7 @@ from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, commands_of, fit_steering
 from datagen.slam.scans import Progress, scans_of
 from datagen.slam.seen import road_edges, see_drive
-from datagen.slam.segment import SolvedSegment, relative_ways, solve_frames
+from datagen.slam.segment import SolvedSegment, solve_frames
 from lanenet.data.drive import Drive
 from lanenet.geometry.camera import Camera
 
@@ -105,7 +105,7 @@ def _with_frames_between(
         pairs += loop_pairs(revisits, none) + side_by_side(poses, height, settings.revisits)
     bundle = adjust(
         road.edges, poses, camera, settings.bundle, rng, (), pairs,
-        values_between(solved.bundle.tilt, keys, ways), expected=relative_ways(commands), keep=road.keep,
+        values_between(solved.bundle.tilt, keys, ways), expected=commands.relative_ways, keep=road.keep,
     )  # fmt: skip
     opened, t = poses_between(solved.open_poses, keys, ways), solved.trajectory
     # How well a key frame matched goes for those before it.

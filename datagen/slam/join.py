@@ -33,12 +33,7 @@ from datagen.slam.places import (
 from datagen.slam.posegraph import borne_out, close_loops
 from datagen.slam.scans import Scans, scans_of
 from datagen.slam.seen import road_edges
-from datagen.slam.segment import (
-    MAX_MISFIT,
-    MAX_MISSED,
-    SolvedSegment,
-    relative_ways,
-)
+from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment
 from lanenet.data.drive import Drive
 from lanenet.geometry.frames import wrap_angle
 
@@ -132,7 +127,7 @@ def _join(
     roads = [road_edges(part, camera, limits, settings) for part in drives]
     edges = [pixels for road in roads for pixels in road.edges]
     commands = [commands_of(part, camera.wheelbase_cm) for part in drives]
-    expected = np.concatenate([relative_ways(part) for part in commands])
+    expected = np.concatenate([part.relative_ways for part in commands])
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     loops = loop_pairs(revisits, breaks)
     for _ in range(2):

@@ -62,6 +62,12 @@ class CommandedMotion:
     speed_known: bool
     turn: Float[np.ndarray, "n"] | None
 
+    @property
+    def relative_ways(self) -> Float[np.ndarray, "n"]:
+        """Commanded way per frame relative to the usual one; 0 where the car was told to stand."""
+        moving = self.distance_cm[self.distance_cm > 0.0]
+        return self.distance_cm / (float(np.median(moving)) if moving.size else 1.0)
+
 
 @dataclass(frozen=True)
 class SteeringFit:

@@ -114,10 +114,9 @@ def solve_frames(
         progress, far_turns(drive, camera),
     )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
-    expected = relative_ways(commands)
     opened = adjust(
         road.edges, trajectory.poses, camera, settings.bundle, rng, free,
-        expected=expected, believed=believed, keep=road.keep, recorded=commands.speed_known,
+        expected=commands.relative_ways, believed=believed, keep=road.keep, recorded=commands.speed_known,
     )  # fmt: skip
     scans = scans_of(road.edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
@@ -146,8 +145,8 @@ def solve_frames(
             loops = loop_pairs(true, none) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 road.edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=expected, believed=believed, keep=road.keep,
-                recorded=commands.speed_known,
+                loops=loops, tilt=bundle.tilt, expected=commands.relative_ways, believed=believed,
+                keep=road.keep, recorded=commands.speed_known,
             )  # fmt: skip
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
@@ -222,15 +221,9 @@ def _closed_by(
     loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
     closed = adjust(
         road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-        expected=relative_ways(commands), believed=believed, keep=road.keep, recorded=commands.speed_known,
+        expected=commands.relative_ways, believed=believed, keep=road.keep, recorded=commands.speed_known,
     )  # fmt: skip
     return _Closure(revisits, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
-
-
-def relative_ways(commands: CommandedMotion) -> Float[np.ndarray, "n"]:
-    """Commanded way per frame relative to the usual one; 0 where the car was told to stand."""
-    moving = commands.distance_cm[commands.distance_cm > 0.0]
-    return commands.distance_cm / (float(np.median(moving)) if moving.size else 1.0)
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:

@@ -147,9 +147,9 @@ def test_pairs_around_a_revisit_stay_within_the_drive():
 
 
 def test_ways_are_relative_to_the_usual_one():
-    ways = relative_ways(CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None))
-    np.testing.assert_allclose(ways, [0.0, 1.0, 1.0, 2.0, 0.0])
-    np.testing.assert_array_equal(relative_ways(CommandedMotion(np.zeros(3), True, None)), np.zeros(3))
+    commands = CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
+    np.testing.assert_allclose(commands.relative_ways, [0.0, 1.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_ways, np.zeros(3))
 
 
 @pytest.mark.slow
