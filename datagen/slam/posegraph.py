@@ -106,7 +106,7 @@ def _integrate(
 
 
 def missed_by(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
-    """What each revisit misses with these poses: ahead, left, heading."""
+    """What each revisit misses with these poses: ahead and to the left, [cm], and in heading, [rad]."""
     if not revisits:
         return np.empty((0, 3))
     seen = np.array([relative_pose(poses[r.earlier], poses[r.later]) for r in revisits])

@@ -45,7 +45,8 @@ class SolvedSegment:
     Attributes:
         camera: The camera, adjusted where it was not known.
         scans: Edge points per frame, with the camera as it nodded in each.
-        trajectory: Open-loop trajectory of the particle filter.
+        trajectory: Open-loop trajectory of the particle filter; where the car crawls, that of key frames,
+            with the others put between.
         open_poses: Rear-axle poses, adjusted, before loops were closed.
         poses: The same after closing loops, frame map.
         steering: How curvature answers to the command, where it does.
@@ -95,7 +96,7 @@ def solve_frames(
     find_camera: bool = False,
     believed: Camera | None = None,
 ) -> SolvedSegment:
-    """Track one segment, close its loops, and adjust all of it together.
+    """Track one segment by all of its frames, close its loops, and adjust all of it together.
 
     Args:
         seen: The segment; a car that crawls is followed by key frames, see :mod:`datagen.slam.crawl`.
