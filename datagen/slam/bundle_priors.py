@@ -10,6 +10,9 @@ from datagen.slam.bundle_kernels import N_FRAME
 from datagen.slam.bundle_settings import BundleSettings
 from datagen.slam.bundle_state import BundleState
 
+#: Shorter commanded ways than this, 1 where they are usual, count as this one.
+_LEAST_WAY = 0.1
+
 
 def frame_priors(
     state: BundleState,
@@ -64,7 +67,7 @@ def frame_priors(
     follows = np.flatnonzero(j[:-1] == i[1:])
     a, b = follows, follows + 1
     # Ways in proportion to what was commanded; where the car was told to stand, its way is left alone.
-    per = np.where(expected[j] > 0.0, 1.0 / np.maximum(expected[j], 0.1), 0.0)
+    per = np.where(expected[j] > 0.0, 1.0 / np.maximum(expected[j], _LEAST_WAY), 0.0)
     per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
     add(
         per_b * along[b] - per_a * along[a],
@@ -78,7 +81,8 @@ def frame_priors(
         *((k, 0.5 * per_b * across[b]) for k in (ti[b], tj[b])),
         *((k, -0.5 * per_a * across[a]) for k in (ti[a], tj[a])),
     )
-    told = np.flatnonzero(per > 0.0) if recorded else np.zeros(0, np.int64)
+    # Of a car that hardly moves the recorded speed says little of the way.
+    told = np.flatnonzero(expected[j] >= _LEAST_WAY) if recorded else np.zeros(0, np.int64)
     if told.size:
         # Of the gain the ways themselves are asked: what all have in common is left to the pictures.
         usual = max(float(np.median(per[told] * along[told])), 1e-6)

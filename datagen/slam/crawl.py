@@ -106,6 +106,7 @@ def _with_frames_between(
     bundle = adjust(
         road.edges, poses, camera, settings.bundle, rng, (), pairs,
         values_between(solved.bundle.tilt, keys, ways), expected=commands.relative_ways, keep=road.keep,
+        recorded=commands.speed_known,
     )  # fmt: skip
     opened, t = poses_between(solved.open_poses, keys, ways), solved.trajectory
     # How well a key frame matched goes for those before it.
