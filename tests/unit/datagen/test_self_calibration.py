@@ -51,9 +51,7 @@ def found(heading: np.ndarray, revisits: int = 8, focal_sigma: float = 0.02) -> 
     bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, SIGMA, np.zeros(5), 1.0, 10)
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
     places = [REVISIT] * revisits
-    solved = SolvedSegment(
-        CAMERA, nothing, trajectory, poses, poses, None, places, np.zeros((revisits, 3)), None, bundle
-    )
+    solved = SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, places, None, bundle)
     return FoundCamera(solved, [], {**SIGMA, "focal": focal_sigma}, False, 0.5)
 
 

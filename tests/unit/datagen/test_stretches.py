@@ -58,7 +58,7 @@ def _solved(n: int) -> SolvedSegment:
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
     bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), 1.0, 10)
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
-    return SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, [], np.zeros((0, 3)), None, bundle)
+    return SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, [], None, bundle)
 
 
 @pytest.mark.parametrize("at", [70, 130])
