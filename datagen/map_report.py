@@ -150,17 +150,17 @@ def contradicted_share(contradicted: Bool[np.ndarray, "n 2"] | None, deleted: Bo
 
 def map_evidence(
     drive_map: DriveMap,
-    parts: list[MappedSegment],
     figures: dict[str, Any],
     deleted: Bool[np.ndarray, "n"],
+    free_cm: float | None,
 ) -> MapEvidence:
     """Collect what the verdict rests on.
 
     Args:
         drive_map: The map.
-        parts: Its segments.
         figures: Those of the map and of its quality.
         deleted: Which frames of the map the driver deleted.
+        free_cm: See :func:`free_lane_cm`.
     """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
     held = figures["held_out"]
@@ -173,7 +173,6 @@ def map_evidence(
     revisits = sum(count for _, count in across)
     # A camera that was given stays known when the drive has refined it: no search has guessed its lens.
     known = not figures.get("calibration", {}).get("candidates")
-    free_cm = free_lane_cm(parts)
     return MapEvidence(
         lines={
             side: LineEvidence(

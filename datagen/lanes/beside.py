@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from datagen.lanes.follow import follow_line
 from datagen.lanes.line import Side
 from datagen.lanes.path import Path, PathEdges
-from datagen.lanes.profile import edge_profile
-from datagen.lanes.trace import TracedLane, known_middle
+from datagen.lanes.trace import TracedLane, known_middle, profile_along
 from datagen.lanes.trace_settings import TraceSettings
 from datagen.runs import true_runs
 
@@ -41,9 +40,7 @@ def trace_beside(
     Returns:
         The driven lane, with the lines beside it.
     """
-    cell = settings.cell_heights * camera_height_cm
-    half = int(settings.side_heights / settings.cell_heights)
-    profile = edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
+    profile = profile_along(path, edges, camera_height_cm, settings)
     tapes = profile.tapes(lane.tape_cm)
     band = 2.0 * settings.width_share * lane.lane_cm
     beside: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}

@@ -70,9 +70,7 @@ def trace_lane(
     Raises:
         TrackingLostError: If no pair of lines runs along the path.
     """
-    cell = settings.cell_heights * camera_height_cm
-    half = int(settings.side_heights / settings.cell_heights)
-    profile = edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
+    profile = profile_along(path, edges, camera_height_cm, settings)
     driven = len(path.xy_cm)
     if not path.closed:
         driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
@@ -94,6 +92,15 @@ def trace_lane(
             "and the camera's height, and look at the map's picture"
         )
     return TracedLane(left, right, centre, lane, tape)
+
+
+def profile_along(
+    path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings
+) -> EdgeProfile:
+    """Density of edges beside the path in which lines are followed."""
+    cell = settings.cell_heights * camera_height_cm
+    half = int(settings.side_heights / settings.cell_heights)
+    return edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
 
 
 def known_middle(
