@@ -111,11 +111,12 @@ class DriveMap:
         """The lane of each frame, and its direction of travel along the segment's path."""
         lane = np.zeros(len(self.frames), dtype=np.int64)
         forward = np.ones(len(self.frames), dtype=bool)
+        between = np.zeros(len(self.frames), dtype=bool)
         for segment, lines in self.lines.items():
             rows = np.flatnonzero(self.segment == segment)
             found = assign_lanes(lines, self.poses[rows], self.s_cm[rows], self.camera.wheelbase_cm)
-            lane[rows], forward[rows] = found.lane, found.forward
-        return FrameLanes(lane, forward)
+            lane[rows], forward[rows], between[rows] = found.lane, found.forward, found.between
+        return FrameLanes(lane, forward, between)
 
 
 def write_map(

@@ -25,6 +25,7 @@ _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 CONTRADICTED = "the pictures disagree with the map"
+BETWEEN_LANES = "on the line between two lanes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +105,18 @@ def label_frame(
 ) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:
     """Return the lane of the map's k-th frame and its six labels, or why it gets none.
 
-    A frame gets no labels where its pose is uncertain (few edges match the map), where the pictures disagree
-    with both of the map's lines, or where the driver has deleted it; a point is masked where they disagree
-    with its line, where the map does not support it, or where it lies beside the window.
+    A frame gets no labels where its pose is uncertain (few edges match the map), where the car is between two
+    lanes, where the pictures disagree with both of the map's lines, or where the driver has deleted it; a
+    point is masked where they disagree with its line, where the map does not support it, or where it lies
+    beside the window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED
     # The first frame of a segment has no map to match yet, so that its match is NaN.
     if mapped.drive_map.match[k] < _MIN_MATCH:
         return UNCERTAIN
+    if mapped.drive_map.lanes.between[k]:
+        return BETWEEN_LANES
     seen = lines_at(mapped.drive_map, k)
     visible = window.labelled(seen.points_cm)
     if not np.isfinite(visible).any():

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from datagen.lanes.assign import BEYOND_LANES
 from datagen.world.track_file import read_track
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.label_set import LabelMeta, LabelSet
@@ -26,6 +27,8 @@ def truth_labels(
     marking_cm: float | None = None,
 ) -> LabelSet:
     """Make a label set from a simulator's truth, for scoring.
+
+    As in a map's labels, the frames on the line between two lanes have none.
 
     Args:
         drive_path: Simulated drive.
@@ -48,6 +51,9 @@ def truth_labels(
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
+    lines, between = _true_lines(drive_path, poses, drive.camera.wheelbase_cm)
+    points_cm = window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1))
+    points_cm[between] = np.nan
     return LabelSet(
         meta=LabelMeta(
             window=window,
@@ -65,28 +71,35 @@ def truth_labels(
         t_s=drive.t_s,
         lap=np.zeros(n, dtype=np.int64),
         poses=poses,
-        points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
+        points_cm=points_cm,
         edges=edges,
-        lines=_true_lines(drive_path, poses, drive.camera.wheelbase_cm),
+        lines=lines,
         quality=np.ones(n),
     )
 
 
 def _true_lines(
     drive_path: Path, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The lines of the driven lane in each frame, as thin as a map's; none without a road."""
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"]]:
+    """The lines of the driven lane in each frame, as thin as a map's, and whether it is between two lanes.
+
+    Without a road there are none.
+    """
+    between = np.zeros(len(poses), dtype=bool)
     if not (drive_path / "track.json").is_file():
         nothing = np.empty((0, 2))
-        return [(nothing, nothing)] * len(poses)
+        return [(nothing, nothing)] * len(poses), between
     track = read_track(drive_path / "track.json")
     every = max(1, round(_SAMPLE_CM / track.step_cm))
     lines = []
     place: float | None = None
-    for pose in poses:
+    for k, pose in enumerate(poses):
         # Where the road comes near itself, the car is on the stretch that it was on before.
         front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
-        place = track.nearest(front, place)[0]
+        place, offset_cm = track.nearest(front, place)
         left, right = track.lines_car(pose, wheelbase_cm, place)
         lines.append((left[::every], right[::every]))
-    return lines
+        if track.oncoming_cm is not None:
+            share = offset_cm / track.oncoming_cm  # 0 in the middle of the driver's lane, 1 in the other's
+            between[k] = abs(share - 0.5) < BEYOND_LANES
+    return lines, between

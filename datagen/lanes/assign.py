@@ -11,7 +11,7 @@ from datagen.lanes.line import LaneLine
 from datagen.runs import equal_runs
 
 #: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
-_BEYOND = 0.1
+BEYOND_LANES = 0.1
 #: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
 _ENTERED = 0.2
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
@@ -26,10 +26,12 @@ class FrameLanes:
         lane: Index of the line on the left of the lane, seen in the path's direction: 0 for the driven lane,
             -1 for the one to its left, 1 for the one to its right.
         forward: Whether the frame drives in the path's direction.
+        between: Frames on the line between two lanes: which one is meant cannot be told from the picture.
     """
 
     lane: Int[np.ndarray, "n"]
     forward: Bool[np.ndarray, "n"]
+    between: Bool[np.ndarray, "n"]
 
 
 def assign_lanes(
@@ -40,7 +42,7 @@ def assign_lanes(
     The lane is the one in which the middle of the front axle is; it changes when that is clearly beyond a
     line that has a lane behind it: one of which the far line is seen there, or any behind dashes. Beside the
     road the car keeps the lane that it left, and so it does where it comes back before it is well inside the
-    other one.
+    other one. On such a line and close beside it a frame is between two lanes.
 
     Args:
         lines: Lines of the segment.
@@ -60,7 +62,7 @@ def assign_lanes(
     usual = float(np.nanmedian(left_of[1] - left_of[0]))
     exists = _lanes(by_index, left_of, s_front, usual)
     lane = np.zeros(n, dtype=np.int64)
-    margin, current = _BEYOND * usual, 0
+    margin, current = BEYOND_LANES * usual, 0
     # The first frame may be in any lane.
     for k in [0] * min(n, len(exists)) + list(range(n)):
         if current - 1 in exists and left_of[current][k] > margin and exists[current - 1][k]:
@@ -68,7 +70,8 @@ def assign_lanes(
         elif current + 1 in exists and left_of[current + 1][k] < -margin and exists[current + 1][k]:
             current += 1
         lane[k] = current
-    return FrameLanes(_without_swerves(lane, left_of, _ENTERED * usual), forward)
+    lane = _without_swerves(lane, left_of, _ENTERED * usual)
+    return FrameLanes(lane, forward, _between_lanes(lane, left_of, exists, margin))
 
 
 def _lanes(
@@ -105,6 +108,22 @@ def _without_swerves(
         if home == lane[after[0]] and inside.max() < entered_cm:
             lane[run] = home
     return lane
+
+
+def _between_lanes(
+    lane: Int[np.ndarray, "n"],
+    left_of: dict[int, Float[np.ndarray, "n"]],
+    exists: dict[int, Bool[np.ndarray, "n"]],
+    margin_cm: float,
+) -> Bool[np.ndarray, "n"]:
+    """Tell which frames are not clearly inside their lane on a side where there is another one."""
+    between = np.zeros(len(lane), dtype=bool)
+    for i in exists:
+        inside = {i - 1: -left_of[i] if i in left_of else None, i + 1: left_of.get(i + 1)}
+        for beside, far_in_cm in inside.items():
+            if far_in_cm is not None and beside in exists:
+                between |= (lane == i) & exists[beside] & (far_in_cm < margin_cm)
+    return between
 
 
 def _left_of(

@@ -7,13 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings
 from datagen.world.track_settings import TrackSettings, preset
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import ROWS_CM
 
+#: A road is redrawn where the camera does not see both lines of its lane, on a straight, so far ahead.
+_SEES_AHEAD_CM = max(ROWS_CM)
+_SIGHT_TRIES = 20
+#: Lateral acceleration that nobody exceeds in the tightest bend.
+_BEND_CM_S2 = 300.0
 #: Share of the drives on roads drawn from scratch; the others are on presets.
 _DRAWN_SHARE = 0.5
 #: Presets of roads that home-made cars are driven on.
@@ -51,10 +58,10 @@ def camera_like(camera: Camera) -> CameraSettings:
 def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSettings:
     """Draw a camera near another: what differs between two cars built from the same parts.
 
-    Field of view within a tenth, pitch within 4 degrees, roll and yaw within 1.5, height 13 to 25 cm.
+    Field of view within a tenth, pitch within 4 degrees, roll and yaw within 1.5, height 11 to 25 cm.
     """
     wider, pitch, roll, yaw = rng.uniform(-1.0, 1.0, 4)
-    height_cm = float(np.exp(rng.uniform(np.log(13.0), np.log(25.0))))
+    height_cm = float(np.exp(rng.uniform(np.log(11.0), np.log(25.0))))
     return camera.model_copy(
         update={
             "field_of_view_rad": camera.field_of_view_rad * (1.0 + 0.1 * wider),
@@ -66,15 +73,47 @@ def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSetti
     )
 
 
-def vary_road(rng: np.random.Generator) -> TrackSettings:
+def sees_lane(camera: CameraSettings, lane_width_cm: float, wheelbase_cm: float) -> bool:
+    """Whether both lines of a straight lane are in the picture where the farthest label row crosses them."""
+    built = camera.build(wheelbase_cm)
+    half_cm = 0.5 * lane_width_cm
+    pixels = built.project_ground(np.array([[-half_cm, _SEES_AHEAD_CM], [half_cm, _SEES_AHEAD_CM]]))
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0.0) & (pixels <= np.array([built.width - 1.0, built.height - 1.0]))
+    return bool(inside.all())
+
+
+def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
+    """Draw a car's size: wheelbases of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
+    wheelbase, turn = rng.random(2)
+    return car.model_copy(
+        update={
+            "wheelbase_cm": float(15.0 * 1.8**wheelbase),
+            "max_steering_rad": math.radians(27.0 + 8.0 * turn),
+        }
+    )
+
+
+def tightest_bend_cm(car: CarSettings) -> float:
+    """Smallest radius that the front axle's middle can follow, with some left to correct."""
+    most_rad = car.max_steering_rad * min(1.0, car.steering_gain) - abs(car.steering_trim_rad)
+    return 1.1 * car.wheelbase_cm / math.sin(most_rad)
+
+
+def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSettings:
     """Draw a kind of road: one of the presets, or tape laid out on a floor.
 
     Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm;
-    every other road has two lanes, on one of eight the line on the right is dashed too, and from every other
-    one up to a sixth of the tape has come off in short stretches.
+    the tightest bends have radii of 0.9 to 1.3 lane widths. Every other road has two lanes, on one of eight
+    the line on the right is dashed too, and from every other one up to a sixth of the tape has come off in
+    short stretches.
+
+    Args:
+        rng: Source of randomness.
+        tightest_cm: Smallest radius that the car can follow.
     """
     drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
-    two_lanes, width, tape, gaps, dash, gap, right, worn = rng.random(8)
+    two_lanes, width, tape, gaps, dash, gap, right, worn, tight = rng.random(9)
     if drawn >= _DRAWN_SHARE:
         return preset(_PRESETS[number])
     lane_cm = float(30.0 * 2.3**width)
@@ -86,7 +125,7 @@ def vary_road(rng: np.random.Generator) -> TrackSettings:
     road = {
         "lane_width_cm": lane_cm,
         "line_width_cm": float(1.5 * 3.4**tape),
-        "min_radius_cm": max(60.0, 1.1 * lane_cm),
+        "min_radius_cm": max(tightest_cm, (0.9 + 0.4 * tight) * lane_cm),
         "interruptions_per_m": 0.2 * gaps,
         "right": {"kind": "dashed" if right < 0.125 else "solid", **dashes},
     }
@@ -95,19 +134,31 @@ def vary_road(rng: np.random.Generator) -> TrackSettings:
     return TrackSettings.model_validate(road)
 
 
-def vary_driver(lane_width_cm: float, rng: np.random.Generator) -> DriverSettings:
-    """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every fourth one further.
+def vary_driver(track: TrackSettings, rng: np.random.Generator) -> DriverSettings:
+    """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
-    People who drive by hand keep to no line: for stretches they have one wheel on a marking.
+    People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
+    car beside the lane. Where there are two lanes, every third one also changes between them. Nobody is
+    faster than the tightest bend allows.
     """
-    speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(150.0))))
-    recovers, wander, recover = rng.random(3)
-    return DriverSettings(
-        style="recover" if recovers < 0.25 else "wander",
+    lane_cm = track.lane_width_cm
+    fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.min_radius_cm))
+    speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(fastest_cm_s))))
+    recovers, wander, recover, changes, change = rng.random(5)
+    recover_cm = lane_cm * (0.2 + 0.4 * recover)
+    driver = DriverSettings(
+        style="recover" if recovers < 0.35 else "wander",
         speed_cm_s=speed_cm_s,
-        wander_cm=lane_width_cm * (0.08 + 0.22 * wander),
-        recover_cm=lane_width_cm * (0.2 + 0.2 * recover),
+        wander_cm=lane_cm * (0.08 + 0.22 * wander),
+        recover_cm=recover_cm,
+        # Not more steeply than a car can turn.
+        recover_every_cm=max(200.0, 7.0 * recover_cm),
     )
+    if track.lanes == 1 or changes >= 1.0 / 3.0:
+        return driver
+    change_cm = max(150.0, 3.5 * lane_cm)
+    update = {"lane_change_cm": change_cm, "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change)}
+    return driver.model_copy(update={"style": "wander", **update})
 
 
 def vary_simulation(
@@ -121,22 +172,35 @@ def vary_simulation(
 ) -> SimulationSettings:
     """Draw one of many drives; its seed is the sequence's first number.
 
+    Camera and road are drawn until the camera sees both lines: with a lens that does not, nobody would drive.
+
     Args:
         simulation: What all drives share.
         sequence: Decides everything that is drawn.
         number: Of the drive; the cameras take turns.
-        cameras: The drive's camera is drawn near one of these; none leaves the simulation's.
+        cameras: The drive's camera is drawn near one of these, and the car's size is drawn; none leaves the
+            simulation's.
         road: Draw the kind of road.
         driver: Draw how the car is driven.
     """
-    camera_rng, road_rng, driver_rng = np.random.default_rng(sequence).spawn(3)
-    changes: dict[str, object] = {"seed": int(sequence.generate_state(1)[0])}
-    if cameras:
-        changes["camera"] = vary_camera(cameras[number % len(cameras)], camera_rng)
-    track = vary_road(road_rng) if road else simulation.track
-    changes["track"] = track
+    camera_rng, road_rng, driver_rng, car_rng = np.random.default_rng(sequence).spawn(4)
+    car = vary_car(simulation.car, car_rng) if cameras else simulation.car
+    camera, track = simulation.camera, simulation.track
+    for _ in range(_SIGHT_TRIES):
+        if cameras:
+            camera = vary_camera(cameras[number % len(cameras)], camera_rng)
+        if road:
+            track = vary_road(road_rng, tightest_bend_cm(car))
+        if sees_lane(camera, track.lane_width_cm, car.wheelbase_cm):
+            break
+    changes: dict[str, object] = {
+        "seed": int(sequence.generate_state(1)[0]),
+        "camera": camera,
+        "track": track,
+        "car": car,
+    }
     if driver:
-        changes["driver"] = vary_driver(track.lane_width_cm, driver_rng)
+        changes["driver"] = vary_driver(track, driver_rng)
     return simulation.model_copy(update=changes)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import (
+    BETWEEN_LANES,
     CONTRADICTED,
     DELETED,
     UNCERTAIN,
@@ -144,6 +145,15 @@ def test_why_a_frame_gets_no_labels(folder):
     doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
     assert label_frame(replace(mapped, drive_map=doubted), 6, window) == CONTRADICTED
     assert not isinstance(label_frame(mapped, 0, window), str)
+    dashed = [replace(line, bare=0.4) for line in mapped.drive_map.lines[0][:1]]
+    on_dashes = replace(
+        mapped.drive_map,
+        poses=mapped.drive_map.poses + [0.0, 17.0, 0.0],
+        lines={0: dashed + mapped.drive_map.lines[0][1:], 1: mapped.drive_map.lines[1]},
+    )
+    assert label_frame(replace(mapped, drive_map=on_dashes), 6, window) == BETWEEN_LANES
+    # Behind a solid line there is no lane: the second segment.
+    assert not isinstance(label_frame(replace(mapped, drive_map=on_dashes), 20, window), str)
     assert label_frame(mapped, 3, BirdseyeWindow(left_cm=100.0)) == "no line in the window"
     deleted = replace(mapped.drive, deleted=np.arange(N) == 16)
     # Frame 16 of the drive is the 12th of the map.

@@ -170,11 +170,14 @@ def test_a_lane_change_and_back():
     going = slice(0, 80)
     np.testing.assert_array_equal(found.lane[going], np.where(y[going] > 18.0 + 3.6, -1, 0))
     np.testing.assert_array_equal(found.lane[80:], np.where(y[80:] < 18.0 - 3.6, 0, -1))
+    # As far on either side of the line nobody can tell which lane is meant.
+    np.testing.assert_array_equal(found.between, np.abs(y - 18.0) < 3.6)
 
 
 def test_straddling_a_line_does_not_flicker():
     poses, s = _drive(18.0 + 2.5 * np.sin(np.arange(100.0)))
-    assert not assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM).lane.any()
+    found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
+    assert not found.lane.any() and found.between.all()
 
 
 @pytest.mark.parametrize(("reach", "changes"), [(0.15, False), (0.4, True)])
@@ -186,14 +189,19 @@ def test_a_swerve_across_a_line_is_no_lane_change(reach, changes, side):
     y = start + side * (18.0 + 36.0 * reach) * np.sin(np.linspace(0.0, np.pi, 60))
     poses, s = _drive(y)
     home, away = (0, -1) if side > 0.0 else (-1, 0)
-    lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
+    found = assign_lanes(lines, poses, s, WHEELBASE_CM)
+    lane = found.lane
     assert lane[0] == home and lane[-1] == home
     assert (away in lane) == changes
+    # Frames of a swerve have the lane of before, and are not clearly in it.
+    beyond = side * (y - 18.0) > 0.0
+    assert beyond.any() and (found.between | (lane == np.where(beyond, away, home))).all()
 
 
 def test_beyond_the_outer_line_the_car_keeps_its_lane():
     poses, s = _drive(np.linspace(0.0, -60.0, 50))
-    assert not assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM).lane.any()
+    found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
+    assert not found.lane.any() and not found.between.any()
     # Where the further line is not known there is no lane to change to.
     poses, s = _drive(np.full(50, 36.0))
     gone = assign_lanes(_straight_lines(TWO_LANES, until_cm=5.0), poses, s, WHEELBASE_CM)

@@ -7,9 +7,21 @@ import math
 import numpy as np
 import pytest
 
+from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
 from datagen.world.track import random_track
-from datagen.world.variety import camera_like, first_world, vary_camera, vary_driver, vary_road
+from datagen.world.track_settings import TrackSettings
+from datagen.world.variety import (
+    camera_like,
+    first_world,
+    sees_lane,
+    tightest_bend_cm,
+    vary_camera,
+    vary_car,
+    vary_driver,
+    vary_road,
+    vary_simulation,
+)
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
@@ -37,7 +49,7 @@ def test_cameras_vary_around_the_given_one():
     fields = np.array([camera.field_of_view_rad for camera in drawn])
     assert 1.8 <= fields.min() < 1.85 and 2.15 < fields.max() <= 2.2
     heights = np.array([camera.height_cm for camera in drawn])
-    assert heights.min() >= 13.0 and heights.max() <= 25.0
+    assert heights.min() >= 11.0 and heights.max() <= 25.0
     assert all((camera.width, camera.height) == (160, 120) for camera in drawn)
     assert vary_camera(base, np.random.default_rng(3)) == drawn[3]
 
@@ -73,10 +85,41 @@ def test_a_road_without_room_gives_way_to_the_next_seed(monkeypatch):
         first_world(simulation)
 
 
-def test_drivers_keep_to_their_lane():
-    drivers = [vary_driver(40.0, np.random.default_rng(seed)) for seed in range(60)]
+def test_no_bend_is_tighter_than_the_car_can_turn():
+    rng = np.random.default_rng(2)
+    cars = [vary_car(CarSettings(), rng) for _ in range(40)]
+    assert min(car.wheelbase_cm for car in cars) < 16.0 and max(car.wheelbase_cm for car in cars) > 25.0
+    for car in cars:
+        # The front axle's middle turns on this radius when the wheels are as far round as they go.
+        assert tightest_bend_cm(car) > car.wheelbase_cm / math.sin(car.max_steering_rad)
+    roads = [vary_road(rng, tightest_bend_cm(car)) for car in cars]
+    own = [(car, road) for car, road in zip(cars, roads, strict=True) if road.preset is None]
+    assert all(road.min_radius_cm >= tightest_bend_cm(car) for car, road in own)
+    assert min(road.min_radius_cm for _, road in own) < 45.0
+
+
+def test_the_camera_sees_the_lane_that_it_drives_in():
+    narrow = CameraSettings(width=160, height=120, field_of_view_rad=1.2, pitch_down_rad=0.4, height_cm=15.0)
+    # 32 cm ahead of the lens, 34 degrees to either side: 22 cm.
+    assert sees_lane(narrow, 40.0, 20.0) and not sees_lane(narrow, 50.0, 20.0)
+    # A lens that looks above the road sees no line near the car.
+    assert not sees_lane(narrow.model_copy(update={"pitch_down_rad": -0.4}), 30.0, 20.0)
+    for number in range(40):
+        sequence = np.random.SeedSequence([5, number])
+        drawn = vary_simulation(SimulationSettings(), sequence, number, cameras=(narrow,))
+        assert sees_lane(drawn.camera, drawn.track.lane_width_cm, drawn.car.wheelbase_cm)
+
+
+def test_drivers_leave_the_middle_but_find_back():
+    road = TrackSettings(lane_width_cm=40.0)
+    drivers = [vary_driver(road, np.random.default_rng(seed)) for seed in range(60)]
     assert {driver.style for driver in drivers} == {"wander", "recover"}
     speeds = [driver.speed_cm_s for driver in drivers]
-    assert all(40.0 <= speed <= 150.0 for speed in speeds if speed is not None) and None not in speeds
-    # The middle of the car stays between the lines.
-    assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 16.0 for driver in drivers)
+    # In a bend of 60 cm nobody exceeds 3 m/s^2.
+    assert None not in speeds and all(40.0 <= speed <= 135.0 for speed in speeds if speed is not None)
+    assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 24.0 for driver in drivers)
+    assert max(driver.recover_cm for driver in drivers) > 20.0
+    assert all(driver.change_lanes_every_cm is None for driver in drivers)
+    two = TrackSettings(lane_width_cm=69.0, lanes=2)
+    every = [vary_driver(two, np.random.default_rng(seed)).change_lanes_every_cm for seed in range(60)]
+    assert sum(way is not None for way in every) in range(12, 31)
