@@ -51,7 +51,7 @@ def truth_labels(
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
-    lines, between = _true_lines(drive_path, poses, drive.camera.wheelbase_cm)
+    lines, between = true_lines(drive_path, poses, drive.camera.wheelbase_cm)
     points_cm = window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1))
     points_cm[between] = np.nan
     return LabelSet(
@@ -78,12 +78,15 @@ def truth_labels(
     )
 
 
-def _true_lines(
+def true_lines(
     drive_path: Path, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"]]:
-    """The lines of the driven lane in each frame, as thin as a map's, and whether it is between two lanes.
+    """Return the driven lane's lines in each frame, as thin as a map's, and whether it is between two lanes.
 
-    Without a road there are none.
+    Args:
+        drive_path: Simulated drive; without a road there are no lines.
+        poses: Rear-axle poses, frame map.
+        wheelbase_cm: Distance between the axles.
     """
     between = np.zeros(len(poses), dtype=bool)
     if not (drive_path / "track.json").is_file():

@@ -11,7 +11,7 @@ from datagen.lanes.line import LaneLine
 from datagen.runs import equal_runs
 
 #: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
-BEYOND_LANES = 0.1
+BEYOND_LANES = 0.05
 #: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
 _ENTERED = 0.2
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from datagen.labels.mapped_drive import read_map_frames
+from datagen.labels.truth import true_lines
 from datagen.map_folder import read_map
 from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
@@ -144,6 +145,9 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     index = drive_map.frames
     true_points = np.stack([truth[point] for point in POINT_NAMES], axis=1)
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
+    poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
+    # On the line between two lanes there is nothing to label.
+    true_points[true_lines(drive, poses, settings.car.wheelbase_cm)[1]] = np.nan
     miss_cm = frames.points_cm - true_points[index]
     # A frame that counts and was not mapped is one without labels; repeated ones and pauses do not count.
     counted = np.unique(np.concatenate([following_frames(open_drive(drive), []).frames, index]))

@@ -30,5 +30,5 @@ def test_on_the_line_between_two_lanes_there_are_no_labels(tmp_path):
     hidden = np.isnan(labels.points_cm).all(axis=1)
     # From either lane the line between them is the one that the front axle is nearer to.
     away_cm = np.minimum(np.abs(truth["left_0_cm"]), np.abs(truth["right_0_cm"]))
-    assert 3 <= hidden.sum() <= 20
-    assert away_cm[hidden].max() < 4.4 and away_cm[~hidden].min() > 3.6
+    assert 2 <= hidden.sum() <= 10
+    assert away_cm[hidden].max() < 2.3 and away_cm[~hidden].min() > 1.8

@@ -166,16 +166,16 @@ def test_a_lane_change_and_back():
     poses, s = _drive(y)
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
     assert found.forward.all()
-    # The line is at 18 cm; a tenth of a lane beyond it the car is in the other lane, back likewise.
+    # The line is at 18 cm; a twentieth of a lane beyond it the car is in the other lane, back likewise.
     going = slice(0, 80)
-    np.testing.assert_array_equal(found.lane[going], np.where(y[going] > 18.0 + 3.6, -1, 0))
-    np.testing.assert_array_equal(found.lane[80:], np.where(y[80:] < 18.0 - 3.6, 0, -1))
+    np.testing.assert_array_equal(found.lane[going], np.where(y[going] > 18.0 + 1.8, -1, 0))
+    np.testing.assert_array_equal(found.lane[80:], np.where(y[80:] < 18.0 - 1.8, 0, -1))
     # As far on either side of the line nobody can tell which lane is meant.
-    np.testing.assert_array_equal(found.between, np.abs(y - 18.0) < 3.6)
+    np.testing.assert_array_equal(found.between, np.abs(y - 18.0) < 1.8)
 
 
 def test_straddling_a_line_does_not_flicker():
-    poses, s = _drive(18.0 + 2.5 * np.sin(np.arange(100.0)))
+    poses, s = _drive(18.0 + 1.5 * np.sin(np.arange(100.0)))
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
     assert not found.lane.any() and found.between.all()
 
