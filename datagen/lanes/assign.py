@@ -104,6 +104,9 @@ def _without_swerves(
     runs = equal_runs(lane)
     for before, run, after in zip(runs[:-2], runs[1:-1], runs[2:], strict=True):
         home, away = lane[before[-1]], lane[run[0]]
+        # The run before may have been given back already.
+        if home == away:
+            continue
         inside = left_of[home][run] if away < home else -left_of[away][run]
         if home == lane[after[0]] and inside.max() < entered_cm:
             lane[run] = home

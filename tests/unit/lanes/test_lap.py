@@ -220,6 +220,14 @@ def test_behind_dashes_there_is_a_lane_whether_its_far_line_is_known_or_not(offs
     assert not assign_lanes(solid, poses, s, WHEELBASE_CM).lane.any()
 
 
+def test_swerves_from_a_lane_whose_far_line_is_unknown():
+    lines = [replace(line, bare=0.4 * (line.index == 0)) for line in _straight_lines({0: 18.0, 1: -18.0})]
+    y = np.repeat([36.0, 14.0, 36.0, 0.0], 20)
+    poses, s = _drive(y)
+    lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
+    np.testing.assert_array_equal(lane, np.where(y > 0.0, -1, 0))
+
+
 def test_dashes_on_the_right_have_a_lane_behind_them_too():
     lines = [replace(line, bare=0.3 * line.index) for line in _straight_lines({0: 18.0, 1: -18.0})]
     poses, s = _drive(np.concatenate([np.zeros(20), np.full(20, -36.0), np.zeros(20), np.full(20, 36.0)]))
