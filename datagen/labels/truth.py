@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from datagen.lanes.assign import BEYOND_LANES
 from datagen.world.track_file import read_track
@@ -51,7 +51,7 @@ def truth_labels(
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
-    lines, between = true_lines(drive_path, poses, drive.camera.wheelbase_cm)
+    lines, between = true_lines(drive_path, truth, drive.camera.wheelbase_cm)
     points_cm = window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1))
     points_cm[between] = np.nan
     return LabelSet(
@@ -79,20 +79,24 @@ def truth_labels(
 
 
 def true_lines(
-    drive_path: Path, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float
+    drive_path: Path, truth: dict[str, np.ndarray], wheelbase_cm: float
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"]]:
-    """Return the driven lane's lines in each frame, as thin as a map's, and whether it is between two lanes.
+    """Return the lines of each frame's lane, as thin as a map's, and whether it is between two lanes.
+
+    As in a map's labels, a frame is between two lanes that is not clearly inside its own on the other's side.
 
     Args:
         drive_path: Simulated drive; without a road there are no lines.
-        poses: Rear-axle poses, frame map.
+        truth: Its truth, see :func:`lanenet.data.drive.read_truth`.
         wheelbase_cm: Distance between the axles.
     """
+    poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
     between = np.zeros(len(poses), dtype=bool)
     if not (drive_path / "track.json").is_file():
         nothing = np.empty((0, 2))
         return [(nothing, nothing)] * len(poses), between
     track = read_track(drive_path / "track.json")
+    other_cm = track.oncoming_cm
     every = max(1, round(_SAMPLE_CM / track.step_cm))
     lines = []
     place: float | None = None
@@ -100,9 +104,14 @@ def true_lines(
         # Where the road comes near itself, the car is on the stretch that it was on before.
         front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
         place, offset_cm = track.nearest(front, place)
-        left, right = track.lines_car(pose, wheelbase_cm, place)
+        lane_cm = 0.0
+        if other_cm is not None:
+            to_centre_cm = 0.5 * (truth["left_0_cm"][k] + truth["right_0_cm"][k])
+            in_other = (offset_cm - to_centre_cm) / other_cm > 0.5
+            lane_cm = other_cm if in_other else 0.0
+            # How far the front axle's middle is beyond the line between the lanes, seen from the right one.
+            beyond_lanes = offset_cm / other_cm - 0.5
+            between[k] = (-beyond_lanes if not in_other else beyond_lanes) < BEYOND_LANES
+        left, right = track.lines_car(pose, wheelbase_cm, place, lane_cm)
         lines.append((left[::every], right[::every]))
-        if track.oncoming_cm is not None:
-            share = offset_cm / track.oncoming_cm  # 0 in the middle of the driver's lane, 1 in the other's
-            between[k] = abs(share - 0.5) < BEYOND_LANES
     return lines, between

@@ -145,9 +145,8 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     index = drive_map.frames
     true_points = np.stack([truth[point] for point in POINT_NAMES], axis=1)
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
-    poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
     # On the line between two lanes there is nothing to label.
-    true_points[true_lines(drive, poses, settings.car.wheelbase_cm)[1]] = np.nan
+    true_points[true_lines(drive, truth, settings.car.wheelbase_cm)[1]] = np.nan
     miss_cm = frames.points_cm - true_points[index]
     # A frame that counts and was not mapped is one without labels; repeated ones and pauses do not count.
     counted = np.unique(np.concatenate([following_frames(open_drive(drive), []).frames, index]))

@@ -12,12 +12,9 @@ from datagen.world.track_settings import TrackSettings
 from lanenet.data.drive import read_truth
 
 
-def test_on_the_line_between_two_lanes_there_are_no_labels(tmp_path):
-    driver = DriverSettings(
-        speed_cm_s=100.0, wander_cm=0.0, change_lanes_every_cm=160.0, lane_change_cm=150.0
-    )
+def _truth_of(tmp_path, driver: DriverSettings, seed: int):
     settings = SimulationSettings(
-        seed=3,
+        seed=seed,
         frames=90,
         camera=CameraSettings(width=64, height=48),
         track=TrackSettings(lanes=2, lane_width_cm=40.0),
@@ -25,10 +22,38 @@ def test_on_the_line_between_two_lanes_there_are_no_labels(tmp_path):
         random_look=False,
     )
     simulate_drive(settings, tmp_path / "drive")
-    labels, truth = truth_labels(tmp_path / "drive"), read_truth(tmp_path / "drive" / "truth.csv")
+    truth = read_truth(tmp_path / "drive" / "truth.csv")
     assert truth is not None
+    return truth_labels(tmp_path / "drive"), truth
+
+
+def test_on_the_line_between_two_lanes_there_are_no_labels(tmp_path):
+    driver = DriverSettings(
+        speed_cm_s=100.0, wander_cm=0.0, change_lanes_every_cm=160.0, lane_change_cm=150.0
+    )
+    labels, truth = _truth_of(tmp_path, driver, 3)
     hidden = np.isnan(labels.points_cm).all(axis=1)
     # From either lane the line between them is the one that the front axle is nearer to.
     away_cm = np.minimum(np.abs(truth["left_0_cm"]), np.abs(truth["right_0_cm"]))
     assert 2 <= hidden.sum() <= 10
     assert away_cm[hidden].max() < 2.3 and away_cm[~hidden].min() > 1.8
+    # Points lie on the lines of the lane that they name, also in the other one.
+    for k in np.flatnonzero(~hidden):
+        left, right = labels.lines[k]
+        for line, x_cm in ((left, labels.points_cm[k, 0]), (right, labels.points_cm[k, 3])):
+            if np.isfinite(x_cm):
+                assert np.hypot(line[:, 0] - x_cm, line[:, 1]).min() < 2.0
+
+
+def test_a_swerve_into_the_other_lane_has_no_labels(tmp_path):
+    driver = DriverSettings(
+        style="recover", speed_cm_s=100.0, wander_cm=0.0, recover_cm=27.0, recover_every_cm=200.0
+    )
+    swerved = 0
+    for seed in range(4):
+        labels, truth = _truth_of(tmp_path / str(seed), driver, seed)
+        hidden = np.isnan(labels.points_cm).all(axis=1)
+        # The truth names the lane on the right throughout; its left line is that between the two.
+        np.testing.assert_array_equal(hidden, -truth["left_0_cm"] < 2.0)
+        swerved += int((truth["left_0_cm"] > 2.0).sum())
+    assert swerved > 5
