@@ -59,7 +59,7 @@ def _solve(
     believed: Camera | None,
 ) -> SolvedSegment:
     seen = see_drive(drive, camera, commands, settings, rng)
-    ways = seen.usual.step * seen.usual.relative
+    ways = seen.usual.step_heights * seen.usual.relative
     keys = key_frames(ways)
     if len(keys) == len(drive):
         return solve_frames(seen, settings, rng, progress, find_camera, believed)
