@@ -127,7 +127,9 @@ def _join(
     roads = [road_edges(part, camera, limits, settings) for part in drives]
     edges = [pixels for road in roads for pixels in road.edges]
     commands = [commands_of(part, camera.wheelbase_cm) for part in drives]
-    expected = np.concatenate([part.relative_ways for part in commands])
+    # In one unit: the usual way of one stretch need not be that of the other one.
+    ways_cm = np.concatenate([part.distance_cm for part in commands])
+    expected = replace(commands[0], distance_cm=ways_cm, turn=None).relative_ways
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     loops = loop_pairs(revisits, breaks)
     for _ in range(2):

@@ -87,6 +87,29 @@ def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
     assert solved.path_cm[-1] == pytest.approx((len(true) - 2) * LAP_CM / LAP_FRAMES, rel=0.03)
 
 
+class _StopError(Exception):
+    """The rest is another test's."""
+
+
+def test_recorded_speeds_of_both_stretches_are_told_in_one_unit(same_road, monkeypatch):
+    drive, _, stretches = same_road
+    told: list[np.ndarray] = []
+
+    def adjust(*_: object, expected: np.ndarray, **__: object) -> None:
+        told.append(expected)
+        raise _StopError
+
+    monkeypatch.setattr("datagen.slam.join.adjust", adjust)
+    speed_cm_s = np.where(np.arange(len(drive)) < FIRST, 80.0, 160.0)
+    faster = replace(drive, commands=Commands(speed_cm_s=speed_cm_s))
+    with pytest.raises(_StopError):
+        join_stretches(stretches, faster, SMALL, np.random.default_rng(1), [])
+    # Nothing is known of the first frame of either.
+    np.testing.assert_array_equal(told[0][[0, FIRST]], 0.0)
+    np.testing.assert_allclose(told[0][1:FIRST], 1.0)
+    np.testing.assert_allclose(told[0][FIRST + 1 :], 2.0)
+
+
 def test_the_stretch_that_carries_may_be_the_later_one(same_road):
     drive, true, stretches = same_road
     # The short stretch was driven first.
