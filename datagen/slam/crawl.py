@@ -11,7 +11,7 @@ from datagen.map_settings import MapSettings
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
-from datagen.slam.key_frames import commands_between, key_frames, poses_between, values_between
+from datagen.slam.key_frames import commands_between, key_frames, key_pairs, poses_between, values_between
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, commands_of, fit_steering
 from datagen.slam.scans import Progress, scans_of
@@ -97,9 +97,7 @@ def _with_frames_between(
     road = road_edges(drive, camera, limits, settings, keys)
     poses = poses_between(solved.poses, keys, ways)
     revisits = [replace(r, earlier=int(keys[r.earlier]), later=int(keys[r.later])) for r in solved.revisits]
-    # What holds the key frames on each other is what holds the map in shape: frames of a crawl that follow
-    # each other hardly tell how far they are apart.
-    pairs = [(int(a), int(b)) for lag in settings.bundle.lags for a, b in zip(keys, keys[lag:], strict=False)]
+    pairs = key_pairs(keys, settings.bundle.lags)
     if revisits:
         none = np.zeros(len(drive), dtype=bool)
         pairs += loop_pairs(revisits, none) + side_by_side(poses, height, settings.revisits)
@@ -122,4 +120,5 @@ def _with_frames_between(
         steering=fit_steering(opened, commands, height),
         revisits=revisits,
         bundle=replace(bundle, sigma=solved.bundle.sigma),
+        keys=keys,
     )

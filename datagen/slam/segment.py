@@ -54,6 +54,7 @@ class SolvedSegment:
         drift_rad_per_cm: Heading that the open loop missed per length; None without a revisit.
         bundle: The adjustment.
         breaks: Frames that do not follow the one before them; None for an uninterrupted segment.
+        keys: Key frames by which a car that crawls was followed; None where every frame is one.
     """
 
     camera: Camera
@@ -66,6 +67,7 @@ class SolvedSegment:
     drift_rad_per_cm: float | None
     bundle: BundleResult
     breaks: Bool[np.ndarray, "n"] | None = None
+    keys: Int[np.ndarray, "k"] | None = None
 
     @property
     def path_cm(self) -> Float[np.ndarray, "n"]:
