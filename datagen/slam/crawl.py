@@ -14,6 +14,7 @@ from datagen.slam.filter import Trajectory
 from datagen.slam.key_frames import commands_between, key_frames, key_pairs, poses_between, values_between
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, commands_of, fit_steering
+from datagen.slam.posegraph import borne_out
 from datagen.slam.scans import Progress, scans_of
 from datagen.slam.seen import road_edges, see_drive
 from datagen.slam.segment import SolvedSegment, solve_frames
@@ -99,8 +100,9 @@ def _with_frames_between(
     revisits = [replace(r, earlier=int(keys[r.earlier]), later=int(keys[r.later])) for r in solved.revisits]
     pairs = key_pairs(keys, settings.bundle.lags)
     if revisits:
-        none = np.zeros(len(drive), dtype=bool)
-        pairs += loop_pairs(revisits, none) + side_by_side(poses, height, settings.revisits)
+        # Those that the key frames' map contradicts would pull again.
+        true = borne_out(poses, revisits, height)
+        pairs += loop_pairs(true, len(drive)) + side_by_side(poses, height, settings.revisits)
     bundle = adjust(
         road.edges, poses, camera, settings.bundle, rng, (), pairs,
         values_between(solved.bundle.tilt, keys, ways), expected=commands.relative_ways, keep=road.keep,

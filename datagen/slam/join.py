@@ -137,14 +137,15 @@ def _join(
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     keys = _keys_of_both(base.solved, other.solved)
     held = [] if keys is None else key_pairs(keys, settings.bundle.lags, breaks)
-    loops = loop_pairs(revisits, breaks)
+    loops = loop_pairs(revisits, len(poses), breaks)
     for _ in range(2):
         bundle = adjust(
             edges, poses, camera, settings.bundle, rng, (), held + loops, tilt, breaks,
             expected=expected, keep=roads[0].keep, recorded=commands[0].speed_known,
         )  # fmt: skip
         poses, tilt = bundle.poses, bundle.tilt
-        loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)
+        true = borne_out(poses, revisits, height)
+        loops = loop_pairs(true, len(poses), breaks) + side_by_side(poses, height, s)
     alone = base.solved.bundle, other.solved.bundle
     before = np.average([b.misfit for b in alone], weights=[b.pairs for b in alone])
     if bundle.misfit > MAX_MISFIT * before:

@@ -217,7 +217,7 @@ def test_one_stretch_is_all_there_is(same_road):
 
 def test_pairs_beside_a_revisit_keep_to_their_stretches():
     breaks = np.arange(100) == 50
-    pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], breaks)
+    pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], 100, breaks)
     assert (44, 86) in pairs and (52, 94) not in pairs
     assert (14, 56) in pairs and (6, 48) not in pairs
 
