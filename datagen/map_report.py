@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from datagen.labels.mapped_drive import known_lines
 from datagen.lanes.line import LaneLine
 from datagen.lanes.trace import TracedLane
 from datagen.map_folder import DriveMap
@@ -134,18 +135,25 @@ def free_lane_cm(parts: list[MappedSegment]) -> float | None:
     return float(np.median(free)) if free else None
 
 
-def contradicted_share(contradicted: Bool[np.ndarray, "n 2"] | None, deleted: Bool[np.ndarray, "n"]) -> float:
+def contradicted_share(
+    contradicted: Bool[np.ndarray, "n 2"] | None,
+    known: Bool[np.ndarray, "n 2"],
+    deleted: Bool[np.ndarray, "n"],
+) -> float:
     """Share of the frames' lines with which the pictures disagree.
 
-    Frames that the driver deleted get no labels: where the car leaves the road, it says nothing of the map.
+    A line that a frame does not have is neither right nor wrong. Frames that the driver deleted get no
+    labels: where the car leaves the road, it says nothing of the map.
 
     Args:
         contradicted: Left and right line of the map's frames; None where nobody has looked.
-        deleted: Which of them the driver deleted.
+        known: Which of them the frames have, see :func:`datagen.labels.mapped_drive.known_lines`.
+        deleted: Which frames the driver deleted.
     """
-    if contradicted is None or deleted.all():
+    counted = known & ~deleted[:, None]
+    if contradicted is None or not counted.any():
         return 0.0
-    return float(contradicted[~deleted].mean())
+    return float(contradicted[counted].mean())
 
 
 def map_evidence(
@@ -187,7 +195,7 @@ def map_evidence(
         coverage=both["coverage"],
         labelled_share=figures["labelled"]["share"],
         point_shares=figures["labelled"]["points_in_window"],
-        contradicted_share=contradicted_share(drive_map.contradicted, deleted),
+        contradicted_share=contradicted_share(drive_map.contradicted, known_lines(drive_map), deleted),
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm

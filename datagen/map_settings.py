@@ -80,8 +80,10 @@ def with_wheelbase(
         Settings and camera with it, and a note where it is only nominal.
     """
     if wheelbase_cm is None:
-        nominal = camera is None and "wheelbase_cm" not in settings.guess.model_fields_set
-        note = f"the wheelbase is a nominal {settings.guess.wheelbase_cm:g} cm; give --wheelbase"
+        # Settings that were saved in full name it whether or not anybody did: the value tells.
+        nominal_cm = GuessSettings().wheelbase_cm
+        nominal = camera is None and settings.guess.wheelbase_cm == nominal_cm
+        note = f"the wheelbase is a nominal {nominal_cm:g} cm; give --wheelbase if the car's is another"
         return settings, camera, [note] if nominal else []
     guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
     settings = settings.model_copy(update={"guess": guess})

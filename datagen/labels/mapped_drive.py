@@ -100,6 +100,12 @@ def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LA
     )
 
 
+def known_lines(drive_map: DriveMap) -> Bool[np.ndarray, "n 2"]:
+    """Tell which of the map's frames have their left, their right line at one label row at least."""
+    points = [lines_at(drive_map, k).points_cm for k in range(len(drive_map.frames))]
+    return np.asarray(np.isfinite(points).reshape(-1, 2, N_POINTS // 2).any(axis=2))
+
+
 def label_frame(
     mapped: MappedDrive, k: int, window: BirdseyeWindow
 ) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:

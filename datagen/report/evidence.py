@@ -33,7 +33,8 @@ class MapEvidence:
         labelled_share: Of the frames that the driver did not delete.
         point_shares: Of the left and the right line's points that lie in the window in these frames: those
             that have labels.
-        contradicted_share: Of these frames' lines: those with which the pictures around disagree.
+        contradicted_share: Of the lines that these frames have: those with which the pictures around
+            disagree.
         not_labelled: Why the others have none, and how many.
         revisits: Places seen twice.
         closure_across_heights: What the revisits miss across the road, as median; None without any.

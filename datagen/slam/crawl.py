@@ -11,9 +11,10 @@ from datagen.map_settings import MapSettings
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
-from datagen.slam.key_frames import commands_between, key_frames, poses_between, values_between
+from datagen.slam.key_frames import commands_between, key_frames, key_pairs, poses_between, values_between
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import CommandedMotion, commands_of, fit_steering
+from datagen.slam.posegraph import borne_out
 from datagen.slam.scans import Progress, scans_of
 from datagen.slam.seen import road_edges, see_drive
 from datagen.slam.segment import SolvedSegment, solve_frames
@@ -59,7 +60,7 @@ def _solve(
     believed: Camera | None,
 ) -> SolvedSegment:
     seen = see_drive(drive, camera, commands, settings, rng)
-    ways = seen.usual.step * seen.usual.relative
+    ways = seen.usual.step_heights * seen.usual.relative
     keys = key_frames(ways)
     if len(keys) == len(drive):
         return solve_frames(seen, settings, rng, progress, find_camera, believed)
@@ -97,12 +98,11 @@ def _with_frames_between(
     road = road_edges(drive, camera, limits, settings, keys)
     poses = poses_between(solved.poses, keys, ways)
     revisits = [replace(r, earlier=int(keys[r.earlier]), later=int(keys[r.later])) for r in solved.revisits]
-    # What holds the key frames on each other is what holds the map in shape: frames of a crawl that follow
-    # each other hardly tell how far they are apart.
-    pairs = [(int(a), int(b)) for lag in settings.bundle.lags for a, b in zip(keys, keys[lag:], strict=False)]
+    pairs = key_pairs(keys, settings.bundle.lags)
     if revisits:
-        none = np.zeros(len(drive), dtype=bool)
-        pairs += loop_pairs(revisits, none) + side_by_side(poses, height, settings.revisits)
+        # Those that the key frames' map contradicts would pull again.
+        true = borne_out(poses, revisits, height)
+        pairs += loop_pairs(true, len(drive)) + side_by_side(poses, height, settings.revisits)
     bundle = adjust(
         road.edges, poses, camera, settings.bundle, rng, (), pairs,
         values_between(solved.bundle.tilt, keys, ways), expected=commands.relative_ways, keep=road.keep,
@@ -122,4 +122,5 @@ def _with_frames_between(
         steering=fit_steering(opened, commands, height),
         revisits=revisits,
         bundle=replace(bundle, sigma=solved.bundle.sigma),
+        keys=keys,
     )

@@ -18,6 +18,7 @@ from datagen.runs import equal_runs
 from datagen.slam.bundle import adjust
 from datagen.slam.calibrate import mapping_range
 from datagen.slam.filter import Trajectory
+from datagen.slam.key_frames import key_pairs
 from datagen.slam.loop_pairs import loop_pairs, side_by_side
 from datagen.slam.mapper import commands_of
 from datagen.slam.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
@@ -124,22 +125,29 @@ def _join(
     if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
         return None
     limits = mapping_range(height, settings.perception.range)
-    roads = [road_edges(part, camera, limits, settings) for part in drives]
+    roads = [
+        road_edges(part, camera, limits, settings, stretch.solved.keys)
+        for part, stretch in zip(drives, (base, other), strict=True)
+    ]
     edges = [pixels for road in roads for pixels in road.edges]
     commands = [commands_of(part, camera.wheelbase_cm) for part in drives]
-    expected = np.concatenate([part.relative_ways for part in commands])
+    # In one unit: the usual way of one stretch need not be that of the other one.
+    ways_cm = np.concatenate([part.distance_cm for part in commands])
+    expected = replace(commands[0], distance_cm=ways_cm, turn=None).relative_ways
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
-    loops = loop_pairs(revisits, breaks)
+    keys = _keys_of_both(base.solved, other.solved)
+    held = [] if keys is None else key_pairs(keys, settings.bundle.lags, breaks)
+    loops = loop_pairs(revisits, len(poses), breaks)
     for _ in range(2):
         bundle = adjust(
-            edges, poses, camera, settings.bundle, rng, (), loops, tilt, breaks,
+            edges, poses, camera, settings.bundle, rng, (), held + loops, tilt, breaks,
             expected=expected, keep=roads[0].keep, recorded=commands[0].speed_known,
         )  # fmt: skip
         poses, tilt = bundle.poses, bundle.tilt
-        loops = loop_pairs(borne_out(poses, revisits, height), breaks) + side_by_side(poses, height, s)
-    before = np.average(
-        [base.solved.bundle.misfit, other.solved.bundle.misfit], weights=[first, len(other.rows)]
-    )
+        true = borne_out(poses, revisits, height)
+        loops = loop_pairs(true, len(poses), breaks) + side_by_side(poses, height, s)
+    alone = base.solved.bundle, other.solved.bundle
+    before = np.average([b.misfit for b in alone], weights=[b.pairs for b in alone])
     if bundle.misfit > MAX_MISFIT * before:
         return None
     opened = _carried(other.solved.open_poses, other.solved.poses[0], bundle.poses[first])
@@ -159,6 +167,7 @@ def _join(
         revisits=[replace(r, earlier=int(place[r.earlier]), later=int(place[r.later])) for r in revisits],
         bundle=bundle,
         breaks=breaks,
+        keys=None if keys is None else np.sort(place[keys]),
     )
     notes.append(
         f"{frames_text(drive, other.rows)} lie on the same map as {frames_text(drive, base.rows)}: "
@@ -245,6 +254,14 @@ def _together(a: Scans, b: Scans) -> Scans:
         np.concatenate([getattr(a, name), getattr(b, name)]) for name in ("points_cm", "normals", "weights")
     )
     return Scans(points, normals, weights, starts)
+
+
+def _keys_of_both(a: SolvedSegment, b: SolvedSegment) -> Int[np.ndarray, "k"] | None:
+    """Key frames of two segments, those of the second counted on; None where every frame is one."""
+    if a.keys is None and b.keys is None:
+        return None
+    first, second = (np.arange(len(x.poses)) if x.keys is None else x.keys for x in (a, b))
+    return np.concatenate([first, len(a.poses) + second])
 
 
 def _one_of_both(a: Trajectory, b: Trajectory, order: Int[np.ndarray, "n"]) -> Trajectory:

@@ -7,12 +7,13 @@ drives a tenth of its camera's height per frame or more. A slower one is followe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from datagen.runs import true_runs
+from datagen.runs import equal_runs, true_runs
 from datagen.slam.mapper import CommandedMotion
 
 #: Way per frame below which a car crawls, and from one key frame to the next, in camera heights.
@@ -58,6 +59,28 @@ def alongside(keys: Int[np.ndarray, "k"], n: int) -> list[Int[np.ndarray, "_"]]:
     """
     after = np.arange(n) - keys[np.searchsorted(keys, np.arange(n), side="right") - 1]
     return [np.flatnonzero(after == later) for later in range(int(after.max()) + 1)]
+
+
+def key_pairs(
+    keys: Int[np.ndarray, "k"], lags: Sequence[int], breaks: Bool[np.ndarray, "n"] | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of frames that are so many key frames apart, for the adjustment of all frames together.
+
+    What holds the key frames on each other is what holds the map in shape: frames of a crawl that follow each
+    other hardly tell how far they are apart. A stretch of which every frame is a key frame needs none.
+
+    Args:
+        keys: The key frames, the first and the last frame of each stretch among them.
+        lags: How many key frames apart.
+        breaks: Frames that do not follow the one before them; None for one stretch.
+    """
+    stretch = np.zeros(keys[-1] + 1, np.int64) if breaks is None else np.cumsum(breaks)
+    pairs = []
+    for run in equal_runs(stretch):
+        own = keys[(keys >= run[0]) & (keys <= run[-1])]
+        if len(own) < len(run):
+            pairs += [(int(a), int(b)) for lag in lags for a, b in zip(own, own[lag:], strict=False)]
+    return pairs
 
 
 def commands_between(commands: CommandedMotion, keys: Int[np.ndarray, "k"]) -> CommandedMotion:

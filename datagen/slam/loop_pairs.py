@@ -17,14 +17,22 @@ _BESIDE_EVERY, _BESIDE_LAPS, _BESIDE_HEIGHTS, _BESIDE_RAD = 3, 3, 1.5, 0.3
 _PASSING_HEIGHTS = 10.0
 
 
-def loop_pairs(revisits: list[Revisit], breaks: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
-    """Pairs of frames around each revisit that show the same place, not beyond a break of the drive."""
-    stretch = np.cumsum(breaks)
+def loop_pairs(
+    revisits: list[Revisit], count: int, breaks: Bool[np.ndarray, "n"] | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of frames around each revisit that show the same place, not beyond a break of the drive.
+
+    Args:
+        revisits: The revisits.
+        count: Number of frames.
+        breaks: Frames that do not follow the one before them; None for one stretch.
+    """
+    stretch = np.zeros(count, np.int64) if breaks is None else np.cumsum(breaks)
     pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
     return [
         (a, b)
         for r, a, b in pairs
-        if a >= 0 and b < len(breaks) and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
+        if a >= 0 and b < count and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
     ]
 
 

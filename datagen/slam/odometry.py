@@ -109,12 +109,12 @@ class UsualWay:
 
     Attributes:
         relative: Way of each frame relative to the usual one.
-        step: Way per frame of usual length, camera heights.
+        step_heights: Way per frame of usual length, camera heights.
         factor: Way per unit of the commands: gain of a recorded speed, else the usual way, [cm].
     """
 
     relative: Float[np.ndarray, "n"]
-    step: float
+    step_heights: float
     factor: float
 
 
@@ -201,7 +201,7 @@ class Evidence:
         self.settings, self.height_cm = s, height_cm
         self.seen: SeenTurns | None = None
         self.usual = usual_way(pictures, distance_cm, speed_known, height_cm) if usual is None else usual
-        self.relative, step = self.usual.relative, self.usual.step
+        self.relative, step = self.usual.relative, self.usual.step_heights
         spread, keep = s.unknown_spread, s.unknown_keep
         if speed_known:
             spread, keep = s.known_spread, s.known_keep

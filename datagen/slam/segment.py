@@ -54,6 +54,7 @@ class SolvedSegment:
         drift_rad_per_cm: Heading that the open loop missed per length; None without a revisit.
         bundle: The adjustment.
         breaks: Frames that do not follow the one before them; None for an uninterrupted segment.
+        keys: Key frames by which a car that crawls was followed; None where every frame is one.
     """
 
     camera: Camera
@@ -66,6 +67,7 @@ class SolvedSegment:
     drift_rad_per_cm: float | None
     bundle: BundleResult
     breaks: Bool[np.ndarray, "n"] | None = None
+    keys: Int[np.ndarray, "k"] | None = None
 
     @property
     def path_cm(self) -> Float[np.ndarray, "n"]:
@@ -141,9 +143,8 @@ def solve_frames(
             # A camera that has changed sees other edges on the road.
             road = road_edges(drive, bundle.camera, limits, settings)
             before = bundle.camera.K[0, 0]
-            none = np.zeros(len(drive), dtype=bool)
             true = borne_out(bundle.poses, closure.revisits, height)
-            loops = loop_pairs(true, none) + side_by_side(bundle.poses, height, settings.revisits)
+            loops = loop_pairs(true, len(drive)) + side_by_side(bundle.poses, height, settings.revisits)
             bundle = adjust(
                 road.edges, bundle.poses, bundle.camera, settings.bundle, rng,
                 loops=loops, tilt=bundle.tilt, expected=commands.relative_ways, believed=believed,
@@ -219,7 +220,7 @@ def _closed_by(
     along, across = np.median(np.abs(missed[:, :2]), axis=0) / height
     if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
         return None
-    loops = loop_pairs(revisits, np.zeros(len(poses), dtype=bool))
+    loops = loop_pairs(revisits, len(poses))
     closed = adjust(
         road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
         expected=commands.relative_ways, believed=believed, keep=road.keep, recorded=commands.speed_known,

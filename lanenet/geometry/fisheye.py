@@ -10,20 +10,20 @@ _NEWTON_STEPS = 30
 _LAST_STEP_RAD = 1e-12
 
 
-def fisheye_radius(theta: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
+def fisheye_radius(angle_rad: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
     """Return how far from the optical axis a ray meets the image, in focal lengths.
 
     Args:
-        theta: Angle between ray and optical axis, [rad].
+        angle_rad: Angle between ray and optical axis, [rad].
         D: Coefficients k1 to k4.
     """
-    t2 = theta * theta
-    return theta * (1.0 + t2 * (D[0] + t2 * (D[1] + t2 * (D[2] + t2 * D[3]))))
+    t2 = angle_rad * angle_rad
+    return angle_rad * (1.0 + t2 * (D[0] + t2 * (D[1] + t2 * (D[2] + t2 * D[3]))))
 
 
-def fisheye_slope(theta: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
+def fisheye_slope(angle_rad: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
     """Return the derivative of :func:`fisheye_radius` by the angle."""
-    t2 = theta * theta
+    t2 = angle_rad * angle_rad
     return 1.0 + t2 * (3.0 * D[0] + t2 * (5.0 * D[1] + t2 * (7.0 * D[2] + t2 * 9.0 * D[3])))
 
 
@@ -36,17 +36,17 @@ def invert_fisheye(
     """
     low = np.zeros_like(radius)
     high = np.full_like(radius, max_angle_rad)
-    theta = np.clip(radius, 0.0, max_angle_rad)
+    angle_rad = np.clip(radius, 0.0, max_angle_rad)
     seen = radius <= fisheye_radius(np.array([max_angle_rad]), D)
     for _ in range(_NEWTON_STEPS):
-        error = fisheye_radius(theta, D) - radius
-        low = np.where(error < 0.0, theta, low)
-        high = np.where(error > 0.0, theta, high)
-        slope = fisheye_slope(theta, D)
+        error = fisheye_radius(angle_rad, D) - radius
+        low = np.where(error < 0.0, angle_rad, low)
+        high = np.where(error > 0.0, angle_rad, high)
+        slope = fisheye_slope(angle_rad, D)
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = theta - error / slope
+            step = angle_rad - error / slope
         inside = (step >= low) & (step <= high)
-        before, theta = theta, np.where(inside, step, 0.5 * (low + high))
-        if np.max(np.abs(theta - before), where=seen, initial=0.0) <= _LAST_STEP_RAD:
+        before, angle_rad = angle_rad, np.where(inside, step, 0.5 * (low + high))
+        if np.max(np.abs(angle_rad - before), where=seen, initial=0.0) <= _LAST_STEP_RAD:
             break
-    return np.where(seen, theta, np.nan)
+    return np.where(seen, angle_rad, np.nan)

@@ -10,6 +10,7 @@ import pytest
 from datagen.map_settings import MapSettings, with_wheelbase
 from datagen.slam.calibrate import guessed_camera
 from lanenet.cli import map_
+from lanenet.config import dump_settings, load_settings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, MapSettings().guess)
 
@@ -17,11 +18,21 @@ CAMERA = guessed_camera(160, 120, 80.0, 15.0, MapSettings().guess)
 def test_a_wheelbase_that_nobody_gave_is_nominal_and_said_so():
     settings, camera, notes = with_wheelbase(MapSettings(), None, None)
     assert settings == MapSettings() and camera is None
-    assert notes == ["the wheelbase is a nominal 17 cm; give --wheelbase"]
+    assert notes == ["the wheelbase is a nominal 17 cm; give --wheelbase if the car's is another"]
+
+
+def test_settings_that_were_saved_in_full_do_not_make_a_nominal_wheelbase_known(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text(dump_settings(MapSettings()), encoding="utf-8")
+    saved = load_settings(MapSettings, path)
+    assert "wheelbase_cm" in saved.guess.model_fields_set
+    _, _, notes = with_wheelbase(saved, None, None)
+    assert notes == ["the wheelbase is a nominal 17 cm; give --wheelbase if the car's is another"]
+    assert with_wheelbase(saved, None, 17.0)[2] == []
 
 
 def test_a_wheelbase_of_the_settings_or_the_camera_is_not_nominal():
-    told = MapSettings.model_validate({"guess": {"wheelbase_cm": 17.0}})
+    told = MapSettings.model_validate({"guess": {"wheelbase_cm": 26.0}})
     assert with_wheelbase(told, None, None) == (told, None, [])
     assert with_wheelbase(MapSettings(), CAMERA, None) == (MapSettings(), CAMERA, [])
 

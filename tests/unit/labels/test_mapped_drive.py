@@ -15,6 +15,7 @@ from datagen.labels.mapped_drive import (
     CONTRADICTED,
     DELETED,
     UNCERTAIN,
+    known_lines,
     label_frame,
     labelled_points,
     open_mapped_drive,
@@ -22,7 +23,7 @@ from datagen.labels.mapped_drive import (
     read_map_frames,
 )
 from datagen.lanes.line import LaneLine, Side
-from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
+from datagen.map_folder import FORMAT, DriveMap, MapMeta, read_map, write_map
 from datagen.map_settings import SETTINGS_NAME, MapSettings
 from lanenet.config import dump_settings
 from lanenet.data.drive_writer import DriveWriter
@@ -180,6 +181,17 @@ def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folde
     far = BirdseyeWindow(left_cm=-48.0, columns=64)
     doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, -1])
     assert label_frame(replace(mapped, drive_map=doubted), 6, far) == CONTRADICTED
+
+
+def test_a_frame_lacks_a_line_that_ends_before_its_first_label_row(folder):
+    drive_map = read_map(folder)
+    assert known_lines(drive_map).all()
+    # The right line ends at 60 cm, and the front axle is 20 cm ahead of the pose.
+    further = 2.0 * MAPPED
+    later = replace(drive_map, poses=np.column_stack([further, *np.zeros((2, len(MAPPED)))]), s_cm=further)
+    found = known_lines(later)
+    assert found[:, 0].all()
+    np.testing.assert_array_equal(found[:, 1], further + CAMERA.wheelbase_cm < 60.0)
 
 
 def test_points_that_the_map_lacks_are_missed_and_those_beside_the_window_are_not(folder):

@@ -6,14 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from picture_road import loop_drive
+from picture_road import loop_drive, made_up_drive
 from pixel_road import fisheye
 
 from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleSettings
-from datagen.slam.crawl import solve_segment
-from datagen.slam.filter import FilterSettings
-from datagen.slam.places import path_lengths
+from datagen.slam.bundle import BundleResult, BundleSettings
+from datagen.slam.crawl import _with_frames_between, solve_segment
+from datagen.slam.filter import FilterSettings, Trajectory
+from datagen.slam.key_frames import key_pairs
+from datagen.slam.mapper import commands_of
+from datagen.slam.places import Revisit, path_lengths
+from datagen.slam.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
@@ -70,3 +73,38 @@ def test_where_no_speed_was_recorded_a_crawl_shows_by_its_step():
     segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
     assert len(np.unique(segment.trajectory.match[1:])) < 50
     assert path_lengths(segment.poses)[-1] == pytest.approx(path_lengths(poses)[-1], rel=0.1)
+
+
+class _StopError(Exception):
+    """The rest is another test's."""
+
+
+def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypatch):
+    lap, keys = 150, np.arange(0, 301, 3)
+    angle = 2.0 * np.pi * np.arange(301) / lap
+    poses = np.column_stack([60.0 * np.sin(angle), -60.0 * np.cos(angle), angle])
+    true = Revisit(5, 5 + lap // 3, np.zeros(3), 0.8, turns=1)
+    # Half a lap further on it only looks alike.
+    false = Revisit(10, 10 + lap // 2, np.zeros(3), 0.8)
+    on_keys = poses[keys]
+    still = np.zeros(len(keys))
+    bundle = BundleResult(on_keys, np.zeros((len(keys), 2)), _camera(), {}, np.zeros(1), 1.0, 1)
+    solved = SolvedSegment(
+        _camera(), pack_scans([], 15.0), Trajectory(on_keys, still, still, still), on_keys, on_keys, None,
+        [true, false], None, bundle,
+    )  # fmt: skip
+    drive = made_up_drive([np.zeros((120, 160, 3), np.uint8)] * 301)
+    held: list[tuple[int, int]] = []
+
+    def adjust(*args: object, **_: object) -> None:
+        held.extend(args[6])
+        raise _StopError
+
+    monkeypatch.setattr("datagen.slam.crawl.adjust", adjust)
+    with pytest.raises(_StopError):
+        _with_frames_between(
+            solved, keys, np.full(301, 0.05), drive, commands_of(drive, 17.0), SMALL, np.random.default_rng(0)
+        )
+    assert {(15 + d, 15 + lap + d) for d in range(-12, 13, 4)} <= set(held)
+    assert not {(30 + d, 30 + 3 * lap // 2 + d) for d in range(-12, 13, 4)} & set(held)
+    assert set(key_pairs(keys, SMALL.bundle.lags)) <= set(held)

@@ -10,12 +10,14 @@ from picture_road import Pictures, loop_drive, made_up_drive
 from pixel_road import fisheye
 
 from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleSettings
+from datagen.slam.bundle import BundleResult, BundleSettings
 from datagen.slam.crawl import solve_segment
 from datagen.slam.filter import FilterSettings
 from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
+from datagen.slam.key_frames import key_pairs
 from datagen.slam.loop_pairs import loop_pairs
 from datagen.slam.places import Revisit, RevisitSettings, relative_pose
+from datagen.slam.seen import SeenRoad, road_edges
 from lanenet.data.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 
@@ -24,6 +26,8 @@ SMALL = MapSettings(
     bundle=BundleSettings(points=40),
     revisits=RevisitSettings(max_pairs=30),
 )
+#: Where it does not matter how many places join the stretches.
+FEW = SMALL.model_copy(update={"revisits": RevisitSettings(max_pairs=8)})
 LAP_FRAMES, LAP_CM = 90, 360.0
 FIRST = 125
 #: The car was lifted, and put down where it had been a lap before.
@@ -81,10 +85,70 @@ def test_a_stretch_put_down_on_the_same_road_joins_its_map(same_road):
     cross = [r for r in solved.revisits if r.earlier < FIRST <= r.later]
     assert len(cross) >= SMALL.revisits.min_revisits
     assert notes == [f"frames 125-169 lie on the same map as frames 0-124: {len(cross)} places seen in both"]
+    assert solved.keys is None
     assert len(solved.uninterrupted_revisits()) == len(solved.revisits) - len(cross)
     assert len(solved.scans) == len(true) == len(solved.trajectory.match) == len(solved.open_poses)
     # What lies between the two stretches was not driven.
     assert solved.path_cm[-1] == pytest.approx((len(true) - 2) * LAP_CM / LAP_FRAMES, rel=0.03)
+
+
+class _StopError(Exception):
+    """The rest is another test's."""
+
+
+def test_recorded_speeds_of_both_stretches_are_told_in_one_unit(same_road, monkeypatch):
+    drive, _, stretches = same_road
+    told: list[np.ndarray] = []
+
+    def adjust(*_: object, expected: np.ndarray, **__: object) -> None:
+        told.append(expected)
+        raise _StopError
+
+    monkeypatch.setattr("datagen.slam.join.adjust", adjust)
+    speed_cm_s = np.where(np.arange(len(drive)) < FIRST, 80.0, 160.0)
+    faster = replace(drive, commands=Commands(speed_cm_s=speed_cm_s))
+    with pytest.raises(_StopError):
+        join_stretches(stretches, faster, FEW, np.random.default_rng(1), [])
+    # Nothing is known of the first frame of either.
+    np.testing.assert_array_equal(told[0][[0, FIRST]], 0.0)
+    np.testing.assert_allclose(told[0][1:FIRST], 1.0)
+    np.testing.assert_allclose(told[0][FIRST + 1 :], 2.0)
+
+
+def test_key_frames_of_a_crawl_are_those_of_the_joined_stretch(same_road, monkeypatch):
+    drive, _, (long, short) = same_road
+    n = len(drive)
+    keys = np.r_[0:FIRST:3, FIRST - 1]
+    crawled = replace(long, solved=replace(long.solved, keys=keys))
+    cleaned: list[np.ndarray | None] = []
+    pairs: list[tuple[int, int]] = []
+
+    def see(*args: object) -> SeenRoad:
+        cleaned.append(args[-1])
+        return road_edges(*args)
+
+    def adjust(_edges: object, poses: np.ndarray, *args: object, **_: object) -> BundleResult:
+        pairs[:] = args[4]
+        return replace(long.solved.bundle, poses=poses, tilt=args[5])
+
+    monkeypatch.setattr("datagen.slam.join.road_edges", see)
+    monkeypatch.setattr("datagen.slam.join.adjust", adjust)
+    (joined,) = join_stretches([crawled, short], drive, FEW, np.random.default_rng(1), [])
+    # Each stretch is cleaned of reflections by its own frames.
+    assert cleaned[0] is keys and cleaned[1] is None
+    assert set(key_pairs(keys, SMALL.bundle.lags)) <= set(pairs)
+    assert joined.solved.keys is not None
+    np.testing.assert_array_equal(joined.solved.keys, np.r_[keys, FIRST:n])
+    # In the order of the drive, also where the crawl came later.
+    later = drive.subset(np.r_[FIRST:n, 0:FIRST])
+    swapped = [
+        Stretch(np.arange(n - FIRST), short.solved),
+        Stretch(np.arange(n - FIRST, n), crawled.solved),
+    ]
+    (joined,) = join_stretches(swapped, later, FEW, np.random.default_rng(1), [])
+    assert joined.solved.keys is not None
+    np.testing.assert_array_equal(joined.solved.keys, np.r_[0 : n - FIRST, n - FIRST + keys])
+    assert set(key_pairs(keys, SMALL.bundle.lags)) <= set(pairs)
 
 
 def test_the_stretch_that_carries_may_be_the_later_one(same_road):
@@ -153,7 +217,7 @@ def test_one_stretch_is_all_there_is(same_road):
 
 def test_pairs_beside_a_revisit_keep_to_their_stretches():
     breaks = np.arange(100) == 50
-    pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], breaks)
+    pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], 100, breaks)
     assert (44, 86) in pairs and (52, 94) not in pairs
     assert (14, 56) in pairs and (6, 48) not in pairs
 

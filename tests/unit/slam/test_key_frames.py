@@ -9,6 +9,7 @@ from datagen.slam.key_frames import (
     alongside,
     commands_between,
     key_frames,
+    key_pairs,
     poses_between,
     values_between,
 )
@@ -60,6 +61,19 @@ def test_rows_alongside_share_the_frames_out():
     rows = alongside(keys, 14)
     assert [row.tolist() for row in rows] == [keys.tolist(), [3, 6, 10], [4, 7, 11], [8]]
     assert [row.tolist() for row in alongside(np.arange(5), 5)] == [[0, 1, 2, 3, 4]]
+
+
+def test_pairs_of_key_frames_keep_to_their_stretches():
+    keys = np.array([0, 3, 6, 7, 8, 9, 13])
+    one = [(0, 3), (3, 6), (6, 7), (7, 8), (8, 9), (9, 13), (0, 7), (3, 8), (6, 9), (7, 13)]
+    assert key_pairs(keys, (1, 3)) == one
+    assert key_pairs(keys, (1, 3), np.zeros(14, dtype=bool)) == one
+    # Frame 7 was recorded elsewhere than frame 6.
+    assert key_pairs(keys, (1, 3), np.arange(14) == 7) == [(0, 3), (3, 6), (7, 8), (8, 9), (9, 13), (7, 13)]
+    # From frame 7 to frame 9 nobody crawled: what follows on each other is compared as it is.
+    keys, breaks = np.array([0, 3, 6, 7, 8, 9, 10, 13]), np.isin(np.arange(14), (7, 10))
+    assert key_pairs(keys, (1, 2), breaks) == [(0, 3), (3, 6), (0, 6), (10, 13)]
+    assert key_pairs(np.arange(30), (1, 4)) == []
 
 
 def test_commands_between_keep_the_way_and_the_turn():

@@ -206,7 +206,7 @@ def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
 def test_a_recorded_speed_that_is_far_off_gives_the_right_way(edges, off, lamp):
     pictures = _pictures(_with_a_lamp(edges, lamp))
     usual = usual_way(pictures, np.full(60, off * STEP_CM), True, HEIGHT_CM)
-    assert usual.step == pytest.approx(STEP, rel=0.03)
+    assert usual.step_heights == pytest.approx(STEP, rel=0.03)
     assert usual.factor == pytest.approx(1.0 / off, rel=0.03)
 
 
