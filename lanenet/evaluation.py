@@ -228,6 +228,7 @@ def _answer(
 
     answers = answer_frames(frames, detectors, report)
     conditions, visible = {"light": answers.brightness}, None
+    conditions["confidence"] = answers.confidence[next(iter(detectors))]
     if labels is not None:
         visible = at_frames(lines_seen(labels), labels.frame, frames.frames)
         way = way_to_training_cm(labels, training)

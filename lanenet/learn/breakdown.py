@@ -21,6 +21,11 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
         "lines of the lane that the frame shows",
         (("none", 0.0), ("partly", 0.5), ("one", 1.0), ("both", 2.0)),
     ),
+    # The limits are those of lanenet.onboard.safety.SafetySettings.
+    "confidence": (
+        "confidence of the first detector (a car slows down below 0.5 and stops below 0.2)",
+        (("under 0.2", 0.0), ("0.2 to 0.5", 0.2), ("over 0.5", 0.5)),
+    ),
     "light": (
         "mean grey level of the frame, 0 to 255",
         (("under 60", 0.0), ("60 to 140", 60.0), ("over 140", 140.0)),

@@ -36,12 +36,14 @@ class FrameAnswers:
         points_cm: Six points per frame, frame car; NaN where a detector has no answer.
         sigma_cm: Standard deviation of each point; NaN where a detector does not know it.
         presence: Probability that the left and the right line can be seen; NaN likewise.
+        confidence: By which the car slows down and stops.
         brightness: Mean grey level of each frame, 0 to 255.
     """
 
     points_cm: dict[str, Float[np.ndarray, "n 6"]]
     sigma_cm: dict[str, Float[np.ndarray, "n 6"]]
     presence: dict[str, Float[np.ndarray, "n 2"]]
+    confidence: dict[str, Float[np.ndarray, "n"]]
     brightness: Float[np.ndarray, "n"]
 
 
@@ -134,6 +136,7 @@ def answer_frames(
         {name: np.full((n, N_POINTS), np.nan) for name in detectors},
         {name: np.full((n, N_POINTS), np.nan) for name in detectors},
         {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
+        {name: np.full(n, np.nan) for name in detectors},
         np.empty(n),
     )
     for i in range(n):
@@ -153,6 +156,7 @@ def answer_frames(
             answers.points_cm[name][i] = found.points_cm
             answers.sigma_cm[name][i] = found.sigma_cm
             answers.presence[name][i] = found.presence
+            answers.confidence[name][i] = found.confidence
         if progress is not None:
             progress(i + 1, n)
     return answers

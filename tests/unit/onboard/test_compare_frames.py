@@ -8,8 +8,10 @@ import pytest
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
 from lanenet.geometry.camera import Camera
+from lanenet.learn.breakdown import GROUPS
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.compare import COMPARED, answer_frames, build_compared, choose_names
+from lanenet.onboard.safety import SafetySettings
 from lanenet.onboard.worst_frames import WorstFrame, draw_worst, find_worst, jpeg_bytes
 from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 from lanenet.perception.draw import TRUTH_BGR
@@ -58,7 +60,12 @@ class Counter:
     def detect(self, frame_bgr):
         self.since += 1
         points = np.array([self.since, frame_bgr[0, 0, 0], NAN, NAN, NAN, NAN], np.float64)
-        return LaneEstimate(points, sigma_cm=np.full(6, float(self.since)), presence=np.array([0.25, 0.75]))
+        return LaneEstimate(
+            points,
+            sigma_cm=np.full(6, float(self.since)),
+            presence=np.array([0.25, 0.75]),
+            confidence=1.0 / self.since,
+        )
 
 
 def test_frames_come_in_order_with_a_reset_at_breaks():
@@ -74,7 +81,14 @@ def test_frames_come_in_order_with_a_reset_at_breaks():
         assert np.isnan(answers.points_cm[name][:, 2:]).all()
         np.testing.assert_array_equal(answers.sigma_cm[name][:, 0], [1, 2, 3, 1, 2, 3])
         np.testing.assert_array_equal(answers.presence[name], np.tile([0.25, 0.75], (6, 1)))
+        np.testing.assert_array_equal(1.0 / answers.confidence[name], [1, 2, 3, 1, 2, 3])
     assert seen == [(k, 6) for k in range(1, 7)]
+
+
+def test_the_groups_by_confidence_are_what_the_car_does():
+    safety = SafetySettings()
+    limits = [low for _, low in GROUPS["confidence"][1]]
+    assert limits == [0.0, safety.stop_below, safety.slow_below]
 
 
 def test_a_bad_frame_is_named():
