@@ -83,7 +83,8 @@ def with_wheelbase(
         # Settings that were saved in full name it whether or not anybody did: the value tells.
         nominal_cm = GuessSettings().wheelbase_cm
         nominal = camera is None and settings.guess.wheelbase_cm == nominal_cm
-        note = f"the wheelbase is a nominal {nominal_cm:g} cm; give --wheelbase if the car's is another"
+        given = "give the car's with --wheelbase or guess.wheelbase_cm if it is another"
+        note = f"the wheelbase is a nominal {nominal_cm:g} cm; {given}"
         return settings, camera, [note] if nominal else []
     guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
     settings = settings.model_copy(update={"guess": guess})

@@ -14,11 +14,15 @@ from lanenet.config import dump_settings, load_settings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, MapSettings().guess)
 
+NOMINAL = (
+    "the wheelbase is a nominal 17 cm; give the car's with --wheelbase or guess.wheelbase_cm if it is another"
+)
+
 
 def test_a_wheelbase_that_nobody_gave_is_nominal_and_said_so():
     settings, camera, notes = with_wheelbase(MapSettings(), None, None)
     assert settings == MapSettings() and camera is None
-    assert notes == ["the wheelbase is a nominal 17 cm; give --wheelbase if the car's is another"]
+    assert notes == [NOMINAL]
 
 
 def test_settings_that_were_saved_in_full_do_not_make_a_nominal_wheelbase_known(tmp_path):
@@ -27,7 +31,7 @@ def test_settings_that_were_saved_in_full_do_not_make_a_nominal_wheelbase_known(
     saved = load_settings(MapSettings, path)
     assert "wheelbase_cm" in saved.guess.model_fields_set
     _, _, notes = with_wheelbase(saved, None, None)
-    assert notes == ["the wheelbase is a nominal 17 cm; give --wheelbase if the car's is another"]
+    assert notes == [NOMINAL]
     assert with_wheelbase(saved, None, 17.0)[2] == []
 
 
