@@ -23,7 +23,7 @@ class SyntheticSettings(Settings):
         validation: Drives to choose the epoch by.
         test: Drives whose truth scores the result.
         variety: ``none``: all drives are those of ``simulation``; ``roads``: every drive has a kind of road
-            and a driver of its own; ``all``: and a camera near one of ``cameras``.
+            and a driver of its own; ``all``: a camera near one of ``cameras``, and a car of its own size.
         cameras: Lenses and mountings that the drives' cameras are drawn near, by turns; none takes the
             simulation's.
         may_fail: Up to this share of the drives that are mapped may be left out because their map is rejected

@@ -90,7 +90,8 @@ def open_source(path: Path, window: BirdseyeWindow) -> Opened:
         return Opened(path, frames)
     from datagen.labels.truth import truth_labels
 
-    return Opened(path, frames, truth_labels(path, window=window))
+    labels = truth_labels(path, window=window)
+    return Opened(path, _as_labelled(frames, labels), labels)
 
 
 def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
@@ -102,6 +103,13 @@ def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
     from lanenet.data.labelled_frames import read_truth_frames
 
     return read_truth_frames(path, window)
+
+
+def _as_labelled(frames: LabelledFrames, labels: LabelSet) -> LabelledFrames:
+    """Frames with the points of their label set, which leaves out what no frame can tell."""
+    from lanenet.learn.conditions import at_frames
+
+    return replace(frames, points_cm=at_frames(labels.points_cm, labels.frame, frames.frames))
 
 
 def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
@@ -126,7 +134,7 @@ def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
             part = whole.numbered(int(label_set.frame[0]), int(label_set.frame[-1]))
             meta = label_set.meta
             part = replace(part, perception=meta.perception, marking_cm=meta.marking_cm)
-            opened = Opened(frames_path, part, label_set)
+            opened = Opened(frames_path, _as_labelled(part, label_set), label_set)
         sources.append(opened)
     return sources
 

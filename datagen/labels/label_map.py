@@ -11,6 +11,7 @@ from datagen.labels.mapped_drive import (
     CONTRADICTED,
     DELETED,
     NO_LINE,
+    NOT_TO_LABEL,
     UNCERTAIN,
     label_frame,
     labelled_points,
@@ -71,7 +72,7 @@ def label_map(
         if progress is not None:
             progress(k + 1, len(drive_map.frames))
         labelled = label_frame(mapped, k, window)
-        if labelled != DELETED:
+        if labelled not in NOT_TO_LABEL:
             in_window[k] = points_in_window(drive_map, k, window)
         if isinstance(labelled, str):
             skipped[labelled] += 1

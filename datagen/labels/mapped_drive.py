@@ -25,7 +25,9 @@ _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 CONTRADICTED = "the pictures disagree with the map"
-BETWEEN_LANES = "on the line between two lanes"
+BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
+#: Frames that even a map that lacks nothing would not label.
+NOT_TO_LABEL = (DELETED, BETWEEN_LANES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,8 @@ def truth_labels(
 ) -> LabelSet:
     """Make a label set from a simulator's truth, for scoring.
 
-    As in a map's labels, the frames on the line between two lanes have none.
+    As in a map's labels, the frames on the line between two lanes have none. A map also takes the road beyond
+    a dashed line on the outside for a lane, since it cannot know; the truth does not.
 
     Args:
         drive_path: Simulated drive.

@@ -26,7 +26,8 @@ class FrameLanes:
         lane: Index of the line on the left of the lane, seen in the path's direction: 0 for the driven lane,
             -1 for the one to its left, 1 for the one to its right.
         forward: Whether the frame drives in the path's direction.
-        between: Frames on the line between two lanes: which one is meant cannot be told from the picture.
+        between: Frames on the line between two lanes, or beyond it in a swerve: which lane is meant cannot be
+            told from the picture.
     """
 
     lane: Int[np.ndarray, "n"]

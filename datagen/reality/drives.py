@@ -31,7 +31,8 @@ class RealitySettings(Settings):
         frames: Frames that are drawn of each.
         real_frames: Frames that are measured of a recorded drive, at most.
         every: Only one frame of so many is drawn: neighbours show the same.
-        vary_camera: Draw each drive's camera near that of a real drive, by turns; else ``simulation.camera``.
+        vary_camera: Draw each drive's camera near that of a real drive, by turns, and the car's
+            size; else ``simulation.camera`` and the car as it is.
         vary_road: Draw each drive's kind of road; else ``simulation.track``.
         vary_driver: Draw how each is driven; else ``simulation.driver``.
         simulation: What all drives share; its seed and number of frames are set here.

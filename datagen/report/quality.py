@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.labels.mapped_drive import (
     DELETED,
+    NOT_TO_LABEL,
     MappedDrive,
     label_frame,
     labelled_points,
@@ -48,7 +49,7 @@ class MapQuality:
         chance: Samples of one line moved into the middle of the lane, where no marking is.
         status: Per frame of the drive: labelled, or why not.
         points_cm: Six labels per frame of the map.
-        in_window: Which of them a map that lacks nothing would give; none where the driver deleted the frame.
+        in_window: Which of them a map that lacks nothing would give; none of frames not to be labelled.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -76,8 +77,8 @@ class MapQuality:
 
     @property
     def labelled_share(self) -> float:
-        """Share of the frames, without those that the driver deleted, that get labels."""
-        kept = [status for status in self.status if status != DELETED]
+        """Share of the frames that get labels, of those that are not deleted nor between two lanes."""
+        kept = [status for status in self.status if status not in NOT_TO_LABEL]
         return sum(status == LABELLED for status in kept) / max(len(kept), 1)
 
     @property
@@ -120,7 +121,7 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
         status[row] = labelled if isinstance(labelled, str) else LABELLED
         if not isinstance(labelled, str):
             points[k] = labelled[1]
-        if labelled != DELETED:
+        if labelled not in NOT_TO_LABEL:
             in_window[k] = points_in_window(drive_map, k, window)
     return MapQuality(rows, samples, join_samples(chance), status, points, in_window)
 

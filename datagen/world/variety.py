@@ -84,7 +84,7 @@ def sees_lane(camera: CameraSettings, lane_width_cm: float, wheelbase_cm: float)
 
 
 def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
-    """Draw a car's size: wheelbases of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
+    """Draw a car's size, whatever it was: wheelbases of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
     wheelbase, turn = rng.random(2)
     return car.model_copy(
         update={
@@ -110,7 +110,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
 
     Args:
         rng: Source of randomness.
-        tightest_cm: Smallest radius that the car can follow.
+        tightest_cm: Smallest radius that the car can follow; presets keep their own.
     """
     drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
     two_lanes, width, tape, gaps, dash, gap, right, worn, tight = rng.random(9)
@@ -138,8 +138,9 @@ def vary_driver(track: TrackSettings, rng: np.random.Generator) -> DriverSetting
     """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
     People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
-    car beside the lane. Where there are two lanes, every third one also changes between them. Nobody is
-    faster than the tightest bend allows.
+    car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes, every third one
+    also changes between them, if the drive goes on for that long. Nobody is faster than the tightest bend
+    allows.
     """
     lane_cm = track.lane_width_cm
     fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.min_radius_cm))
@@ -151,7 +152,7 @@ def vary_driver(track: TrackSettings, rng: np.random.Generator) -> DriverSetting
         speed_cm_s=speed_cm_s,
         wander_cm=lane_cm * (0.08 + 0.22 * wander),
         recover_cm=recover_cm,
-        # Not more steeply than a car can turn.
+        # Less steeply in wide lanes; a long car's wheels are at their stop for a moment all the same.
         recover_every_cm=max(200.0, 7.0 * recover_cm),
     )
     if track.lanes == 1 or changes >= 1.0 / 3.0:
@@ -172,7 +173,8 @@ def vary_simulation(
 ) -> SimulationSettings:
     """Draw one of many drives; its seed is the sequence's first number.
 
-    Camera and road are drawn until the camera sees both lines: with a lens that does not, nobody would drive.
+    Camera and road are drawn until the camera sees both lines, for a while: with a lens that does not, nobody
+    would drive.
 
     Args:
         simulation: What all drives share.

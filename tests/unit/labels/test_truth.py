@@ -10,13 +10,16 @@ from datagen.world.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from datagen.world.track_settings import TrackSettings
 from lanenet.data.drive import read_truth
+from lanenet.data.label_set import write_labels
+from lanenet.evaluation import evaluate, open_source, open_tests
+from lanenet.geometry.birdseye import BirdseyeWindow
 
 
 def _truth_of(tmp_path, driver: DriverSettings, seed: int):
     settings = SimulationSettings(
         seed=seed,
         frames=90,
-        camera=CameraSettings(width=64, height=48),
+        camera=CameraSettings(width=160, height=120),
         track=TrackSettings(lanes=2, lane_width_cm=40.0),
         driver=driver,
         random_look=False,
@@ -57,3 +60,22 @@ def test_a_swerve_into_the_other_lane_has_no_labels(tmp_path):
         np.testing.assert_array_equal(hidden, -truth["left_0_cm"] < 2.0)
         swerved += int((truth["left_0_cm"] > 2.0).sum())
     assert swerved > 5
+
+
+def test_what_is_scored_is_what_the_labels_name(tmp_path):
+    driver = DriverSettings(
+        speed_cm_s=100.0, wander_cm=0.0, change_lanes_every_cm=160.0, lane_change_cm=150.0
+    )
+    labels, _ = _truth_of(tmp_path, driver, 3)
+    write_labels(tmp_path / "labels.parquet", labels)
+    (source,) = open_tests([tmp_path / "labels.parquet"], [tmp_path / "drive"])
+    opened = open_source(tmp_path / "drive", BirdseyeWindow())
+    assert np.isnan(labels.points_cm).all(axis=1).any()
+    for found in (source.frames, opened.frames):
+        assert found is not None
+        np.testing.assert_array_equal(found.points_cm, labels.points_cm)
+    table = evaluate([source], ("lane-filter",), None).comparison.as_dict()["detectors"]["lane-filter"]
+    # What the car would make of the answers stands beside the other conditions.
+    groups = table["conditions"]["confidence"]
+    assert list(groups) == ["under 0.2", "0.2 to 0.5", "over 0.5"]
+    assert sum(group["count"] for group in groups.values()) == table["groups"]["all"]["count"] > 0

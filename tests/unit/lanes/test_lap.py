@@ -228,6 +228,20 @@ def test_swerves_from_a_lane_whose_far_line_is_unknown():
     np.testing.assert_array_equal(lane, np.where(y > 0.0, -1, 0))
 
 
+def test_a_line_is_between_two_lanes_only_where_there_are_two():
+    lines = _straight_lines(TWO_LANES)
+    # The far line of the other lane comes so near in the second half that there is no lane before it.
+    lines = [_bent_in(line) if line.index == -1 else line for line in lines]
+    poses, s = _drive(np.full(60, 17.0))
+    between = assign_lanes(lines, poses, s, WHEELBASE_CM).between
+    assert between[:20].all() and not between[-20:].any()
+
+
+def _bent_in(line: LaneLine) -> LaneLine:
+    s_cm, y_cm = line.coefficients_cm.T
+    return replace(line, coefficients_cm=np.column_stack([s_cm, np.where(s_cm > 260.0, 30.0, y_cm)]))
+
+
 def test_dashes_on_the_right_have_a_lane_behind_them_too():
     lines = [replace(line, bare=0.3 * line.index) for line in _straight_lines({0: 18.0, 1: -18.0})]
     poses, s = _drive(np.concatenate([np.zeros(20), np.full(20, -36.0), np.zeros(20), np.full(20, 36.0)]))

@@ -110,6 +110,20 @@ def test_the_camera_sees_the_lane_that_it_drives_in():
         assert sees_lane(drawn.camera, drawn.track.lane_width_cm, drawn.car.wheelbase_cm)
 
 
+def test_what_is_not_drawn_stays():
+    given = SimulationSettings(car=CarSettings(wheelbase_cm=21.0), camera=CameraSettings(height_cm=19.0))
+    drawn = vary_simulation(given, np.random.SeedSequence([5, 0]), 0, road=False, driver=False)
+    assert drawn.model_copy(update={"seed": given.seed}) == given
+    lens = CameraSettings(height_cm=19.0)
+    cars = [
+        vary_simulation(given, np.random.SeedSequence([5, number]), number, cameras=(lens,))
+        for number in range(40)
+    ]
+    assert len({one.car.wheelbase_cm for one in cars}) == 40
+    own = [one for one in cars if one.track.preset is None]
+    assert all(one.track.min_radius_cm >= tightest_bend_cm(one.car) for one in own)
+
+
 def test_drivers_leave_the_middle_but_find_back():
     road = TrackSettings(lane_width_cm=40.0)
     drivers = [vary_driver(road, np.random.default_rng(seed)) for seed in range(60)]
@@ -120,6 +134,10 @@ def test_drivers_leave_the_middle_but_find_back():
     assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 24.0 for driver in drivers)
     assert max(driver.recover_cm for driver in drivers) > 20.0
     assert all(driver.change_lanes_every_cm is None for driver in drivers)
+    # Wide excursions take a longer way.
+    wide = [vary_driver(TrackSettings(lane_width_cm=75.0), np.random.default_rng(seed)) for seed in range(60)]
+    assert all(driver.recover_every_cm >= 7.0 * driver.recover_cm for driver in wide)
+    assert max(driver.recover_every_cm for driver in wide) > 250.0
     two = TrackSettings(lane_width_cm=69.0, lanes=2)
     every = [vary_driver(two, np.random.default_rng(seed)).change_lanes_every_cm for seed in range(60)]
     assert sum(way is not None for way in every) in range(12, 31)
