@@ -111,7 +111,7 @@ def _options(
     pass
 
 
-@app.command(epilog="Example: lanenet simulate configs/drive.yaml seed=3 --out drives/three")
+@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out drives/three")
 def simulate(
     config: _Config,
     out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],

@@ -150,7 +150,8 @@ class RasterModel:
         """
         if window != self.meta.window:
             raise ModelMismatchError(
-                f"{self.path}: made for the window {self.meta.window}, but the label set has {window}"
+                f"{self.path}: made for the window {self.meta.window}, but the label set has {window}; "
+                "give the map or the drive itself, which has edges for any window"
             )
 
     def answer(
