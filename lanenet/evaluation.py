@@ -235,8 +235,9 @@ def _answer(
             progress(source.path.name, done, total)
 
     answers = answer_frames(frames, detectors, report)
-    conditions, visible = {"light": answers.brightness}, None
-    conditions["confidence"] = answers.confidence[next(iter(detectors))]
+    first = next(iter(detectors))
+    conditions = {"light": answers.brightness, "confidence": answers.confidence[first]}
+    visible = None
     if labels is not None:
         visible = at_frames(lines_seen(labels), labels.frame, frames.frames)
         way = way_to_training_cm(labels, training)

@@ -112,7 +112,7 @@ def true_lines(
             lane_cm = other_cm if in_other else 0.0
             # How far the front axle's middle is beyond the line between the lanes, seen from the right one.
             beyond_lanes = offset_cm / other_cm - 0.5
-            between[k] = (-beyond_lanes if not in_other else beyond_lanes) < BEYOND_LANES
+            between[k] = (beyond_lanes if in_other else -beyond_lanes) < BEYOND_LANES
         left, right = track.lines_car(pose, wheelbase_cm, place, lane_cm)
         lines.append((left[::every], right[::every]))
     return lines, between

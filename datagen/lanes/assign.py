@@ -123,10 +123,9 @@ def _between_lanes(
     """Tell which frames are not clearly inside their lane on a side where there is another one."""
     between = np.zeros(len(lane), dtype=bool)
     for i in exists:
-        inside = {i - 1: -left_of[i] if i in left_of else None, i + 1: left_of.get(i + 1)}
-        for beside, far_in_cm in inside.items():
-            if far_in_cm is not None and beside in exists:
-                between |= (lane == i) & exists[beside] & (far_in_cm < margin_cm)
+        if i - 1 in exists:  # line i divides the two
+            between |= (lane == i) & exists[i - 1] & (-left_of[i] < margin_cm)
+            between |= (lane == i - 1) & exists[i] & (left_of[i] < margin_cm)
     return between
 
 
