@@ -112,11 +112,13 @@ class DriveMap:
         lane = np.zeros(len(self.frames), dtype=np.int64)
         forward = np.ones(len(self.frames), dtype=bool)
         between = np.zeros(len(self.frames), dtype=bool)
+        divides = np.zeros((len(self.frames), len(SIDES)), dtype=bool)
         for segment, lines in self.lines.items():
             rows = np.flatnonzero(self.segment == segment)
             found = assign_lanes(lines, self.poses[rows], self.s_cm[rows], self.camera.wheelbase_cm)
             lane[rows], forward[rows], between[rows] = found.lane, found.forward, found.between
-        return FrameLanes(lane, forward, between)
+            divides[rows] = found.divides
+        return FrameLanes(lane, forward, between, divides)
 
 
 def write_map(

@@ -108,6 +108,7 @@ def label_map(
         edges=edges,
         lines=lines,
         quality=np.exp(-np.nan_to_num(residual, nan=2.0)),
+        divides=drive_map.lanes.divides[rows],
     )
     shares = labelled_points(kept_points, in_window)
     report = label_report(labels, residual, len(drive_map.frames), skipped, shares)

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from datagen.lanes.assign import BEYOND_LANES
 from datagen.world.track_file import read_track
 from lanenet.data.drive import open_drive, read_truth
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.frames import map_from_car
-from lanenet.geometry.lane import POINT_NAMES
+from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, POINT_NAMES, SIDES
 from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
 
 _SAMPLE_CM = 2.0
@@ -52,7 +51,7 @@ def truth_labels(
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
-    lines, between = true_lines(drive_path, truth, drive.camera.wheelbase_cm)
+    lines, between, divides = true_lines(drive_path, truth, drive.camera.wheelbase_cm)
     points_cm = window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1))
     points_cm[between] = np.nan
     return LabelSet(
@@ -76,15 +75,18 @@ def truth_labels(
         edges=edges,
         lines=lines,
         quality=np.ones(n),
+        divides=divides,
     )
 
 
 def true_lines(
     drive_path: Path, truth: dict[str, np.ndarray], wheelbase_cm: float
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"]]:
-    """Return the lines of each frame's lane, as thin as a map's, and whether it is between two lanes.
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"], Bool[np.ndarray, "n 2"]]:
+    """Return the lines of each frame's lane, as thin as a map's, and where the other lane is.
 
-    As in a map's labels, a frame is between two lanes that is not clearly inside its own on the other's side.
+    The second part of the answer tells which frames are between two lanes, the third whether the other lane
+    is beyond the left or beyond the right line. As in a map's labels, a frame is between two lanes that is
+    not clearly inside its own on the other's side.
 
     Args:
         drive_path: Simulated drive; without a road there are no lines.
@@ -93,9 +95,10 @@ def true_lines(
     """
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
     between = np.zeros(len(poses), dtype=bool)
+    divides = np.zeros((len(poses), len(SIDES)), dtype=bool)
     if not (drive_path / "track.json").is_file():
         nothing = np.empty((0, 2))
-        return [(nothing, nothing)] * len(poses), between
+        return [(nothing, nothing)] * len(poses), between, divides
     track = read_track(drive_path / "track.json")
     other_cm = track.oncoming_cm
     every = max(1, round(_SAMPLE_CM / track.step_cm))
@@ -112,7 +115,8 @@ def true_lines(
             lane_cm = other_cm if in_other else 0.0
             # How far the front axle's middle is beyond the line between the lanes, seen from the right one.
             beyond_lanes = offset_cm / other_cm - 0.5
-            between[k] = (beyond_lanes if in_other else -beyond_lanes) < BEYOND_LANES
+            between[k] = (beyond_lanes if in_other else -beyond_lanes) < BESIDE_DIVIDER_LANES
+            divides[k, 0 if (other_cm > 0.0) != in_other else 1] = True
         left, right = track.lines_car(pose, wheelbase_cm, place, lane_cm)
         lines.append((left[::every], right[::every]))
-    return lines, between
+    return lines, between, divides

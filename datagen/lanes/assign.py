@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.line import LaneLine
 from datagen.runs import equal_runs
+from lanenet.geometry.lane import BESIDE_DIVIDER_LANES
 
-#: How far the front axle's middle is beyond a line before the car counts as in the next lane, in lane widths.
-BEYOND_LANES = 0.05
 #: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
 _ENTERED = 0.2
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
@@ -28,11 +27,14 @@ class FrameLanes:
         forward: Whether the frame drives in the path's direction.
         between: Frames on the line between two lanes, or beyond it in a swerve: which lane is meant cannot be
             told from the picture.
+        divides: Whether there is another lane beyond the left, beyond the right line of the frame's lane, in
+            its direction of travel.
     """
 
     lane: Int[np.ndarray, "n"]
     forward: Bool[np.ndarray, "n"]
     between: Bool[np.ndarray, "n"]
+    divides: Bool[np.ndarray, "n 2"]
 
 
 def assign_lanes(
@@ -63,7 +65,7 @@ def assign_lanes(
     usual = float(np.nanmedian(left_of[1] - left_of[0]))
     exists = _lanes(by_index, left_of, s_front, usual)
     lane = np.zeros(n, dtype=np.int64)
-    margin, current = BEYOND_LANES * usual, 0
+    margin, current = BESIDE_DIVIDER_LANES * usual, 0
     # The first frame may be in any lane.
     for k in [0] * min(n, len(exists)) + list(range(n)):
         if current - 1 in exists and left_of[current][k] > margin and exists[current - 1][k]:
@@ -72,7 +74,8 @@ def assign_lanes(
             current += 1
         lane[k] = current
     lane = _without_swerves(lane, left_of, _ENTERED * usual)
-    return FrameLanes(lane, forward, _between_lanes(lane, left_of, exists, margin))
+    divides = _dividers(lane, forward, exists)
+    return FrameLanes(lane, forward, _between_lanes(lane, left_of, exists, margin), divides)
 
 
 def _lanes(
@@ -127,6 +130,18 @@ def _between_lanes(
             between |= (lane == i) & exists[i - 1] & (-left_of[i] < margin_cm)
             between |= (lane == i - 1) & exists[i] & (left_of[i] < margin_cm)
     return between
+
+
+def _dividers(
+    lane: Int[np.ndarray, "n"], forward: Bool[np.ndarray, "n"], exists: dict[int, Bool[np.ndarray, "n"]]
+) -> Bool[np.ndarray, "n 2"]:
+    """Tell beyond which lines of a frame's lane there is another one: the left, the right."""
+    divides = np.zeros((len(lane), 2), dtype=bool)
+    for i in exists:
+        for side, beyond in enumerate((i - 1, i + 1)):
+            if beyond in exists:
+                divides[:, side] |= (lane == i) & exists[beyond]
+    return np.where(forward[:, None], divides, divides[:, ::-1])
 
 
 def _left_of(

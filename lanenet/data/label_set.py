@@ -27,6 +27,8 @@ __all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
 
 _EDGE_COLUMNS = ("edges_x_cm", "edges_y_cm", "edges_normal_x", "edges_normal_y")
 _LINE_COLUMNS = (("left_line_x_cm", "left_line_y_cm"), ("right_line_x_cm", "right_line_y_cm"))
+#: Older files lack these.
+_DIVIDES_COLUMNS = ("left_divides", "right_divides")
 _POSE_COLUMNS = ("x_cm", "y_cm", "heading_rad")
 
 
@@ -47,6 +49,7 @@ class LabelSet:
         lines: Per frame the left and the right line as polylines in the direction of travel, [cm], frame
             car; NaN rows break them.
         quality: 0 (worthless) to 1.
+        divides: Whether there is another lane beyond the left, beyond the right line; none where nobody said.
     """
 
     meta: LabelMeta
@@ -60,9 +63,11 @@ class LabelSet:
     edges: list[Float[np.ndarray, "_ 4"]]
     lines: list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]
     quality: Float[np.ndarray, "n"]
+    divides: Bool[np.ndarray, "n 2"]
 
     def __post_init__(self) -> None:
-        for name in ("drive", "file", "t_s", "lap", "poses", "points_cm", "edges", "lines", "quality"):
+        names = ("drive", "file", "t_s", "lap", "poses", "points_cm", "edges", "lines", "quality", "divides")
+        for name in names:
             if len(getattr(self, name)) != len(self.frame):
                 raise LabelFormatError(
                     f"label set: {len(self.frame)} frames, but {len(getattr(self, name))} of {name!r}"
@@ -90,6 +95,7 @@ class LabelSet:
             edges=[self.edges[i] for i in rows],
             lines=[self.lines[i] for i in rows],
             quality=self.quality[rows],
+            divides=self.divides[rows],
         )
 
 
@@ -119,6 +125,7 @@ def write_labels(path: Path, label_set: LabelSet) -> None:
     for side, names in enumerate(_LINE_COLUMNS):
         arrays |= {n: list_array([line[side][:, k] for line in label_set.lines]) for k, n in enumerate(names)}
     arrays["quality"] = float_array(label_set.quality)
+    arrays |= {name: arrow.array(label_set.divides[:, k]) for k, name in enumerate(_DIVIDES_COLUMNS)}
     # The layout in which Hugging Face `datasets` stores pictures, and the note by which it shows them.
     image_type = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
     window = label_set.meta.window
@@ -147,6 +154,8 @@ def read_labels(path: Path) -> LabelSet:
         _stacked(names, columns, path) for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
     )
     _check_images(table, meta.window)
+    nobody_said = np.zeros(len(table), dtype=bool)
+    divides = [table.flags(name) if name in table.column_names else nobody_said for name in _DIVIDES_COLUMNS]
     label_set = LabelSet(
         meta=meta,
         drive=table.texts("drive"),
@@ -159,6 +168,7 @@ def read_labels(path: Path) -> LabelSet:
         edges=_stacked(_EDGE_COLUMNS, edge_columns, path),
         lines=list(zip(left, right, strict=True)),
         quality=table.floats("quality"),
+        divides=np.stack(divides, axis=1),
     )
     _check_values(label_set, str(path))
     return label_set

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lanenet.data.files import atomic_file, require
 from lanenet.errors import LabelFormatError
@@ -86,6 +86,17 @@ class ParquetTable:
         if self._column(name).null_count:
             raise LabelFormatError(f"{self.path}: column {name!r} holds empty values")
         return self._numpy(name, np.int64)
+
+    def flags(self, name: str) -> Bool[np.ndarray, "n"]:
+        """Return a column of yes and no.
+
+        Raises:
+            LabelFormatError: If the column is missing, holds something else, or a null.
+        """
+        values = self._column(name).to_pylist()
+        if any(not isinstance(value, bool) for value in values):
+            raise LabelFormatError(f"{self.path}: column {name!r}: expected true or false in every row")
+        return np.array(values, dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return a column of texts; null is an empty text.

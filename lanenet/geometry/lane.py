@@ -16,6 +16,9 @@ ROWS_CM: tuple[float, float, float] = (0.0, 15.0, 30.0)
 SIDES: tuple[str, str] = ("left", "right")
 POINT_NAMES: tuple[str, ...] = tuple(f"{side}_{row:.0f}_cm" for side in SIDES for row in ROWS_CM)
 N_POINTS = len(POINT_NAMES)
+#: Beside a line between two lanes nobody can tell from a picture which lane is meant: so far from it the
+#: front axle's middle has to be for the lane to count as the car's, in lane widths.
+BESIDE_DIVIDER_LANES = 0.05
 
 #: x at the three rows = POINTS_FROM_PARABOLA @ (a, b, c).
 POINTS_FROM_PARABOLA: Float[np.ndarray, "3 3"] = np.array([[y * y, y, 1.0] for y in ROWS_CM])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.augment_kernels import (
@@ -82,6 +82,7 @@ def join_frames(
     points_cm: Float[np.ndarray, "n 6"],
     camera_cm: Float[np.ndarray, "n 3"] | None = None,
     lane_cm: Float[np.ndarray, "n"] | None = None,
+    divides: Bool[np.ndarray, "n 2"] | None = None,
 ) -> Frames:
     """Lay frames one after the other, as the compiled loops take them.
 
@@ -92,6 +93,7 @@ def join_frames(
         camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
             one for all.
         lane_cm: Width of the lane of each frame; None where it is not known.
+        divides: Whether there is another lane beyond its left, its right line; None for none anywhere.
     """
     size = len(edges)
     polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
@@ -112,6 +114,7 @@ def join_frames(
         points_cm=np.ascontiguousarray(points_cm, np.float64),
         camera_cm=typical if camera_cm is None else np.ascontiguousarray(camera_cm, np.float64),
         lane_cm=np.zeros(size) if lane_cm is None else np.ascontiguousarray(lane_cm, np.float64),
+        divides=np.zeros((size, 2), np.bool_) if divides is None else np.ascontiguousarray(divides, np.bool_),
     )
 
 

@@ -13,8 +13,9 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from lanenet.geometry.lane import ROWS_CM
+from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, ROWS_CM
 from lanenet.learn.clutter_kernels import CORNERS, add_clutter, draw_outline, is_inside, mark_outline
+from lanenet.learn.dash_kernels import middle_dashes
 from lanenet.learn.mounting_kernels import misplace
 from lanenet.learn.presence_kernels import count_cells, presence
 from lanenet.learn.random_stream import (
@@ -46,6 +47,7 @@ class Amounts(NamedTuple):
     missing_stretch: float
     missing_line: float
     missing_both: float
+    middle_dashes: float
     objects: int
     clutter_segments: int
     clutter_points: int
@@ -72,6 +74,7 @@ class Frames(NamedTuple):
     points_cm: np.ndarray
     camera_cm: np.ndarray
     lane_cm: np.ndarray
+    divides: np.ndarray
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -102,15 +105,18 @@ def augment_frames(out, labels, present, told, indices, streams, seed, epoch, fr
     cells = np.empty(2, np.int64)
     corners = np.empty((amounts.objects, CORNERS, 2))
     opaque = np.empty(amounts.objects, np.bool_)
+    nothing = np.empty((0, 2))
     for slot in range(len(indices)):
         i, raster = indices[slot], out[slot, 0]
         raster[:] = 0
         cells[:] = 0
         start_stream(rng, seed, epoch, streams[slot])
         mirror = next_uniform(rng) < amounts.mirror
-        shift = next_spread(rng, amounts.shift_cm, amounts.limit)
+        shift = next_spread(rng, 1.0, amounts.limit)
         turn = next_spread(rng, amounts.rotate_rad, amounts.limit)
         scale = np.exp(next_spread(rng, np.log1p(amounts.scale), amounts.limit))
+        left_cm, right_cm = _room(frames, i, mirror, scale, amounts.shift_cm)
+        shift *= right_cm if shift > 0.0 else left_cm
         sign = -1.0 if mirror else 1.0
         c, s = np.cos(turn), np.sin(turn)
         # As in `lanenet.learn.augment.make_view`.
@@ -133,12 +139,24 @@ def augment_frames(out, labels, present, told, indices, streams, seed, epoch, fr
         doubled = next_amount(rng, amounts.double_points, amounts.limit)
         first, last = frames.edge_start[i], frames.edge_start[i + 1]
         kind, place_x, place_y, radius = _stretch(rng, amounts.missing_stretch, frames.edges_cm, first, last)
+        is_told, error = (
+            next_uniform(rng) >= amounts.untold_width,
+            next_spread(rng, amounts.width_error, amounts.limit),
+        )
+        told[slot] = frames.lane_cm[i] * scale * (1.0 + error) if is_told else 0.0
+        dashes = nothing
+        # Where the width is not known nobody could tell them from the border of a narrower lane.
+        if told[slot] > 0.0 and next_uniform(rng) < amounts.middle_dashes:
+            dashes = middle_dashes(rng, frames, i)
         count = 0
-        for k in range(first, last):
-            lines = frames.edge_lines[k]
+        for k in range(first, last + len(dashes)):
+            lines = frames.edge_lines[k] if k < last else 0
             if lines & gone or (share > 0.0 and next_uniform(rng) < share):
                 continue
-            px, py = frames.edges_cm[k, 0], frames.edges_cm[k, 1]
+            if k < last:
+                px, py = np.float64(frames.edges_cm[k, 0]), np.float64(frames.edges_cm[k, 1])
+            else:
+                px, py = dashes[k - last, 0], dashes[k - last, 1]
             if kind == 1 and (px - place_x) ** 2 + (py - place_y) ** 2 <= radius * radius:
                 continue
             if kind == 2 and abs(np.sqrt(px * px + py * py) - place_x) <= radius:
@@ -166,8 +184,27 @@ def augment_frames(out, labels, present, told, indices, streams, seed, epoch, fr
         for o in range(n_objects):
             mark_outline(raster, corners[o], grid)
         add_clutter(rng, raster, count, grid, amounts)
-        untold, error = next_uniform(rng), next_spread(rng, amounts.width_error, amounts.limit)
-        told[slot] = 0.0 if untold < amounts.untold_width else frames.lane_cm[i] * scale * (1.0 + error)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _room(frames, i, mirror, scale, most_cm):
+    """How far the car can be put to the left and to the right without a change of lane.
+
+    Across a line at which another lane begins it would be in that one, and its labels those of a lane that it
+    is not in; close beside it a picture shows too little to tell. Beyond other lines it stays in its lane.
+    """
+    room_left, room_right = most_cm, most_cm
+    margin_cm = BESIDE_DIVIDER_LANES * scale * frames.lane_cm[i]
+    for side in range(2):
+        x = scale * frames.points_cm[i, 3 * side]
+        if frames.divides[i, side] and not np.isnan(x):
+            room_cm = min(max((-x if side == 0 else x) - margin_cm, 0.0), most_cm)
+            if (side == 0) != mirror:
+                room_left = room_cm
+            else:
+                room_right = room_cm
+    return room_left, room_right
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -57,6 +57,8 @@ class AugmentSettings(Settings):
         missing_line: Probability that the points of one of the two lines are dropped, and with them what
             runs along it farther out: nobody could tell the next lane's border from a line that is gone.
         missing_both: Probability that the points of both are.
+        middle_dashes: Probability that a dashed line runs along the middle of the lane, where the network is
+            told the lane's width.
         objects: Up to this many closed outlines of unknown things; boxes, cones and cars hide the road below
             them, shadows do not.
         clutter_segments: Up to this many straight edges of things that are not lanes.
@@ -83,6 +85,7 @@ class AugmentSettings(Settings):
     missing_stretch: float = Field(default=0.3, ge=0.0, le=1.0)
     missing_line: float = Field(default=0.25, ge=0.0, le=1.0)
     missing_both: float = Field(default=0.05, ge=0.0, le=1.0)
+    middle_dashes: float = Field(default=0.0, ge=0.0, le=1.0)
     objects: int = Field(default=2, ge=0, le=20)
     clutter_segments: int = Field(default=4, ge=0, le=100)
     clutter_points: int = Field(default=30, ge=0, le=2000)

@@ -88,6 +88,7 @@ class LaneSamples:
             self.points_cm,
             np.array([labels.meta.camera_cm or TYPICAL_CAMERA_CM for labels, _ in pairs]),
             np.array([labels.meta.lane_width_cm for labels, _ in pairs]),
+            np.array([labels.divides[i] for labels, i in pairs]),
         )
 
     def __len__(self) -> int:

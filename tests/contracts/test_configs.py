@@ -110,6 +110,7 @@ def write_quick_labels(path: Path, window: Any, source: str, camera: str) -> Non
         edges=[edge.astype(np.float32) for edge in edges],
         lines=[(line + [s - 15.0, 0.0], line + [s + 15.0, 0.0]) for s in shift],
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
     write_labels(path, labels)
 

@@ -53,6 +53,7 @@ def make_labels(n: int = 6, seed: int = 0) -> LabelSet:
         edges=edges,
         lines=lines,
         quality=rng.random(n),
+        divides=rng.random((n, 2)) < 0.5,
     )
 
 
@@ -60,7 +61,7 @@ def assert_same(a: LabelSet, b: LabelSet) -> None:
     assert a.meta == b.meta
     assert a.drive == b.drive
     assert a.file == b.file
-    for name in ("frame", "t_s", "lap", "poses", "points_cm", "quality"):
+    for name in ("frame", "t_s", "lap", "poses", "points_cm", "quality", "divides"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
     for edge_a, edge_b in zip(a.edges, b.edges, strict=True):
         np.testing.assert_array_equal(edge_a, edge_b)

@@ -42,6 +42,7 @@ def _labels(frames: np.ndarray) -> LabelSet:
         edges=[np.empty((0, 4), np.float32)] * n,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
 
 

@@ -34,6 +34,7 @@ def drive(laps: np.ndarray, step_cm: np.ndarray | float = 3.0, frames: np.ndarra
         edges=[np.empty((0, 4), np.float32)] * n,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
 
 

@@ -100,6 +100,7 @@ def _labels(points_cm: np.ndarray) -> LabelSet:
         edges=[np.empty((0, 4), np.float32)] * n,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
 
 

@@ -40,6 +40,12 @@ def test_on_the_line_between_two_lanes_there_are_no_labels(tmp_path):
     away_cm = np.minimum(np.abs(truth["left_0_cm"]), np.abs(truth["right_0_cm"]))
     assert 2 <= hidden.sum() <= 10
     assert away_cm[hidden].max() < 2.3 and away_cm[~hidden].min() > 1.8
+    # The line between the lanes is on the left of the right one, and on the right of the left one.
+    assert {tuple(row) for row in labels.divides.tolist()} == {(True, False), (False, True)}
+    nearer_left = np.abs(truth["left_0_cm"]) < np.abs(truth["right_0_cm"])
+    near = ~hidden & (away_cm < 10.0)
+    assert near.sum() >= 4
+    np.testing.assert_array_equal(labels.divides[near, 0], nearer_left[near])
     # Points lie on the lines of the lane that they name, also in the other one.
     for k in np.flatnonzero(~hidden):
         left, right = labels.lines[k]

@@ -172,6 +172,8 @@ def test_a_lane_change_and_back():
     np.testing.assert_array_equal(found.lane[80:], np.where(y[80:] < 18.0 - 1.8, 0, -1))
     # As far on either side of the line nobody can tell which lane is meant.
     np.testing.assert_array_equal(found.between, np.abs(y - 18.0) < 1.8)
+    # It is the left line of the one lane and the right line of the other.
+    np.testing.assert_array_equal(found.divides, np.stack([found.lane == 0, found.lane == -1], axis=1))
 
 
 def test_straddling_a_line_does_not_flicker():
@@ -233,8 +235,9 @@ def test_a_line_is_between_two_lanes_only_where_there_are_two():
     # The far line of the other lane comes so near in the second half that there is no lane before it.
     lines = [_bent_in(line) if line.index == -1 else line for line in lines]
     poses, s = _drive(np.full(60, 17.0))
-    between = assign_lanes(lines, poses, s, WHEELBASE_CM).between
-    assert between[:20].all() and not between[-20:].any()
+    found = assign_lanes(lines, poses, s, WHEELBASE_CM)
+    assert found.between[:20].all() and not found.between[-20:].any()
+    assert found.divides[:20, 0].all() and not found.divides[-20:].any() and not found.divides[:, 1].any()
 
 
 def _bent_in(line: LaneLine) -> LaneLine:
@@ -254,6 +257,8 @@ def test_the_other_way_in_the_other_lane():
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
     assert not found.forward.any()
     assert (found.lane == -1).all()
+    # Against the path's direction the driven lane's line is on the left again.
+    assert found.divides[:, 0].all() and not found.divides[:, 1].any()
 
 
 def test_a_single_lane_is_the_lane():

@@ -52,4 +52,5 @@ def make_label_set(
         edges=edges,
         lines=lines,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )

@@ -354,3 +354,51 @@ def lane_over_cosine(points):
     """How much longer the way across a lane along x is than its width, from the slope of its middle."""
     slope = (points[2] + points[5] - points[0] - points[3]) / 60.0
     return np.hypot(1.0, slope)
+
+
+@pytest.mark.parametrize("mirror", [0.0, 1.0])
+@pytest.mark.parametrize("draw", ["even", "limit"])
+def test_the_car_is_not_put_into_the_next_lane(mirror, draw):
+    divides = np.tile([True, False], (len(EDGES), 1))
+    frames = join_frames(
+        EDGES, LABELS.lines, LABELS.points_cm, lane_cm=np.full(len(EDGES), 40.0), divides=divides
+    )
+    many, streams = np.tile(ALL, 40), np.arange(40 * len(ALL))
+    changes = NOTHING.model_copy(update={"shift_cm": 30.0, "mirror": mirror, "draw": draw})
+    points = augment_batch(frames, many, BirdseyeWindow(), changes, 0, 0, streams)[1]
+    left, right = points[:, 0], points[:, 3]
+    divider, border = (left, right) if mirror == 0.0 else (-right, -left)
+    # A twentieth of the lane stays between car and divider, and no more; the other line is crossed.
+    assert np.nanmax(divider) == pytest.approx(-2.0, abs=0.01 if draw == "limit" else 0.3)
+    assert np.nanmin(border) < -5.0
+    if draw == "even":
+        assert np.histogram(divider, bins=[-60, -30, -20, -10, 0])[0].min() > 20
+
+
+def test_middle_dashes_lie_between_the_lines_and_change_nothing_else():
+    fine = BirdseyeWindow()
+    frames = join_frames(EDGES, LABELS.lines, LABELS.points_cm, lane_cm=np.full(len(EDGES), 40.0))
+    many, streams = np.tile(ALL, 10), np.arange(10 * len(ALL))
+    dashed = NOTHING.model_copy(update={"middle_dashes": 1.0})
+    plain = augment_batch(frames, many, fine, NOTHING, 0, 0, streams)
+    rasters, points, present, told = augment_batch(frames, many, fine, dashed, 0, 0, streams)
+    np.testing.assert_array_equal(points, plain.points_cm)
+    np.testing.assert_array_equal(present, plain.present)
+    added = (rasters > 0) & (plain.rasters == 0)
+    assert not np.any(rasters < plain.rasters)
+    painted = []
+    for i, new in zip(many, added[:, 0], strict=True):
+        seen = fine.points(np.argwhere(new).astype(float))
+        middle = 0.5 * (LABELS.lines[i][0] + LABELS.lines[i][1])
+        off_cm = np.abs(seen[:, 0] - np.interp(seen[:, 1], middle[:, 1], middle[:, 0]))
+        # 4 % of 40 cm off the middle, and half a tape of 2 cm; a cell may round by one.
+        assert off_cm.max(initial=0.0) < 1.6 + 1.0 + fine.cell_cm
+        rows = np.unique(np.argwhere(new)[:, 0])
+        painted.append(len(rows) * fine.cell_cm / 64.0)  # of 8 to 72 cm ahead
+    # Dashes and gaps of 5 to 30 cm: half of the way on average, never all of it.
+    assert 0.35 < np.mean(painted) < 0.75 and np.max(painted) < 1.0
+    untold = dashed.model_copy(update={"untold_width": 1.0})
+    np.testing.assert_array_equal(
+        augment_batch(frames, many, fine, untold, 0, 0, streams).rasters, plain.rasters
+    )
+    assert (told == 40.0).all()

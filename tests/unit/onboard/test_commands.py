@@ -262,6 +262,7 @@ def tiny_labels(path: Path) -> LabelSet:
         edges=edges,
         lines=[(line, line)] * n,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
     write_labels(path, labels)
     return labels

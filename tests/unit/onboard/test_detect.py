@@ -179,6 +179,7 @@ def test_lane_filter_on_label_sets_starts_again_after_gaps() -> None:
         edges=[edges(shift) for shift in shifts],
         lines=[(np.zeros((2, 2)), np.zeros((2, 2)))] * n,
         quality=np.ones(n),
+        divides=np.zeros((n, 2), dtype=bool),
     )
     centres = lane_filter_points_cm(labels)[:, [1, 4]].mean(axis=1)
     assert centres == pytest.approx([0.0, -8.0, -16.0, -24.0, 16.0], abs=0.2)
