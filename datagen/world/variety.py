@@ -9,9 +9,9 @@ import numpy as np
 
 from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
-from datagen.world.script import DriverSettings
+from datagen.world.script import DriverSettings, shortest_excursion_spacing_cm, shortest_lane_change_cm
 from datagen.world.track_settings import TrackSettings, preset
-from datagen.world.world import SimulationSettings, World, build_world
+from datagen.world.world import START_CM, SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
@@ -25,6 +25,8 @@ _BEND_CM_S2 = 300.0
 _DRAWN_SHARE = 0.5
 #: Presets of roads that home-made cars are driven on.
 _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
+#: Nobody changes lanes sooner after the start.
+_FIRST_CHANGE_CM = 30.0
 _TRIES = 8
 
 
@@ -134,31 +136,43 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     return TrackSettings.model_validate(road)
 
 
-def vary_driver(track: TrackSettings, rng: np.random.Generator) -> DriverSettings:
+def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> DriverSettings:
     """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
     People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
     car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes, every third one
-    also changes between them, if the drive goes on for that long. Nobody is faster than the tightest bend
-    allows.
+    also changes between them, for the first time at any place from 30 cm on at which half of the change is
+    still within the drive. Nobody is faster than the tightest bend allows, and no excursion and no change
+    bends more sharply than the car can turn.
+
+    Args:
+        simulation: Road, car, and how long the drive is.
+        rng: Source of randomness.
     """
+    track, tightest_cm = simulation.track, tightest_bend_cm(simulation.car)
     lane_cm = track.lane_width_cm
     fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.min_radius_cm))
     speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(fastest_cm_s))))
-    recovers, wander, recover, changes, change = rng.random(5)
+    recovers, wander, recover, changes, change, first = rng.random(6)
     recover_cm = lane_cm * (0.2 + 0.4 * recover)
     driver = DriverSettings(
         style="recover" if recovers < 0.35 else "wander",
         speed_cm_s=speed_cm_s,
         wander_cm=lane_cm * (0.08 + 0.22 * wander),
         recover_cm=recover_cm,
-        # Less steeply in wide lanes; a long car's wheels are at their stop for a moment all the same.
-        recover_every_cm=max(200.0, 7.0 * recover_cm),
+        recover_every_cm=max(200.0, shortest_excursion_spacing_cm(recover_cm, tightest_cm)),
     )
     if track.lanes == 1 or changes >= 1.0 / 3.0:
         return driver
-    change_cm = max(150.0, 3.5 * lane_cm)
-    update = {"lane_change_cm": change_cm, "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change)}
+    change_cm = max(150.0, 3.5 * lane_cm, shortest_lane_change_cm(lane_cm, tightest_cm))
+    start_cm = 0.0 if track.closed else START_CM + simulation.car.wheelbase_cm
+    way_cm = simulation.frames / simulation.rate_hz * speed_cm_s
+    latest_cm = max(_FIRST_CHANGE_CM, way_cm - 0.5 * change_cm)
+    update = {
+        "lane_change_cm": change_cm,
+        "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change),
+        "first_change_cm": start_cm + _FIRST_CHANGE_CM + first * (latest_cm - _FIRST_CHANGE_CM),
+    }
     return driver.model_copy(update={"style": "wander", **update})
 
 
@@ -195,15 +209,9 @@ def vary_simulation(
             track = vary_road(road_rng, tightest_bend_cm(car))
         if sees_lane(camera, track.lane_width_cm, car.wheelbase_cm):
             break
-    changes: dict[str, object] = {
-        "seed": int(sequence.generate_state(1)[0]),
-        "camera": camera,
-        "track": track,
-        "car": car,
-    }
-    if driver:
-        changes["driver"] = vary_driver(track, driver_rng)
-    return simulation.model_copy(update=changes)
+    seed = int(sequence.generate_state(1)[0])
+    drawn = simulation.model_copy(update={"seed": seed, "camera": camera, "track": track, "car": car})
+    return drawn.model_copy(update={"driver": vary_driver(drawn, driver_rng)}) if driver else drawn
 
 
 def first_world(simulation: SimulationSettings) -> World:

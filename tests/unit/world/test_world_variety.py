@@ -9,6 +9,7 @@ import pytest
 
 from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
+from datagen.world.script import DriverSettings
 from datagen.world.track import random_track
 from datagen.world.track_settings import TrackSettings
 from datagen.world.variety import (
@@ -124,9 +125,13 @@ def test_what_is_not_drawn_stays():
     assert all(one.track.min_radius_cm >= tightest_bend_cm(one.car) for one in own)
 
 
+def _drivers(track: TrackSettings, **changes: object) -> list[DriverSettings]:
+    simulation = SimulationSettings(**{"track": track, **changes})
+    return [vary_driver(simulation, np.random.default_rng(seed)) for seed in range(60)]
+
+
 def test_drivers_leave_the_middle_but_find_back():
-    road = TrackSettings(lane_width_cm=40.0)
-    drivers = [vary_driver(road, np.random.default_rng(seed)) for seed in range(60)]
+    drivers = _drivers(TrackSettings(lane_width_cm=40.0))
     assert {driver.style for driver in drivers} == {"wander", "recover"}
     speeds = [driver.speed_cm_s for driver in drivers]
     # In a bend of 60 cm nobody exceeds 3 m/s^2.
@@ -134,10 +139,37 @@ def test_drivers_leave_the_middle_but_find_back():
     assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 24.0 for driver in drivers)
     assert max(driver.recover_cm for driver in drivers) > 20.0
     assert all(driver.change_lanes_every_cm is None for driver in drivers)
-    # Wide excursions take a longer way.
-    wide = [vary_driver(TrackSettings(lane_width_cm=75.0), np.random.default_rng(seed)) for seed in range(60)]
-    assert all(driver.recover_every_cm >= 7.0 * driver.recover_cm for driver in wide)
-    assert max(driver.recover_every_cm for driver in wide) > 250.0
-    two = TrackSettings(lane_width_cm=69.0, lanes=2)
-    every = [vary_driver(two, np.random.default_rng(seed)).change_lanes_every_cm for seed in range(60)]
+    every = [driver.change_lanes_every_cm for driver in _drivers(TrackSettings(lane_width_cm=69.0, lanes=2))]
     assert sum(way is not None for way in every) in range(12, 31)
+
+
+def test_nobody_swerves_more_sharply_than_the_car_can_turn():
+    two_lanes = TrackSettings(lane_width_cm=60.0, lanes=2)
+    for car in (CarSettings(wheelbase_cm=16.0), CarSettings(wheelbase_cm=60.0)):
+        drivers = _drivers(two_lanes, car=car)
+        for driver in drivers:
+            # Over 0.7 of the spacing: height times the squared sine of half a turn.
+            excursion = 2.0 * math.pi**2 * driver.recover_cm / (0.7 * driver.recover_every_cm) ** 2
+            change = 6.0 * 60.0 / driver.lane_change_cm**2
+            ways = [excursion, change] if driver.change_lanes_every_cm else [excursion]
+            assert max(ways) * tightest_bend_cm(car) < 1.001
+        assert all(driver.recover_every_cm >= 200.0 and driver.lane_change_cm >= 150.0 for driver in drivers)
+    # The long car needs the longer way.
+    assert min(driver.recover_every_cm for driver in drivers) > 250.0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("frames", [20, 100, 300])
+def test_lanes_are_changed_within_the_drive(frames, closed):
+    track = TrackSettings(lane_width_cm=40.0, lanes=2, closed=closed)
+    drivers = [one for one in _drivers(track, frames=frames) if one.change_lanes_every_cm is not None]
+    # The front axle of a car on an open road starts a wheelbase beyond the rear axle's 40 cm.
+    start_cm = 0.0 if closed else 66.0
+    begins = np.array([one.first_change_cm for one in drivers]) - start_cm
+    ways = np.array([one.speed_cm_s for one in drivers]) * frames / 20.0
+    assert (begins >= 30.0).all()
+    latest = np.maximum(30.0, ways - 75.0)
+    assert (begins <= latest).all()
+    if frames == 300:
+        share = (begins - 30.0) / (latest - 30.0)
+        assert share.min() < 0.25 and share.max() > 0.75
