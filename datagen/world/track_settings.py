@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -139,6 +140,15 @@ class TrackSettings(Settings):
         if self.far is not None:
             lines["far"] = (3.0 * half_cm, self.far)
         return lines
+
+    @property
+    def tightest_radius_cm(self) -> float:
+        """Smallest radius of the driven lane's centre line, [cm]; infinite where it has straights only."""
+        if not self.pieces:
+            return self.min_radius_cm
+        return min(
+            (radius_cm for piece in self.pieces for _, radius_cm, _ in piece.bends()), default=math.inf
+        )
 
     def _check_lines(self) -> None:
         wanted = ("left", "right") if self.lanes == 1 else ("middle", "right", "far")

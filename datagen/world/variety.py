@@ -10,14 +10,12 @@ import numpy as np
 from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings, shortest_excursion_spacing_cm, shortest_lane_change_cm
+from datagen.world.sight import sees_lane
 from datagen.world.track_settings import TrackSettings, preset
 from datagen.world.world import START_CM, SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM
 
-#: A road is redrawn where the camera does not see both lines of its lane, on a straight, so far ahead.
-_SEES_AHEAD_CM = max(ROWS_CM)
 _SIGHT_TRIES = 20
 #: Lateral acceleration that nobody exceeds in the tightest bend.
 _BEND_CM_S2 = 300.0
@@ -73,16 +71,6 @@ def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSetti
             "height_cm": height_cm,
         }
     )
-
-
-def sees_lane(camera: CameraSettings, lane_width_cm: float, wheelbase_cm: float) -> bool:
-    """Whether both lines of a straight lane are in the picture where the farthest label row crosses them."""
-    built = camera.build(wheelbase_cm)
-    half_cm = 0.5 * lane_width_cm
-    pixels = built.project_ground(np.array([[-half_cm, _SEES_AHEAD_CM], [half_cm, _SEES_AHEAD_CM]]))
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0.0) & (pixels <= np.array([built.width - 1.0, built.height - 1.0]))
-    return bool(inside.all())
 
 
 def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
@@ -151,7 +139,7 @@ def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> Dri
     """
     track, tightest_cm = simulation.track, tightest_bend_cm(simulation.car)
     lane_cm = track.lane_width_cm
-    fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.min_radius_cm))
+    fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.tightest_radius_cm))
     speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(fastest_cm_s))))
     recovers, wander, recover, changes, change, first = rng.random(6)
     recover_cm = lane_cm * (0.2 + 0.4 * recover)
@@ -187,7 +175,7 @@ def vary_simulation(
 ) -> SimulationSettings:
     """Draw one of many drives; its seed is the sequence's first number.
 
-    Camera and road are drawn until the camera sees both lines, for a while: with a lens that does not, nobody
+    Camera and road are drawn until the camera sees the lane, for a while: with a lens that does not, nobody
     would drive.
 
     Args:
@@ -207,7 +195,7 @@ def vary_simulation(
             camera = vary_camera(cameras[number % len(cameras)], camera_rng)
         if road:
             track = vary_road(road_rng, tightest_bend_cm(car))
-        if sees_lane(camera, track.lane_width_cm, car.wheelbase_cm):
+        if sees_lane(camera, track, car.wheelbase_cm):
             break
     seed = int(sequence.generate_state(1)[0])
     drawn = simulation.model_copy(update={"seed": seed, "camera": camera, "track": track, "car": car})

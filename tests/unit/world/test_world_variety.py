@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from datagen.world.car import CarSettings
+from datagen.world.driver import Driver
 from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings
+from datagen.world.sight import line_in_bend_car, sees_lane
 from datagen.world.track import random_track
 from datagen.world.track_settings import TrackSettings
 from datagen.world.variety import (
     camera_like,
     first_world,
-    sees_lane,
     tightest_bend_cm,
     vary_camera,
     vary_car,
@@ -26,6 +27,7 @@ from datagen.world.variety import (
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.lane import rows_of_polyline
 
 
 @pytest.mark.parametrize(
@@ -102,13 +104,85 @@ def test_no_bend_is_tighter_than_the_car_can_turn():
 def test_the_camera_sees_the_lane_that_it_drives_in():
     narrow = CameraSettings(width=160, height=120, field_of_view_rad=1.2, pitch_down_rad=0.4, height_cm=15.0)
     # 32 cm ahead of the lens, 34 degrees to either side: 22 cm.
-    assert sees_lane(narrow, 40.0, 20.0) and not sees_lane(narrow, 50.0, 20.0)
+    wide_bends = {width: TrackSettings(lane_width_cm=width, min_radius_cm=500.0) for width in (30, 40, 50)}
+    assert sees_lane(narrow, wide_bends[40], 20.0) and not sees_lane(narrow, wide_bends[50], 20.0)
     # A lens that looks above the road sees no line near the car.
-    assert not sees_lane(narrow.model_copy(update={"pitch_down_rad": -0.4}), 30.0, 20.0)
+    assert not sees_lane(narrow.model_copy(update={"pitch_down_rad": -0.4}), wide_bends[30], 20.0)
     for number in range(40):
         sequence = np.random.SeedSequence([5, number])
         drawn = vary_simulation(SimulationSettings(), sequence, number, cameras=(narrow,))
-        assert sees_lane(drawn.camera, drawn.track.lane_width_cm, drawn.car.wheelbase_cm)
+        assert sees_lane(drawn.camera, drawn.track, drawn.car.wheelbase_cm)
+
+
+def _in_bend(radius_cm: float, width_cm: float, wheelbase_cm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right line, frame car, of a road that is one bend (a negative radius to the right)."""
+    bend = {
+        "radius_cm": abs(radius_cm),
+        "angle_deg": 180.0,
+        "direction": "left" if radius_cm > 0.0 else "right",
+    }
+    track = random_track(
+        TrackSettings(lane_width_cm=width_cm, pieces=({"arc": bend},)), np.random.default_rng(0)
+    )
+    car = CarSettings(wheelbase_cm=wheelbase_cm)
+    driver = Driver(DriverSettings(), track, 0.0, car, 20.0, np.random.default_rng(0))
+    return track.lines_car(driver.pose_at(70.0), wheelbase_cm, near_s_cm=70.0)
+
+
+@pytest.mark.parametrize("radius_cm", [50.0, -50.0, 90.0])
+@pytest.mark.parametrize("wheelbase_cm", [16.0, 26.0])
+def test_lines_of_a_bend_lie_where_a_road_has_them(radius_cm, wheelbase_cm):
+    for line, offset_cm in zip(_in_bend(radius_cm, 40.0, wheelbase_cm), (20.0, -20.0), strict=True):
+        drawn = line_in_bend_car(1.0 / radius_cm, offset_cm, wheelbase_cm)
+        np.testing.assert_allclose(np.linalg.norm(np.diff(drawn, axis=0), axis=1), 0.5, atol=1e-3)
+        assert (drawn[:, 1] >= 0.0).all() and (drawn[:, 1] <= 45.0).all()
+        # The road's samples are about a centimetre apart.
+        assert np.linalg.norm(drawn[:, None] - line[None], axis=2).min(axis=1).max() < 0.8
+        # Where the line inside turns away before a row, neither crosses it.
+        crossed = np.interp((15.0, 30.0), drawn[:, 1], drawn[:, 0], right=np.nan)
+        np.testing.assert_allclose(crossed, rows_of_polyline(line)[1:], atol=0.05)
+
+
+def test_a_bend_needs_a_stretch_of_line_that_is_longer_than_its_gaps():
+    # A long lens: on a straight both lines are in the picture 30 cm ahead.
+    lens = CameraSettings(width=160, height=120, field_of_view_rad=1.1, pitch_down_rad=0.3, height_cm=18.0)
+    wheelbase_cm, width_cm = 24.0, 34.0
+    seen = []
+    for radius_cm in (40.0, 60.0, 90.0, 150.0, 400.0):
+        longest_cm = []
+        for side in (1.0, -1.0):
+            stretches_cm = []
+            for line in _in_bend(side * radius_cm, width_cm, wheelbase_cm):
+                near = line[(line[:, 1] >= 0.0) & (line[:, 1] <= 45.0) & (np.gradient(line[:, 1]) > 0.0)]
+                pixels = lens.build(wheelbase_cm).project_ground(near)
+                visible = near[((pixels >= 0.0) & (pixels <= [159.0, 119.0])).all(axis=1)]
+                # A line that has left the picture does not come back here: one stretch.
+                stretches_cm.append(float(np.linalg.norm(np.diff(visible, axis=0), axis=1).sum()))
+            longest_cm.append(max(stretches_cm))
+        for gap_cm in (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0):
+            # Samples of the road and of the rule are not the same.
+            if abs(min(longest_cm) - gap_cm - 10.0) < 2.0:
+                continue
+            line = {"kind": "dashed" if gap_cm else "solid", "gap_cm": max(gap_cm, 1.0)}
+            road = {"lane_width_cm": width_cm, "left": line, "right": line}
+            expected = min(longest_cm) >= gap_cm + 10.0
+            assert sees_lane(lens, TrackSettings(**road, min_radius_cm=radius_cm), wheelbase_cm) == expected
+            # A road from pieces is judged by its own bends, not by a key that has no effect on it.
+            arc = {"arc": {"radius_cm": radius_cm, "angle_deg": 20.0, "direction": "left"}}
+            pieces = ({"straight": {"length_cm": 100.0}}, arc)
+            assert sees_lane(lens, TrackSettings(**road, pieces=pieces), wheelbase_cm) == expected
+            seen.append(expected)
+    assert True in seen and False in seen
+
+
+def test_a_road_without_paint_in_sight_is_not_seen():
+    road = TrackSettings(pieces=({"straight": {"length_cm": 200.0}},))
+    assert road.tightest_radius_cm == math.inf
+    assert sees_lane(CameraSettings(), road, 26.0)
+    bare = {"left": {"kind": "none"}, "right": {"kind": "none"}}
+    assert not sees_lane(CameraSettings(), TrackSettings(**bare), 26.0)
+    # No such road can be laid; that is told where it is laid.
+    assert not sees_lane(CameraSettings(), TrackSettings(min_radius_cm=20.0, lane_width_cm=40.0), 26.0)
 
 
 def test_what_is_not_drawn_stays():
