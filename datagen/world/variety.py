@@ -94,7 +94,8 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     """Draw a kind of road: one of the presets, or tape laid out on a floor.
 
     Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm;
-    the tightest bends have radii of 0.9 to 1.3 lane widths. Every other road has two lanes, on one of eight
+    the tightest bends have radii of 0.9 to 1.3 lane widths, and on one road of four up to 80 % of the pieces
+    are corners. Every other road has two lanes, on one of eight
     the line on the right is dashed too, and from every other one up to a sixth of the tape has come off in
     short stretches.
 
@@ -103,7 +104,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
         tightest_cm: Smallest radius that the car can follow; presets keep their own.
     """
     drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
-    two_lanes, width, tape, gaps, dash, gap, right, worn, tight = rng.random(9)
+    two_lanes, width, tape, gaps, dash, gap, right, worn, tight, cornered, corners = rng.random(11)
     if drawn >= _DRAWN_SHARE:
         return preset(_PRESETS[number])
     lane_cm = float(30.0 * 2.3**width)
@@ -116,6 +117,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
         "lane_width_cm": lane_cm,
         "line_width_cm": float(1.5 * 3.4**tape),
         "min_radius_cm": max(tightest_cm, (0.9 + 0.4 * tight) * lane_cm),
+        "corners": 0.3 + 0.5 * corners if cornered < 0.25 else 0.0,
         "interruptions_per_m": 0.2 * gaps,
         "right": {"kind": "dashed" if right < 0.125 else "solid", **dashes},
     }

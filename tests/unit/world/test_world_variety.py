@@ -65,6 +65,8 @@ def test_roads_vary_and_can_be_laid():
     own = [road for road in roads if road.preset is None]
     assert all(30.0 <= road.lane_width_cm <= 69.0 and 1.5 <= road.line_width_cm <= 5.1 for road in own)
     assert {road.right.kind for road in own} == {"solid", "dashed"}
+    cornered = [road.corners for road in roads if road.corners > 0.0]
+    assert 3 <= len(cornered) <= len(own) // 2 and 0.3 <= min(cornered) < max(cornered) <= 0.8
     for seed, road in enumerate(own[:4]):
         track = random_track(road.model_copy(update={"length_cm": 400.0}), np.random.default_rng(seed))
         assert len(track.markings) >= 2
