@@ -14,6 +14,7 @@ from lanenet.config import Settings
 _NOISE_TIME_S = 0.7  # how long a deviation of speed or steering lasts
 _STEP_S = 0.01  # longest step of the motion; the deviations are drawn once per step
 _SAME_TIME_S = 1e-9
+_MOST_TURNED = 0.9  # sine of the front wheels' angle in a bend that no car could turn
 
 
 class CarSettings(Settings):
@@ -90,6 +91,21 @@ def advance_along(
     chord_cm = distance_cm * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
     direction = float(pose[2]) + 0.5 * turn - slip_rad
     return pose + np.array([chord_cm * math.cos(direction), chord_cm * math.sin(direction), turn])
+
+
+def front_wheels_in_bend_rad(curvature_per_cm: float, wheelbase_cm: float) -> float:
+    """Return where the front wheels point from the heading of a car whose front axle follows a bend.
+
+    The rear axle runs further inside, so that the car is turned outwards against the bend at its front axle.
+
+    Args:
+        curvature_per_cm: Of the front axle's way, positive left.
+        wheelbase_cm: Distance between the axles.
+
+    Returns:
+        The angle, [rad], positive left; never more than 64 degrees, however tight the bend.
+    """
+    return math.asin(min(max(wheelbase_cm * curvature_per_cm, -_MOST_TURNED), _MOST_TURNED))
 
 
 def driven_curvature_per_cm(wheels_rad: float, speed_cm_s: float, settings: CarSettings) -> float:

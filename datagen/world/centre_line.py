@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,12 @@ _CHECK_CM = 5.0  # spacing of the points compared for clearance
 _PIECE_TRIES = 30
 _RETREATS = 60
 _RETREAT_PIECES = 5
+
+# A corner: its turn, its radius in smallest radii, the ways into and out of it, and the straight behind it.
+_CORNER_RAD = (math.radians(80.0), math.radians(100.0))
+_CORNER_RADII = (1.0, 1.25)
+_CORNER_RAMP_CM = (8.0, 20.0)
+_CORNER_STRAIGHT_CM = (20.0, 150.0)
 
 #: Smallest radius of left and of right bends, [cm].
 Radii = tuple[float, float]
@@ -88,7 +95,12 @@ def comes_near_itself(
 
 
 def open_centre_line(
-    length_cm: float, min_radius_cm: Radii, separation_cm: float, middle_cm: float, rng: np.random.Generator
+    length_cm: float,
+    min_radius_cm: Radii,
+    separation_cm: float,
+    middle_cm: float,
+    rng: np.random.Generator,
+    corners: float = 0.0,
 ) -> CentreLine:
     """Draw a random open road of straights, bends and S-bends joined by clothoids.
 
@@ -100,6 +112,8 @@ def open_centre_line(
         separation_cm: Least distance of the middles of two stretches of road.
         middle_cm: Offset of the road's middle from the centre line.
         rng: Source of randomness.
+        corners: Share of the pieces that are sharp turns of nearly a right angle, each with a straight
+            behind it.
 
     Raises:
         ConfigError: If no road of this length fits.
@@ -111,7 +125,9 @@ def open_centre_line(
     for _ in range(_RETREATS + target // 100):
         failed = 0
         while failed < _PIECE_TRIES and len(line.xy_cm) < target:
-            piece = _random_piece(float(line.curvature_per_cm[-1]), min_radius_cm, rng)
+            # Without corners nothing more is drawn: the roads stay those that they were.
+            draw = _corner if corners > 0.0 and rng.random() < corners else _random_piece
+            piece = draw(float(line.curvature_per_cm[-1]), min_radius_cm, rng)
             trial = _continue(line, piece[: target - len(line.xy_cm)])
             after_cm = len(line.xy_cm) * _SAMPLE_CM
             if comes_near_itself(trial, separation_cm, False, after_cm, middle_cm) is not None:
@@ -151,15 +167,44 @@ def _random_piece(
     """Curvature of one more piece: a linear change to a new value, then that value for a while."""
     straight = rng.random() < 0.25
     share = rng.random()
+    sign = _random_side(curvature_before, rng)
+    smallest_cm = min_radius_cm[0] if sign > 0.0 else min_radius_cm[1]
+    radius_cm = smallest_cm * 4.0**share
+    hold_cm = rng.uniform(20.0, 120.0) if straight else radius_cm * rng.uniform(0.3, 1.8)
+    after = 0.0 if straight else sign / radius_cm
+    ramp_cm = rng.uniform(30.0, 60.0) * max(0.3, abs(after - curvature_before) * smallest_cm)
+    n_ramp, n_hold = max(5, round(ramp_cm / _SAMPLE_CM)), round(hold_cm / _SAMPLE_CM)
+    return np.concatenate([_ramp(curvature_before, after, n_ramp), np.full(n_hold, after)])
+
+
+def _corner(
+    curvature_before: float, min_radius_cm: Radii, rng: np.random.Generator
+) -> Float[np.ndarray, "n"]:
+    """Curvature of a corner as tape has it that is laid in a rectangle, and of the straight behind it."""
+    sign = _random_side(curvature_before, rng)
+    turn_rad, radii, ramp_cm, straight_cm = (
+        rng.uniform(*span) for span in (_CORNER_RAD, _CORNER_RADII, _CORNER_RAMP_CM, _CORNER_STRAIGHT_CM)
+    )
+    curvature = sign / (radii * (min_radius_cm[0] if sign > 0.0 else min_radius_cm[1]))
+    n_out = round(ramp_cm / _SAMPLE_CM)
+    # Out of a bend the other way it takes as much longer.
+    n_in = max(5, round(n_out * abs(1.0 - curvature_before / curvature)))
+    ramps = [_ramp(curvature_before, curvature, n_in), _ramp(curvature, 0.0, n_out)]
+    turned_rad = 0.5 * _SAMPLE_CM * (n_in * (curvature_before + curvature) + n_out * curvature)
+    hold_cm = max(0.0, (turn_rad - sign * turned_rad) / abs(curvature))
+    held = np.full(round(hold_cm / _SAMPLE_CM), curvature)
+    return np.concatenate([ramps[0], held, ramps[1], np.zeros(round(straight_cm / _SAMPLE_CM))])
+
+
+def _random_side(curvature_before: float, rng: np.random.Generator) -> float:
+    """Draw where the next bend turns: 1 left, -1 right."""
     # Turning the other way is likelier, so that roads wind rather than curl up.
     sign = -np.sign(curvature_before) if rng.random() < 0.65 else np.sign(curvature_before)
     if sign == 0.0:
         sign = 1.0 if rng.random() < 0.5 else -1.0
-    smallest_cm = min_radius_cm[0] if sign > 0.0 else min_radius_cm[1]
-    radius_cm = smallest_cm * 4.0**share
-    hold_cm = rng.uniform(20.0, 120.0) if straight else radius_cm * rng.uniform(0.3, 1.8)
-    after = 0.0 if straight else float(sign) / radius_cm
-    ramp_cm = rng.uniform(30.0, 60.0) * max(0.3, abs(after - curvature_before) * smallest_cm)
-    n_ramp, n_hold = max(5, round(ramp_cm / _SAMPLE_CM)), round(hold_cm / _SAMPLE_CM)
-    ramp = curvature_before + (after - curvature_before) * np.arange(1, n_ramp + 1) / n_ramp
-    return np.concatenate([ramp, np.full(n_hold, after)])
+    return float(sign)
+
+
+def _ramp(before: float, after: float, n: int) -> Float[np.ndarray, "n"]:
+    """Curvature on the way from one value to another, which it ends on."""
+    return before + (after - before) * np.arange(1, n + 1) / n

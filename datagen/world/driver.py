@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from datagen.world.car import CarSettings, advance
+from datagen.world.car import CarSettings, advance, front_wheels_in_bend_rad
 from datagen.world.script import DriverSettings, Script
 from datagen.world.track import Track
 from lanenet.geometry.frames import map_from_car
@@ -64,8 +64,7 @@ class Driver:
         """
         front_cm, road_rad = self.track.point(s_cm, offset_cm)
         curvature = self.track.point(s_cm + 1.0)[1] - road_rad
-        turned = min(max(self._wheelbase_cm * curvature, -0.9), 0.9)
-        heading = road_rad + math.atan(slope) - math.asin(turned)
+        heading = road_rad + math.atan(slope) - front_wheels_in_bend_rad(curvature, self._wheelbase_cm)
         rear_cm = front_cm - self._wheelbase_cm * np.array([math.cos(heading), math.sin(heading)])
         return np.array([rear_cm[0], rear_cm[1], heading])
 

@@ -37,6 +37,7 @@ class DriverSettings(Settings):
         recover_every_cm: From one excursion to the next.
         change_lanes_every_cm: On a road with two lanes, way from one change to the next; the car then
             drives in the other lane, against its traffic. None: it keeps its lane.
+        first_change_cm: Where along the road the first change begins; None: at ``change_lanes_every_cm``.
         lane_change_cm: Way that a change takes.
     """
 
@@ -53,6 +54,7 @@ class DriverSettings(Settings):
     recover_cm: float = Field(default=12.0, ge=0.0)
     recover_every_cm: float = Field(default=200.0, gt=0.0)
     change_lanes_every_cm: float | None = Field(default=None, gt=0.0)
+    first_change_cm: float | None = Field(default=None, ge=0.0)
     lane_change_cm: float = Field(default=150.0, gt=0.0)
 
     @model_validator(mode="after")
@@ -73,11 +75,39 @@ class DriverSettings(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _a_first_change_has_others(self) -> DriverSettings:
+        if self.first_change_cm is not None and self.change_lanes_every_cm is None:
+            raise ValueError(
+                f"first_change_cm {self.first_change_cm:g} needs change_lanes_every_cm, found none"
+            )
+        return self
+
     def chosen_speed_cm_s(self, rate_hz: float) -> float:
         """Commanded speed at a frame rate, without its variation."""
         if self.speed_cm_s is not None:
             return self.speed_cm_s
         return _CRAWL_CM * rate_hz if self.style == "crawl" else _SPEED_CM_S[self.style]
+
+
+def shortest_excursion_spacing_cm(height_cm: float, radius_cm: float) -> float:
+    """Return the smallest ``recover_every_cm`` at which no excursion bends more sharply than a circle.
+
+    Args:
+        height_cm: Of the excursion: height sin^2(pi u / L) over its way L, sharpest at both ends and the top.
+        radius_cm: Of the circle.
+    """
+    return math.sqrt(2.0 * math.pi**2 * height_cm * radius_cm) / _EXCURSION_SHARE
+
+
+def shortest_lane_change_cm(width_cm: float, radius_cm: float) -> float:
+    """Return the smallest ``lane_change_cm`` at which no change bends more sharply than a circle.
+
+    Args:
+        width_cm: From one lane's middle to the other's.
+        radius_cm: Of the circle.
+    """
+    return math.sqrt(6.0 * width_cm * radius_cm)
 
 
 class Script:
@@ -127,10 +157,14 @@ class Script:
 
     def _lane_cm(self, s_cm: float) -> float:
         """Middle of the lane that the driver aims for, and on the way from one to the other between them."""
-        every_cm = self.settings.change_lanes_every_cm
-        if every_cm is None or s_cm < every_cm:
+        every_cm, first_cm = self.settings.change_lanes_every_cm, self.settings.first_change_cm
+        if every_cm is None:
             return 0.0
-        number, since_cm = divmod(s_cm, every_cm)
+        first_cm = every_cm if first_cm is None else first_cm
+        if s_cm < first_cm:
+            return 0.0
+        # Counted from where the change before the first would have begun.
+        number, since_cm = divmod(s_cm - (first_cm - every_cm), every_cm)
         share = min(since_cm / self.settings.lane_change_cm, 1.0)
         gone = share * share * (3.0 - 2.0 * share)
         return self.other_lane_cm * (gone if number % 2.0 else 1.0 - gone)

@@ -198,9 +198,10 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
     # The other lane must keep to the smallest radius as well, and it lies inside left bends.
     radii_cm = (settings.min_radius_cm + 2.0 * middle_cm, settings.min_radius_cm)
     separation_cm = road_cm + 2.0 * _CLEARANCE_LANES * 0.5 * settings.lane_width_cm
-    draw = closed_centre_line if settings.closed else open_centre_line
     length_cm = _LENGTH_CM if settings.length_cm is None else settings.length_cm
-    return draw(length_cm, radii_cm, separation_cm, middle_cm, rng)
+    if settings.closed:
+        return closed_centre_line(length_cm, radii_cm, separation_cm, middle_cm, rng)
+    return open_centre_line(length_cm, radii_cm, separation_cm, middle_cm, rng, settings.corners)
 
 
 def _piece_at(settings: TrackSettings, s_cm: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -67,6 +68,9 @@ class TrackSettings(Settings):
         lane_width_cm: Between the middles of the two lines of a lane.
         line_width_cm: Width of the tape.
         min_radius_cm: Of the centre line of either lane, where the road is drawn at random.
+        corners: Share of the pieces of a random open road, from 0 to 1, that are corners: turns of 80 to 100
+            degrees at up to 1.25 times ``min_radius_cm``, as tape laid round a garage has them, each with a
+            straight behind it.
         closed: A loop instead of a road with two ends.
         length_cm: Along the centre line; None: as long as the drive needs, or 1200 cm for a loop. Given by
             the pieces where there are any.
@@ -88,6 +92,7 @@ class TrackSettings(Settings):
     lane_width_cm: float = Field(default=40.0, gt=0.0)
     line_width_cm: float = Field(default=2.0, gt=0.0)
     min_radius_cm: float = Field(default=60.0, gt=0.0)
+    corners: float = Field(default=0.0, ge=0.0, le=1.0)
     closed: bool = False
     length_cm: float | None = Field(default=None, gt=100.0)
     lanes: Literal[1, 2] = 1
@@ -119,6 +124,7 @@ class TrackSettings(Settings):
         settings = handler(data)
         settings._origin = origin
         settings._check_lines()
+        settings._check_corners()
         return settings
 
     @property
@@ -140,6 +146,15 @@ class TrackSettings(Settings):
             lines["far"] = (3.0 * half_cm, self.far)
         return lines
 
+    @property
+    def tightest_radius_cm(self) -> float:
+        """Smallest radius of the driven lane's centre line, [cm]; infinite where it has straights only."""
+        if not self.pieces:
+            return self.min_radius_cm
+        return min(
+            (radius_cm for piece in self.pieces for _, radius_cm, _ in piece.bends()), default=math.inf
+        )
+
     def _check_lines(self) -> None:
         wanted = ("left", "right") if self.lanes == 1 else ("middle", "right", "far")
         for name in ("left", "middle", "far"):
@@ -149,6 +164,14 @@ class TrackSettings(Settings):
                     f"key {name!r}: a road of {self.lanes} lane(s) has the lines {', '.join(wanted)}; the "
                     f"others are null, found {'a line' if found else 'none'} for {name}"
                 )
+
+    def _check_corners(self) -> None:
+        if self.corners > 0.0 and (self.closed or self.pieces):
+            kind = "from pieces" if self.pieces else "that is a loop"
+            raise ValueError(
+                f"key 'corners': found {self.corners:g} for a road {kind}, expected 0: only open roads drawn "
+                "at random have them (closed: false)"
+            )
 
 
 def preset_names() -> list[str]:

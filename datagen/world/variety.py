@@ -9,15 +9,13 @@ import numpy as np
 
 from datagen.world.car import CarSettings
 from datagen.world.rig import CameraSettings
-from datagen.world.script import DriverSettings
+from datagen.world.script import DriverSettings, shortest_excursion_spacing_cm, shortest_lane_change_cm
+from datagen.world.sight import sees_lane
 from datagen.world.track_settings import TrackSettings, preset
-from datagen.world.world import SimulationSettings, World, build_world
+from datagen.world.world import START_CM, SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM
 
-#: A road is redrawn where the camera does not see both lines of its lane, on a straight, so far ahead.
-_SEES_AHEAD_CM = max(ROWS_CM)
 _SIGHT_TRIES = 20
 #: Lateral acceleration that nobody exceeds in the tightest bend.
 _BEND_CM_S2 = 300.0
@@ -25,6 +23,8 @@ _BEND_CM_S2 = 300.0
 _DRAWN_SHARE = 0.5
 #: Presets of roads that home-made cars are driven on.
 _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
+#: Nobody changes lanes sooner after the start.
+_FIRST_CHANGE_CM = 30.0
 _TRIES = 8
 
 
@@ -73,16 +73,6 @@ def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSetti
     )
 
 
-def sees_lane(camera: CameraSettings, lane_width_cm: float, wheelbase_cm: float) -> bool:
-    """Whether both lines of a straight lane are in the picture where the farthest label row crosses them."""
-    built = camera.build(wheelbase_cm)
-    half_cm = 0.5 * lane_width_cm
-    pixels = built.project_ground(np.array([[-half_cm, _SEES_AHEAD_CM], [half_cm, _SEES_AHEAD_CM]]))
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0.0) & (pixels <= np.array([built.width - 1.0, built.height - 1.0]))
-    return bool(inside.all())
-
-
 def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
     """Draw a car's size, whatever it was: wheelbases of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
     wheelbase, turn = rng.random(2)
@@ -104,7 +94,8 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     """Draw a kind of road: one of the presets, or tape laid out on a floor.
 
     Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm;
-    the tightest bends have radii of 0.9 to 1.3 lane widths. Every other road has two lanes, on one of eight
+    the tightest bends have radii of 0.9 to 1.3 lane widths, and on one road of four up to 80 % of the pieces
+    are corners. Every other road has two lanes, on one of eight
     the line on the right is dashed too, and from every other one up to a sixth of the tape has come off in
     short stretches.
 
@@ -113,7 +104,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
         tightest_cm: Smallest radius that the car can follow; presets keep their own.
     """
     drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
-    two_lanes, width, tape, gaps, dash, gap, right, worn, tight = rng.random(9)
+    two_lanes, width, tape, gaps, dash, gap, right, worn, tight, cornered, corners = rng.random(11)
     if drawn >= _DRAWN_SHARE:
         return preset(_PRESETS[number])
     lane_cm = float(30.0 * 2.3**width)
@@ -126,6 +117,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
         "lane_width_cm": lane_cm,
         "line_width_cm": float(1.5 * 3.4**tape),
         "min_radius_cm": max(tightest_cm, (0.9 + 0.4 * tight) * lane_cm),
+        "corners": 0.3 + 0.5 * corners if cornered < 0.25 else 0.0,
         "interruptions_per_m": 0.2 * gaps,
         "right": {"kind": "dashed" if right < 0.125 else "solid", **dashes},
     }
@@ -134,31 +126,43 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     return TrackSettings.model_validate(road)
 
 
-def vary_driver(track: TrackSettings, rng: np.random.Generator) -> DriverSettings:
+def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> DriverSettings:
     """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
     People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
     car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes, every third one
-    also changes between them, if the drive goes on for that long. Nobody is faster than the tightest bend
-    allows.
+    also changes between them, for the first time at any place from 30 cm on at which half of the change is
+    still within the drive. Nobody is faster than the tightest bend allows, and no excursion and no change
+    bends more sharply than the car can turn.
+
+    Args:
+        simulation: Road, car, and how long the drive is.
+        rng: Source of randomness.
     """
+    track, tightest_cm = simulation.track, tightest_bend_cm(simulation.car)
     lane_cm = track.lane_width_cm
-    fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.min_radius_cm))
+    fastest_cm_s = min(150.0, math.sqrt(_BEND_CM_S2 * track.tightest_radius_cm))
     speed_cm_s = float(np.exp(rng.uniform(np.log(40.0), np.log(fastest_cm_s))))
-    recovers, wander, recover, changes, change = rng.random(5)
+    recovers, wander, recover, changes, change, first = rng.random(6)
     recover_cm = lane_cm * (0.2 + 0.4 * recover)
     driver = DriverSettings(
         style="recover" if recovers < 0.35 else "wander",
         speed_cm_s=speed_cm_s,
         wander_cm=lane_cm * (0.08 + 0.22 * wander),
         recover_cm=recover_cm,
-        # Less steeply in wide lanes; a long car's wheels are at their stop for a moment all the same.
-        recover_every_cm=max(200.0, 7.0 * recover_cm),
+        recover_every_cm=max(200.0, shortest_excursion_spacing_cm(recover_cm, tightest_cm)),
     )
     if track.lanes == 1 or changes >= 1.0 / 3.0:
         return driver
-    change_cm = max(150.0, 3.5 * lane_cm)
-    update = {"lane_change_cm": change_cm, "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change)}
+    change_cm = max(150.0, 3.5 * lane_cm, shortest_lane_change_cm(lane_cm, tightest_cm))
+    start_cm = 0.0 if track.closed else START_CM + simulation.car.wheelbase_cm
+    way_cm = simulation.frames / simulation.rate_hz * speed_cm_s
+    latest_cm = max(_FIRST_CHANGE_CM, way_cm - 0.5 * change_cm)
+    update = {
+        "lane_change_cm": change_cm,
+        "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change),
+        "first_change_cm": start_cm + _FIRST_CHANGE_CM + first * (latest_cm - _FIRST_CHANGE_CM),
+    }
     return driver.model_copy(update={"style": "wander", **update})
 
 
@@ -173,7 +177,7 @@ def vary_simulation(
 ) -> SimulationSettings:
     """Draw one of many drives; its seed is the sequence's first number.
 
-    Camera and road are drawn until the camera sees both lines, for a while: with a lens that does not, nobody
+    Camera and road are drawn until the camera sees the lane, for a while: with a lens that does not, nobody
     would drive.
 
     Args:
@@ -193,17 +197,11 @@ def vary_simulation(
             camera = vary_camera(cameras[number % len(cameras)], camera_rng)
         if road:
             track = vary_road(road_rng, tightest_bend_cm(car))
-        if sees_lane(camera, track.lane_width_cm, car.wheelbase_cm):
+        if sees_lane(camera, track, car.wheelbase_cm):
             break
-    changes: dict[str, object] = {
-        "seed": int(sequence.generate_state(1)[0]),
-        "camera": camera,
-        "track": track,
-        "car": car,
-    }
-    if driver:
-        changes["driver"] = vary_driver(track, driver_rng)
-    return simulation.model_copy(update=changes)
+    seed = int(sequence.generate_state(1)[0])
+    drawn = simulation.model_copy(update={"seed": seed, "camera": camera, "track": track, "car": car})
+    return drawn.model_copy(update={"driver": vary_driver(drawn, driver_rng)}) if driver else drawn
 
 
 def first_world(simulation: SimulationSettings) -> World:

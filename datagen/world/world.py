@@ -23,7 +23,8 @@ from lanenet.config import Settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 
-_START_CM = 40.0  # rear axle at the start of an open road
+#: Place of the rear axle along an open road at the start.
+START_CM = 40.0
 _SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
 _LOOP_CM = 1200.0
 _STEERING_RESERVE = 1.2
@@ -126,7 +127,7 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
     donkey = draw_donkey(settings.donkey, donkey_rng, _needed_steering_rad(settings, track))
     settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
     camera = settings.camera.build(settings.car.wheelbase_cm)
-    start_cm = 0.0 if track.closed else _START_CM
+    start_cm = 0.0 if track.closed else START_CM
     driver = Driver(settings.driver, track, start_cm, settings.car, settings.rate_hz, driver_rng)
     car = Car(settings.car, driver.start_pose(), car_rng)
     car.place(car.pose, settings.driver.chosen_speed_cm_s(settings.rate_hz))
@@ -156,7 +157,7 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     per_frame_cm = driver.chosen_speed_cm_s(settings.rate_hz) / settings.rate_hz * car.speed_gain
     # The car may be faster than it should be for a while; a tenth covers that, and the wandering.
     way_cm = settings.frames * per_frame_cm * (1.1 + car.speed_noise + driver.speed_variation)
-    needed_cm = float(np.ceil(_START_CM + way_cm + car.wheelbase_cm + _SIGHT_CM))
+    needed_cm = float(np.ceil(START_CM + way_cm + car.wheelbase_cm + _SIGHT_CM))
     length_cm = settings.track.length_cm
     if length_cm is None:
         length_cm = _LOOP_CM if settings.track.closed else needed_cm

@@ -11,7 +11,12 @@ from datagen.world.donkey import DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.drive_loop import scripted_states
 from datagen.world.driver import place_on_track
 from datagen.world.rig import CameraSettings
-from datagen.world.script import DriverSettings, Script
+from datagen.world.script import (
+    DriverSettings,
+    Script,
+    shortest_excursion_spacing_cm,
+    shortest_lane_change_cm,
+)
 from datagen.world.track import TrackSettings
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
@@ -118,6 +123,32 @@ def test_lanes_are_changed_and_changed_back():
     assert [script.offset_cm(s) for s in places] == pytest.approx(aimed)
     # Halfway it is steepest: half as steep again as the straight way across.
     assert max(script.slope(s) for s in np.arange(300.0, 401.0)) == pytest.approx(1.5 * 0.4, rel=0.01)
+
+
+def test_the_first_change_begins_where_it_is_told_to():
+    driver = DriverSettings(
+        wander_cm=0.0, change_lanes_every_cm=300.0, first_change_cm=70.0, lane_change_cm=100.0
+    )
+    script = Script(driver, 20.0, np.random.default_rng(0), other_lane_cm=40.0)
+    places = (0.0, 69.0, 70.0, 120.0, 170.0, 369.0, 370.0, 420.0, 470.0, 669.0, 720.0)
+    aimed = [0.0, 0.0, 0.0, 20.0, 40.0, 40.0, 40.0, 20.0, 0.0, 0.0, 20.0]
+    assert [script.offset_cm(s) for s in places] == pytest.approx(aimed)
+    with pytest.raises(ConfigError, match="first_change_cm 70 needs change_lanes_every_cm, found none"):
+        check_settings(DriverSettings, {"first_change_cm": 70.0}, "driver")
+
+
+@pytest.mark.parametrize("radius_cm", [35.0, 90.0])
+def test_excursions_and_changes_can_be_as_sharp_as_a_circle_and_no_sharper(radius_cm):
+    every_cm = shortest_excursion_spacing_cm(24.0, radius_cm)
+    change_cm = shortest_lane_change_cm(40.0, radius_cm)
+    out = DriverSettings(style="recover", wander_cm=0.0, recover_cm=24.0, recover_every_cm=every_cm)
+    across = DriverSettings(wander_cm=0.0, change_lanes_every_cm=2.0 * change_cm, lane_change_cm=change_cm)
+    for settings, steps in ((out, 12.0 * every_cm), (across, 2.9 * change_cm)):
+        script = Script(settings, 20.0, np.random.default_rng(3), other_lane_cm=40.0)
+        offset_cm = np.array([script.offset_cm(s) for s in np.arange(0.0, steps, 0.5)])
+        bend = np.abs(np.diff(offset_cm, 2)) / 0.5**2
+        # Excursions are of half the height or more: the highest of a dozen is nearly as high as they get.
+        assert 0.85 / radius_cm < bend.max() < 1.001 / radius_cm
 
 
 def test_truth_is_of_the_lane_that_the_car_is_in():

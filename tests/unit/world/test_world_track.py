@@ -13,6 +13,7 @@ from datagen.world.centre_line import comes_near_itself, integrate_curvature
 from datagen.world.paint import interrupt, paint_dashes
 from datagen.world.track import Marking, MarkingSettings, Track, TrackSettings, random_track
 from datagen.world.track_file import read_track, write_track
+from lanenet.config import check_settings
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.lane import mirror_points
 
@@ -95,6 +96,47 @@ def test_self_contact_is_noticed():
     assert comes_near_itself(circle, 60.0, closed=False)
     half = integrate_curvature(np.full(220, 1.0 / 70.0))
     assert not comes_near_itself(half, 60.0, closed=False)
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_a_road_of_corners_turns_at_right_angles_between_straights(lanes):
+    least_cm = (
+        50.0,
+        50.0 if lanes == 1 else 90.0,
+    )  # to the right and to the left, where the other lane is inside
+    turns, radii = [], []
+    for seed in range(6):
+        track = _draw(seed, corners=1.0, min_radius_cm=50.0, lanes=lanes)
+        bent = np.abs(track.curvature_per_cm) > 1e-12
+        ends = np.flatnonzero(np.diff(bent.astype(int)))
+        # From straight to straight; the last piece of a road may be cut short.
+        for first, last in zip(ends[::2], ends[1::2], strict=False):
+            turns.append(abs(track.heading_rad[last + 1] - track.heading_rad[first]))
+            sharpest = track.curvature_per_cm[np.argmax(np.abs(track.curvature_per_cm[first:last])) + first]
+            radii.append(1.0 / abs(sharpest) / least_cm[int(sharpest > 0.0)])
+            assert last - first < 1.8 * 1.25 * max(least_cm) + 40.0
+    assert len(turns) > 12
+    # A bend's length is a whole number of centimetres.
+    assert np.deg2rad(79.0) < min(turns) and max(turns) < np.deg2rad(101.0)
+    assert min(radii) > 0.999 and max(radii) < 1.251 and np.ptp(radii) > 0.1
+
+
+def test_corners_are_as_many_as_asked_for():
+    def sharp_share(corners: float) -> float:
+        tracks = [_draw(seed, corners=corners) for seed in range(8)]
+        return float(np.mean([np.abs(track.curvature_per_cm) > 1.0 / 75.1 for track in tracks]))
+
+    assert sharp_share(0.0) < 0.5 * sharp_share(0.7)
+
+
+def test_corners_are_refused_where_they_have_no_effect():
+    for changes, kind in (
+        ({"closed": True}, "that is a loop"),
+        ({"pieces": [{"straight": {"length_cm": 200.0}}]}, "from pieces"),
+        ({"preset": "bfmc"}, "that is a loop"),
+    ):
+        with pytest.raises(ConfigError, match=f"'corners': found 0.5 for a road {kind}, expected 0"):
+            check_settings(TrackSettings, {"corners": 0.5, **changes}, "track")
 
 
 def test_impossible_roads_are_refused():

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from datagen.world.car import CarSettings
+from datagen.world.driver import Driver
 from datagen.world.rig import CameraSettings
+from datagen.world.script import DriverSettings
+from datagen.world.sight import line_in_bend_car, sees_lane
 from datagen.world.track import random_track
 from datagen.world.track_settings import TrackSettings
 from datagen.world.variety import (
     camera_like,
     first_world,
-    sees_lane,
     tightest_bend_cm,
     vary_camera,
     vary_car,
@@ -25,6 +27,7 @@ from datagen.world.variety import (
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.lane import rows_of_polyline
 
 
 @pytest.mark.parametrize(
@@ -62,6 +65,8 @@ def test_roads_vary_and_can_be_laid():
     own = [road for road in roads if road.preset is None]
     assert all(30.0 <= road.lane_width_cm <= 69.0 and 1.5 <= road.line_width_cm <= 5.1 for road in own)
     assert {road.right.kind for road in own} == {"solid", "dashed"}
+    cornered = [road.corners for road in roads if road.corners > 0.0]
+    assert 3 <= len(cornered) <= len(own) // 2 and 0.3 <= min(cornered) < max(cornered) <= 0.8
     for seed, road in enumerate(own[:4]):
         track = random_track(road.model_copy(update={"length_cm": 400.0}), np.random.default_rng(seed))
         assert len(track.markings) >= 2
@@ -101,13 +106,85 @@ def test_no_bend_is_tighter_than_the_car_can_turn():
 def test_the_camera_sees_the_lane_that_it_drives_in():
     narrow = CameraSettings(width=160, height=120, field_of_view_rad=1.2, pitch_down_rad=0.4, height_cm=15.0)
     # 32 cm ahead of the lens, 34 degrees to either side: 22 cm.
-    assert sees_lane(narrow, 40.0, 20.0) and not sees_lane(narrow, 50.0, 20.0)
+    wide_bends = {width: TrackSettings(lane_width_cm=width, min_radius_cm=500.0) for width in (30, 40, 50)}
+    assert sees_lane(narrow, wide_bends[40], 20.0) and not sees_lane(narrow, wide_bends[50], 20.0)
     # A lens that looks above the road sees no line near the car.
-    assert not sees_lane(narrow.model_copy(update={"pitch_down_rad": -0.4}), 30.0, 20.0)
+    assert not sees_lane(narrow.model_copy(update={"pitch_down_rad": -0.4}), wide_bends[30], 20.0)
     for number in range(40):
         sequence = np.random.SeedSequence([5, number])
         drawn = vary_simulation(SimulationSettings(), sequence, number, cameras=(narrow,))
-        assert sees_lane(drawn.camera, drawn.track.lane_width_cm, drawn.car.wheelbase_cm)
+        assert sees_lane(drawn.camera, drawn.track, drawn.car.wheelbase_cm)
+
+
+def _in_bend(radius_cm: float, width_cm: float, wheelbase_cm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right line, frame car, of a road that is one bend (a negative radius to the right)."""
+    bend = {
+        "radius_cm": abs(radius_cm),
+        "angle_deg": 180.0,
+        "direction": "left" if radius_cm > 0.0 else "right",
+    }
+    track = random_track(
+        TrackSettings(lane_width_cm=width_cm, pieces=({"arc": bend},)), np.random.default_rng(0)
+    )
+    car = CarSettings(wheelbase_cm=wheelbase_cm)
+    driver = Driver(DriverSettings(), track, 0.0, car, 20.0, np.random.default_rng(0))
+    return track.lines_car(driver.pose_at(70.0), wheelbase_cm, near_s_cm=70.0)
+
+
+@pytest.mark.parametrize("radius_cm", [50.0, -50.0, 90.0])
+@pytest.mark.parametrize("wheelbase_cm", [16.0, 26.0])
+def test_lines_of_a_bend_lie_where_a_road_has_them(radius_cm, wheelbase_cm):
+    for line, offset_cm in zip(_in_bend(radius_cm, 40.0, wheelbase_cm), (20.0, -20.0), strict=True):
+        drawn = line_in_bend_car(1.0 / radius_cm, offset_cm, wheelbase_cm)
+        np.testing.assert_allclose(np.linalg.norm(np.diff(drawn, axis=0), axis=1), 0.5, atol=1e-3)
+        assert (drawn[:, 1] >= 0.0).all() and (drawn[:, 1] <= 45.0).all()
+        # The road's samples are about a centimetre apart.
+        assert np.linalg.norm(drawn[:, None] - line[None], axis=2).min(axis=1).max() < 0.8
+        # Where the line inside turns away before a row, neither crosses it.
+        crossed = np.interp((15.0, 30.0), drawn[:, 1], drawn[:, 0], right=np.nan)
+        np.testing.assert_allclose(crossed, rows_of_polyline(line)[1:], atol=0.05)
+
+
+def test_a_bend_needs_a_stretch_of_line_that_is_longer_than_its_gaps():
+    # A long lens: on a straight both lines are in the picture 30 cm ahead.
+    lens = CameraSettings(width=160, height=120, field_of_view_rad=1.1, pitch_down_rad=0.3, height_cm=18.0)
+    wheelbase_cm, width_cm = 24.0, 34.0
+    seen = []
+    for radius_cm in (40.0, 60.0, 90.0, 150.0, 400.0):
+        longest_cm = []
+        for side in (1.0, -1.0):
+            stretches_cm = []
+            for line in _in_bend(side * radius_cm, width_cm, wheelbase_cm):
+                near = line[(line[:, 1] >= 0.0) & (line[:, 1] <= 45.0) & (np.gradient(line[:, 1]) > 0.0)]
+                pixels = lens.build(wheelbase_cm).project_ground(near)
+                visible = near[((pixels >= 0.0) & (pixels <= [159.0, 119.0])).all(axis=1)]
+                # A line that has left the picture does not come back here: one stretch.
+                stretches_cm.append(float(np.linalg.norm(np.diff(visible, axis=0), axis=1).sum()))
+            longest_cm.append(max(stretches_cm))
+        for gap_cm in (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0):
+            # Samples of the road and of the rule are not the same.
+            if abs(min(longest_cm) - gap_cm - 10.0) < 2.0:
+                continue
+            line = {"kind": "dashed" if gap_cm else "solid", "gap_cm": max(gap_cm, 1.0)}
+            road = {"lane_width_cm": width_cm, "left": line, "right": line}
+            expected = min(longest_cm) >= gap_cm + 10.0
+            assert sees_lane(lens, TrackSettings(**road, min_radius_cm=radius_cm), wheelbase_cm) == expected
+            # A road from pieces is judged by its own bends, not by a key that has no effect on it.
+            arc = {"arc": {"radius_cm": radius_cm, "angle_deg": 20.0, "direction": "left"}}
+            pieces = ({"straight": {"length_cm": 100.0}}, arc)
+            assert sees_lane(lens, TrackSettings(**road, pieces=pieces), wheelbase_cm) == expected
+            seen.append(expected)
+    assert True in seen and False in seen
+
+
+def test_a_road_without_paint_in_sight_is_not_seen():
+    road = TrackSettings(pieces=({"straight": {"length_cm": 200.0}},))
+    assert road.tightest_radius_cm == math.inf
+    assert sees_lane(CameraSettings(), road, 26.0)
+    bare = {"left": {"kind": "none"}, "right": {"kind": "none"}}
+    assert not sees_lane(CameraSettings(), TrackSettings(**bare), 26.0)
+    # No such road can be laid; that is told where it is laid.
+    assert not sees_lane(CameraSettings(), TrackSettings(min_radius_cm=20.0, lane_width_cm=40.0), 26.0)
 
 
 def test_what_is_not_drawn_stays():
@@ -124,9 +201,13 @@ def test_what_is_not_drawn_stays():
     assert all(one.track.min_radius_cm >= tightest_bend_cm(one.car) for one in own)
 
 
+def _drivers(track: TrackSettings, **changes: object) -> list[DriverSettings]:
+    simulation = SimulationSettings(**{"track": track, **changes})
+    return [vary_driver(simulation, np.random.default_rng(seed)) for seed in range(60)]
+
+
 def test_drivers_leave_the_middle_but_find_back():
-    road = TrackSettings(lane_width_cm=40.0)
-    drivers = [vary_driver(road, np.random.default_rng(seed)) for seed in range(60)]
+    drivers = _drivers(TrackSettings(lane_width_cm=40.0))
     assert {driver.style for driver in drivers} == {"wander", "recover"}
     speeds = [driver.speed_cm_s for driver in drivers]
     # In a bend of 60 cm nobody exceeds 3 m/s^2.
@@ -134,10 +215,37 @@ def test_drivers_leave_the_middle_but_find_back():
     assert all(driver.wander_cm <= 12.0 and driver.recover_cm <= 24.0 for driver in drivers)
     assert max(driver.recover_cm for driver in drivers) > 20.0
     assert all(driver.change_lanes_every_cm is None for driver in drivers)
-    # Wide excursions take a longer way.
-    wide = [vary_driver(TrackSettings(lane_width_cm=75.0), np.random.default_rng(seed)) for seed in range(60)]
-    assert all(driver.recover_every_cm >= 7.0 * driver.recover_cm for driver in wide)
-    assert max(driver.recover_every_cm for driver in wide) > 250.0
-    two = TrackSettings(lane_width_cm=69.0, lanes=2)
-    every = [vary_driver(two, np.random.default_rng(seed)).change_lanes_every_cm for seed in range(60)]
+    every = [driver.change_lanes_every_cm for driver in _drivers(TrackSettings(lane_width_cm=69.0, lanes=2))]
     assert sum(way is not None for way in every) in range(12, 31)
+
+
+def test_nobody_swerves_more_sharply_than_the_car_can_turn():
+    two_lanes = TrackSettings(lane_width_cm=60.0, lanes=2)
+    for car in (CarSettings(wheelbase_cm=16.0), CarSettings(wheelbase_cm=60.0)):
+        drivers = _drivers(two_lanes, car=car)
+        for driver in drivers:
+            # Over 0.7 of the spacing: height times the squared sine of half a turn.
+            excursion = 2.0 * math.pi**2 * driver.recover_cm / (0.7 * driver.recover_every_cm) ** 2
+            change = 6.0 * 60.0 / driver.lane_change_cm**2
+            ways = [excursion, change] if driver.change_lanes_every_cm else [excursion]
+            assert max(ways) * tightest_bend_cm(car) < 1.001
+        assert all(driver.recover_every_cm >= 200.0 and driver.lane_change_cm >= 150.0 for driver in drivers)
+    # The long car needs the longer way.
+    assert min(driver.recover_every_cm for driver in drivers) > 250.0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("frames", [20, 100, 300])
+def test_lanes_are_changed_within_the_drive(frames, closed):
+    track = TrackSettings(lane_width_cm=40.0, lanes=2, closed=closed)
+    drivers = [one for one in _drivers(track, frames=frames) if one.change_lanes_every_cm is not None]
+    # The front axle of a car on an open road starts a wheelbase beyond the rear axle's 40 cm.
+    start_cm = 0.0 if closed else 66.0
+    begins = np.array([one.first_change_cm for one in drivers]) - start_cm
+    ways = np.array([one.speed_cm_s for one in drivers]) * frames / 20.0
+    assert (begins >= 30.0).all()
+    latest = np.maximum(30.0, ways - 75.0)
+    assert (begins <= latest).all()
+    if frames == 300:
+        share = (begins - 30.0) / (latest - 30.0)
+        assert share.min() < 0.25 and share.max() > 0.75
