@@ -28,6 +28,8 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 
 Progress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
+#: Of each role so many synthetic drives get pictures of map and labels; nobody looks at those of hundreds.
+_PICTURED = 4
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,7 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
         "role": role,
         "name": name,
         "simulation": simulation,
+        "pictures": number < _PICTURED,
         "may_fail": role != "test" and synthetic.may_fail > 0.0,
         # The simulated camera does not see its car.
         "map": settings.map.model_copy(update={"find_bumper": False}),
@@ -220,11 +223,14 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
         seed = first_world(simulation).settings.seed
         simulate_drive(simulation.model_copy(update={"seed": seed}), drive)
         if job["role"] == "test":
-            truth = truth_labels(drive, job["map"].perception, job["window"], simulation.track.line_width_cm)
+            truth = truth_labels(drive, mapping.perception, job["window"], simulation.track.line_width_cm)
             write_labels(labels, truth)
         else:
-            map_drive(drive, simulation.track.lane_width_cm, None, job["map"], drive_map)
-            label_map(drive_map, labels, perception=job["map"].perception, window=job["window"])
+            lane_cm, pictures = simulation.track.lane_width_cm, job["pictures"]
+            map_drive(drive, lane_cm, None, mapping, drive_map, pictures=pictures)
+            label_map(
+                drive_map, labels, perception=mapping.perception, window=job["window"], pictures=pictures
+            )
     except (TrackingLostError, CalibrationError, ConfigError) as error:
         if not job["may_fail"]:
             raise

@@ -53,6 +53,7 @@ from lanenet.perception.static import find_static, spread_frames
 __all__ = ["MapSettings", "Report", "label_map", "map_drive"]
 
 _MIN_SEGMENT = 60  # frames
+_SHOWN = 24  # frames on the contact sheet
 
 
 def map_drive(
@@ -64,6 +65,7 @@ def map_drive(
     progress: Progress | None = None,
     refine_camera: bool = False,
     wheelbase_cm: float | None = None,
+    pictures: bool = True,
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
 
@@ -77,6 +79,7 @@ def map_drive(
         progress: Called with (done, total).
         refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
         wheelbase_cm: Distance between the axles; None takes the camera's own, or a nominal one.
+        pictures: Draw the map, its frames and the report's page, which takes a third of a short drive's time.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -89,7 +92,15 @@ def map_drive(
     check_replaceable(out, "map")
     try:
         return _map_drive(
-            drive_path, lane_width_cm, camera_path, settings, out, progress, refine_camera, wheelbase_cm
+            drive_path,
+            lane_width_cm,
+            camera_path,
+            settings,
+            out,
+            progress,
+            refine_camera,
+            wheelbase_cm,
+            pictures,
         )
     except CalibrationError as error:
         raise CalibrationError(f"{error}{kept_map(out)}") from error
@@ -107,6 +118,7 @@ def _map_drive(
     progress: Progress | None,
     refine_camera: bool,
     wheelbase_cm: float | None,
+    pictures: bool,
 ) -> Report:
     rng = np.random.default_rng(settings.seed)
     recorded = keep_images(open_drive(drive_path))
@@ -158,26 +170,37 @@ def _map_drive(
     drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"verdict": verdict.grade}))
     figures["verdict"] = asdict(verdict)
     figures["notes"] = notes
-    index = {int(frame): i for i, frame in enumerate(drive.frames)}
-    shown = np.linspace(0, len(drive_map.frames) - 1, 24).astype(int)
     with atomic_folder(out, "map") as folder:
         write_map(folder, drive_map, map_edges(parts, drive.frames, camera, factor), figures, how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
         opened = _in_order(parts, [part.solved.open_poses for part in parts]) * [factor, factor, 1.0]
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
-        scaled = [(part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts]
-        draw_map(folder / "map.png", drive_map, scaled, mapped.starts)
-        numbers = [int(drive_map.frames[k]) for k in shown]
-        tiles = [
-            (drive.image(index[number]), lines_at(drive_map, int(k)), number)
-            for k, number in zip(shown, numbers, strict=True)
-        ]
-        draw_contact_sheet(folder / "frames.png", tiles, camera)
-        png = (folder / "map.png").read_bytes()
-        page = report_page(mapped, quality, verdict, figures, opened, png, settings.verdict)
-        write_text(folder / PAGE_NAME, page)
+        if pictures:
+            scaled = [
+                (part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts
+            ]
+            draw_map(folder / "map.png", drive_map, scaled, mapped.starts)
+            _draw_frames(folder / "frames.png", mapped)
+            png = (folder / "map.png").read_bytes()
+            page = report_page(mapped, quality, verdict, figures, opened, png, settings.verdict)
+            write_text(folder / PAGE_NAME, page)
     said = [f"verdict: {verdict.grade}", *verdict.reasons, *notes, *verdict.remarks]
     return Report(tuple(said), figures)
+
+
+def _draw_frames(path: Path, mapped: MappedDrive) -> None:
+    """Draw frames from all over a map with the lines that it sees in them."""
+    drive_map = mapped.drive_map
+    shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
+    tiles = [
+        (
+            mapped.drive.image(int(mapped.rows[k])),
+            lines_at(drive_map, int(k)),
+            int(drive_map.frames[k]),
+        )
+        for k in shown
+    ]
+    draw_contact_sheet(path, tiles, drive_map.camera)
 
 
 def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSettings:

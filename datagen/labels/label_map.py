@@ -42,6 +42,7 @@ def label_map(
     perception: PerceptionSettings | None = None,
     window: BirdseyeWindow | None = None,
     force: bool = False,
+    pictures: bool = True,
 ) -> Report:
     """Project a map's lines into each frame and write the label set, its report and a contact sheet.
 
@@ -55,6 +56,7 @@ def label_map(
         perception: How the network's edge points are found; None takes what the map was made with.
         window: The network's window.
         force: Label a map that was rejected, too.
+        pictures: Draw the contact sheet.
     """
     mapped = open_mapped_drive(map_folder, drive_path)
     drive_map, drive = mapped.drive_map, mapped.drive
@@ -114,21 +116,15 @@ def label_map(
     report = label_report(labels, residual, len(drive_map.frames), skipped, shares)
     write_labels(out, labels)
     write_json(out.with_suffix(".json"), report)
-    order = np.argsort(np.nan_to_num(residual, nan=9.0))
-    picks = np.concatenate([order[:8], order[len(order) // 2 - 4 : len(order) // 2 + 4], order[-8:]])
-    with atomic_file(out.with_suffix(".png")) as temporary:
-        draw_contact_sheet(
-            temporary,
-            [
-                (
-                    drive.image(int(mapped.rows[rows[j]])),
-                    lines_at(drive_map, rows[j]),
-                    int(labels.frame[j]),
-                )
-                for j in picks
-            ],
-            drive_map.camera,
-        )
+    if pictures:
+        order = np.argsort(np.nan_to_num(residual, nan=9.0))
+        picks = np.concatenate([order[:8], order[len(order) // 2 - 4 : len(order) // 2 + 4], order[-8:]])
+        tiles = [
+            (drive.image(int(mapped.rows[rows[j]])), lines_at(drive_map, rows[j]), int(labels.frame[j]))
+            for j in picks
+        ]
+        with atomic_file(out.with_suffix(".png")) as temporary:
+            draw_contact_sheet(temporary, tiles, drive_map.camera)
     share = report["labelled_share"]
     lines_out = [
         f"{len(rows)} of {len(drive_map.frames)} frames labelled ({100 * share:.0f} %)",
