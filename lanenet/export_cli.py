@@ -37,8 +37,8 @@ def export(
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch, expected it without --int8")
     if int8:
-        from lanenet.learn.export import MODEL_NAME
         from lanenet.learn.quantise import export_int8
+        from lanenet.perception.checkpoint import MODEL_NAME
 
         path, report = export_int8(checkpoint, out)
         console.show_lines(report.lines)

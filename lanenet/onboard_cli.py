@@ -25,6 +25,10 @@ _CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAM
 MarkingOption = Annotated[
     float | None, typer.Option("--marking", help="Thickness of the tape for the lane filter, cm.")
 ]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", help="Model (.onnx) or checkpoint folder of the network.", show_default=False),
+]
 
 
 class DetectorName(StrEnum):
@@ -48,7 +52,7 @@ def detect(
     ],
     detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
-    model: Annotated[Path | None, typer.Option(help="ONNX model, for --detector network.")] = None,
+    model: ModelOption = None,
     camera: _CameraOption = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
@@ -139,9 +143,9 @@ def detect(
         console.next_command("bench")
 
 
-@app.command(epilog="Example: lanenet bench --model checkpoints/small/model.onnx --out bench.json")
+@app.command(epilog="Example: lanenet bench --model checkpoints/small --out runs/bench.json")
 def bench(
-    model: Annotated[Path | None, typer.Option(help="ONNX model to time as well.")] = None,
+    model: ModelOption = None,
     also: Annotated[
         list[Path] | None, typer.Option(help="More models, for their time from frame to steering.")
     ] = None,

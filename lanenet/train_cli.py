@@ -21,7 +21,7 @@ from lanenet.onboard_cli import MarkingOption
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanenet.evaluation import Opened
+    from lanenet.labelled_sources import Opened
     from lanenet.learn.robust import RobustRow
 
 app = typer.Typer()
@@ -75,7 +75,8 @@ def train(
     from datagen.datasets import prepare
     from lanenet.data.files import json_text
     from lanenet.data.label_set import read_labels
-    from lanenet.evaluation import default_names, evaluate, open_tests
+    from lanenet.evaluation import default_names, evaluate
+    from lanenet.labelled_sources import open_tests
     from lanenet.learn.card import CARD_NAME, model_card
     from lanenet.learn.publish import publish
     from lanenet.learn.robust import as_dict

@@ -10,9 +10,11 @@ import typer
 
 from lanenet import console
 from lanenet.errors import ConfigError
-from lanenet.evaluation import Opened, default_names, evaluate, open_source
+from lanenet.evaluation import default_names, evaluate
+from lanenet.labelled_sources import Opened, open_source
 from lanenet.onboard_cli import MarkingOption
 from lanenet.outputs import check_not_source
+from lanenet.perception.checkpoint import find_model, is_model
 
 if TYPE_CHECKING:
     from lanenet.learn.compare import Comparison
@@ -146,8 +148,7 @@ def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
 
     models: dict[str, Path] = {}
     for path in paths:
-        model = _model_at(path)
-        if model is None:
+        if path.is_file() and not is_model(path):
             raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
         name = path.resolve().stem
         if path.is_dir() or name == "model":
@@ -172,6 +173,7 @@ def _check_robust(model: Path | None, sources: Sequence[Opened]) -> None:
 def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[str, dict[str, object]]:
     """Measure, show and return the table as Markdown and as plain values."""
     from rich.console import Console
+        model = find_model(path)
 
     from lanenet.learn.evaluate import RasterModel
     from lanenet.learn.robust import as_dict, measure_robustness, robust_table
@@ -185,21 +187,14 @@ def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[
     return table.as_markdown(), as_dict(rows)
 
 
-def _model_at(path: Path) -> Path | None:
-    """The model that a path stands for: a file, or that of a checkpoint folder."""
-    if (path / "model.onnx").is_file() or (path / "checkpoint.yaml").is_file():
-        return path / "model.onnx"
-    return path if path.suffix.lower() == ".onnx" else None
-
-
 def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
     """The model, if the first path is one, and the sources."""
-    first, model = paths[0], _model_at(paths[0])
-    if model is None:
+    first, *sources = paths
+    if not is_model(first):
         return None, paths
-    if not paths[1:]:
+    if not sources:
         raise ConfigError(f"{first}: expected a SOURCE after the model: a simulated drive, map or label set")
-    return model, paths[1:]
+    return find_model(first), sources
 
 
 def _chosen(

@@ -67,7 +67,7 @@ class NetworkDetector:
         """Open a model for a camera.
 
         Args:
-            model_path: ONNX file.
+            model_path: ONNX file or checkpoint folder.
             camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
