@@ -67,7 +67,7 @@ def evaluate(
         training: What the network has learned from, where it is known: errors are told by the distance from
             it.
         marking_cm: Thickness of the tape for the lane filter; None takes the source's, or the default.
-        any_camera: Accept a model that was trained with another camera than that of the frames.
+        any_camera: Accept a model that was trained with another camera than that of the frames or labels.
         progress: Called with (source, frames done, frames).
 
     Raises:
@@ -120,7 +120,7 @@ def _answer(
     frames, labels, name = source.frames, source.labels, str(source.path)
     if frames is None:
         assert labels is not None
-        return _answer_labels(name, labels, names, models, training, marking_cm)
+        return _answer_labels(name, labels, names, models, training, marking_cm, any_camera)
     detectors: dict[str, Detector] = {}
     for key in _in_order(names, models):
         detector: Any = "network" if key in models else key
@@ -161,6 +161,7 @@ def _answer_labels(
     models: Mapping[str, Path],
     training: Sequence[LabelSet],
     marking_cm: float | None,
+    any_camera: bool,
 ) -> SourceAnswers:
     from lanenet.learn.compare import SourceAnswers
     from lanenet.learn.conditions import lines_seen, way_to_training_cm
@@ -172,7 +173,11 @@ def _answer_labels(
     presence: dict[str, Any] = {}
     for key in _in_order(names, models):
         if key in models:
-            found = RasterModel(models[key]).answer_labels(labels)
+            model = RasterModel(models[key])
+            if not any_camera:
+                camera = f"the camera of {name}"
+                model.meta.check_trained_with(labels.meta.camera_hash, camera, str(models[key]))
+            found = model.answer_labels(labels)
             points[key], sigma[key], presence[key] = found.points_cm, found.sigma_cm, found.presence
         else:
             meta = labels.meta

@@ -159,13 +159,9 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
                 f"{model_path}: made for any camera that sees its window, {meta.window}; this one sees "
                 f"{share:.0%} of the window's far half, expected at least {_LEAST_SHARE_SEEN:.0%}"
             )
-    elif camera.hash not in meta.camera_hashes:
-        raise ModelMismatchError(
-            f"{model_path}: trained with camera {', '.join(meta.camera_hashes) or 'unknown'}, but "
-            f"this camera, {camera.model} {camera.width}x{camera.height}, is {camera.hash}; train with this "
-            "camera, or allow any camera (--any-camera, detector.any_camera) if both are calibrated and see "
-            "about the same road"
-        )
+        return
+    this = f"this camera, {camera.model} {camera.width}x{camera.height},"
+    meta.check_trained_with(camera.hash, this, str(model_path))
 
 
 def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
