@@ -27,7 +27,7 @@ from lanenet import (
     world_cli,
 )
 from lanenet.config import load_settings
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.outputs import check_ending, check_not_source
 
 _Config = Annotated[
@@ -120,17 +120,20 @@ def simulate(
     detector: Annotated[
         str | None, typer.Option(help="Who steers instead of the scripted driver.", show_default=False)
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="Model or checkpoint folder of the network.")] = None,
+    model: onboard_cli.ModelOption = None,
 ) -> None:
     """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
     from datagen.world.simulate import SimulationSettings, simulate_drive
 
     settings = load_settings(SimulationSettings, config, overrides)
-    pilot = None if detector is None else judge_cli.pilot_builder(detector, model)
+    if model is not None and detector is None:
+        raise ConfigError("--model: is the network's, expected --detector network as well")
+    width_cm = settings.track.lane_width_cm
+    pilot = None if detector is None else judge_cli.pilot_builder(detector, model, width_cm)
     with console.progress_bar("simulate") as progress:
         drive = simulate_drive(settings, out, progress, workers=workers, pilot=pilot)
     console.wrote(drive)
-    console.next_command("map", drive, "--lane-width", f"{settings.track.lane_width_cm:g}", "--out", "MAP")
+    console.next_command("map", drive, "--lane-width", f"{width_cm:g}", "--out", "MAP")
 
 
 @app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out maps/tub")

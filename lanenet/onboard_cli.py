@@ -114,6 +114,7 @@ def detect(
         config=config,
         mask=_mask_of(mask, whole, detector),
     )
+    console.show_problems(getattr(chosen, "problems", ()))
     with console.progress_bar(f"detect ({detector.value})") as progress:
         report = run_detector(
             opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable

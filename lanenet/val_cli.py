@@ -83,6 +83,7 @@ def val(
     from lanenet.perception.network import read_model_meta
 
     model, source_paths = _split_paths(paths)
+    more = _more_models(also or [])
     if out is not None:
         for source in source_paths:
             check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
@@ -91,9 +92,12 @@ def val(
     names = _chosen(detectors, no_baselines, model, sources)
     if detectors is None and not no_baselines and any(source.frames is None for source in sources):
         console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
-    more = _more_models(also or [])
     if robust:
         _check_robust(model, sources)
+    networks = more if model is None or "network" not in names else {"network": model, **more}
+    for path in networks.values():
+        widths_cm = [source.lane_width_cm for source in sources]
+        console.show_problems(read_model_meta(path).untrained_widths(widths_cm, str(path)))
     with console.progress_bar("val") as progress:
         evaluation = evaluate(
             sources,

@@ -50,6 +50,7 @@ class NetworkDetector:
     Attributes:
         meta: What the model says about itself.
         memory: Rebuilds the missing line of a frame with one; None if that is switched off.
+        problems: What is known to be wrong with what it was given, a line each.
     """
 
     def __init__(
@@ -91,6 +92,8 @@ class NetworkDetector:
             )
         if not any_camera:
             _check_camera(self.meta, camera, model_path)
+        widths_cm = [] if lane_width_cm is None else [lane_width_cm]
+        self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self.memory = LaneMemory(lane_width_cm) if memory else None
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
