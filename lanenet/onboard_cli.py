@@ -128,20 +128,23 @@ def detect(
         typer.echo(f"hint: {hint}")
     console.wrote(report.out, report.video)
     if report.video is None:
-        options: dict[str, Path | float | str | None] = {
+        again = {
+            "--detector": detector.value,
             "--model": model,
             "--camera": camera,
             "--lane-width": lane_width,
             "--marking": marking,
+            "--any-camera": any_camera,
+            "--frames": frames,
+            "--skip-unreadable": skip_unreadable,
             "--config": config,
             "--mask": mask,
+            "--out": out,
+            "--video": out.with_suffix(".mp4"),
         }
-        given = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
-        given += ["--any-camera"] if any_camera else []
-        again = ("detect", source, "--detector", detector.value, *given, "--out", out)
-        console.next_command(*again, "--video", out.with_suffix(".mp4"))
+        console.next_command("detect", source, *console.given(again))
     else:
-        console.next_command("bench")
+        console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
 
 
 @app.command(epilog="Example: lanenet bench --model checkpoints/small --out runs/bench.json")

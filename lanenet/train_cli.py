@@ -130,9 +130,14 @@ def train(
         files[f"example{data.example.suffix}"] = data.example.read_bytes()
     publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
     console.wrote(checkpoint)
-    words = ["detect", "SOURCE", "--detector", "network", "--model", checkpoint / model.name]
-    words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
-    console.next_command(*words, "--out", "lanes.csv")
+    options = {
+        "--detector": "network",
+        "--model": checkpoint,
+        "--camera": checkpoint / "camera.yaml" if data.camera is not None else None,
+        "--out": "runs/lanes.csv",
+    }
+    source = checkpoint / f"example{data.example.suffix}" if data.example is not None else "SOURCE"
+    console.next_command("detect", source, *console.given(options))
 
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:

@@ -131,9 +131,7 @@ def val(
             console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
     best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
     shown = "network" if "network" in names else best
-    words: list[str | Path] = ["detect", "SOURCE", "--detector", shown.removesuffix("-value")]
-    words += ["--model", model] if model is not None and shown == "network" else []
-    console.next_command(*words, "--out", "lanes.csv")
+    console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
 
 
 def show(comparison: Comparison) -> None:
@@ -146,6 +144,27 @@ def show(comparison: Comparison) -> None:
         Console().print(table.as_rich())
 
 
+def _next_words(
+    sources: Sequence[Opened], shown: str, model: Path | None, marking: float | None, any_camera: bool
+) -> list[str | Path]:
+    """A command that runs as it stands: the lanes that a detector finds in the first source with frames."""
+    with_frames = [source for source in sources if source.frames is not None]
+    if not with_frames:
+        return ["bench", *console.given({"--model": model})]
+    source, detector = with_frames[0], "network" if model is not None else shown.removesuffix("-value")
+    is_map, needs_width = source.drive != source.path, detector in ("network", "lane-filter")
+    options = {
+        "--detector": detector,
+        "--model": model,
+        "--camera": source.path / "camera.yaml" if is_map else None,
+        "--lane-width": round(source.lane_width_cm, 2) if is_map and needs_width else None,
+        "--marking": marking if detector == "lane-filter" else None,
+        "--any-camera": any_camera and model is not None,
+        "--out": "runs/lanes.csv",
+    }
+    return ["detect", source.drive, *console.given(options)]
+
+
 def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
     """Models by the names that they get in the tables: those of their folders or files."""
     from lanenet.onboard.compare import COMPARED
@@ -154,6 +173,7 @@ def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
     for path in paths:
         if path.is_file() and not is_model(path):
             raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
+        model = find_model(path)
         name = path.resolve().stem
         if path.is_dir() or name == "model":
             # A checkpoint's file is called as every other one's.
@@ -177,7 +197,6 @@ def _check_robust(model: Path | None, sources: Sequence[Opened]) -> None:
 def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[str, dict[str, object]]:
     """Measure, show and return the table as Markdown and as plain values."""
     from rich.console import Console
-        model = find_model(path)
 
     from lanenet.learn.evaluate import RasterModel
     from lanenet.learn.robust import as_dict, measure_robustness, robust_table
