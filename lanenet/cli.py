@@ -111,7 +111,7 @@ def _options(
     pass
 
 
-@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out drives/three")
+@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out runs/three")
 def simulate(
     config: _Config,
     out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],
@@ -136,7 +136,7 @@ def simulate(
     console.next_command("map", drive, "--lane-width", f"{width_cm:g}", "--out", "MAP")
 
 
-@app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out maps/tub")
+@app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out runs/tub")
 def map_(
     drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)],
     lane_width: Annotated[
@@ -164,7 +164,7 @@ def map_(
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 
 
-@app.command(epilog="Example: lanenet label maps/tub --out labels/tub.parquet")
+@app.command(epilog="Example: lanenet label runs/tub --out runs/tub.parquet")
 def label(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Label set to write (.parquet).", show_default=False)],

@@ -13,7 +13,7 @@ from lanenet.errors import ConfigError
 app = typer.Typer()
 
 
-@app.command(epilog="Example: lanenet export checkpoints/small --out small.onnx")
+@app.command(epilog="Example: lanenet export checkpoints/small --out runs/small.onnx")
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.", show_default=False)

@@ -41,7 +41,7 @@ class DetectorName(StrEnum):
 
 
 @app.command(
-    epilog="Example: lanenet detect data/tub --detector lane-filter --camera camera.yaml --out l.csv"
+    epilog="Example: lanenet detect tub --detector lane-filter --camera runs/camera.yaml --out runs/l.csv"
 )
 def detect(
     source: Annotated[
@@ -191,7 +191,7 @@ def bench(
     console.next_command("doctor")
 
 
-@app.command(epilog="Example: lanenet analyse camera.yaml --out density.png")
+@app.command(epilog="Example: lanenet analyse runs/camera.yaml --out runs/density.png")
 def analyse(
     camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.", show_default=False)],
     out: Annotated[Path | None, typer.Option(help="Picture of pixels per ground cell (.png).")] = None,
