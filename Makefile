@@ -64,7 +64,7 @@ imports: $(VENV)/.stamp-dev
 
 bench: $(VENV)/.stamp-train
 	mkdir -p runs
-	$(BIN)/lanenet bench --model checkpoints/small/model.onnx --out runs/bench.json
+	$(BIN)/lanenet bench --model checkpoints/small --out runs/bench.json
 
 clean:
 	rm -rf runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -36,7 +36,7 @@ class LensModel(StrEnum):
     PINHOLE = "pinhole"
 
 
-@app.command(epilog="Example: lanenet calibrate chessboard photos/*.jpg --board 9x6 --out camera.yaml")
+@app.command(epilog="Example: lanenet calibrate chessboard photos/*.jpg --board 9x6 --out runs/camera.yaml")
 def chessboard(
     images: Annotated[
         list[str], typer.Argument(metavar="IMAGES", help="Photos, patterns or folders.", show_default=False)
@@ -103,7 +103,9 @@ def chessboard(
     console.next_command("calibrate", "ground", "POINTS.csv", "--camera", out, "--out", out)
 
 
-@app.command(epilog="Example: lanenet calibrate ground points.csv --camera camera.yaml --out camera.yaml")
+@app.command(
+    epilog="Example: lanenet calibrate ground points.csv --camera runs/camera.yaml --out runs/camera.yaml"
+)
 def ground(
     camera: Annotated[
         Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.", show_default=False)
@@ -168,7 +170,7 @@ def ground(
 
 @app.command(
     "drive",
-    epilog="Example: lanenet calibrate drive data/tub --lane-width 40 --wheelbase 26 --out camera.yaml",
+    epilog="Example: lanenet calibrate drive data/tub --lane-width 40 --wheelbase 26 --out runs/camera.yaml",
 )
 def drive_(
     drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)],

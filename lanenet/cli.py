@@ -27,7 +27,7 @@ from lanenet import (
     world_cli,
 )
 from lanenet.config import load_settings
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.outputs import check_ending, check_not_source
 
 _Config = Annotated[
@@ -111,7 +111,7 @@ def _options(
     pass
 
 
-@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out drives/three")
+@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out runs/three")
 def simulate(
     config: _Config,
     out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],
@@ -120,20 +120,23 @@ def simulate(
     detector: Annotated[
         str | None, typer.Option(help="Who steers instead of the scripted driver.", show_default=False)
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="Model or checkpoint folder of the network.")] = None,
+    model: onboard_cli.ModelOption = None,
 ) -> None:
     """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
     from datagen.world.simulate import SimulationSettings, simulate_drive
 
     settings = load_settings(SimulationSettings, config, overrides)
-    pilot = None if detector is None else judge_cli.pilot_builder(detector, model)
+    if model is not None and detector is None:
+        raise ConfigError("--model: is the network's, expected --detector network as well")
+    width_cm = settings.track.lane_width_cm
+    pilot = None if detector is None else judge_cli.pilot_builder(detector, model, width_cm)
     with console.progress_bar("simulate") as progress:
         drive = simulate_drive(settings, out, progress, workers=workers, pilot=pilot)
     console.wrote(drive)
-    console.next_command("map", drive, "--lane-width", f"{settings.track.lane_width_cm:g}", "--out", "MAP")
+    console.next_command("map", drive, "--lane-width", f"{width_cm:g}", "--out", "MAP")
 
 
-@app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out maps/tub")
+@app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out runs/tub")
 def map_(
     drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)],
     lane_width: Annotated[
@@ -161,7 +164,7 @@ def map_(
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 
 
-@app.command(epilog="Example: lanenet label maps/tub --out labels/tub.parquet")
+@app.command(epilog="Example: lanenet label runs/tub --out runs/tub.parquet")
 def label(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Label set to write (.parquet).", show_default=False)],

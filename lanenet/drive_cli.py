@@ -42,6 +42,7 @@ def drive(
             show(lambda: f"{loop.report.text}  {step.text}")
 
         loop = build_loop(settings, arm=arm, steering_only=steering_only, dry_run=dry_run, watch=watch)
+        console.show_problems(loop.problems)
         report = loop.run(frames)
     console.show_lines(report.lines())
     console.wrote(report.recording)

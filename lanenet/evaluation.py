@@ -1,4 +1,4 @@
-"""Labels opened from drives, maps and label sets, and every detector compared on them.
+"""Every detector compared on labelled sources, and the report of it.
 
 Knows ``datagen``, ``lanenet.learn`` and ``lanenet.onboard``, as the command line does, and imports them only
 where they are needed: the car has neither SciPy nor PyArrow.
@@ -7,51 +7,20 @@ where they are needed: the car has neither SciPy nor PyArrow.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lanenet.errors import DriveFormatError
+from lanenet.labelled_sources import Opened
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
-    from lanenet.data.labelled_frames import LabelledFrames
-    from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.learn.compare import Comparison, SourceAnswers
     from lanenet.onboard.compare import ComparedName
     from lanenet.perception.estimate import Detector
 
 #: Called with (source, frames done, frames).
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Opened:
-    """A source of labels.
-
-    Attributes:
-        path: Where it lies.
-        content: A label set, which holds edge points only, or frames with labels.
-        beside: The label set of the frames, if there is one: it knows which lines can be seen.
-    """
-
-    path: Path
-    content: LabelSet | LabelledFrames
-    beside: LabelSet | None = None
-
-    @property
-    def frames(self) -> LabelledFrames | None:
-        """The frames, if the source has any."""
-        from lanenet.data.labelled_frames import LabelledFrames
-
-        return self.content if isinstance(self.content, LabelledFrames) else None
-
-    @property
-    def labels(self) -> LabelSet | None:
-        """The label set, if there is one."""
-        from lanenet.data.label_set import LabelSet
-
-        return self.content if isinstance(self.content, LabelSet) else self.beside
 
 
 @dataclass(frozen=True)
@@ -67,76 +36,6 @@ class Evaluation:
 
     comparison: Comparison
     files: dict[str, str | bytes]
-
-
-def open_source(path: Path, window: BirdseyeWindow) -> Opened:
-    """Open a label set, a map folder or a simulated drive.
-
-    Args:
-        path: Where it lies.
-        window: Points of drives and maps beside this bird's-eye window have no label.
-
-    Raises:
-        LanenetError: If it is none of these, or cannot be read.
-    """
-    from lanenet.data.label_set import read_labels
-
-    if not path.exists():
-        raise DriveFormatError(f"{path}: no such model or source")
-    if path.is_file():
-        return Opened(path, read_labels(path))
-    frames = _open_frames(path, window)
-    if frames.reference == "map":
-        return Opened(path, frames)
-    from datagen.labels.truth import truth_labels
-
-    labels = truth_labels(path, window=window)
-    return Opened(path, _as_labelled(frames, labels), labels)
-
-
-def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
-    """Open a map folder or a simulated drive."""
-    if (path / "map.yaml").is_file():
-        from datagen.labels.mapped_drive import read_map_frames
-
-        return read_map_frames(path, window)
-    from lanenet.data.labelled_frames import read_truth_frames
-
-    return read_truth_frames(path, window)
-
-
-def _as_labelled(frames: LabelledFrames, labels: LabelSet) -> LabelledFrames:
-    """Frames with the points of their label set, which leaves out what no frame can tell."""
-    from lanenet.learn.conditions import at_frames
-
-    return replace(frames, points_cm=at_frames(labels.points_cm, labels.frame, frames.frames))
-
-
-def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
-    """Open the test part of a training run, from frames where they are still there.
-
-    Args:
-        labels: Label sets.
-        frames: For each label set the simulated drive or the map that it was made of.
-
-    Raises:
-        LanenetError: If one cannot be read.
-    """
-    from lanenet.data.label_set import read_labels
-
-    sources = []
-    for labels_path, frames_path in zip(labels, frames, strict=True):
-        label_set = read_labels(labels_path)
-        opened = Opened(labels_path, label_set)
-        if frames_path.is_dir():
-            whole = _open_frames(frames_path, label_set.meta.window)
-            # A recorded drive was cut along its time; the network has learned from its first part.
-            part = whole.numbered(int(label_set.frame[0]), int(label_set.frame[-1]))
-            meta = label_set.meta
-            part = replace(part, perception=meta.perception, marking_cm=meta.marking_cm)
-            opened = Opened(frames_path, _as_labelled(part, label_set), label_set)
-        sources.append(opened)
-    return sources
 
 
 def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[ComparedName, ...]:
@@ -168,7 +67,7 @@ def evaluate(
         training: What the network has learned from, where it is known: errors are told by the distance from
             it.
         marking_cm: Thickness of the tape for the lane filter; None takes the source's, or the default.
-        any_camera: Accept a model that was trained with another camera than that of the frames.
+        any_camera: Accept a model that was trained with another camera than that of the frames or labels.
         progress: Called with (source, frames done, frames).
 
     Raises:
@@ -221,7 +120,7 @@ def _answer(
     frames, labels, name = source.frames, source.labels, str(source.path)
     if frames is None:
         assert labels is not None
-        return _answer_labels(name, labels, names, models, training, marking_cm)
+        return _answer_labels(name, labels, names, models, training, marking_cm, any_camera)
     detectors: dict[str, Detector] = {}
     for key in _in_order(names, models):
         detector: Any = "network" if key in models else key
@@ -262,6 +161,7 @@ def _answer_labels(
     models: Mapping[str, Path],
     training: Sequence[LabelSet],
     marking_cm: float | None,
+    any_camera: bool,
 ) -> SourceAnswers:
     from lanenet.learn.compare import SourceAnswers
     from lanenet.learn.conditions import lines_seen, way_to_training_cm
@@ -273,7 +173,11 @@ def _answer_labels(
     presence: dict[str, Any] = {}
     for key in _in_order(names, models):
         if key in models:
-            found = RasterModel(models[key]).answer_labels(labels)
+            model = RasterModel(models[key])
+            if not any_camera:
+                camera = f"the camera of {name}"
+                model.meta.check_trained_with(labels.meta.camera_hash, camera, str(models[key]))
+            found = model.answer_labels(labels)
             points[key], sigma[key], presence[key] = found.points_cm, found.sigma_cm, found.presence
         else:
             meta = labels.meta

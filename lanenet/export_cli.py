@@ -13,7 +13,7 @@ from lanenet.errors import ConfigError
 app = typer.Typer()
 
 
-@app.command(epilog="Example: lanenet export checkpoints/small --out small.onnx")
+@app.command(epilog="Example: lanenet export checkpoints/small --out runs/small.onnx")
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.", show_default=False)
@@ -37,8 +37,8 @@ def export(
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch, expected it without --int8")
     if int8:
-        from lanenet.learn.export import MODEL_NAME
         from lanenet.learn.quantise import export_int8
+        from lanenet.perception.checkpoint import MODEL_NAME
 
         path, report = export_int8(checkpoint, out)
         console.show_lines(report.lines)

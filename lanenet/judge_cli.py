@@ -12,6 +12,7 @@ import typer
 from lanenet import console
 from lanenet.config import apply_overrides, check_settings, read_yaml
 from lanenet.errors import ConfigError
+from lanenet.perception.checkpoint import find_model
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
@@ -130,9 +131,10 @@ def judge(
         if model is None and not _MODEL.exists():
             detectors = ",".join(name for name in _DETECTORS.split(",") if name != "network")
             console.show_problems([f"{_MODEL} is not there: without the network; --model names one"])
-    model = _MODEL if model is None else model
-    entrants = [_entrant(text.strip(), model, any_camera) for text in detectors.split(",")]
+    names = [text.strip() for text in detectors.split(",")]
+    entrants = [_entrant(name, model, "--detectors", any_camera) for name in names]
     _try_out(settings, entrants)
+    _warn_of_widths(entrants, _lane_widths_cm(settings))
     with console.progress_bar("judge") as progress:
         results = run_contest(settings, entrants, out, workers, progress)
     for kind, (measures, *table) in tables(results).items():
@@ -145,24 +147,27 @@ def judge(
     console.next_command("judge", "--law", "own", "--out", "DIR")
 
 
-def pilot_builder(text: str, model: Path | None) -> BuildPilot:
+def pilot_builder(text: str, model: Path | None, lane_width_cm: float) -> BuildPilot:
     """Return who steers a simulated drive in closed loop, for its world.
 
     Args:
-        text: As one of ``--detectors``.
-        model: Model or checkpoint folder, for the network; None takes the one that ships.
+        text: As one of judge's ``--detectors``.
+        model: Model or checkpoint folder, for the network; None takes the one that ships, and says so.
+        lane_width_cm: Of the road; a network that was trained on other ones is warned of.
 
     Raises:
-        ConfigError: If there is no such detector or file.
+        LanenetError: If there is no such detector or file.
     """
     from datagen.judge.run import build_pilot
     from datagen.world.pilot import PilotSettings
 
-    entrant = _entrant(text, _MODEL if model is None else model, any_camera=False)
+    entrant = _entrant(text, model, "--detector", any_camera=False)
+    _warn_of_widths([entrant], [lane_width_cm])
     return lambda world: build_pilot(world, entrant, PilotSettings())
 
 
-def _entrant(text: str, model: Path, any_camera: bool) -> Entrant:
+def _entrant(text: str, model: Path | None, option: str, any_camera: bool) -> Entrant:
+    """Who a text stands for; ``option`` is where it comes from."""
     from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant
     from lanenet.onboard.detectors import DetectorName
 
@@ -171,18 +176,42 @@ def _entrant(text: str, model: Path, any_camera: bool) -> Entrant:
         return Entrant(name)
     known = get_args(DetectorName)
     if name not in known:
-        raise ConfigError(f"--detectors {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *known))}")
-    path = model / "model.onnx" if model.is_dir() else model
+        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *known))}")
+    if equals and not Path(file).is_file():
+        raise ConfigError(f"{option} {text!r}: {file}: no such file")
     detector = NamedDetector(
         cast("Literal['network', 'lane-filter', 'hough', 'painter']", name),
-        path.resolve() if name == "network" else None,
+        _network_model(model) if name == "network" else None,
         Path(file).resolve() if equals else None,
         any_camera,
     )
-    for needed in (detector.model, detector.config):
-        if needed is not None and not needed.is_file():
-            raise ConfigError(f"--detectors {text!r}: {needed}: no such file")
     return Entrant(f"{name}-{Path(file).stem}" if equals else name, detector, detector.identity)
+
+
+def _network_model(given: Path | None) -> Path:
+    """The network's file; where none is named, the one that ships."""
+    if given is None:
+        if not _MODEL.exists():
+            raise ConfigError(f"detector network: expected a model (--model), {_MODEL} is not there")
+        typer.echo(f"network: {_MODEL}; --model names another one")
+    return find_model(_MODEL if given is None else given).resolve()
+
+
+def _lane_widths_cm(settings: JudgeSettings) -> list[float]:
+    """Widths of the lanes, a road of each kind after the other."""
+    from datagen.judge.settings import road_simulation
+
+    kinds = range(len(settings.tracks))
+    return [road_simulation(settings, kind * settings.count).track.lane_width_cm for kind in kinds]
+
+
+def _warn_of_widths(entrants: list[Entrant], lane_widths_cm: list[float]) -> None:
+    from lanenet.perception.model_file import read_model_meta
+
+    for entrant in entrants:
+        if isinstance(entrant.build, NamedDetector) and entrant.build.model is not None:
+            model = entrant.build.model
+            console.show_problems(read_model_meta(model).untrained_widths(lane_widths_cm, str(model)))
 
 
 def _try_out(settings: JudgeSettings, entrants: list[Entrant]) -> None:

@@ -28,8 +28,9 @@ _WAIT_S = 0.1
 
 
 @app.command(
-    epilog="Example: lanenet localise data/tub --camera maps/tub/camera.yaml "
-    "--config maps/tub/settings.yaml --out poses.csv; lanenet localise --live car.yaml --out poses.csv"
+    epilog="Example: lanenet localise data/tub --camera runs/tub/camera.yaml "
+    "--config runs/tub/settings.yaml --out runs/poses.csv; "
+    "lanenet localise --live car.yaml --out runs/poses.csv"
 )
 def localise(
     out: Annotated[

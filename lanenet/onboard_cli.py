@@ -25,6 +25,10 @@ _CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAM
 MarkingOption = Annotated[
     float | None, typer.Option("--marking", help="Thickness of the tape for the lane filter, cm.")
 ]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", help="Model (.onnx) or checkpoint folder of the network.", show_default=False),
+]
 
 
 class DetectorName(StrEnum):
@@ -37,7 +41,7 @@ class DetectorName(StrEnum):
 
 
 @app.command(
-    epilog="Example: lanenet detect data/tub --detector lane-filter --camera camera.yaml --out l.csv"
+    epilog="Example: lanenet detect tub --detector lane-filter --camera runs/camera.yaml --out runs/l.csv"
 )
 def detect(
     source: Annotated[
@@ -48,7 +52,7 @@ def detect(
     ],
     detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
-    model: Annotated[Path | None, typer.Option(help="ONNX model, for --detector network.")] = None,
+    model: ModelOption = None,
     camera: _CameraOption = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
@@ -110,6 +114,7 @@ def detect(
         config=config,
         mask=_mask_of(mask, whole, detector),
     )
+    console.show_problems(getattr(chosen, "problems", ()))
     with console.progress_bar(f"detect ({detector.value})") as progress:
         report = run_detector(
             opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
@@ -123,25 +128,28 @@ def detect(
         typer.echo(f"hint: {hint}")
     console.wrote(report.out, report.video)
     if report.video is None:
-        options: dict[str, Path | float | str | None] = {
+        again = {
+            "--detector": detector.value,
             "--model": model,
             "--camera": camera,
             "--lane-width": lane_width,
             "--marking": marking,
+            "--any-camera": any_camera,
+            "--frames": frames,
+            "--skip-unreadable": skip_unreadable,
             "--config": config,
             "--mask": mask,
+            "--out": out,
+            "--video": out.with_suffix(".mp4"),
         }
-        given = [str(word) for pair in options.items() if pair[1] is not None for word in pair]
-        given += ["--any-camera"] if any_camera else []
-        again = ("detect", source, "--detector", detector.value, *given, "--out", out)
-        console.next_command(*again, "--video", out.with_suffix(".mp4"))
+        console.next_command("detect", source, *console.given(again))
     else:
-        console.next_command("bench")
+        console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
 
 
-@app.command(epilog="Example: lanenet bench --model checkpoints/small/model.onnx --out bench.json")
+@app.command(epilog="Example: lanenet bench --model checkpoints/small --out runs/bench.json")
 def bench(
-    model: Annotated[Path | None, typer.Option(help="ONNX model to time as well.")] = None,
+    model: ModelOption = None,
     also: Annotated[
         list[Path] | None, typer.Option(help="More models, for their time from frame to steering.")
     ] = None,
@@ -183,7 +191,7 @@ def bench(
     console.next_command("doctor")
 
 
-@app.command(epilog="Example: lanenet analyse camera.yaml --out density.png")
+@app.command(epilog="Example: lanenet analyse runs/camera.yaml --out runs/density.png")
 def analyse(
     camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.", show_default=False)],
     out: Annotated[Path | None, typer.Option(help="Picture of pixels per ground cell (.png).")] = None,

@@ -22,7 +22,9 @@ app = typer.Typer()
 _YAML = (".yaml", ".yml")
 
 
-@app.command(epilog="Example: lanenet reality my_tub --camera camera.yaml --count 100 --out runs/reality")
+@app.command(
+    epilog="Example: lanenet reality my_tub --camera runs/camera.yaml --count 100 --out runs/reality"
+)
 def reality(
     drives: Annotated[
         list[Path],

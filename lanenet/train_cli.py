@@ -21,7 +21,7 @@ from lanenet.onboard_cli import MarkingOption
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lanenet.evaluation import Opened
+    from lanenet.labelled_sources import Opened
     from lanenet.learn.robust import RobustRow
 
 app = typer.Typer()
@@ -75,7 +75,8 @@ def train(
     from datagen.datasets import prepare
     from lanenet.data.files import json_text
     from lanenet.data.label_set import read_labels
-    from lanenet.evaluation import default_names, evaluate, open_tests
+    from lanenet.evaluation import default_names, evaluate
+    from lanenet.labelled_sources import open_tests
     from lanenet.learn.card import CARD_NAME, model_card
     from lanenet.learn.publish import publish
     from lanenet.learn.robust import as_dict
@@ -129,9 +130,14 @@ def train(
         files[f"example{data.example.suffix}"] = data.example.read_bytes()
     publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
     console.wrote(checkpoint)
-    words = ["detect", "SOURCE", "--detector", "network", "--model", checkpoint / model.name]
-    words += ["--camera", checkpoint / "camera.yaml"] if data.camera is not None else []
-    console.next_command(*words, "--out", "lanes.csv")
+    options = {
+        "--detector": "network",
+        "--model": checkpoint,
+        "--camera": checkpoint / "camera.yaml" if data.camera is not None else None,
+        "--out": "runs/lanes.csv",
+    }
+    source = checkpoint / f"example{data.example.suffix}" if data.example is not None else "SOURCE"
+    console.next_command("detect", source, *console.given(options))
 
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:

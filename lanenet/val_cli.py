@@ -10,9 +10,11 @@ import typer
 
 from lanenet import console
 from lanenet.errors import ConfigError
-from lanenet.evaluation import Opened, default_names, evaluate, open_source
+from lanenet.evaluation import default_names, evaluate
+from lanenet.labelled_sources import Opened, open_source
 from lanenet.onboard_cli import MarkingOption
 from lanenet.outputs import check_not_source
+from lanenet.perception.checkpoint import find_model, is_model
 
 if TYPE_CHECKING:
     from lanenet.learn.compare import Comparison
@@ -81,6 +83,7 @@ def val(
     from lanenet.perception.network import read_model_meta
 
     model, source_paths = _split_paths(paths)
+    more = _more_models(also or [])
     if out is not None:
         for source in source_paths:
             check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
@@ -89,9 +92,12 @@ def val(
     names = _chosen(detectors, no_baselines, model, sources)
     if detectors is None and not no_baselines and any(source.frames is None for source in sources):
         console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
-    more = _more_models(also or [])
     if robust:
         _check_robust(model, sources)
+    networks = more if model is None or "network" not in names else {"network": model, **more}
+    for path in networks.values():
+        widths_cm = [source.lane_width_cm for source in sources]
+        console.show_problems(read_model_meta(path).untrained_widths(widths_cm, str(path)))
     with console.progress_bar("val") as progress:
         evaluation = evaluate(
             sources,
@@ -125,9 +131,7 @@ def val(
             console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
     best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
     shown = "network" if "network" in names else best
-    words: list[str | Path] = ["detect", "SOURCE", "--detector", shown.removesuffix("-value")]
-    words += ["--model", model] if model is not None and shown == "network" else []
-    console.next_command(*words, "--out", "lanes.csv")
+    console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
 
 
 def show(comparison: Comparison) -> None:
@@ -140,15 +144,36 @@ def show(comparison: Comparison) -> None:
         Console().print(table.as_rich())
 
 
+def _next_words(
+    sources: Sequence[Opened], shown: str, model: Path | None, marking: float | None, any_camera: bool
+) -> list[str | Path]:
+    """A command that runs as it stands: the lanes that a detector finds in the first source with frames."""
+    with_frames = [source for source in sources if source.frames is not None]
+    if not with_frames:
+        return ["bench", *console.given({"--model": model})]
+    source, detector = with_frames[0], "network" if model is not None else shown.removesuffix("-value")
+    is_map, needs_width = source.drive != source.path, detector in ("network", "lane-filter")
+    options = {
+        "--detector": detector,
+        "--model": model,
+        "--camera": source.path / "camera.yaml" if is_map else None,
+        "--lane-width": round(source.lane_width_cm, 2) if is_map and needs_width else None,
+        "--marking": marking if detector == "lane-filter" else None,
+        "--any-camera": any_camera and model is not None,
+        "--out": "runs/lanes.csv",
+    }
+    return ["detect", source.drive, *console.given(options)]
+
+
 def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
     """Models by the names that they get in the tables: those of their folders or files."""
     from lanenet.onboard.compare import COMPARED
 
     models: dict[str, Path] = {}
     for path in paths:
-        model = _model_at(path)
-        if model is None:
+        if path.is_file() and not is_model(path):
             raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
+        model = find_model(path)
         name = path.resolve().stem
         if path.is_dir() or name == "model":
             # A checkpoint's file is called as every other one's.
@@ -185,21 +210,14 @@ def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[
     return table.as_markdown(), as_dict(rows)
 
 
-def _model_at(path: Path) -> Path | None:
-    """The model that a path stands for: a file, or that of a checkpoint folder."""
-    if (path / "model.onnx").is_file() or (path / "checkpoint.yaml").is_file():
-        return path / "model.onnx"
-    return path if path.suffix.lower() == ".onnx" else None
-
-
 def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
     """The model, if the first path is one, and the sources."""
-    first, model = paths[0], _model_at(paths[0])
-    if model is None:
+    first, *sources = paths
+    if not is_model(first):
         return None, paths
-    if not paths[1:]:
+    if not sources:
         raise ConfigError(f"{first}: expected a SOURCE after the model: a simulated drive, map or label set")
-    return model, paths[1:]
+    return find_model(first), sources
 
 
 def _chosen(

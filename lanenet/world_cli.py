@@ -13,7 +13,7 @@ from lanenet.errors import ConfigError
 app = typer.Typer()
 
 
-@app.command(epilog="Example: lanenet track bfmc --out track.png --seed 3")
+@app.command(epilog="Example: lanenet track bfmc --out runs/bfmc.png --seed 3")
 def track(
     road: Annotated[
         str,
@@ -59,7 +59,7 @@ def track(
     )
 
 
-@app.command(epilog="Example: lanenet sheets bfmc light --out sheets")
+@app.command(epilog="Example: lanenet sheets bfmc light --out runs/sheets")
 def sheets(
     out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).", show_default=False)],
     names: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ from pydantic import Field
 
 from datagen.world.pilot import PilotSettings
 from datagen.world.script import DriverSettings
-from datagen.world.track import TrackSettings, load_track_settings
+from datagen.world.track import TrackSettings, load_track_settings, preset, preset_names
 from datagen.world.world import SimulationSettings
-from lanenet.config import Settings, check_settings
+from lanenet.config import Settings
 from lanenet.errors import ConfigError
 
 _FILE_ENDINGS = (".yaml", ".yml")
+_DRAWN = ("random", "open")
 _STREAM = 3  # of seeds; the drives of a training run take 0 to 2, so that its roads are never judged on
 
 
@@ -85,8 +87,16 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
 
 
 def _track_settings(kind: str, common: TrackSettings) -> TrackSettings:
-    if kind in ("random", "open"):
+    if kind in _DRAWN:
         return common.model_copy(update={"closed": kind == "random"})
     if kind.endswith(_FILE_ENDINGS):
         return load_track_settings(Path(kind))
-    return check_settings(TrackSettings, {"preset": kind}, f"tracks: {kind}")
+    known = (*_DRAWN, *preset_names())
+    if kind not in known:
+        close = difflib.get_close_matches(kind, known, n=1)
+        hint = f", did you mean {close[0]!r}?" if close else ""
+        raise ConfigError(
+            f"tracks: found {kind!r}, expected {' or '.join(_DRAWN)} (drawn roads), a preset "
+            f"({', '.join(preset_names())}) or a track file (.yaml){hint}"
+        )
+    return preset(kind)

@@ -128,7 +128,8 @@ def _weak_spots(comparison: Comparison) -> list[str]:
     name = comparison.first
     groups = comparison.tables[name].groups
     spots = [
-        (f"{GROUPS[condition][0]} {group}", stats)
+        # Here only one detector is spoken of.
+        (f"{GROUPS[condition][0].replace('the first detector', 'the network')} {group}", stats)
         for condition, by_detector in comparison.breakdown.groups.items()
         for group, stats in by_detector[name].items()
     ]

@@ -25,6 +25,7 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.perception.checkpoint import MARKER_NAME, MODEL_NAME
 from lanenet.perception.model_file import BATCH_NAME, WIDTH_NAME
 from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 
@@ -39,10 +40,8 @@ _CHECKED_WIDTHS_CM = (0.0, 30.0, 60.0)
 _BATCH = 256
 
 CHECKPOINT_FORMAT = "lanenet-checkpoint/1"
-MARKER_NAME = "checkpoint.yaml"
 CONFIG_NAME = "config.yaml"
 WEIGHTS_NAME = "weights.safetensors"
-MODEL_NAME = "model.onnx"
 RASTERS_NAME = "check_rasters.png"
 CALIBRATION_NAME = "calibration_rasters.png"
 

@@ -10,8 +10,9 @@ import yaml
 
 from lanenet.data.files import atomic_folder, write_json, write_text
 from lanenet.errors import CheckpointError
-from lanenet.learn.export import CHECKPOINT_FORMAT, MARKER_NAME
+from lanenet.learn.export import CHECKPOINT_FORMAT
 from lanenet.learn.run_state import METRICS_NAME, STATE_NAME
+from lanenet.perception.checkpoint import MARKER_NAME
 
 
 def publish(

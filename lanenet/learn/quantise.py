@@ -15,7 +15,8 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 
 from lanenet.data.files import atomic_file, write_json
 from lanenet.errors import CheckpointError
-from lanenet.learn.export import CALIBRATION_NAME, MODEL_NAME, RASTERS_NAME, quiet, read_rasters
+from lanenet.learn.export import CALIBRATION_NAME, RASTERS_NAME, quiet, read_rasters
+from lanenet.perception.checkpoint import MODEL_NAME
 from lanenet.perception.network import INPUT_NAME, open_model
 
 INT8_NAME = "model-int8.onnx"

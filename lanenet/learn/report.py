@@ -19,7 +19,6 @@ from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.export import (
     CALIBRATION_NAME,
     CONFIG_NAME,
-    MODEL_NAME,
     RASTERS_NAME,
     WEIGHTS_NAME,
     export_onnx,
@@ -30,6 +29,7 @@ from lanenet.learn.figure import new_figure, png_bytes
 from lanenet.learn.network import LaneNet
 from lanenet.learn.predict import Answers
 from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, EpochRecord, best_record
+from lanenet.perception.checkpoint import MODEL_NAME
 from lanenet.perception.network import ModelMeta
 
 CURVE_NAME = "curve"

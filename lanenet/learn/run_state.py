@@ -17,8 +17,9 @@ from lanenet.data.files import atomic_file
 from lanenet.errors import CheckpointError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import hash_files
-from lanenet.learn.export import MODEL_NAME, WEIGHTS_NAME
+from lanenet.learn.export import WEIGHTS_NAME
 from lanenet.learn.start import hash_of_start
+from lanenet.perception.checkpoint import MODEL_NAME
 
 STATE_NAME = "last.pt"
 METRICS_NAME = "metrics.json"

@@ -19,7 +19,6 @@ from lanenet.learn.augment import Batch
 from lanenet.learn.calibrate import calibrate_presence, calibrate_sigma
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import LaneSamples, check_same
-from lanenet.learn.export import MODEL_NAME
 from lanenet.learn.loss import lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
@@ -36,6 +35,7 @@ from lanenet.learn.run_state import (
     write_state,
 )
 from lanenet.learn.start import load_start_weights
+from lanenet.perception.checkpoint import MODEL_NAME
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]

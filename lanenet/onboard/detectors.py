@@ -55,7 +55,7 @@ def build_detector(
     Args:
         name: Which one.
         camera: Camera of the frames; ``hough`` and ``painter`` do without, but then know no centimetres.
-        model: ONNX file, needed by ``network``.
+        model: ONNX file or checkpoint folder, needed by ``network``.
         lane_width_cm: Between the middles of the two lines, for ``lane-filter``, where it goes before the
             file's, and for ``network``, which rebuilds a missing line with it.
         drive_lane_width_cm: What the source says about that; counts where neither it nor the file does.
@@ -86,7 +86,7 @@ def build_detector(
         raise CalibrationError(f"detector {name}: expected a camera (--camera camera.yaml)")
     if name == "network":
         if model is None:
-            raise ConfigError("detector network: expected a model (--model MODEL.onnx)")
+            raise ConfigError("detector network: expected a model (--model MODEL)")
         width_cm = drive_lane_width_cm if lane_width_cm is None else lane_width_cm
         return NetworkDetector(model, camera, any_camera=any_camera, mask=mask, lane_width_cm=width_cm)
     settings, perception = lane_filter_settings(config, lane_width_cm, drive_lane_width_cm, marking_cm)

@@ -159,9 +159,11 @@ def _rate(frames: list[Frame], wanted_hz: float | None) -> Check:
 def _detector(settings: DriveSettings, camera: Camera | None) -> Check:
     name = f"detector {settings.detector.kind}"
     try:
-        build_drive_detector(settings, camera)
+        detector = build_drive_detector(settings, camera)
     except LanenetError as error:
         return Check(name, "problem", str(error))
+    if problems := getattr(detector, "problems", ()):
+        return Check(name, "note", "; ".join(problems))
     model = settings.detector.model
     return Check(name, "ok", f"{model} fits this camera" if model is not None else "ready")
 

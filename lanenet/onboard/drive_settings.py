@@ -22,7 +22,7 @@ class DriveDetectorSettings(Settings):
 
     Attributes:
         kind: As in ``lanenet detect --detector``.
-        model: ONNX file of the network.
+        model: ONNX file or checkpoint folder of the network.
         config: Settings file of the other detectors.
         mask: PNG that shows the car itself; what lies there is left out.
         any_camera: Use a network with another camera than it was trained with.

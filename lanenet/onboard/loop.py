@@ -6,7 +6,7 @@ import gc
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -52,6 +52,7 @@ class DriveLoop:
 
     Attributes:
         report: Figures of the drive so far.
+        problems: What is known to be wrong with what the detector was given, a line each.
     """
 
     def __init__(
@@ -89,6 +90,7 @@ class DriveLoop:
             clock: The clock of the frames' times.
         """
         self.report = DriveReport()
+        self.problems: Sequence[str] = getattr(detector, "problems", ())
         self._source, self._detector, self._controller, self._sink = source, detector, controller, sink
         self._safety, self._limiter, self._speed = safety, limiter, speed
         self._armed, self._moves = armed, armed or steering_only

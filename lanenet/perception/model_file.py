@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM
 from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.checkpoint import find_model
 
 FORMAT = "lanenet-model/2"
 #: Of models from before the network told its uncertainty; they are still read.
@@ -28,6 +29,8 @@ BATCH_NAME = "n"
 OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
 #: Stands for the cameras of a model that was trained with many.
 ANY_CAMERA = "any"
+#: So exactly is a lane's width known that was measured on the floor.
+_WIDTH_SLACK_CM = 0.5
 
 _UNITS = {
     "points_cm": "cm",
@@ -82,6 +85,46 @@ class ModelMeta:
     def widths_cm(self) -> tuple[float, float]:
         """The narrowest and the widest lane of the training data."""
         return self.lane_width_range_cm or (self.lane_width_cm, self.lane_width_cm)
+
+    def check_trained_with(self, camera_hash: str, camera: str, where: str) -> None:
+        """Refuse a camera that the model was not trained with.
+
+        Args:
+            camera_hash: Of the camera.
+            camera: What the error calls it.
+            where: Names the model's file in the error.
+
+        Raises:
+            ModelMismatchError: Naming both cameras, and the way out.
+        """
+        if not self.any_camera and camera_hash not in self.camera_hashes:
+            raise ModelMismatchError(
+                f"{where}: trained with camera {', '.join(self.camera_hashes) or 'unknown'}, but {camera} is "
+                f"{camera_hash}; train with this camera, or allow any camera (--any-camera, "
+                "detector.any_camera) if both are calibrated and see about the same road"
+            )
+
+    def untrained_widths(self, lane_widths_cm: Iterable[float], where: str) -> list[str]:
+        """Warn of lanes that are narrower or wider than those of the training data.
+
+        Args:
+            lane_widths_cm: What the model will be told, or will see.
+            where: Names the model's file in the warning.
+
+        Returns:
+            One line; none where the model knows all the widths.
+        """
+        low, high = self.widths_cm
+        least, most = low - _WIDTH_SLACK_CM, high + _WIDTH_SLACK_CM
+        others = sorted({width for width in lane_widths_cm if not least <= width <= most})
+        if not others:
+            return []
+        told = " and ".join(f"{width:g}" for width in others)
+        known = f"{low:.0f} cm" if high - low < 1.0 else f"{low:.0f} to {high:.0f} cm"
+        return [
+            f"lane width {told} cm: {where} was trained on lanes of {known}, and how wrong it is on others "
+            "is not known"
+        ]
 
     def to_properties(self) -> dict[str, str]:
         """Return the description as the text properties of an ONNX file."""
@@ -160,7 +203,7 @@ def open_model(
     """Open a model file and check that it is what its description says.
 
     Args:
-        path: ONNX file that :mod:`lanenet.learn` exported.
+        path: ONNX file that :mod:`lanenet.learn` exported, or its checkpoint folder.
         threads: Threads of the computation.
         frames: Rasters of every run, which is faster for being known; None takes any number.
 
@@ -168,8 +211,7 @@ def open_model(
         ModelMismatchError: If the file is missing, is not an ONNX file, or its description is of another
             format or does not fit its own inputs and outputs.
     """
-    if not path.is_file():
-        raise ModelMismatchError(f"{path}: no such file, expected an ONNX model")
+    path = find_model(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

@@ -50,6 +50,7 @@ class NetworkDetector:
     Attributes:
         meta: What the model says about itself.
         memory: Rebuilds the missing line of a frame with one; None if that is switched off.
+        problems: What is known to be wrong with what it was given, a line each.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class NetworkDetector:
         """Open a model for a camera.
 
         Args:
-            model_path: ONNX file.
+            model_path: ONNX file or checkpoint folder.
             camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
@@ -91,6 +92,8 @@ class NetworkDetector:
             )
         if not any_camera:
             _check_camera(self.meta, camera, model_path)
+        widths_cm = [] if lane_width_cm is None else [lane_width_cm]
+        self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self.memory = LaneMemory(lane_width_cm) if memory else None
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
@@ -159,13 +162,9 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
                 f"{model_path}: made for any camera that sees its window, {meta.window}; this one sees "
                 f"{share:.0%} of the window's far half, expected at least {_LEAST_SHARE_SEEN:.0%}"
             )
-    elif camera.hash not in meta.camera_hashes:
-        raise ModelMismatchError(
-            f"{model_path}: trained with camera {', '.join(meta.camera_hashes) or 'unknown'}, but "
-            f"this camera, {camera.model} {camera.width}x{camera.height}, is {camera.hash}; train with this "
-            "camera, or allow any camera (--any-camera, detector.any_camera) if both are calibrated and see "
-            "about the same road"
-        )
+        return
+    this = f"this camera, {camera.model} {camera.width}x{camera.height},"
+    meta.check_trained_with(camera.hash, this, str(model_path))
 
 
 def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:

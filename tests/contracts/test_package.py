@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,29 @@ def test_every_line_of_the_readme_names_what_exists(line: str) -> None:
     for word in words:
         if word.startswith("--"):
             assert word.partition("=")[0] in known, f"{word} is no option of {' '.join(names)}"
+
+
+def outputs(line: str) -> list[str]:
+    """What a command line says that it writes."""
+    words = shlex.split(line, comments=True)
+    return [value for option, value in pairwise(words) if option in ("--out", "--video")]
+
+
+def examples() -> list[str]:
+    """The command lines of the README and of the help texts, those that do not run from the clone too."""
+    readme = (REPO / "README.md").read_text()
+    shown = [line for line in readme.splitlines() if re.match(r"(lanenet-env/bin/)?lanenet ", line)]
+    return [*shown, *(str(command.epilog) for command in COMMANDS.values())]
+
+
+def test_what_the_examples_write_leaves_the_clone_clean() -> None:
+    ignored = (REPO / ".gitignore").read_text().splitlines()
+    written = [path for line in examples() for path in outputs(line)]
+    assert len(written) > 30
+    for path in written:
+        assert f"{path.partition('/')[0]}/" in ignored, path
+    # What the cars of configs/car record, and the environment of the README's car.
+    assert {"/drives/", "/lanenet-env/"} <= set(ignored)
 
 
 def test_constraints_pin_the_direct_dependencies_exactly() -> None:

@@ -225,7 +225,11 @@ def test_everybody_drives_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (["--detectors", "network", "--model", "nowhere.onnx"], "no such file"),
         (["--detectors", "truth=x.yaml"], "expected truth"),
         (["--detectors", "truth", "--law", "magic"], "pilot.law"),
-        (["--detectors", "truth", "--tracks", "moon"], "moon"),
+        (
+            ["--detectors", "truth", "--tracks", "random,moon"],
+            "tracks: found 'moon', expected random or open (drawn roads), a preset (bfmc, carolo_cup, ",
+        ),
+        (["--detectors", "truth", "--tracks", "donkytape"], "(.yaml), did you mean 'donkey_tape'?"),
         (["--detectors", "truth,truth"], "each may be named once"),
     ],
 )

@@ -29,9 +29,9 @@ from lanenet.config import dump_settings
 from lanenet.data.drive_writer import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CalibrationError, DriveFormatError, MapFormatError
-from lanenet.evaluation import open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
+from lanenet.labelled_sources import open_tests
 from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 
 N = 30

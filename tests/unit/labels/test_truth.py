@@ -11,8 +11,9 @@ from datagen.world.simulate import SimulationSettings, simulate_drive
 from datagen.world.track_settings import TrackSettings
 from lanenet.data.drive import read_truth
 from lanenet.data.label_set import write_labels
-from lanenet.evaluation import evaluate, open_source, open_tests
+from lanenet.evaluation import evaluate
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.labelled_sources import open_source, open_tests
 
 
 def _truth_of(tmp_path, driver: DriverSettings, seed: int):

@@ -10,9 +10,10 @@ TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (50, 1))
 METRICS = {"parameters": 97310, "epochs": 8, "best_epoch": 7, "val_frames": 12, "val_rmse_cm": 0.5}
 
 
-def card(*errors_cm, meta=None):
+def card(*errors_cm, meta=None, conditions=None):
     answers = [
-        SourceAnswers(f"d/t{k}", "map", "map", TRUTH, {"n": TRUTH + e}) for k, e in enumerate(errors_cm)
+        SourceAnswers(f"d/t{k}", "map", "map", TRUTH, {"n": TRUTH + e}, conditions=conditions or {})
+        for k, e in enumerate(errors_cm)
     ]
     training = [make_label_set(4, 0), make_label_set(5, 1, camera_hash="cam1")]
     meta = meta or model_meta()
@@ -50,6 +51,15 @@ def test_weak_spots_are_named_the_worst_drive_first():
     assert len(weak) == 2
     # One of six points of one of three drives.
     assert "5.56 % of the points are off by more than 4 cm" in text
+
+
+def test_doubt_is_told_as_the_networks_own():
+    """The comparison's tables speak of the first of several detectors; in the card there is one."""
+    unsure = np.repeat([0.1, 0.9], [10, 40])
+    wrong = np.where(unsure < 0.5, 6.0, 0.1)[:, None]
+    text = card(wrong, conditions={"confidence": unsure})
+    assert "- confidence of the network (a car slows down below 0.5 and stops below 0.2) under 0.2: " in text
+    assert "first detector" not in text
 
 
 def test_lane_widths_of_the_training_are_its_limits():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.evaluate import RasterAnswers, RasterModel
 from lanenet.onboard.bench import example_camera, example_frames
+from lanenet.perception.model_file import ModelMeta
 
 
 def run(*words: str | Path) -> Result:
@@ -274,15 +276,12 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
     (folder / "model.onnx").write_bytes(b"")
     opened: list[Path] = []
 
-    @dataclass(frozen=True)
-    class Meta:
-        window: BirdseyeWindow
-        takes_width: bool = False
+    meta = ModelMeta(BirdseyeWindow(), ("c" * 16,), 26.0, 40.0, "", (math.nan,) * 6, "map")
 
     class OneOff(RasterModel):
         def __init__(self, path: Path) -> None:
             opened.append(path)
-            self.meta = Meta(BirdseyeWindow())
+            self.meta = meta
 
         def check_window(self, window: BirdseyeWindow) -> None:
             assert window == BirdseyeWindow()
@@ -296,7 +295,7 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
     monkeypatch.setattr("lanenet.learn.evaluate.RasterModel", OneOff)
-    monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: Meta(BirdseyeWindow()))
+    monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: meta)
     return opened
 
 

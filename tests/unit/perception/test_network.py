@@ -128,6 +128,25 @@ def test_another_camera_is_refused_unless_allowed(model_path):
     assert NetworkDetector(model_path, other, any_camera=True).detect(striped_frame()).mask.all()
 
 
+def test_a_checkpoint_folder_will_do_for_its_model(model_path):
+    detector = NetworkDetector(model_path.parent, CAMERA)
+    assert detector.detect(striped_frame()).mask.all()
+
+
+def test_a_lane_beside_the_widths_of_the_training_is_warned_of_once(model_path):
+    ranged = replace(META, lane_width_range_cm=(21.08, 78.26))
+    # Told as a card shows them, to the whole centimetre, both ends are inside.
+    assert ranged.untrained_widths([21.0, 40.0, 78.5], "m.onnx") == []
+    (line,) = ranged.untrained_widths([90.0, 40.0, 15.5, 90.0], "m.onnx")
+    assert line.startswith("lane width 15.5 and 90 cm: m.onnx was trained on lanes of 21 to 78 cm")
+    # Without a range all lanes had the mean width.
+    assert "trained on lanes of 40 cm" in META.untrained_widths([59.0], "m.onnx")[0]
+    assert NetworkDetector(model_path, CAMERA).problems == []
+    assert NetworkDetector(model_path, CAMERA, lane_width_cm=40.2).problems == []
+    (line,) = NetworkDetector(model_path, CAMERA, lane_width_cm=59.0).problems
+    assert line.startswith(f"lane width 59 cm: {model_path} was trained")
+
+
 def test_the_same_camera_at_another_resolution_is_refused(model_path):
     K = CAMERA.K * [[0.5], [0.5], [1.0]]
     half = replace(CAMERA, width=80, height=60, K=K)
