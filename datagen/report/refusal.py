@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from datagen.map_folder import DriveMap
+from datagen.report.page import PAGE_NAME
 from lanenet.config import read_yaml
 from lanenet.errors import ConfigError, TrackingLostError
 
@@ -45,7 +46,10 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
         reason = str(reasons[0])
     except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
         reason = "its report cannot be read"
+    page = map_folder / PAGE_NAME
+    # Maps of which nobody wants pictures have no page.
+    told_by = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
-        f"{map_folder}: the map was rejected: {reason}; see {map_folder / 'report.html'}, and label it with "
-        "--force if it is to be used all the same"
+        f"{map_folder}: the map was rejected: {reason}; see {told_by}, and label it with --force if it is to "
+        "be used all the same"
     )

@@ -151,8 +151,11 @@ def test_varied_drives_have_roads_and_cameras_of_their_own(tmp_path):
 def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, monkeypatch):
     mapped: list[str] = []
 
-    def map_drive(path: Path, *_: object) -> None:
+    pictured: list[str] = []
+
+    def map_drive(path: Path, *_: object, pictures: bool) -> None:
         mapped.append(path.name)
+        pictured.extend([path.name] if pictures else [])
         if path.name in ("train_01", "train_02"):
             raise TrackingLostError(f"{path.name}: no lane")
 
@@ -166,13 +169,17 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
     with pytest.raises(TrackingLostError, match="train_01: no lane"):
         prepare(varied(), tmp_path / "strict")
     mapped.clear()
+    pictured.clear()
     found = prepare(varied(may_fail=0.5), tmp_path / "work")
     assert [path.stem for path in found.train] == ["train_00", "train_03"]
     assert len(found.left_out) == 2 and found.left_out[0].startswith("train_01 (seed")
-    assert len(mapped) == 5
+    assert len(mapped) == 5 and pictured == mapped
+    # Of many drives only the first ones are there to be looked at.
+    prepare(varied(may_fail=0.5, train=6), tmp_path / "work")
+    assert mapped[5:] == ["train_04", "train_05"] and len(pictured) == 5
     # What failed is not tried again, and what is there is kept.
     again = prepare(varied(may_fail=0.5), tmp_path / "work")
-    assert again == found and len(mapped) == 5
+    assert again == found and len(mapped) == 7
     with pytest.raises(TrackingLostError, match=r"2 of 5 synthetic drives .* expected at most 1"):
         prepare(varied(may_fail=0.2), tmp_path / "work")
 

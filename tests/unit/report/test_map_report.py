@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from datagen.labels.label_map import label_map
 from datagen.map_folder import read_map
 from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
+from datagen.report.refusal import refuse_rejected
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.errors import TrackingLostError
@@ -50,6 +52,23 @@ def test_a_clean_drive_is_good_and_says_so_first(mapped):
     folder, lines = mapped
     assert lines[0] == "verdict: good"
     assert read_map(folder).meta.verdict == "good"
+
+
+def test_without_pictures_the_map_is_the_same(drive, mapped, tmp_path):
+    folder, lines = mapped
+    bare = tmp_path / "bare"
+    assert map_drive(drive, 40.0, None, SETTINGS, bare, pictures=False).lines == lines
+    drawn = {"map.png", "frames.png", "report.html"}
+    assert {p.name for p in folder.iterdir()} - {p.name for p in bare.iterdir()} == drawn
+    for name in ("poses.csv", "lanes.json", "report.json"):
+        assert (bare / name).read_bytes() == (folder / name).read_bytes()
+    rejected = read_map(bare)
+    rejected = replace(rejected, meta=rejected.meta.model_copy(update={"verdict": "reject"}))
+    # Nobody is sent to a page that is not there.
+    with pytest.raises(TrackingLostError, match=r"rejected.*see .*report\.json"):
+        refuse_rejected(bare, rejected)
+    with pytest.raises(TrackingLostError, match=r"rejected.*see .*report\.html"):
+        refuse_rejected(folder, rejected)
 
 
 def test_figures_for_machines(mapped):
