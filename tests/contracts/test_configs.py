@@ -135,10 +135,19 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
     from lanenet.learn.publish import publish
     from lanenet.learn.train import train
 
-    def map_drive(drive: Path, lane_width_cm: float, camera: Path | None, settings: Any, out: Path) -> None:
+    def map_drive(
+        drive: Path,
+        lane_width_cm: float,
+        camera: Path | None,
+        settings: Any,
+        out: Path,
+        pictures: bool = True,
+    ) -> None:
         assert lane_width_cm > 20.0
 
-    def label_map(drive_map: Path, out: Path, *, window: Any, perception: Any = None) -> None:
+    def label_map(
+        drive_map: Path, out: Path, *, window: Any, perception: Any = None, pictures: bool = True
+    ) -> None:
         write_quick_labels(out, window, "map", drive_map.name)
 
     def truth_labels(drive: Path, perception: Any, window: Any, marking_cm: float) -> Path:

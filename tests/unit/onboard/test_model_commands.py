@@ -97,6 +97,7 @@ def label_set(path: Path, camera_hash: str) -> Path:
         edges=[np.concatenate(edges).astype(np.float32)] * 2,
         lines=[(line, line + [40.0, 0.0])] * 2,
         quality=np.ones(2),
+        divides=np.zeros((2, 2), dtype=bool),
     )
     write_labels(path, labels)
     return path
