@@ -98,13 +98,12 @@ def test_labels_come_from_the_map_and_are_close_to_the_truth(finished):
 
 def test_a_second_run_does_nothing_again(finished):
     folder, config, _ = finished
-    made = sorted((folder / "work").rglob("*.parquet"))
+    # Of the drives, and of the training, which writes its state after each epoch.
+    made = [*sorted((folder / "work").rglob("*.parquet")), *(folder / "work").glob("train-*/last.pt")]
+    assert made[-1].name == "last.pt"
     before = [path.stat().st_mtime_ns for path in made]
     weights = (folder / "ck" / "tiny" / "weights.safetensors").read_bytes()
-    # Time of the processor: on a busy machine the clock says little.
-    begin = time.process_time()
     invoke("train", config)
-    assert time.process_time() - begin < 20.0
     assert [path.stat().st_mtime_ns for path in made] == before
     assert (folder / "ck" / "tiny" / "weights.safetensors").read_bytes() == weights
 
