@@ -113,7 +113,10 @@ def test_revisits_are_a_lap_apart_and_meet(solved):
     ]
     drift = float(np.median(missed_rad)) / LAP_CM
     assert segment.drift_rad_per_cm == pytest.approx(drift, abs=np.deg2rad(10.0) / LAP_CM)
-    np.testing.assert_array_equal(segment.laps, segment.path_cm // LAP_CM > 0.99)
+    # A frame lies where the lap ends: the last bits decide which side of it that is.
+    clear = np.abs(segment.path_cm - LAP_CM) > 0.5 * LAP_CM / LAP_FRAMES
+    assert clear.sum() >= len(clear) - 1
+    np.testing.assert_array_equal(segment.laps[clear], segment.path_cm[clear] > LAP_CM)
 
 
 def test_a_known_camera_stays_and_the_frames_agree(solved):
