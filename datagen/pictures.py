@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.labels.project import FrameLines
 from datagen.map_folder import DriveMap
 from datagen.runs import true_runs
@@ -96,14 +98,18 @@ def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarra
             cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
 
 
-def draw_contact_sheet(
-    path: Path,
-    frames: list[tuple[UInt8[np.ndarray, "h w 3"], FrameLines, int]],
-    camera: Camera,
-    columns: int = 4,
-) -> None:
-    """Draw frames with their projected lines (green left, magenta right) and six points (red rings)."""
-    tiles = [draw_lines(image, lines, camera, f"{number}") for image, lines, number in frames]
+def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Iterable[int], columns: int = 4) -> None:
+    """Draw some frames of a map with their projected lines (green left, magenta right) and six points."""
+    drive_map = mapped.drive_map
+    tiles = [
+        draw_lines(
+            mapped.drive.image(int(mapped.rows[k])),
+            lines_at(drive_map, k),
+            drive_map.camera,
+            f"{drive_map.frames[k]}",
+        )
+        for k in map(int, chosen)
+    ]
     while len(tiles) % columns:
         tiles.append(np.zeros_like(tiles[0]))
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]

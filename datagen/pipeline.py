@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import MappedDrive, lines_at, points_text
+from datagen.labels.mapped_drive import MappedDrive, points_text
 from datagen.lane_scale import fitted_width_cm
 from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
 from datagen.map_report import (
@@ -180,27 +180,13 @@ def _map_drive(
                 (part.solved.scans, part.solved.poses * [factor, factor, 1.0], factor) for part in parts
             ]
             draw_map(folder / "map.png", drive_map, scaled, mapped.starts)
-            _draw_frames(folder / "frames.png", mapped)
+            shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
+            draw_contact_sheet(folder / "frames.png", mapped, shown)
             png = (folder / "map.png").read_bytes()
             page = report_page(mapped, quality, verdict, figures, opened, png, settings.verdict)
             write_text(folder / PAGE_NAME, page)
     said = [f"verdict: {verdict.grade}", *verdict.reasons, *notes, *verdict.remarks]
     return Report(tuple(said), figures)
-
-
-def _draw_frames(path: Path, mapped: MappedDrive) -> None:
-    """Draw frames from all over a map with the lines that it sees in them."""
-    drive_map = mapped.drive_map
-    shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
-    tiles = [
-        (
-            mapped.drive.image(int(mapped.rows[k])),
-            lines_at(drive_map, int(k)),
-            int(drive_map.frames[k]),
-        )
-        for k in shown
-    ]
-    draw_contact_sheet(path, tiles, drive_map.camera)
 
 
 def hide_bumper(drive: Drive, settings: MapSettings, notes: list[str]) -> MapSettings:

@@ -6,7 +6,6 @@ A YAML file lists only what differs from the defaults; ``key=value`` overrides c
 
 from __future__ import annotations
 
-import difflib
 import math
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +13,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, did_you_mean
 
 
 class Settings(BaseModel):
@@ -111,8 +110,7 @@ def _describe(schema: type[BaseModel], error: Any) -> str:
     key = ".".join(location) or "(top level)"
     if error["type"] == "extra_forbidden":
         known = _known_keys(schema, location[:-1])
-        close = difflib.get_close_matches(location[-1], known, n=1)
-        hint = f", did you mean {close[0]!r}?" if close else f", known keys: {', '.join(sorted(known))}"
+        hint = did_you_mean(location[-1], known) or f", known keys: {', '.join(sorted(known))}"
         return f"unknown key {key!r}{hint}"
     if error["type"] == "missing":
         return f"key {key!r} is missing"

@@ -15,6 +15,21 @@
 A message says what was found, what was expected and where (file, key, frame).
 """
 
+import difflib
+from collections.abc import Iterable
+
+
+def did_you_mean(name: str, known: Iterable[str], least: float = 0.6) -> str:
+    """Return the end of a message on an unknown name, with the known one most like it; empty without one.
+
+    Args:
+        name: What was found.
+        known: What was expected.
+        least: How alike the two have to be, from 0 to 1.
+    """
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=least)
+    return f", did you mean {close[0]!r}?" if close else ""
+
 
 class LanenetError(Exception):
     """Base of every error that is the input's fault, shown to the user as one line."""

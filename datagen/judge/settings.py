@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from datagen.world.script import DriverSettings
 from datagen.world.track import TrackSettings, load_track_settings, preset, preset_names
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, did_you_mean
 
 _FILE_ENDINGS = (".yaml", ".yml")
 _DRAWN = ("random", "open")
@@ -93,10 +92,8 @@ def _track_settings(kind: str, common: TrackSettings) -> TrackSettings:
         return load_track_settings(Path(kind))
     known = (*_DRAWN, *preset_names())
     if kind not in known:
-        close = difflib.get_close_matches(kind, known, n=1)
-        hint = f", did you mean {close[0]!r}?" if close else ""
         raise ConfigError(
             f"tracks: found {kind!r}, expected {' or '.join(_DRAWN)} (drawn roads), a preset "
-            f"({', '.join(preset_names())}) or a track file (.yaml){hint}"
+            f"({', '.join(preset_names())}) or a track file (.yaml){did_you_mean(kind, known)}"
         )
     return preset(kind)

@@ -15,7 +15,6 @@ from datagen.labels.mapped_drive import (
     UNCERTAIN,
     label_frame,
     labelled_points,
-    lines_at,
     open_mapped_drive,
     points_in_window,
     points_text,
@@ -119,12 +118,8 @@ def label_map(
     if pictures:
         order = np.argsort(np.nan_to_num(residual, nan=9.0))
         picks = np.concatenate([order[:8], order[len(order) // 2 - 4 : len(order) // 2 + 4], order[-8:]])
-        tiles = [
-            (drive.image(int(mapped.rows[rows[j]])), lines_at(drive_map, rows[j]), int(labels.frame[j]))
-            for j in picks
-        ]
         with atomic_file(out.with_suffix(".png")) as temporary:
-            draw_contact_sheet(temporary, tiles, drive_map.camera)
+            draw_contact_sheet(temporary, mapped, np.array(rows)[picks])
     share = report["labelled_share"]
     lines_out = [
         f"{len(rows)} of {len(drive_map.frames)} frames labelled ({100 * share:.0f} %)",

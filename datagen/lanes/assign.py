@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.line import LaneLine
-from datagen.runs import equal_runs
+from datagen.runs import equal_runs, true_runs
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES
 
 #: How far it gets into the next lane at least, in lane widths, where it does not just swerve.
 _ENTERED = 0.2
+#: How far beyond a line of the lane nobody gets who means to stay in it, in lane widths.
+_AWAY = 0.35
 #: Widths of a lane beside the driven one, relative to it; wider or narrower is a lay-by or a double line.
 _WIDTHS = (0.6, 1.5)
 
@@ -25,8 +27,8 @@ class FrameLanes:
         lane: Index of the line on the left of the lane, seen in the path's direction: 0 for the driven lane,
             -1 for the one to its left, 1 for the one to its right.
         forward: Whether the frame drives in the path's direction.
-        between: Frames on the line between two lanes, or beyond it in a swerve: which lane is meant cannot be
-            told from the picture.
+        between: Frames on the line between two lanes, or beyond it in a swerve, or away from the road: which
+            lane is meant cannot be told.
         divides: Whether there is another lane beyond the left, beyond the right line of the frame's lane, in
             its direction of travel.
     """
@@ -45,7 +47,9 @@ def assign_lanes(
     The lane is the one in which the middle of the front axle is; it changes when that is clearly beyond a
     line that has a lane behind it: one of which the far line is seen there, or any behind dashes. Beside the
     road the car keeps the lane that it left, and so it does where it comes back before it is well inside the
-    other one. On such a line and close beside it a frame is between two lanes.
+    other one. On such a line and close beside it a frame is between two lanes. Where it gets so far beside
+    the road that it may well be in a lane of which nothing is known (it crossed a solid line, and the far
+    line is in no frame), it is in no lane until it comes back.
 
     Args:
         lines: Lines of the segment.
@@ -75,7 +79,8 @@ def assign_lanes(
         lane[k] = current
     lane = _without_swerves(lane, left_of, _ENTERED * usual)
     divides = _dividers(lane, forward, exists)
-    return FrameLanes(lane, forward, _between_lanes(lane, left_of, exists, margin), divides)
+    between = _between_lanes(lane, left_of, exists, margin) | _off_the_road(lane, left_of, _AWAY * usual)
+    return FrameLanes(lane, forward, between, divides)
 
 
 def _lanes(
@@ -130,6 +135,22 @@ def _between_lanes(
             between |= (lane == i) & exists[i - 1] & (-left_of[i] < margin_cm)
             between |= (lane == i - 1) & exists[i] & (left_of[i] < margin_cm)
     return between
+
+
+def _off_the_road(
+    lane: Int[np.ndarray, "n"], left_of: dict[int, Float[np.ndarray, "n"]], away_cm: float
+) -> Bool[np.ndarray, "n"]:
+    """Tell which frames belong to a stretch beyond a line of their lane that leads too far from it."""
+    beyond = np.full(len(lane), -np.inf)
+    for i in np.unique(lane):
+        rows = lane == i
+        for side in (s for s in (i, i + 1) if s in left_of):
+            out = left_of[side] if side == i else -left_of[side]
+            beyond[rows] = np.fmax(beyond[rows], out[rows])
+    gone = np.zeros(len(lane), dtype=bool)
+    for run in true_runs(beyond > 0.0):
+        gone[run] = beyond[run].max() > away_cm
+    return gone
 
 
 def _dividers(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable
 from importlib import resources
@@ -14,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from datagen.world.furniture import Furniture, FurnitureRates
 from datagen.world.pieces import Piece, length_of
 from lanenet.config import Settings, check_settings, read_yaml
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, did_you_mean
 
 LineName = Literal["left", "right", "middle", "far"]
 
@@ -225,10 +224,7 @@ def _with_base(
         return _with_length(data, origin), origin
     if isinstance(name, str):
         if name not in preset_names():
-            close = difflib.get_close_matches(name, preset_names(), n=1)
-            hint = (
-                f", did you mean {close[0]!r}?" if close else f", expected one of {', '.join(preset_names())}"
-            )
+            hint = did_you_mean(name, preset_names()) or f", expected one of {', '.join(preset_names())}"
             raise ConfigError(f"no preset {name!r}{hint}")
         with resources.as_file(_presets() / f"{name}.yaml") as path:
             return _merge(read_yaml(path), data), f"preset {name}"

@@ -23,6 +23,8 @@ _BEND_CM_S2 = 300.0
 _DRAWN_SHARE = 0.5
 #: Presets of roads that home-made cars are driven on.
 _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
+#: Kinds of line between two lanes that are crossed.
+_CROSSED = ("dashed", "random")
 #: Nobody changes lanes sooner after the start.
 _FIRST_CHANGE_CM = 30.0
 _TRIES = 8
@@ -130,10 +132,10 @@ def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> Dri
     """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
     People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
-    car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes, every third one
-    also changes between them, for the first time at any place from 30 cm on at which half of the change is
-    still within the drive. Nobody is faster than the tightest bend allows, and no excursion and no change
-    bends more sharply than the car can turn.
+    car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes and dashes between
+    them, or may be, every third one also changes between them, for the first time at any place from 30 cm on
+    at which half of the change is still within the drive. Nobody is faster than the tightest bend allows, and
+    no excursion and no change bends more sharply than the car can turn.
 
     Args:
         simulation: Road, car, and how long the drive is.
@@ -152,7 +154,8 @@ def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> Dri
         recover_cm=recover_cm,
         recover_every_cm=max(200.0, shortest_excursion_spacing_cm(recover_cm, tightest_cm)),
     )
-    if track.lanes == 1 or changes >= 1.0 / 3.0:
+    crossed = track.middle is not None and track.middle.kind in _CROSSED
+    if not crossed or changes >= 1.0 / 3.0:
         return driver
     change_cm = max(150.0, 3.5 * lane_cm, shortest_lane_change_cm(lane_cm, tightest_cm))
     start_cm = 0.0 if track.closed else START_CM + simulation.car.wheelbase_cm
@@ -201,7 +204,18 @@ def vary_simulation(
             break
     seed = int(sequence.generate_state(1)[0])
     drawn = simulation.model_copy(update={"seed": seed, "camera": camera, "track": track, "car": car})
-    return drawn.model_copy(update={"driver": vary_driver(drawn, driver_rng)}) if driver else drawn
+    if not driver:
+        return drawn
+    who = vary_driver(drawn, driver_rng)
+    if who.change_lanes_every_cm is not None:
+        drawn = drawn.model_copy(update={"track": _dashed_between_lanes(track)})
+    return drawn.model_copy(update={"driver": who})
+
+
+def _dashed_between_lanes(track: TrackSettings) -> TrackSettings:
+    """Paint dashes where there may be some: the line between two lanes of a driver who changes them."""
+    assert track.middle is not None
+    return track.model_copy(update={"middle": track.middle.model_copy(update={"kind": "dashed"})})
 
 
 def first_world(simulation: SimulationSettings) -> World:

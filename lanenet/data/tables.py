@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lanenet.data.files import write_text
-from lanenet.errors import DriveFormatError, LanenetError
+from lanenet.errors import DriveFormatError, LanenetError, did_you_mean
 
 _INT64_MAX = 2**63 - 1
 #: Above this, nine digits would lose microseconds of a clock that counts from 1970.
@@ -164,9 +163,9 @@ def _check_header(
         raise error(f"{path}: line 1: column {missing[0]!r} is missing; found {', '.join(header)[:200]}")
     absent = [name for name in columns if name not in header]
     for name in header:
-        close = difflib.get_close_matches(name, absent, n=1, cutoff=0.75) if name not in columns else []
-        if close:
-            raise error(f"{path}: line 1: unknown column {name!r}, did you mean {close[0]!r}?")
+        hint = did_you_mean(name, absent, least=0.75) if name not in columns else ""
+        if hint:
+            raise error(f"{path}: line 1: unknown column {name!r}{hint}")
 
 
 def _parsed(cell: str, spec: ColumnSpec) -> float | int | str:

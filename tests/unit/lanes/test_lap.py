@@ -201,13 +201,22 @@ def test_a_swerve_across_a_line_is_no_lane_change(reach, changes, side):
 
 
 def test_beyond_the_outer_line_the_car_keeps_its_lane():
-    poses, s = _drive(np.linspace(0.0, -60.0, 50))
+    poses, s = _drive(np.linspace(0.0, -30.0, 50))
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
     assert not found.lane.any() and not found.between.any()
     # Where the further line is not known there is no lane to change to.
     poses, s = _drive(np.full(50, 36.0))
     gone = assign_lanes(_straight_lines(TWO_LANES, until_cm=5.0), poses, s, WHEELBASE_CM)
     assert not gone.lane.any()
+
+
+def test_far_beyond_a_solid_line_the_car_is_in_no_lane_until_it_comes_back():
+    # Beyond the right line once by a third of a lane, once by half of one.
+    y = np.interp(np.arange(90), [0, 10, 20, 30, 40, 60, 89], [0.0, -30.0, 0.0, 0.0, -36.0, -36.0, 0.0])
+    poses, s = _drive(y)
+    found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
+    assert not found.lane.any()
+    np.testing.assert_array_equal(found.between, (y < -18.0) & (np.arange(90) > 25))
 
 
 @pytest.mark.parametrize("offsets", [TWO_LANES, {0: 18.0, 1: -18.0}])
