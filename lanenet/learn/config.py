@@ -137,6 +137,8 @@ class NetworkSettings(Settings):
         channels: Output channels of the convolutions: the first divides rows and columns by four, each other
             one by two. None takes those of the kind.
         hidden: Width of the fully connected layer before the outputs; None takes that of the kind.
+        bins: A point is answered as a distribution over so many places from the left to the right end of the
+            window; 0: as a number and its spread.
         takes_width: The network can be told the lane's width beside the raster. Where lanes of many widths
             are learned together, that is what tells the lane from two lanes, or from half of one.
         weights: File with pretrained weights of AlexNet as torchvision names them; None starts from random
@@ -146,6 +148,7 @@ class NetworkSettings(Settings):
     kind: Literal["nano", "small", "base", "alexnet"] = "small"
     channels: tuple[int, ...] | None = None
     hidden: int | None = Field(default=None, ge=4, le=1024)
+    bins: int = Field(default=0, ge=0, le=512)
     takes_width: bool = False
     weights: Path | None = None
 
@@ -160,8 +163,10 @@ class NetworkSettings(Settings):
     def _check_kind(self) -> NetworkSettings:
         if self.kind == "alexnet" and (self.channels is not None or self.hidden is not None):
             raise ValueError("alexnet has a size of its own: expected neither channels nor hidden")
-        if self.kind == "alexnet" and self.takes_width:
-            raise ValueError("alexnet takes a raster alone: expected takes_width: false")
+        if self.kind == "alexnet" and (self.takes_width or self.bins):
+            raise ValueError(
+                "alexnet takes a raster alone and answers numbers: expected takes_width: false and bins: 0"
+            )
         if self.kind != "alexnet" and self.weights is not None:
             raise ValueError(f"weights are for alexnet; {self.kind} starts from random ones")
         return self
@@ -177,6 +182,8 @@ class LossSettings(Settings):
     """What a network is trained to make small; see :func:`lanenet.learn.loss.lane_loss`.
 
     Attributes:
+        distance: Weight of the distance of the points beside their probability, for a network with bins;
+            ``kind`` and ``evenness`` are for one without.
         kind: How errors are thought to be spread about the answer: ``student`` (heavy tails, round middle),
             ``laplace`` (heavy tails, sharp middle) or ``gaussian`` (no outliers).
         evenness: Power of the predicted spread that each point's term is multiplied with: 0 is the plain
@@ -184,6 +191,7 @@ class LossSettings(Settings):
         presence: Weight of the presence of the lines beside the points.
     """
 
+    distance: float = Field(default=0.3, ge=0.0)
     kind: Literal["student", "laplace", "gaussian"] = "student"
     evenness: float = Field(default=0.5, ge=0.0, le=2.0)
     presence: float = Field(default=1.0, ge=0.0)

@@ -17,6 +17,8 @@ ONE_SIGMA = 0.6827
 _FREEDOM = 4.0
 #: Half the width that holds 68.27 % over the scale: of Student's distribution, and of Laplace's.
 _STUDENT_SIGMA, _LAPLACE_SIGMA = 1.1417, 1.1479
+#: Up to this distance of a mean, errors count as their squares, beyond it as they are, [cm].
+_NEAR_CM = 2.0
 #: Fewer points than this do not tell a share of 68 %.
 _ENOUGH_POINTS = 50
 
@@ -29,8 +31,10 @@ def lane_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean negative log likelihood of the known labels, and the cross-entropy of the presence.
 
-    The spread that the network predicts is half the width of the interval that holds 68.27 % of the errors,
-    for each kind of distribution: the scale follows from it.
+    A network with bins answers distributions of x: a label between two bins is as likely as their shares say,
+    by its distance to each; the distance of the mean is added, since likelihood alone knows no near miss. Of
+    one without, the spread that it predicts is half the width of the interval that holds 68.27 % of the
+    errors, for each kind of distribution: the scale follows from it.
 
     Args:
         output: Answers of the network.
@@ -43,11 +47,42 @@ def lane_loss(
 
     Source:
         The weighting by the predicted spread: Seitzer et al. 2022, "On the pitfalls of heteroscedastic
-        uncertainty estimation with probabilistic neural networks", eq. 5.
+        uncertainty estimation with probabilistic neural networks", eq. 5. Bins: Li et al. 2020, "Generalized
+        focal loss", eq. 6.
     """
-    known = torch.isfinite(labels_cm)
     # Index, not multiply: 0 * NaN is NaN, and so would be its gradient.
-    error, sigma = output.points_cm[known] - labels_cm[known], output.sigma_cm[known]
+    known = torch.isfinite(labels_cm)
+    error = output.points_cm[known] - labels_cm[known]
+    if output.log_share is not None and output.bins_cm is not None:
+        terms = _surprise(output.log_share[known], labels_cm[known], output.bins_cm)
+        terms = terms + settings.distance * nn.functional.smooth_l1_loss(
+            error, torch.zeros_like(error), beta=_NEAR_CM, reduction="none"
+        )
+        points = terms.sum() / max(terms.numel(), 1)
+    else:
+        points = _doubt(error, output.sigma_cm[known], settings)
+    told = torch.isfinite(present)
+    entropy = nn.functional.binary_cross_entropy_with_logits(
+        output.presence_logit[told], present[told], reduction="sum"
+    )
+    return points + settings.presence * entropy / max(int(told.sum()), 1)
+
+
+def _surprise(
+    log_share: Float[Tensor, "k b"], labels_cm: Float[Tensor, "k"], bins_cm: Float[Tensor, "b"]
+) -> Float[Tensor, "k"]:
+    """Cross-entropy between labels, each between two bins, and distributions over the bins."""
+    last = len(bins_cm) - 1
+    place = ((labels_cm - bins_cm[0]) / (bins_cm[-1] - bins_cm[0]) * last).clamp(0.0, last)
+    lower = place.floor().clamp(max=last - 1)
+    upper_share = (place - lower)[:, None]
+    first = lower.long()[:, None]
+    shares = (1.0 - upper_share) * log_share.gather(1, first) + upper_share * log_share.gather(1, first + 1)
+    return -shares[:, 0]
+
+
+def _doubt(error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossSettings) -> Float[Tensor, ""]:
+    """Mean negative log likelihood of errors, weighted by their spread."""
     if settings.kind == "student":
         z = error * _STUDENT_SIGMA / sigma
         terms = 0.5 * (_FREEDOM + 1.0) * torch.log1p(z * z / _FREEDOM) + torch.log(sigma)
@@ -57,12 +92,7 @@ def lane_loss(
         z = error / sigma
         terms = 0.5 * z * z + torch.log(sigma)
     weights = sigma.detach() ** settings.evenness
-    points = (weights * terms).sum() / max(terms.numel(), 1)
-    told = torch.isfinite(present)
-    entropy = nn.functional.binary_cross_entropy_with_logits(
-        output.presence_logit[told], present[told], reduction="sum"
-    )
-    return points + settings.presence * entropy / max(int(told.sum()), 1)
+    return (weights * terms).sum() / max(terms.numel(), 1)
 
 
 def sigma_factors(

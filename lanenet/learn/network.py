@@ -22,7 +22,8 @@ SIGMA_RANGE_CM = (0.05, 50.0)
 
 #: Width of a bell, in logarithms of the width: about the distance of two.
 _BELL = 0.25
-_N_OUTPUTS = 2 * N_POINTS + len(SIDES)
+#: Least spread of a point that all bins but one are ruled out for, [cm].
+_LEAST_SPREAD_CM = 0.01
 _LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
 
 
@@ -33,11 +34,16 @@ class LaneOutput(NamedTuple):
         points_cm: The six points, frame car, n x 6.
         sigma_cm: Standard deviation of each of them, n x 6.
         presence_logit: Per line the logarithm of the odds that it can be seen, n x 2.
+        log_share: Per point the logarithm of the probability of each bin of x, n x 6 x b; None of a network
+            without bins.
+        bins_cm: Middles of the bins, evenly spaced.
     """
 
     points_cm: Tensor
     sigma_cm: Tensor
     presence_logit: Tensor
+    log_share: Tensor | None = None
+    bins_cm: Tensor | None = None
 
 
 class LaneNet(nn.Module):
@@ -47,6 +53,9 @@ class LaneNet(nn.Module):
     filters, then fully connected layers) with strided convolutions and batch normalisation, 1/600 of its
     size: a raster of edges has no texture to learn. The last feature map is not averaged over rows and
     columns, since the place of a line is the answer.
+
+    A point is answered as a number and its spread, or, with bins, as a distribution of x: its mean and its
+    standard deviation. Where one picture has two explanations, a distribution can say so.
 
     Args:
         settings: Which network, and its size.
@@ -59,21 +68,23 @@ class LaneNet(nn.Module):
 
     Source:
         Kozlowski et al. 2024, section 2.4: AlexNet with its last layers replaced by a regression layer.
+        Bins: Li et al. 2020, "Generalized focal loss", section 3.2.
     """
 
     def __init__(self, settings: NetworkSettings, rows: int, columns: int) -> None:
         super().__init__()
         self.rows, self.columns = rows, columns
+        n_outputs = N_POINTS * (settings.bins or 2) + len(SIDES)
         self.trunk: nn.Module
         self.head: nn.Module
         self.width_bias: nn.ModuleList | None = None
         if settings.kind == "alexnet":
-            self.trunk, self.head = AlexNetTrunk(), nn.Linear(N_FEATURES, _N_OUTPUTS)
+            self.trunk, self.head = AlexNetTrunk(), nn.Linear(N_FEATURES, n_outputs)
         else:
             channels, hidden = settings.size
             self.trunk, n_features = _compact_trunk(channels, rows, columns)
             self.head = nn.Sequential(
-                nn.Linear(n_features, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, _N_OUTPUTS)
+                nn.Linear(n_features, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, n_outputs)
             )
             if settings.takes_width:
                 told = [nn.Linear(len(_WIDTHS_CM), n, bias=False) for n in (*channels[1:], hidden)]
@@ -81,6 +92,8 @@ class LaneNet(nn.Module):
         # The layers predict (x - mean) / scale, so that all six outputs are of order one.
         self.mean_cm: Tensor
         self.scale_cm: Tensor
+        self.bins_cm: Tensor | None
+        self.register_buffer("bins_cm", torch.zeros(settings.bins) if settings.bins else None)
         # What the spread is multiplied with so that it is right on frames that the network has not seen.
         self.sigma_factor: Tensor
         self.register_buffer("mean_cm", torch.zeros(N_POINTS))
@@ -104,11 +117,31 @@ class LaneNet(nn.Module):
             outputs: Tensor = self.head(self.trunk(raster))
         else:
             outputs = self._of_width(raster, lane_cm)
-        points, spread, presence = torch.split(outputs, [N_POINTS, N_POINTS, len(SIDES)], dim=1)
+        points, presence = outputs[:, : -len(SIDES)], outputs[:, -len(SIDES) :]
+        if self.bins_cm is not None:
+            return self._of_bins(points.reshape(-1, N_POINTS, len(self.bins_cm)), presence)
+        points, spread = points[:, :N_POINTS], points[:, N_POINTS:]
         middle, half = 0.5 * (_LOG_LOW + _LOG_HIGH), 0.5 * (_LOG_HIGH - _LOG_LOW)
         # A soft limit: a hard one has no gradient beyond it.
         sigma = torch.exp(middle + half * torch.tanh(spread / half)) * self.sigma_factor
         return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
+
+    def _of_bins(self, logits: Float[Tensor, "n 6 b"], presence: Float[Tensor, "n 2"]) -> LaneOutput:
+        """Answer mean and standard deviation of the distributions of x."""
+        assert self.bins_cm is not None
+        log_share = torch.log_softmax(logits, dim=-1)
+        share = torch.exp(log_share)
+        points = (share * self.bins_cm).sum(dim=-1)
+        apart = self.bins_cm - points[..., None]
+        variance = (share * apart * apart).sum(dim=-1)
+        sigma = torch.sqrt(variance + _LEAST_SPREAD_CM**2) * self.sigma_factor
+        return LaneOutput(points, sigma, presence, log_share, self.bins_cm)
+
+    @torch.no_grad()
+    def spread_bins(self, left_cm: float, right_cm: float) -> None:
+        """Put the first bin at one end of where labels are and the last at the other, if there are bins."""
+        if self.bins_cm is not None:
+            self.bins_cm.copy_(torch.linspace(left_cm, right_cm, len(self.bins_cm)))
 
     def _of_width(
         self, raster: Float[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"]

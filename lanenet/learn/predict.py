@@ -56,7 +56,8 @@ def answer_rasters(
             for start in range(0, len(rasters), _BATCH)
         ]
     network.train(was_training)
-    return LaneOutput(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    columns = list(zip(*(part[:3] for part in parts), strict=True))
+    return LaneOutput(*(torch.cat(column) for column in columns))
 
 
 def predict(network: LaneNet, samples: LaneSamples) -> Answers:

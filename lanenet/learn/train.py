@@ -136,6 +136,7 @@ class TrainingRun:
         mean, scale = samples.normalisation(settings.augment.mirror > 0.0)
         self.network.mean_cm.copy_(torch.from_numpy(mean))
         self.network.scale_cm.copy_(torch.from_numpy(scale))
+        self.network.spread_bins(samples.window.left_cm, samples.window.right_cm)
         if settings.start_from is not None:
             load_start_weights(self.network, settings.start_from, samples.window)
         self.optimizer = new_optimizer(self.network, settings)

@@ -152,6 +152,13 @@ def test_an_export_is_checked_on_labels_as_well(checkpoint, tmp_path):
     assert not (tmp_path / "n.onnx").exists()
 
 
+def test_a_network_with_bins_is_exported(tmp_path):
+    settings = NetworkSettings(channels=(4, 8), hidden=8, bins=16)
+    network = new_network(settings, WINDOW.rows, WINDOW.columns, 1).eval()
+    network.spread_bins(WINDOW.left_cm, WINDOW.right_cm)
+    assert export_onnx(network, META, RASTERS, tmp_path / "m.onnx") < 1e-3
+
+
 def test_an_output_that_is_no_number_is_a_difference(tmp_path):
     network = make_network()
     network.mean_cm[0] = math.nan

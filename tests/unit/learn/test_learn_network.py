@@ -27,7 +27,7 @@ def test_the_family_grows_and_stays_compact():
     sizes = [network.n_parameters for network in networks]
     assert sizes == sorted(sizes) and sizes[0] < 50_000 < sizes[1] <= 150_000 < sizes[2]
     output = networks[1](torch.zeros(3, 1, window.rows, window.columns))
-    assert [tuple(value.shape) for value in output] == [(3, 6), (3, 6), (3, 2)]
+    assert [tuple(value.shape) for value in output[:3]] == [(3, 6), (3, 6), (3, 2)]
 
 
 def test_channels_and_hidden_go_before_the_kind():
@@ -115,6 +115,23 @@ def test_buffers_scale_the_output():
     torch.testing.assert_close(network(raster).sigma_cm, 3.0 * plain.sigma_cm)
 
 
+def test_points_of_bins_are_means_and_their_spread_tells_two_places_from_one():
+    network = LaneNet(NetworkSettings(channels=(2,), hidden=4, bins=9), 24, 32).eval()
+    network.spread_bins(-40.0, 40.0)
+    last = network.head[-1]
+    torch.nn.init.zeros_(last.weight)
+    torch.nn.init.constant_(last.bias, -50.0)
+    logits = last.bias.data[:-2].view(6, 9)
+    logits[0, 3] = 0.0  # at -10 cm
+    logits[1, 2] = logits[1, 6] = 0.0  # at -20 and 20 cm alike
+    logits[2] = 0.0  # anywhere
+    answer = network(torch.zeros(1, 1, 24, 32))
+    torch.testing.assert_close(answer.points_cm[0, :3], torch.tensor([-10.0, 0.0, 0.0]), atol=1e-4, rtol=0.0)
+    spread = torch.tensor([0.01, 20.0, torch.linspace(-40.0, 40.0, 9).std(correction=0)])
+    torch.testing.assert_close(answer.sigma_cm[0, :3], spread, atol=1e-3, rtol=0.0)
+    assert LaneNet(NetworkSettings(bins=64, takes_width=True), 96, 128).n_parameters <= 150_000
+
+
 @pytest.mark.parametrize(("bias", "limit"), [(-1e3, SIGMA_RANGE_CM[0]), (1e3, SIGMA_RANGE_CM[1])])
 def test_the_spread_stays_within_its_range(bias, limit):
     network = LaneNet(NetworkSettings(channels=(2,), hidden=4), 24, 32).eval()
@@ -167,3 +184,5 @@ def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
         assert torch.equal(plain(raster).points_cm, plain(raster, torch.full((3,), 25.0)).points_cm)
     with pytest.raises(ValueError, match="takes a raster alone"):
         NetworkSettings(kind="alexnet", takes_width=True)
+    with pytest.raises(ValueError, match="bins: 0"):
+        NetworkSettings(kind="alexnet", bins=32)

@@ -37,6 +37,33 @@ def test_masked_labels_give_neither_loss_nor_gradient(kind):
     assert answer.presence_logit.grad.count_nonzero() == 0
 
 
+def binned(logits, bins_cm):
+    logits = torch.as_tensor(logits, dtype=torch.float32).requires_grad_()
+    log_share = torch.log_softmax(logits, dim=-1)
+    points = (log_share.exp() * bins_cm).sum(dim=-1)
+    presence = torch.zeros(len(logits), 2)
+    return logits, LaneOutput(points, torch.ones_like(points), presence, log_share, bins_cm)
+
+
+def test_a_label_between_two_bins_belongs_to_both():
+    bins_cm = torch.linspace(-20.0, 20.0, 5)
+    labels, present = unknown(1)
+    labels[0, 1], labels[0, 3], labels[0, 4] = 2.5, -20.0, 20.0
+    shares = torch.tensor([0.1, 0.2, 0.3, 0.15, 0.25])
+    logits, answer = binned(shares.log().repeat(1, 6, 1), bins_cm)
+    loss = lane_loss(answer, labels, present, LossSettings(distance=0.0))
+    expected = -(0.75 * math.log(0.3) + 0.25 * math.log(0.15)) - math.log(0.1) - math.log(0.25)
+    assert loss.item() == pytest.approx(expected / 3.0, rel=1e-5)
+    loss.backward()
+    known = torch.isfinite(labels)
+    assert (logits.grad[known] != 0.0).any() and (logits.grad[~known] == 0.0).all()
+    # The mean of these shares is 2.5 cm: distances of 0, 22.5 and 17.5 cm, the far ones less 1 cm.
+    far = lane_loss(
+        binned(shares.log().repeat(1, 6, 1), bins_cm)[1], labels, present, LossSettings(distance=0.5)
+    )
+    assert far.item() - loss.item() == pytest.approx(0.5 * (21.5 + 16.5) / 3.0, rel=1e-4)
+
+
 def test_values():
     labels, present = unknown(1)
     labels[0, 0] = 3.0

@@ -66,12 +66,13 @@ def finished(data, tmp_path_factory):
     return run(data, out)
 
 
-def test_learns_far_better_than_a_constant(data, tmp_path):
+@pytest.mark.parametrize("bins", [0, 24])
+def test_learns_far_better_than_a_constant(data, tmp_path, bins):
     settings = LearnSettings(
-        epochs=6,
+        epochs=8,
         batch_size=16,
         threads=1,
-        network=NetworkSettings(channels=(8, 16, 24), hidden=32),
+        network=NetworkSettings(channels=(8, 16, 24), hidden=32, bins=bins),
         augment=AugmentSettings(clutter_points=3, clutter_segments=1),
         ema_decay=0.98,
     )
