@@ -138,7 +138,7 @@ class NetworkSettings(Settings):
             one by two. None takes those of the kind.
         hidden: Width of the fully connected layer before the outputs; None takes that of the kind.
         bins: A point is answered as a distribution over so many places from the left to the right end of the
-            window; 0: as a number and its spread.
+            window; 0: as a number and its spread, which is alexnet's way and that of older checkpoints.
         takes_width: The network can be told the lane's width beside the raster. Where lanes of many widths
             are learned together, that is what tells the lane from two lanes, or from half of one.
         weights: File with pretrained weights of AlexNet as torchvision names them; None starts from random
@@ -148,9 +148,16 @@ class NetworkSettings(Settings):
     kind: Literal["nano", "small", "base", "alexnet"] = "small"
     channels: tuple[int, ...] | None = None
     hidden: int | None = Field(default=None, ge=4, le=1024)
-    bins: int = Field(default=0, ge=0, le=512)
+    bins: int = Field(default=64, ge=0, le=512)
     takes_width: bool = False
     weights: Path | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _alexnet_answers_numbers(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("kind") == "alexnet":
+            return {"bins": 0, **data}
+        return data
 
     @field_validator("channels")
     @classmethod

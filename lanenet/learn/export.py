@@ -161,7 +161,9 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         meta = ModelMeta.from_properties(properties, str(path))
     except ModelMismatchError as error:
         raise CheckpointError(str(error)) from None
-    network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
+    # Checkpoints from before there were bins do not say that they have none.
+    older = {} if "bins_cm" in state else {"bins": 0}
+    network = LaneNet(settings.network.model_copy(update=older), meta.window.rows, meta.window.columns)
     try:
         network.load_state_dict(state)
     except RuntimeError as error:

@@ -33,7 +33,8 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "first_channels": (16, 8, 12, 24),
     "layers": (5, 4, 3),
     "hidden": (64, 32, 128),
-    "loss": ("student", "laplace", "gaussian"),
+    # What points are: distributions, or numbers whose errors are spread in one of these ways.
+    "loss": ("bins", "student", "laplace", "gaussian"),
     "evenness": (0.5, 0.0, 1.0, 2.0),
 }
 #: From and to.
@@ -139,7 +140,9 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
     # As in the family: each layer has as many channels more as the first one has.
     channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
     network = {"channels": channels, "hidden": drawn["hidden"], "takes_width": settings.network.takes_width}
-    loss = {"kind": drawn["loss"], "evenness": drawn["evenness"], "presence": settings.loss.presence}
+    loss = {"evenness": drawn["evenness"], "presence": settings.loss.presence}
+    if drawn["loss"] != "bins":
+        network["bins"], loss["kind"] = 0, drawn["loss"]
     rate = trial.suggest_float("learning_rate", *LEARNING_RATE, log=True)
     data = settings.model_dump() | {"network": network, "loss": loss, "learning_rate": rate}
     return window, LearnSettings.model_validate(data)

@@ -30,7 +30,7 @@ RASTERS = np.stack([LABELS.raster(i) for i in range(5)])[:, None]
 
 
 def make_network():
-    network = new_network(LearnSettings().network, WINDOW.rows, WINDOW.columns, 1).eval()
+    network = new_network(NetworkSettings(bins=0), WINDOW.rows, WINDOW.columns, 1).eval()
     network.mean_cm.copy_(torch.tensor([-20.0, -19.0, -17.0, 20.0, 22.0, 25.0]))
     network.scale_cm.fill_(8.0)
     return network
@@ -167,7 +167,7 @@ def test_an_output_that_is_no_number_is_a_difference(tmp_path):
 
 
 def test_the_width_of_the_lane_may_be_told_to_all_or_to_each_or_left_out(tmp_path):
-    settings = NetworkSettings(channels=(4, 8), hidden=8, takes_width=True)
+    settings = NetworkSettings(channels=(4, 8), hidden=8, bins=0, takes_width=True)
     network = new_network(settings, WINDOW.rows, WINDOW.columns, 1).eval()
     meta = replace(META, takes_width=True)
     assert export_onnx(network, meta, RASTERS, tmp_path / "m.onnx") < 1e-3

@@ -105,7 +105,7 @@ def test_first_weights_follow_from_the_seed_and_leave_the_global_generator_alone
 
 
 def test_buffers_scale_the_output():
-    network = LaneNet(NetworkSettings(), 24, 32).eval()
+    network = LaneNet(NetworkSettings(bins=0), 24, 32).eval()
     raster = torch.ones(1, 1, 24, 32)
     plain = network(raster)
     network.mean_cm.fill_(7.0)
@@ -134,14 +134,14 @@ def test_points_of_bins_are_means_and_their_spread_tells_two_places_from_one():
 
 @pytest.mark.parametrize(("bias", "limit"), [(-1e3, SIGMA_RANGE_CM[0]), (1e3, SIGMA_RANGE_CM[1])])
 def test_the_spread_stays_within_its_range(bias, limit):
-    network = LaneNet(NetworkSettings(channels=(2,), hidden=4), 24, 32).eval()
+    network = LaneNet(NetworkSettings(channels=(2,), hidden=4, bins=0), 24, 32).eval()
     network.head[-1].bias.data[6:12] = bias
     sigma = network(torch.zeros(1, 1, 24, 32)).sigma_cm
     torch.testing.assert_close(sigma, torch.full((1, 6), limit))
 
 
 def test_deployed_outputs_follow_from_the_points():
-    network = new_network(NetworkSettings(), 24, 32, 0).eval()
+    network = new_network(NetworkSettings(bins=0), 24, 32, 0).eval()
     network.mean_cm.copy_(torch.tensor([-20.0, -19.0, -17.0, 20.0, 22.0, 25.0]))
     rng = np.random.default_rng(0)
     raster = torch.from_numpy(np.where(rng.random((5, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8))
@@ -161,7 +161,9 @@ def test_deployed_outputs_follow_from_the_points():
 
 
 def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
-    network = new_network(NetworkSettings(channels=(4, 8), hidden=8, takes_width=True), 24, 32, 0).eval()
+    network = new_network(
+        NetworkSettings(channels=(4, 8), hidden=8, bins=0, takes_width=True), 24, 32, 0
+    ).eval()
     raster = torch.rand(3, 1, 24, 32)
     with torch.inference_mode():
         unknown, zero = network(raster), network(raster, torch.zeros(1))
@@ -179,7 +181,7 @@ def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
         hidden = torch.stack([network(raster[:1], w.reshape(1)).points_cm[0] for w in widths])
     assert torch.isfinite(hidden).all()
     assert (hidden[1:] - hidden[:-1]).norm(dim=1)[5:100].min() > 0.0
-    plain = new_network(NetworkSettings(channels=(4, 8), hidden=8), 24, 32, 0).eval()
+    plain = new_network(NetworkSettings(channels=(4, 8), hidden=8, bins=0), 24, 32, 0).eval()
     with torch.inference_mode():
         assert torch.equal(plain(raster).points_cm, plain(raster, torch.full((3,), 25.0)).points_cm)
     with pytest.raises(ValueError, match="takes a raster alone"):

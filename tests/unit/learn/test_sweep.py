@@ -52,7 +52,8 @@ def test_what_is_tried_first_is_the_small_network_as_it_is():
     channels, hidden = NetworkSettings(kind="small").size
     assert [first["first_channels"] * k for k in range(1, first["layers"] + 1)] == list(channels)
     assert first["hidden"] == hidden
-    assert (first["loss"], first["evenness"]) == (LossSettings().kind, LossSettings().evenness)
+    assert (first["loss"], first["evenness"]) == ("bins", LossSettings().evenness)
+    assert NetworkSettings(kind="small").bins > 0
     window = BirdseyeWindow()
     assert (first["cell_cm"], first["far_cm"], first["half_width_cm"]) == (
         window.cell_cm,
@@ -71,7 +72,7 @@ def test_the_network_as_it_is_comes_first_and_a_later_call_goes_on(quick, paths,
     table = sweep(SETTINGS, *paths, tmp_path, 600.0, 2, lambda *done: seen.append(done))
     assert seen == [(1, 2), (2, 2)]
     rows = read(tmp_path)
-    assert (rows[0]["cell_cm"], rows[0]["loss"], rows[0]["learning_rate"]) == ("3.0", "student", "0.003")
+    assert (rows[0]["cell_cm"], rows[0]["loss"], rows[0]["learning_rate"]) == ("3.0", "bins", "0.003")
     assert table == (tmp_path / "sweep.md").read_text() and "2 trials to the end" in table
     sweep(SETTINGS, *paths, tmp_path, 600.0, 3, lambda *done: seen.append(done))
     assert seen[2:] == [(3, 3)]

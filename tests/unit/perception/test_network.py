@@ -39,7 +39,7 @@ def make_extractor(camera=CAMERA):
 @pytest.fixture(scope="module")
 def model_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
-    network = new_network(NetworkSettings(channels=(4, 8), hidden=8), 24, 32, 0).eval()
+    network = new_network(NetworkSettings(channels=(4, 8), hidden=8, bins=0), 24, 32, 0).eval()
     network.mean_cm.copy_(torch.from_numpy(LANE))
     raster = np.where(np.random.default_rng(0).random((2, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
     export_onnx(network, META, raster, path)
@@ -49,7 +49,9 @@ def model_path(tmp_path_factory):
 @pytest.fixture(scope="module")
 def width_model_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("width_model") / "model.onnx"
-    network = new_network(NetworkSettings(channels=(4, 8), hidden=8, takes_width=True), 24, 32, 0).eval()
+    network = new_network(
+        NetworkSettings(channels=(4, 8), hidden=8, bins=0, takes_width=True), 24, 32, 0
+    ).eval()
     raster = np.where(np.random.default_rng(0).random((2, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
     export_onnx(network, replace(META, takes_width=True), raster, path)
     return path
