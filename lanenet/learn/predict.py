@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from lanenet.learn.evaluate import ErrorTable, point_errors
 from lanenet.learn.network import LaneNet, LaneOutput, input_of_rasters
 
 _BATCH = 256
+#: Share of the errors that :func:`trimmed_rmse_cm` looks at.
+_KEPT = 0.99
 
 
 @dataclass(frozen=True)
@@ -72,3 +75,10 @@ def predict(network: LaneNet, samples: LaneSamples) -> Answers:
         parts.append((*(v.cpu().numpy().astype(np.float64) for v in values), present))
     points, sigma, presence, present = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Answers(points, sigma, presence, samples.points_cm, present, samples.reference)
+
+
+def trimmed_rmse_cm(error_cm: Float[np.ndarray, "n 6"]) -> float:
+    """Return the RMSE without the largest hundredth of the errors; NaN ones, of masked labels, do not count."""
+    sizes = np.sort(np.abs(error_cm[np.isfinite(error_cm)]))
+    kept = sizes[: max(1, math.ceil(_KEPT * len(sizes)))]
+    return float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan

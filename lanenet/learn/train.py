@@ -22,7 +22,7 @@ from lanenet.learn.dataset import LaneSamples, check_same
 from lanenet.learn.loss import lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
-from lanenet.learn.predict import predict
+from lanenet.learn.predict import predict, trimmed_rmse_cm
 from lanenet.learn.report import tensorboard_curve, write_checkpoint
 from lanenet.learn.run_state import (
     STATE_NAME,
@@ -187,17 +187,18 @@ class TrainingRun:
                         f"learning_rate (now {settings.learning_rate:g})"
                     )
         seconds = time.perf_counter() - started
-        val_rmse_cm = predict(self.mean.network, val).errors.all.rmse_cm
+        answers = predict(self.mean.network, val)
         record = EpochRecord(
             epoch=epoch + 1,
             train_rmse_cm=math.sqrt(squares / max(count, 1)),
-            val_rmse_cm=val_rmse_cm,
+            val_rmse_cm=answers.errors.all.rmse_cm,
             learning_rate=rate,
             samples_per_s=n_samples / seconds,
+            val_trimmed_cm=trimmed_rmse_cm(answers.points_cm - answers.truth_cm),
         )
-        if not self.history or val_rmse_cm < best_record(self.history).val_rmse_cm:
-            self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
         self.history.append(record)
+        if best_record(self.history) is record:
+            self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
         return record
 
     def _step(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:

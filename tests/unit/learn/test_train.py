@@ -109,7 +109,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     with (finished.folder / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["epoch"]) for row in rows] == [1, 2, 3]
-    best = min(rows, key=lambda row: float(row["val_rmse_cm"]))
+    best = min(rows, key=lambda row: float(row["val_trimmed_cm"]))
     assert int(best["epoch"]) == finished.best_epoch == metrics["best_epoch"]
     assert float(best["val_rmse_cm"]) == pytest.approx(finished.val_rmse_cm, rel=1e-6)
     meta = read_model_meta(finished.model_path)
@@ -235,7 +235,7 @@ def test_patience_ends_a_run_that_gets_no_better():
     def ended(errors_cm, patience, epochs=12):
         settings = TINY.model_copy(update={"epochs": epochs, "patience": patience})
         run = TrainingRun(settings, samples)
-        run.history = [EpochRecord(i + 1, 1.0, error, 1e-3, 1.0) for i, error in enumerate(errors_cm)]
+        run.history = [EpochRecord(i + 1, 1.0, 9.0, 1e-3, 1.0, error) for i, error in enumerate(errors_cm)]
         return run.ended
 
     # The second epoch was the best: two others have brought nothing.
