@@ -229,6 +229,16 @@ def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
     assert {group["lr"] for group in compact.param_groups} == {1e-4}
 
 
+def test_every_part_of_a_network_learns():
+    samples = LaneSamples([make_label_set(48, 0)], ["train.parquet"])
+    sizes = NetworkSettings(channels=(4, 8), hidden=8, takes_width=True, bins=8)
+    run = TrainingRun(TINY.model_copy(update={"network": sizes}), samples)
+    before = {name: value.clone() for name, value in run.network.named_parameters()}
+    run.run_epoch(samples)
+    still = [name for name, value in run.network.named_parameters() if torch.equal(value, before[name])]
+    assert len(before) > 10 and not still
+
+
 def test_patience_ends_a_run_that_gets_no_better():
     samples = LaneSamples([make_label_set(20, 0)], ["train.parquet"])
 
