@@ -138,8 +138,9 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
     )
     # As in the family: each layer has as many channels more as the first one has.
     channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
-    network = {"channels": channels, "hidden": drawn["hidden"], "takes_width": settings.network.takes_width}
-    loss = {"kind": drawn["loss"], "evenness": drawn["evenness"], "presence": settings.loss.presence}
+    kept = settings.network.model_dump(include={"bins", "takes_width"})
+    network = kept | {"channels": channels, "hidden": drawn["hidden"]}
+    loss = settings.loss.model_dump() | {"kind": drawn["loss"], "evenness": drawn["evenness"]}
     rate = trial.suggest_float("learning_rate", *LEARNING_RATE, log=True)
     data = settings.model_dump() | {"network": network, "loss": loss, "learning_rate": rate}
     return window, LearnSettings.model_validate(data)
