@@ -159,6 +159,13 @@ class NetworkSettings(Settings):
             raise ValueError("expected one to six layers of 1 to 512 channels")
         return value
 
+    @field_validator("bins")
+    @classmethod
+    def _check_bins(cls, value: int) -> int:
+        if value == 1:
+            raise ValueError("expected 0, or at least 2: one bin would answer the same x for all points")
+        return value
+
     @model_validator(mode="after")
     def _check_kind(self) -> NetworkSettings:
         if self.kind == "alexnet" and (self.channels is not None or self.hidden is not None):
