@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.labels.mapped_drive import MappedDrive, lines_at
 from datagen.labels.project import FrameLines
@@ -98,7 +97,9 @@ def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarra
             cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
 
 
-def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Iterable[int], columns: int = 4) -> None:
+def draw_contact_sheet(
+    path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"], columns: int = 4
+) -> None:
     """Draw some frames of a map with their projected lines (green left, magenta right) and six points."""
     drive_map = mapped.drive_map
     tiles = [

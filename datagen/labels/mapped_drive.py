@@ -25,7 +25,7 @@ _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 CONTRADICTED = "the pictures disagree with the map"
-BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
+BETWEEN_LANES = "on the line between two lanes, in a swerve beyond it, or far beside the lane"
 #: Frames that even a map that lacks nothing would not label.
 NOT_TO_LABEL = (DELETED, BETWEEN_LANES)
 
@@ -114,9 +114,9 @@ def label_frame(
     """Return the lane of the map's k-th frame and its six labels, or why it gets none.
 
     A frame gets no labels where its pose is uncertain (few edges match the map), where the car is between two
-    lanes, where the pictures disagree with both of the map's lines, or where the driver has deleted it; a
-    point is masked where they disagree with its line, where the map does not support it, or where it lies
-    beside the window.
+    lanes or far beside its own, where the pictures disagree with both of the map's lines, or where the driver
+    has deleted it; a point is masked where they disagree with its line, where the map does not support it, or
+    where it lies beside the window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED

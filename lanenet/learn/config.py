@@ -166,6 +166,13 @@ class NetworkSettings(Settings):
             raise ValueError("expected one to six layers of 1 to 512 channels")
         return value
 
+    @field_validator("bins")
+    @classmethod
+    def _check_bins(cls, value: int) -> int:
+        if value == 1:
+            raise ValueError("expected 0, or at least 2: one bin would answer the same x for all points")
+        return value
+
     @model_validator(mode="after")
     def _check_kind(self) -> NetworkSettings:
         if self.kind == "alexnet" and (self.channels is not None or self.hidden is not None):
@@ -189,8 +196,8 @@ class LossSettings(Settings):
     """What a network is trained to make small; see :func:`lanenet.learn.loss.lane_loss`.
 
     Attributes:
-        distance: Weight of the distance of the points beside their probability, for a network with bins;
-            ``kind`` and ``evenness`` are for one without.
+        distance: For a network with bins, weight of the distance of the points and of the likelihood of their
+            errors (which then trains the spread alone) beside the probability of the bins.
         kind: How errors are thought to be spread about the answer: ``student`` (heavy tails, round middle),
             ``laplace`` (heavy tails, sharp middle) or ``gaussian`` (no outliers).
         evenness: Power of the predicted spread that each point's term is multiplied with: 0 is the plain

@@ -32,9 +32,9 @@ def lane_loss(
     """Return the mean negative log likelihood of the known labels, and the cross-entropy of the presence.
 
     A network with bins answers distributions of x: a label between two bins is as likely as their shares say,
-    by its distance to each; the distance of the mean is added, since likelihood alone knows no near miss. Of
-    one without, the spread that it predicts is half the width of the interval that holds 68.27 % of the
-    errors, for each kind of distribution: the scale follows from it.
+    by its distance to each; the distance of the mean is added, since likelihood alone knows no near miss.
+    Without bins the points themselves are judged. The spread that a network predicts is half the width of the
+    interval that holds 68.27 % of the errors, for each kind of distribution: the scale follows from it.
 
     Args:
         output: Answers of the network.
@@ -59,6 +59,8 @@ def lane_loss(
             error, torch.zeros_like(error), beta=_NEAR_CM, reduction="none"
         )
         points = terms.sum() / max(terms.numel(), 1)
+        # The spread is learned from the errors; the points are not moved by it.
+        points = points + settings.distance * _doubt(error.detach(), output.sigma_cm[known], settings)
     else:
         points = _doubt(error, output.sigma_cm[known], settings)
     told = torch.isfinite(present)

@@ -17,13 +17,11 @@ from lanenet.learn.config import NetworkSettings
 LOOKAHEAD_CM = ROWS_CM[1]
 #: Widths of a lane that a network tells apart, [cm]: the middles of its bells, evenly spaced by ratio.
 _WIDTHS_CM = (15.0, 20.0, 27.0, 36.0, 48.0, 64.0, 85.0, 114.0)
-#: The predicted standard deviation stays within these, [cm], before it is calibrated.
+#: A standard deviation that is answered as a number stays within these, [cm], before it is calibrated.
 SIGMA_RANGE_CM = (0.05, 50.0)
 
 #: Width of a bell, in logarithms of the width: about the distance of two.
 _BELL = 0.25
-#: Least spread of a point that all bins but one are ruled out for, [cm].
-_LEAST_SPREAD_CM = 0.01
 _LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
 
 
@@ -54,8 +52,8 @@ class LaneNet(nn.Module):
     size: a raster of edges has no texture to learn. The last feature map is not averaged over rows and
     columns, since the place of a line is the answer.
 
-    A point is answered as a number and its spread, or, with bins, as a distribution of x: its mean and its
-    standard deviation. Where one picture has two explanations, a distribution can say so.
+    A point is answered as a number, or, with bins, as the mean of a distribution of x: where one picture has
+    two explanations, a distribution can learn both.
 
     Args:
         settings: Which network, and its size.
@@ -74,7 +72,7 @@ class LaneNet(nn.Module):
     def __init__(self, settings: NetworkSettings, rows: int, columns: int) -> None:
         super().__init__()
         self.rows, self.columns = rows, columns
-        n_outputs = N_POINTS * (settings.bins or 2) + len(SIDES)
+        n_outputs = N_POINTS * ((settings.bins or 1) + 1) + len(SIDES)
         self.trunk: nn.Module
         self.head: nn.Module
         self.width_bias: nn.ModuleList | None = None
@@ -117,25 +115,16 @@ class LaneNet(nn.Module):
             outputs: Tensor = self.head(self.trunk(raster))
         else:
             outputs = self._of_width(raster, lane_cm)
-        points, presence = outputs[:, : -len(SIDES)], outputs[:, -len(SIDES) :]
-        if self.bins_cm is not None:
-            return self._of_bins(points.reshape(-1, N_POINTS, len(self.bins_cm)), presence)
-        points, spread = points[:, :N_POINTS], points[:, N_POINTS:]
+        sizes = [outputs.shape[1] - N_POINTS - len(SIDES), N_POINTS, len(SIDES)]
+        points, spread, presence = torch.split(outputs, sizes, dim=1)
         middle, half = 0.5 * (_LOG_LOW + _LOG_HIGH), 0.5 * (_LOG_HIGH - _LOG_LOW)
         # A soft limit: a hard one has no gradient beyond it.
         sigma = torch.exp(middle + half * torch.tanh(spread / half)) * self.sigma_factor
-        return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
-
-    def _of_bins(self, logits: Float[Tensor, "n 6 b"], presence: Float[Tensor, "n 2"]) -> LaneOutput:
-        """Answer mean and standard deviation of the distributions of x."""
-        assert self.bins_cm is not None
-        log_share = torch.log_softmax(logits, dim=-1)
-        share = torch.exp(log_share)
-        points = (share * self.bins_cm).sum(dim=-1)
-        apart = self.bins_cm - points[..., None]
-        variance = (share * apart * apart).sum(dim=-1)
-        sigma = torch.sqrt(variance + _LEAST_SPREAD_CM**2) * self.sigma_factor
-        return LaneOutput(points, sigma, presence, log_share, self.bins_cm)
+        if self.bins_cm is None:
+            return LaneOutput(points * self.scale_cm + self.mean_cm, sigma, presence)
+        log_share = torch.log_softmax(points.reshape(-1, N_POINTS, len(self.bins_cm)), dim=-1)
+        means = (torch.exp(log_share) * self.bins_cm).sum(dim=-1)
+        return LaneOutput(means, sigma, presence, log_share, self.bins_cm)
 
     @torch.no_grad()
     def spread_bins(self, left_cm: float, right_cm: float) -> None:

@@ -20,7 +20,9 @@ def new_optimizer(network: LaneNet, settings: LearnSettings) -> torch.optim.Opti
     """
     head_factor = settings.head_rate if settings.network.kind == "alexnet" else 1.0
     groups = []
-    for part, factor in ((network.trunk, 1.0), (network.head, head_factor)):
+    # All children, so that no part of a network is left as it was drawn.
+    for part in network.children():
+        factor = head_factor if part is network.head else 1.0
         for decays in (True, False):
             chosen = [p for p in part.parameters() if (p.ndim > 1) == decays]
             decay = settings.weight_decay if decays else 0.0

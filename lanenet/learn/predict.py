@@ -78,7 +78,7 @@ def predict(network: LaneNet, samples: LaneSamples) -> Answers:
 
 
 def trimmed_rmse_cm(error_cm: Float[np.ndarray, "n 6"]) -> float:
-    """Return the RMSE without the largest hundredth of the errors; NaN ones, of masked labels, do not count."""
+    """Return the RMSE without the largest hundredth of the errors; NaN, of masked labels, does not count."""
     sizes = np.sort(np.abs(error_cm[np.isfinite(error_cm)]))
     kept = sizes[: max(1, math.ceil(_KEPT * len(sizes)))]
     return float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan

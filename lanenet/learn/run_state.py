@@ -25,6 +25,7 @@ STATE_NAME = "last.pt"
 METRICS_NAME = "metrics.json"
 METRICS_FORMAT = "lanenet-metrics/1"
 
+_VERSION = 2  # of the training; raise it when the same settings and data give other weights
 _ADVICE = "pick another name, or delete the folder to train anew"
 
 
@@ -80,14 +81,16 @@ def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
 
 
 def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
-    """Return a hash of all that decides a run: settings, the contents of its files and its first weights.
+    """Return a hash of all that decides a run: how it learns, settings, files' contents, first weights.
 
     Raises:
         LabelFormatError: If a file cannot be read.
         CheckpointError: If there are no weights to start from.
     """
     weights = [] if settings.network.weights is None else [settings.network.weights]
-    text = f"{settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
+    text = (
+        f"{_VERSION} {settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
+    )
     text += hash_of_start(settings.start_from)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

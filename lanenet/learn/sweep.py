@@ -14,7 +14,7 @@ from lanenet.data.files import require, write_text
 from lanenet.data.label_set import LabelSet, read_labels
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.config import LearnSettings
+from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.dataset import LaneSamples, check_same
 from lanenet.learn.run_state import best_record, hash_run
 from lanenet.learn.sweep_table import trials_csv, trials_table
@@ -139,10 +139,12 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
     )
     # As in the family: each layer has as many channels more as the first one has.
     channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
-    network = {"channels": channels, "hidden": drawn["hidden"], "takes_width": settings.network.takes_width}
-    loss = {"evenness": drawn["evenness"], "presence": settings.loss.presence}
-    if drawn["loss"] != "bins":
-        network["bins"], loss["kind"] = 0, drawn["loss"]
+    bins = (settings.network.bins or NetworkSettings().bins) if drawn["loss"] == "bins" else 0
+    network = {"channels": channels, "hidden": drawn["hidden"], "bins": bins}
+    network["takes_width"] = settings.network.takes_width
+    loss = settings.loss.model_dump() | {"evenness": drawn["evenness"]}
+    if not bins:
+        loss["kind"] = drawn["loss"]
     rate = trial.suggest_float("learning_rate", *LEARNING_RATE, log=True)
     data = settings.model_dump() | {"network": network, "loss": loss, "learning_rate": rate}
     return window, LearnSettings.model_validate(data)

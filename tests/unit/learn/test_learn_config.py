@@ -22,6 +22,12 @@ def test_impossible_networks_are_refused(channels):
         NetworkSettings(channels=channels)
 
 
+def test_a_single_bin_is_refused():
+    with pytest.raises(ConfigError, match=r"network\.bins.*at least 2"):
+        check_settings(LearnSettings, {"network": {"bins": 1}}, "x.yaml")
+    assert NetworkSettings(bins=2).bins == 2
+
+
 def test_alexnet_has_its_own_size_and_the_others_no_pretrained_weights():
     with pytest.raises(ConfigError, match="alexnet has a size of its own"):
         check_settings(LearnSettings, {"network": {"kind": "alexnet", "hidden": 8}}, "x.yaml")

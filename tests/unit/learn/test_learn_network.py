@@ -115,21 +115,24 @@ def test_buffers_scale_the_output():
     torch.testing.assert_close(network(raster).sigma_cm, 3.0 * plain.sigma_cm)
 
 
-def test_points_of_bins_are_means_and_their_spread_tells_two_places_from_one():
+def test_points_of_bins_are_the_means_of_their_distributions():
     network = LaneNet(NetworkSettings(channels=(2,), hidden=4, bins=9), 24, 32).eval()
     network.spread_bins(-40.0, 40.0)
     last = network.head[-1]
     torch.nn.init.zeros_(last.weight)
     torch.nn.init.constant_(last.bias, -50.0)
-    logits = last.bias.data[:-2].view(6, 9)
+    logits = last.bias.data[:54].view(6, 9)
     logits[0, 3] = 0.0  # at -10 cm
-    logits[1, 2] = logits[1, 6] = 0.0  # at -20 and 20 cm alike
+    logits[1, 3] = logits[1, 8] = 0.0  # at -10 and 40 cm alike
     logits[2] = 0.0  # anywhere
+    last.bias.data[54:60] = 0.3
+    last.bias.data[60:] = 2.0
     answer = network(torch.zeros(1, 1, 24, 32))
-    torch.testing.assert_close(answer.points_cm[0, :3], torch.tensor([-10.0, 0.0, 0.0]), atol=1e-4, rtol=0.0)
-    spread = torch.tensor([0.01, 20.0, torch.linspace(-40.0, 40.0, 9).std(correction=0)])
-    torch.testing.assert_close(answer.sigma_cm[0, :3], spread, atol=1e-3, rtol=0.0)
-    assert LaneNet(NetworkSettings(bins=64, takes_width=True), 96, 128).n_parameters <= 150_000
+    torch.testing.assert_close(answer.points_cm[0, :3], torch.tensor([-10.0, 15.0, 0.0]), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(answer.sigma_cm[0], answer.sigma_cm[0, :1].repeat(6))
+    assert SIGMA_RANGE_CM[0] < answer.sigma_cm[0, 0] < SIGMA_RANGE_CM[1]
+    torch.testing.assert_close(answer.presence_logit, torch.full((1, 2), 2.0))
+    assert LaneNet(NetworkSettings(takes_width=True), 96, 128).n_parameters <= 150_000
 
 
 @pytest.mark.parametrize(("bias", "limit"), [(-1e3, SIGMA_RANGE_CM[0]), (1e3, SIGMA_RANGE_CM[1])])

@@ -58,10 +58,20 @@ def test_a_label_between_two_bins_belongs_to_both():
     known = torch.isfinite(labels)
     assert (logits.grad[known] != 0.0).any() and (logits.grad[~known] == 0.0).all()
     # The mean of these shares is 2.5 cm: distances of 0, 22.5 and 17.5 cm, the far ones less 1 cm.
-    far = lane_loss(
-        binned(shares.log().repeat(1, 6, 1), bins_cm)[1], labels, present, LossSettings(distance=0.5)
-    )
-    assert far.item() - loss.item() == pytest.approx(0.5 * (21.5 + 16.5) / 3.0, rel=1e-4)
+    logits, answer = binned(shares.log().repeat(1, 6, 1), bins_cm)
+    answer = answer._replace(sigma_cm=answer.sigma_cm.detach().requires_grad_())
+    far = lane_loss(answer, labels, present, LossSettings(distance=0.5))
+    doubt = [2.5 * math.log1p((1.1417 * error) ** 2 / 4.0) for error in (0.0, 22.5, 17.5)]
+    assert far.item() - loss.item() == pytest.approx(0.5 * (21.5 + 16.5 + sum(doubt)) / 3.0, rel=1e-4)
+    # The spread is learned from the errors without moving the points, so that their pull is the distance's.
+    far.backward()
+    points = torch.zeros(1, 6)
+    points[0, 3], points[0, 4] = 1.0, -1.0
+    pull = torch.softmax(logits.detach(), -1) * (bins_cm - 2.5) * points[..., None] * 0.5 / 3.0
+    alone, plain = binned(shares.log().repeat(1, 6, 1), bins_cm)
+    lane_loss(plain, labels, present, LossSettings(distance=0.0)).backward()
+    torch.testing.assert_close(logits.grad, alone.grad + pull, atol=1e-5, rtol=1e-4)
+    assert (answer.sigma_cm.grad[known] != 0.0).all() and (answer.sigma_cm.grad[~known] == 0.0).all()
 
 
 def test_values():

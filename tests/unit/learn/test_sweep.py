@@ -83,6 +83,15 @@ def test_the_network_as_it_is_comes_first_and_a_later_call_goes_on(quick, paths,
     assert len(read(tmp_path)) == 1
 
 
+def test_bins_and_the_weights_of_the_loss_are_kept_in_every_trial():
+    optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
+    first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
+    trial = optuna.trial.FixedTrial(first | {"learning_rate": SETTINGS.learning_rate})
+    changes = {"network": NetworkSettings(bins=32), "loss": LossSettings(distance=0.7, presence=0.4)}
+    _, chosen = sweep_module._draw(trial, SETTINGS.model_copy(update=changes))
+    assert chosen.network.bins == 32 and chosen.loss == changes["loss"]
+
+
 def test_a_network_that_is_told_the_width_is_told_it_in_every_trial():
     optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
     first = {name: values[0] for name, values in sweep_module.CHOICES.items()}

@@ -22,7 +22,7 @@ from lanenet.learn.evaluate import RasterModel, point_errors
 from lanenet.learn.network import new_network
 from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
 from lanenet.learn.quantise import Int8Report, export_int8
-from lanenet.learn.run_state import EpochRecord
+from lanenet.learn.run_state import EpochRecord, read_state, write_state
 from lanenet.learn.train import TrainingRun, train
 from lanenet.perception.network import open_model, read_model_meta
 
@@ -140,6 +140,19 @@ def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last,
     assert min(e.value for e in events.Scalars("val_rmse_cm")) == pytest.approx(result.val_rmse_cm, rel=1e-5)
 
 
+def test_a_run_of_all_that_a_network_can_have_is_gone_on_with_exactly(tmp_path):
+    samples = LaneSamples([make_label_set(n, n) for n in (30, 18)], ["a.parquet", "b.parquet"])
+    network = NetworkSettings(channels=(4, 8), hidden=8, takes_width=True, bins=8)
+    settings = TINY.model_copy(update={"network": network, "balance": "drive"})
+    whole, half = TrainingRun(settings, samples), TrainingRun(settings, samples)
+    whole.run_epoch(samples), half.run_epoch(samples)
+    write_state(tmp_path / "last.pt", half.state(), "hash")
+    gone_on = TrainingRun(settings, samples, read_state(tmp_path / "last.pt", "hash"))
+    whole.run_epoch(samples), gone_on.run_epoch(samples)
+    for a, b in ((whole.network, gone_on.network), (whole.best_network(), gone_on.best_network())):
+        assert all(torch.equal(value, b.state_dict()[name]) for name, value in a.state_dict().items())
+
+
 def test_the_model_can_be_quantised(finished, tmp_path):
     path, report = export_int8(finished.folder, tmp_path / "model-int8.onnx")
     floats, meta = open_model(finished.model_path)
@@ -227,6 +240,16 @@ def test_the_new_layer_of_alexnet_learns_faster_and_norms_do_not_decay():
     small = new_network(NetworkSettings(), 24, 32, 0)
     set_learning_rate(compact := new_optimizer(small, LearnSettings()), 1e-4)
     assert {group["lr"] for group in compact.param_groups} == {1e-4}
+
+
+def test_every_part_of_a_network_learns():
+    samples = LaneSamples([make_label_set(48, 0)], ["train.parquet"])
+    sizes = NetworkSettings(channels=(4, 8), hidden=8, takes_width=True, bins=8)
+    run = TrainingRun(TINY.model_copy(update={"network": sizes}), samples)
+    before = {name: value.clone() for name, value in run.network.named_parameters()}
+    run.run_epoch(samples)
+    still = [name for name, value in run.network.named_parameters() if torch.equal(value, before[name])]
+    assert len(before) > 10 and not still
 
 
 def test_patience_ends_a_run_that_gets_no_better():

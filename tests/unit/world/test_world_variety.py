@@ -25,6 +25,7 @@ from datagen.world.variety import (
     vary_simulation,
 )
 from datagen.world.world import SimulationSettings, World, build_world
+from lanenet.config import check_settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import rows_of_polyline
@@ -217,6 +218,21 @@ def test_drivers_leave_the_middle_but_find_back():
     assert all(driver.change_lanes_every_cm is None for driver in drivers)
     every = [driver.change_lanes_every_cm for driver in _drivers(TrackSettings(lane_width_cm=69.0, lanes=2))]
     assert sum(way is not None for way in every) in range(12, 31)
+
+
+@pytest.mark.parametrize(("kind", "crossed"), [("solid", False), ("dashed", True), ("random", True)])
+def test_lanes_are_changed_over_dashes_alone(kind, crossed):
+    road = {"lane_width_cm": 50, "lanes": 2, "middle": {"kind": kind}}
+    track = check_settings(TrackSettings, road, "track")
+    drawn = [
+        vary_simulation(SimulationSettings(track=track), np.random.SeedSequence([3, k]), k, road=False)
+        for k in range(30)
+    ]
+    changing = [one.track for one in drawn if one.driver.change_lanes_every_cm is not None]
+    assert bool(changing) == crossed
+    assert all(one.middle is not None and one.middle.kind == "dashed" for one in changing)
+    # Whoever stays in the lane drives on the road as it was.
+    assert all(one.track == track for one in drawn if one.driver.change_lanes_every_cm is None)
 
 
 def test_nobody_swerves_more_sharply_than_the_car_can_turn():
