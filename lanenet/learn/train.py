@@ -176,7 +176,7 @@ class TrainingRun:
             for batch in batches:
                 rate = learning_rate_at(self.step, self.total, settings)
                 targets = torch.from_numpy(batch.points_cm).to(self.device)
-                points = self._step(batch, targets, rate)
+                points = self.learn_from(batch, targets, rate)
                 error = (points - targets)[torch.isfinite(targets)]
                 squares += float((error * error).sum())
                 count += error.numel()
@@ -201,8 +201,8 @@ class TrainingRun:
             self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
         return record
 
-    def _step(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:
-        """Take one step; answers the points that it started from."""
+    def learn_from(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:
+        """Take one step at a learning rate; answers the points that it started from."""
         set_learning_rate(self.optimizer, rate)
         rasters, present, lane_cm = (
             torch.from_numpy(part).to(self.device) for part in (batch.rasters, batch.present, batch.lane_cm)
