@@ -98,3 +98,11 @@ class DataSettings(Settings):
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     workers: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _each_drive_once(self) -> DataSettings:
+        paths = [drive.path.resolve() for drive in self.drives]
+        twice = next((drive.path for drive in self.drives if paths.count(drive.path.resolve()) > 1), None)
+        if twice is not None:
+            raise ValueError(f"drives: {twice} is listed twice; counts_as shows one drive more often")
+        return self

@@ -109,16 +109,16 @@ class DriveMap:
     @cached_property
     def lanes(self) -> FrameLanes:
         """The lane of each frame, and its direction of travel along the segment's path."""
-        lane = np.zeros(len(self.frames), dtype=np.int64)
-        forward = np.ones(len(self.frames), dtype=bool)
-        between = np.zeros(len(self.frames), dtype=bool)
-        divides = np.zeros((len(self.frames), len(SIDES)), dtype=bool)
+        n = len(self.frames)
+        lane, forward = np.zeros(n, dtype=np.int64), np.ones(n, dtype=bool)
+        between, away = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        divides = np.zeros((n, len(SIDES)), dtype=bool)
         for segment, lines in self.lines.items():
             rows = np.flatnonzero(self.segment == segment)
             found = assign_lanes(lines, self.poses[rows], self.s_cm[rows], self.camera.wheelbase_cm)
-            lane[rows], forward[rows], between[rows] = found.lane, found.forward, found.between
-            divides[rows] = found.divides
-        return FrameLanes(lane, forward, between, divides)
+            lane[rows], forward[rows] = found.lane, found.forward
+            between[rows], away[rows], divides[rows] = found.between, found.away, found.divides
+        return FrameLanes(lane, forward, between, away, divides)
 
 
 def write_map(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.labels.mapped_drive import (
+    AWAY,
     BETWEEN_LANES,
     CONTRADICTED,
     DELETED,
@@ -66,7 +67,7 @@ def label_map(
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
     rows: list[int] = []
     edges, lines, residuals = [], [], []
-    skipped = {DELETED: 0, UNCERTAIN: 0, CONTRADICTED: 0, BETWEEN_LANES: 0, NO_LINE: 0}
+    skipped = dict.fromkeys((DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE), 0)
     kept_points = np.full((len(drive_map.frames), N_POINTS), np.nan)
     in_window = np.zeros(kept_points.shape, dtype=bool)
     for k in range(len(drive_map.frames)):

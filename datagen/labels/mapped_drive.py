@@ -25,7 +25,9 @@ _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels.
 DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
 CONTRADICTED = "the pictures disagree with the map"
-BETWEEN_LANES = "on the line between two lanes, in a swerve beyond it, or far beside the lane"
+BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
+#: A map that is wrong puts the car there, too, so that these frames count against it.
+AWAY = "far beside the lane"
 #: Frames that even a map that lacks nothing would not label.
 NOT_TO_LABEL = (DELETED, BETWEEN_LANES)
 
@@ -125,6 +127,8 @@ def label_frame(
         return UNCERTAIN
     if mapped.drive_map.lanes.between[k]:
         return BETWEEN_LANES
+    if mapped.drive_map.lanes.away[k]:
+        return AWAY
     seen = lines_at(mapped.drive_map, k)
     visible = window.labelled(seen.points_cm)
     if not np.isfinite(visible).any():

@@ -27,8 +27,10 @@ class FrameLanes:
         lane: Index of the line on the left of the lane, seen in the path's direction: 0 for the driven lane,
             -1 for the one to its left, 1 for the one to its right.
         forward: Whether the frame drives in the path's direction.
-        between: Frames on the line between two lanes, or beyond it in a swerve, or away from the road: which
-            lane is meant cannot be told.
+        between: Frames on the line between two lanes, or beyond it in a swerve: which lane is meant cannot be
+            told from the picture.
+        away: Frames so far beside the lane, or on the way there and back, that they may be in a lane of which
+            nothing is known.
         divides: Whether there is another lane beyond the left, beyond the right line of the frame's lane, in
             its direction of travel.
     """
@@ -36,6 +38,7 @@ class FrameLanes:
     lane: Int[np.ndarray, "n"]
     forward: Bool[np.ndarray, "n"]
     between: Bool[np.ndarray, "n"]
+    away: Bool[np.ndarray, "n"]
     divides: Bool[np.ndarray, "n 2"]
 
 
@@ -79,8 +82,8 @@ def assign_lanes(
         lane[k] = current
     lane = _without_swerves(lane, left_of, _ENTERED * usual)
     divides = _dividers(lane, forward, exists)
-    between = _between_lanes(lane, left_of, exists, margin) | _off_the_road(lane, left_of, _AWAY * usual)
-    return FrameLanes(lane, forward, between, divides)
+    between = _between_lanes(lane, left_of, exists, margin)
+    return FrameLanes(lane, forward, between, _away(lane, left_of, _AWAY * usual), divides)
 
 
 def _lanes(
@@ -137,7 +140,7 @@ def _between_lanes(
     return between
 
 
-def _off_the_road(
+def _away(
     lane: Int[np.ndarray, "n"], left_of: dict[int, Float[np.ndarray, "n"]], away_cm: float
 ) -> Bool[np.ndarray, "n"]:
     """Tell which frames belong to a stretch beyond a line of their lane that leads too far from it."""

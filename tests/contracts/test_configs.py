@@ -213,3 +213,16 @@ def test_a_misspelt_key_is_named() -> None:
     data = read_yaml(CONFIGS / "small.yaml")
     with pytest.raises(ConfigError, match="'lern', did you mean 'learn'"):
         check_settings(run_settings_schema(), {**data, "lern": {}}, "small.yaml")
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> None:
+    from lanenet.learn.network import new_network
+    from lanenet.learn.start import load_start_weights
+
+    settings = read_training_run(path)
+    folder, window = settings.learn.start_from, settings.data.window
+    if folder is None:
+        pytest.skip("starts from random weights")
+    network = new_network(settings.learn.network, window.rows, window.columns, settings.learn.seed)
+    load_start_weights(network, CONFIGS.parent / folder, window)

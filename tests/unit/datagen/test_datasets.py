@@ -265,3 +265,10 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
     next((folder / "labels").glob("*.validation.parquet")).unlink()
     assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
     assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
+
+
+def test_a_recording_is_listed_once(tmp_path):
+    drive = RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0)
+    again = RecordedSettings(path=tmp_path / "maps" / ".." / "tub", lane_width_cm=30.0)
+    with pytest.raises(ValueError, match=r"tub is listed twice.*counts_as"):
+        DataSettings(drives=(drive, again))

@@ -11,6 +11,7 @@ import pytest
 
 from datagen.labels.label_map import label_map
 from datagen.labels.mapped_drive import (
+    AWAY,
     BETWEEN_LANES,
     CONTRADICTED,
     DELETED,
@@ -155,6 +156,8 @@ def test_why_a_frame_gets_no_labels(folder):
     assert label_frame(replace(mapped, drive_map=on_dashes), 6, window) == BETWEEN_LANES
     # Behind a solid line there is no lane: the second segment.
     assert not isinstance(label_frame(replace(mapped, drive_map=on_dashes), 20, window), str)
+    beside = replace(mapped.drive_map, poses=mapped.drive_map.poses + [0.0, 35.0, 0.0])
+    assert label_frame(replace(mapped, drive_map=beside), 6, window) == AWAY
     assert label_frame(mapped, 3, BirdseyeWindow(left_cm=100.0)) == "no line in the window"
     deleted = replace(mapped.drive, deleted=np.arange(N) == 16)
     # Frame 16 of the drive is the 12th of the map.

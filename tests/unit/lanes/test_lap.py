@@ -203,7 +203,7 @@ def test_a_swerve_across_a_line_is_no_lane_change(reach, changes, side):
 def test_beyond_the_outer_line_the_car_keeps_its_lane():
     poses, s = _drive(np.linspace(0.0, -30.0, 50))
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
-    assert not found.lane.any() and not found.between.any()
+    assert not found.lane.any() and not found.between.any() and not found.away.any()
     # Where the further line is not known there is no lane to change to.
     poses, s = _drive(np.full(50, 36.0))
     gone = assign_lanes(_straight_lines(TWO_LANES, until_cm=5.0), poses, s, WHEELBASE_CM)
@@ -216,7 +216,8 @@ def test_far_beyond_a_solid_line_the_car_is_in_no_lane_until_it_comes_back():
     poses, s = _drive(y)
     found = assign_lanes(_straight_lines(TWO_LANES), poses, s, WHEELBASE_CM)
     assert not found.lane.any()
-    np.testing.assert_array_equal(found.between, (y < -18.0) & (np.arange(90) > 25))
+    np.testing.assert_array_equal(found.away, (y < -18.0) & (np.arange(90) > 25))
+    assert not found.between.any()
 
 
 @pytest.mark.parametrize("offsets", [TWO_LANES, {0: 18.0, 1: -18.0}])
