@@ -17,7 +17,7 @@ from lanenet.learn.config import NetworkSettings
 LOOKAHEAD_CM = ROWS_CM[1]
 #: Widths of a lane that a network tells apart, [cm]: the middles of its bells, evenly spaced by ratio.
 _WIDTHS_CM = (15.0, 20.0, 27.0, 36.0, 48.0, 64.0, 85.0, 114.0)
-#: A standard deviation that is answered as a number stays within these, [cm], before it is calibrated.
+#: The predicted standard deviation stays within these, [cm], before it is calibrated.
 SIGMA_RANGE_CM = (0.05, 50.0)
 
 #: Width of a bell, in logarithms of the width: about the distance of two.

@@ -13,7 +13,7 @@ from datagen.world.rig import CameraSettings
 from datagen.world.script import DriverSettings
 from datagen.world.sight import line_in_bend_car, sees_lane
 from datagen.world.track import random_track
-from datagen.world.track_settings import MarkingSettings, TrackSettings
+from datagen.world.track_settings import TrackSettings
 from datagen.world.variety import (
     camera_like,
     first_world,
@@ -265,17 +265,3 @@ def test_lanes_are_changed_within_the_drive(frames, closed):
     if frames == 300:
         share = (begins - 30.0) / (latest - 30.0)
         assert share.min() < 0.25 and share.max() > 0.75
-
-
-def test_lanes_are_changed_across_dashes_only():
-    drawn = [
-        vary_simulation(SimulationSettings(), np.random.SeedSequence([7, number]), number)
-        for number in range(120)
-    ]
-    middles = [(one.track.middle, one.driver.change_lanes_every_cm) for one in drawn if one.track.lanes == 2]
-    changed = [middle.kind for middle, way in middles if middle is not None and way is not None]
-    kept = [middle.kind for middle, way in middles if middle is not None and way is None]
-    assert len(changed) > 5 and set(changed) == {"dashed"}
-    assert {"random", "dashed"} <= set(kept)
-    solid = TrackSettings(lane_width_cm=40.0, lanes=2, middle=MarkingSettings())
-    assert all(driver.change_lanes_every_cm is None for driver in _drivers(solid))
