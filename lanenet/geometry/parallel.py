@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -13,7 +15,9 @@ _MAX_STEP_CM = 30.0
 _TOLERANCE_CM = 1e-3
 
 
-def parallel_points(points_cm: Float[np.ndarray, "3"], distance_cm: float) -> Float[np.ndarray, "3"]:
+def parallel_points(
+    points_cm: Float[np.ndarray, "3"], distance_cm: float, beyond_cm: float = math.inf
+) -> Float[np.ndarray, "3"]:
     """Return the three label points of the curve at a constant distance from a line.
 
     The line is the parabola through its three points, also beyond them. Each point of the parallel lies
@@ -23,10 +27,11 @@ def parallel_points(points_cm: Float[np.ndarray, "3"], distance_cm: float) -> Fl
     Args:
         points_cm: x of the line at the label rows, frame car.
         distance_cm: To the right of the line in the direction of travel; negative to its left.
+        beyond_cm: How far beyond its first and its last point the line is believed.
 
     Returns:
         x of the parallel at the label rows; NaN where there is none, because the line bends more tightly than
-        the distance, or a point of the line is missing.
+        the distance, or a point of the line is missing, or where it lies across one that is too far beyond.
 
     Source:
         Own derivation; circles about one centre and straight lines in
@@ -48,4 +53,5 @@ def parallel_points(points_cm: Float[np.ndarray, "3"], distance_cm: float) -> Fl
     found = np.abs(y - distance_cm * slope / length - rows) < _TOLERANCE_CM
     # Beyond the centre of the bend the curve runs backwards.
     ahead = 2.0 * a * distance_cm / length**3 < 1.0
-    return np.where(found & ahead, (a * y + b) * y + c + distance_cm / length, np.nan)
+    believed = (y >= rows[0] - beyond_cm) & (y <= rows[-1] + beyond_cm)
+    return np.where(found & ahead & believed, (a * y + b) * y + c + distance_cm / length, np.nan)

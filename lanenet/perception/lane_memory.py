@@ -17,6 +17,8 @@ _SEEN, _SURE = 0.5, 0.9
 _LENGTH, _ENOUGH = 100, 10
 #: Standard deviation of a remembered width, as a share of it: no road keeps its width better.
 _WIDTH_SIGMA = 0.02
+#: How far beyond its label rows the parabola of a line is believed.
+_BEYOND_CM = 15.0
 
 
 class LaneMemory:
@@ -68,8 +70,9 @@ class LaneMemory:
         """Learn from a frame with both lines; rebuild the missing line of a frame with one.
 
         The rebuilt line is parallel to the one that is seen. It replaces the network's own guess only where
-        it is surer of itself. A line that is not seen never replaces one that is, however sure its points
-        are: of lines beside its window a network has learned nothing.
+        it is surer of itself, and where it does not hang on what the seen line does far beyond its points. A
+        line that is not seen never replaces one that is, however sure its points are: of lines beside its
+        window a network has learned nothing.
 
         Args:
             points_cm: The six points, frame car.
@@ -87,7 +90,7 @@ class LaneMemory:
         # The left line is 0: the missing right line lies to the right of it, and the other way round.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
-        rebuilt = parallel_points(lines[1 - missing], side * width_cm)
+        rebuilt = parallel_points(lines[1 - missing], side * width_cm, _BEYOND_CM)
         rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
         if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
             lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma

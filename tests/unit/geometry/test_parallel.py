@@ -49,3 +49,11 @@ def test_no_parallel_inside_a_tight_bend_and_none_without_a_point():
     assert np.isnan(parallel_points(0.02 * ROWS**2, 40.0)).any()
     assert np.isfinite(parallel_points(0.02 * ROWS**2, -40.0)).all()
     assert np.isnan(parallel_points(np.array([0.0, np.nan, 1.0]), 5.0)).all()
+
+
+def test_a_line_is_believed_only_so_far_beyond_its_points():
+    # At 30 degrees the parallel 40 cm to the right lies across the line's points 20 cm further on.
+    line = ROWS * math.tan(math.radians(30.0))
+    assert np.isfinite(parallel_points(line, 40.0, 21.0)).all()
+    np.testing.assert_array_equal(np.isfinite(parallel_points(line, 40.0, 19.0)), [True, True, False])
+    np.testing.assert_array_equal(np.isfinite(parallel_points(line, -40.0, 19.0)), [False, True, True])
