@@ -14,7 +14,7 @@ SAMPLES = LaneSamples([make_label_set(400, 3)], ["set"])
 
 def network_that_says(odds):
     """Of random weights, but for the mean of what it says of the lines."""
-    network = new_network(NetworkSettings(kind="nano"), WINDOW.rows, WINDOW.columns, seed=0).eval()
+    network = new_network(NetworkSettings(kind="nano", bins=0), WINDOW.rows, WINDOW.columns, seed=0).eval()
     batch = SAMPLES.plain_batch(np.arange(len(SAMPLES)))
     found = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.mean(dim=0)
     with torch.no_grad():
