@@ -8,8 +8,12 @@ PIP_ARGS ?=
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt
-# Shapes and types of arguments are checked at run time in tests, and only there.
-PYTEST := $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype
+# Tests run on this many cores. Each process takes over a gigabyte, hence the bound for large machines.
+TEST_PROCESSES ?= auto
+# Shapes and types of arguments are checked at run time in tests, and only there. A process computes with one
+# thread, so that the processes leave each other their cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype \
+  --numprocesses $(TEST_PROCESSES) --maxprocesses 4
 
 .PHONY: help train env test test-slow test-base-install arm check format format-check lint types imports bench clean
 

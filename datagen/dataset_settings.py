@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -90,7 +91,7 @@ class DataSettings(Settings):
         drives: Recorded drives.
         map: Settings for mapping the synthetic drives.
         window: The patch of road that the network sees: wide enough for the lane's lines on either side.
-        workers: Processes that simulate and map; 0 takes one per core.
+        workers: Processes that simulate, map and evaluate; 0 takes one per core.
     """
 
     synthetic: SyntheticSettings = SyntheticSettings()
@@ -98,6 +99,11 @@ class DataSettings(Settings):
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     workers: int = Field(default=0, ge=0)
+
+    @property
+    def processes(self) -> int:
+        """Processes at a time."""
+        return self.workers or os.cpu_count() or 1
 
     @model_validator(mode="after")
     def _each_drive_once(self) -> DataSettings:

@@ -5,7 +5,6 @@ Training and validation labels come from maps, never from the simulator's truth;
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -88,8 +87,11 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
     for role in ("train", "validation"):
         if not settings.drives and not getattr(settings.synthetic, role):
             raise ConfigError(f"data: no {role} drives; set data.synthetic.{role} or list data.drives")
+    # The first drive that is mapped compiles what all others use; the test drives, which need little of that,
+    # go beside it, so that no second process compiles the same.
+    jobs[1:] = sorted(jobs[1:], key=lambda job: job.get("role") != "test")
     named = [(_job_name(job), job) for job in jobs]
-    results = run_jobs(_run_job, named, settings.workers or os.cpu_count() or 1, progress)
+    results = run_jobs(_run_job, named, settings.processes, progress)
     parts: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
     frames: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
     left_out = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,32 @@ from lanenet.labelled_sources import Opened
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
+    from lanenet.data.labelled_frames import LabelledFrames
     from lanenet.learn.compare import Comparison, SourceAnswers
-    from lanenet.onboard.compare import ComparedName
+    from lanenet.onboard.compare import ComparedName, FrameAnswers
     from lanenet.perception.estimate import Detector
 
 #: Called with (source, frames done, frames).
 Progress = Callable[[str, int, int], None]
+#: Fewer frames than these are answered sooner than a process has started.
+_WORTH_PROCESSES = 600
+
+
+@dataclass(frozen=True)
+class _Entrants:
+    """Who answers, in the order of the tables, and how they are built for a source."""
+
+    names: Sequence[ComparedName]
+    models: Mapping[str, Path]
+    marking_cm: float | None
+    any_camera: bool
+
+    @property
+    def in_order(self) -> list[str]:
+        """All detectors; more networks follow the first one."""
+        more = [name for name in self.models if name != "network"]
+        network = [name for name in self.names if name == "network"]
+        return [*network, *more, *(name for name in self.names if name != "network")]
 
 
 @dataclass(frozen=True)
@@ -55,6 +76,7 @@ def evaluate(
     training: Sequence[LabelSet] = (),
     marking_cm: float | None = None,
     any_camera: bool = False,
+    workers: int = 1,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Run detectors over sources and report their errors.
@@ -68,7 +90,9 @@ def evaluate(
             it.
         marking_cm: Thickness of the tape for the lane filter; None takes the source's, or the default.
         any_camera: Accept a model that was trained with another camera than that of the frames or labels.
-        progress: Called with (source, frames done, frames).
+        workers: Processes at a time, where several sources have many frames.
+        progress: Called with (source, frames done, frames); of several processes with (what is done, sources
+            done, sources).
 
     Raises:
         LanenetError: If a source cannot be read or does not fit a detector.
@@ -81,7 +105,13 @@ def evaluate(
 
     models = {} if model is None else {"network": model}
     models |= also or {}
-    answered = [_answer(s, names, models, training, marking_cm, any_camera, progress) for s in sources]
+    entrants = _Entrants(names, models, marking_cm, any_camera)
+    all_frames = [s.frames for s in sources if s.frames is not None]
+    given = iter(_answer_all(all_frames, entrants, workers, progress))
+    answered = [
+        _answer_labels(s, entrants, training) if s.frames is None else _describe(s, next(given), training)
+        for s in sources
+    ]
     comparison = compare_detectors(answered)
     files: dict[str, str | bytes] = {".md": as_markdown(comparison)}
     for ending, picture in ((".png", error_picture), ("-breakdown.png", breakdown_picture)):
@@ -98,43 +128,46 @@ def evaluate(
     return Evaluation(comparison, files)
 
 
-def _in_order(names: Sequence[ComparedName], models: Mapping[str, Path]) -> list[str]:
-    """All detectors in the order of the tables: more networks follow the first one."""
-    more = [name for name in models if name != "network"]
-    return [*(n for n in names if n == "network"), *more, *(n for n in names if n != "network")]
+def _answer_all(
+    frames: Sequence[LabelledFrames], entrants: _Entrants, workers: int, progress: Progress | None
+) -> list[FrameAnswers]:
+    """Let all detectors answer all frames, in several processes where that is faster."""
+    from datagen.jobs import run_jobs
+
+    if workers == 1 or len(frames) == 1 or sum(map(len, frames)) < _WORTH_PROCESSES:
+        return [_answer(each, entrants, progress) for each in frames]
+    jobs = [(each.name, each) for each in frames]
+    report = None if progress is None else partial(progress, "sources")
+    return run_jobs(partial(_answer, entrants=entrants), jobs, workers, report)
 
 
-def _answer(
-    source: Opened,
-    names: Sequence[ComparedName],
-    models: Mapping[str, Path],
-    training: Sequence[LabelSet],
-    marking_cm: float | None,
-    any_camera: bool,
-    progress: Progress | None,
-) -> SourceAnswers:
-    from lanenet.learn.compare import SourceAnswers
-    from lanenet.learn.conditions import at_frames, lines_seen, way_to_training_cm
+def _answer(frames: LabelledFrames, entrants: _Entrants, progress: Progress | None = None) -> FrameAnswers:
     from lanenet.onboard.compare import answer_frames, build_compared
 
-    frames, labels, name = source.frames, source.labels, str(source.path)
-    if frames is None:
-        assert labels is not None
-        return _answer_labels(name, labels, names, models, training, marking_cm, any_camera)
     detectors: dict[str, Detector] = {}
-    for key in _in_order(names, models):
-        detector: Any = "network" if key in models else key
+    for key in entrants.in_order:
+        detector: Any = "network" if key in entrants.models else key
         built = build_compared(
-            [detector], frames, model=models.get(key), marking_cm=marking_cm, any_camera=any_camera
+            [detector],
+            frames,
+            model=entrants.models.get(key),
+            marking_cm=entrants.marking_cm,
+            any_camera=entrants.any_camera,
         )
         detectors[key] = built[detector]
+    return answer_frames(
+        frames, detectors, None if progress is None else partial(progress, Path(frames.name).name)
+    )
 
-    def report(done: int, total: int) -> None:
-        if progress is not None:
-            progress(source.path.name, done, total)
 
-    answers = answer_frames(frames, detectors, report)
-    first = next(iter(detectors))
+def _describe(source: Opened, answers: FrameAnswers, training: Sequence[LabelSet]) -> SourceAnswers:
+    """Answers to frames, beside the truth and the conditions that errors are told by."""
+    from lanenet.learn.compare import SourceAnswers
+    from lanenet.learn.conditions import at_frames, lines_seen, way_to_training_cm
+
+    frames, labels = source.frames, source.labels
+    assert frames is not None
+    first = next(iter(answers.confidence))
     conditions = {"light": answers.brightness, "confidence": answers.confidence[first]}
     visible = None
     if labels is not None:
@@ -142,7 +175,7 @@ def _answer(
         way = way_to_training_cm(labels, training)
         conditions["place"] = at_frames(way, labels.frame, frames.frames)
     return SourceAnswers(
-        name=name,
+        name=str(source.path),
         kind="simulated drive" if frames.reference == "truth" else "map",
         reference=frames.reference,
         truth_cm=frames.points_cm,
@@ -154,39 +187,33 @@ def _answer(
     )
 
 
-def _answer_labels(
-    name: str,
-    labels: LabelSet,
-    names: Sequence[ComparedName],
-    models: Mapping[str, Path],
-    training: Sequence[LabelSet],
-    marking_cm: float | None,
-    any_camera: bool,
-) -> SourceAnswers:
+def _answer_labels(source: Opened, entrants: _Entrants, training: Sequence[LabelSet]) -> SourceAnswers:
     from lanenet.learn.compare import SourceAnswers
     from lanenet.learn.conditions import lines_seen, way_to_training_cm
     from lanenet.learn.evaluate import RasterModel
     from lanenet.onboard.detectors import filter_settings, lane_filter_points_cm
 
+    labels = source.labels
+    assert labels is not None
+    meta = labels.meta
     points: dict[str, Any] = {}
     sigma: dict[str, Any] = {}
     presence: dict[str, Any] = {}
-    for key in _in_order(names, models):
-        if key in models:
-            model = RasterModel(models[key])
-            if not any_camera:
-                camera = f"the camera of {name}"
-                model.meta.check_trained_with(labels.meta.camera_hash, camera, str(models[key]))
+    for key in entrants.in_order:
+        if key in entrants.models:
+            path = entrants.models[key]
+            model = RasterModel(path)
+            if not entrants.any_camera:
+                model.meta.check_trained_with(meta.camera_hash, f"the camera of {source.path}", str(path))
             found = model.answer_labels(labels)
             points[key], sigma[key], presence[key] = found.points_cm, found.sigma_cm, found.presence
         else:
-            meta = labels.meta
-            settings = filter_settings(meta.lane_width_cm, meta.marking_cm, marking_cm)
+            settings = filter_settings(meta.lane_width_cm, meta.marking_cm, entrants.marking_cm)
             points[key] = lane_filter_points_cm(labels, settings)
     return SourceAnswers(
-        name=name,
+        name=str(source.path),
         kind="label set",
-        reference=labels.meta.source,
+        reference=meta.source,
         truth_cm=labels.points_cm,
         answers_cm=points,
         sigma_cm=sigma,

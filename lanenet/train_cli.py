@@ -108,6 +108,7 @@ def train(
             marking_cm=marking,
             # Which camera made which test drive is settled by the config.
             any_camera=True,
+            workers=settings.data.processes,
             progress=progress,
         )
     val_cli.show(evaluation.comparison)

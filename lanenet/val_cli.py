@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,6 +108,7 @@ def val(
             training=[read_labels(path) for path in trained_on or []],
             marking_cm=marking,
             any_camera=any_camera,
+            workers=os.cpu_count() or 1,
             progress=progress,
         )
     show(evaluation.comparison)

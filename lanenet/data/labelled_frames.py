@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +62,21 @@ class LabelledFrames:
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         if not rows.size:
             raise LabelFormatError(f"{self.name}: no frame from {first} to {last}")
-        whole, start = self.image, int(rows[0])
+        start = int(rows[0])
         return replace(
             self,
             frames=self.frames[rows],
             starts=self.starts[rows],
             points_cm=self.points_cm[rows],
-            image=lambda i: whole(start + i),
+            image=partial(_image_from, self.image, start),
         )
+
+
+def _image_from(
+    whole: Callable[[int], UInt8[np.ndarray, "h w 3"]], start: int, i: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Frame i of a part that begins at ``start``; other processes can be given a module's function only."""
+    return whole(start + i)
 
 
 def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> LabelledFrames:
