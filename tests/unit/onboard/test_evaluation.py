@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datagen.world.rig import CameraSettings
+from datagen.world.simulate import SimulationSettings, simulate_drive
+from lanenet import evaluation
+from lanenet.data.labelled_frames import read_truth_frames
+from lanenet.errors import DriveFormatError
+from lanenet.labelled_sources import Opened
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory) -> list[Opened]:
+    opened = []
+    for seed in (1, 2):
+        folder = tmp_path_factory.mktemp(f"drive{seed}") / "drive"
+        simulate_drive(
+            SimulationSettings(seed=seed, frames=12, camera=CameraSettings(width=160, height=120)), folder
+        )
+        opened.append(Opened(folder, read_truth_frames(folder)))
+    # A part of a drive, as `val --frames` takes it.
+    opened.append(Opened(opened[0].path, read_truth_frames(opened[0].path).numbered(4, 9)))
+    return opened
+
+
+def test_several_processes_give_the_answers_of_one(sources, monkeypatch):
+    monkeypatch.setattr(evaluation, "_WORTH_PROCESSES", 1)
+    names = evaluation.default_names(sources, with_model=False)
+    told: dict[int, list] = {1: [], 2: []}
+    one, two = (
+        evaluation.evaluate(
+            sources, names, None, workers=n, progress=lambda *done, told=told[n]: told.append(done)
+        )
+        for n in (1, 2)
+    )
+    assert one.comparison.as_dict() == two.comparison.as_dict()
+    assert one.files == two.files
+    frames = [len(source.frames) for source in sources if source.frames is not None]
+    assert told[1][-1] == ("drive", frames[-1], frames[-1]) and len(told[1]) == sum(frames)
+    assert told[2] == [("sources", done, 3) for done in (1, 2, 3)]
+
+
+def test_few_frames_are_not_worth_processes(sources, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("processes were started")
+
+    monkeypatch.setattr("datagen.jobs.run_jobs", refuse)
+    found = evaluation.evaluate(sources, ("hough",), None, workers=2).comparison.as_dict()
+    assert np.isfinite(found["detectors"]["hough"]["groups"]["all"]["rmse_cm"])
+
+
+def test_a_broken_frame_is_named_by_another_process_too(sources, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "_WORTH_PROCESSES", 1)
+    drive = tmp_path / "drive"
+    simulate_drive(SimulationSettings(seed=3, frames=4, camera=CameraSettings(width=160, height=120)), drive)
+    broken = sorted((drive / "images").iterdir())[2]
+    broken.write_bytes(b"no picture")
+    with pytest.raises(DriveFormatError, match=broken.name):
+        evaluation.evaluate(
+            [sources[0], Opened(drive, read_truth_frames(drive))], ("hough",), None, workers=2
+        )
