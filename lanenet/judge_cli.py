@@ -144,7 +144,22 @@ def judge(
             console.show_table(table_title(settings, kind), headers, rows)
     paths = write_report(out, settings, results)
     console.wrote(*paths, _draw_pictures(settings, entrants, results, out))
-    console.next_command("judge", "--law", "own", "--out", "DIR")
+    again = {
+        "--detectors": detectors,
+        "--model": model,
+        "--tracks": tracks,
+        "--count": count,
+        "--laps": laps,
+        "--speed": speed,
+        "--law": "proportional" if settings.pilot.law == "own" else "own",
+        "--no-put-back": put_back is False,
+        "--put-back": put_back is True,
+        "--seed": seed,
+        "--any-camera": any_camera,
+        "--config": config,
+        "--out": "DIR",
+    }
+    console.next_command("judge", *console.given(again))
 
 
 def pilot_builder(text: str, model: Path | None, lane_width_cm: float) -> BuildPilot:

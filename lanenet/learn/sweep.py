@@ -12,7 +12,7 @@ from typing import Any
 
 from lanenet.data.files import require, write_text
 from lanenet.data.label_set import LabelSet, read_labels
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.dataset import LaneSamples, check_same
@@ -72,9 +72,14 @@ def sweep(
         The table, as Markdown.
 
     Raises:
+        ConfigError: If the network is AlexNet.
         MissingExtraError: If optuna is not installed.
         LabelFormatError: If the label sets cannot be read or learned together.
     """
+    if settings.network.kind == "alexnet":
+        raise ConfigError(
+            "learn.network.kind: found alexnet, expected a compact network: its size is what is tried"
+        )
     optuna: Any = require("optuna", "sweep")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     deadline = time.monotonic() + seconds

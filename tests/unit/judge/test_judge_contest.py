@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import cv2
@@ -190,6 +191,9 @@ def test_the_verb_judges_writes_and_draws(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*command, "--config", str(config), "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert "painter" in result.stdout and "furthest" in result.stdout
+    # What to try next is this contest by another law, not another contest.
+    suggested = shlex.split(result.stdout.replace("\n", " ").split("next: lanenet ")[1])
+    assert suggested == [*command[:-2], "--law", "own", "--config", str(config), "--out", "DIR"]
     data = json.loads((out / "results.json").read_text())
     assert data["format"] == "lanenet-judge/1"
     assert data["settings"]["tracks"] == ["open"] and data["settings"]["simulation"]["camera"]["width"] == 48

@@ -6,7 +6,7 @@ import torch
 from synthetic_labels import make_label_set
 
 from lanenet.data.label_set import write_labels
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
 from lanenet.learn.config import LearnSettings, LossSettings, NetworkSettings
@@ -160,3 +160,10 @@ def test_tables():
 
 def test_without_trials_there_is_a_table_without_rows():
     assert trials_table([], ("loss",)).startswith("0 trials to the end, 0 given up early")
+
+
+def test_alexnet_is_refused_before_anything_is_read(tmp_path):
+    settings = LearnSettings(network=NetworkSettings(kind="alexnet"))
+    with pytest.raises(ConfigError, match="alexnet"):
+        sweep(settings, [tmp_path / "none.parquet"], [tmp_path / "none.parquet"], tmp_path, 1.0, 1)
+    assert not list(tmp_path.iterdir())
