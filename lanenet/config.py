@@ -81,9 +81,10 @@ def load_settings(schema: type[SettingsT], path: Path, overrides: list[str] | No
     """Read ``path``, apply overrides and check the result against ``schema``.
 
     Raises:
-        ConfigError: Naming the file, the key, what was found and what was expected.
+        ConfigError: Naming the file and the overrides, the key, what was found and what was expected.
     """
-    return check_settings(schema, apply_overrides(read_yaml(path), overrides or []), str(path))
+    where = " ".join([str(path), *(overrides or [])])
+    return check_settings(schema, apply_overrides(read_yaml(path), overrides or []), where)
 
 
 def check_settings(schema: type[SettingsT], data: dict[str, Any], where: str) -> SettingsT:

@@ -9,6 +9,7 @@ import typer
 
 from lanenet import console
 from lanenet.errors import ConfigError
+from lanenet.outputs import check_ending
 
 app = typer.Typer()
 
@@ -34,6 +35,8 @@ def export(
     ] = False,
 ) -> None:
     """Write a checkpoint as one ONNX file, checked against PyTorch."""
+    if out is not None:
+        check_ending(out, ".onnx")
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch, expected it without --int8")
     if int8:

@@ -207,6 +207,8 @@ def analyse(
         check_ending(out, ".png")
     analysis = analyse_errors(read_camera(camera))
     console.show_table(str(camera), ("", "found", "paper"), figures(analysis))
+    ahead_cm = analysis.settings.lookahead_cm
+    typer.echo(f"L and R: the middles of the lane's two lines, {ahead_cm:g} cm ahead; -: not seen")
     if out is not None:
         with atomic_file(out) as temporary:
             temporary.write_bytes(png_bytes(draw_analysis(analysis)))

@@ -215,6 +215,12 @@ def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[
 def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
     """The model, if the first path is one, and the sources."""
     first, *sources = paths
+    misplaced = next((path for path in sources if path.exists() and is_model(path)), None)
+    if misplaced is not None:
+        raise ConfigError(
+            f"{misplaced}: is a model, expected a simulated drive, map or label set; the model comes first "
+            "(lanenet val MODEL SOURCE), more of them with --also"
+        )
     if not is_model(first):
         return None, paths
     if not sources:

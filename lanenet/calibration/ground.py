@@ -175,8 +175,8 @@ def _check_answer(answer: GroundCalibration) -> None:
     limit = _MAX_RMS_SHARE * camera.width
     if 2 * answer.used.sum() < len(answer.used) + 1 or not answer.rms_px <= limit:
         raise CalibrationError(
-            f"the points contradict each other or the lens: {answer.used.sum()} of {len(answer.used)} agree, "
-            f"within {answer.rms_px:.4g} px (expected more than half, within {limit:.1f} px)"
+            f"the points contradict each other or the lens: {answer.used.sum()} of {len(answer.used)} used, "
+            f"{answer.rms_px:.4g} px off (RMS); expected more than half, and at most {limit:.1f} px"
         )
     if abs(mounting.yaw_rad) > _MAX_YAW_RAD and mounting.pitch_down_rad < _DOWN_RAD:
         side, turn = "left" if mounting.yaw_rad > 0.0 else "right", abs(np.rad2deg(mounting.yaw_rad))

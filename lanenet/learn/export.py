@@ -25,7 +25,7 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
-from lanenet.perception.checkpoint import MARKER_NAME, MODEL_NAME
+from lanenet.perception.checkpoint import MARKER_NAME, MODEL_NAME, is_model, without_model
 from lanenet.perception.model_file import BATCH_NAME, WIDTH_NAME
 from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 
@@ -142,7 +142,11 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         CheckpointError: If a file is missing, cannot be read, or the weights do not fit the config.
     """
     if not checkpoint.is_dir():
-        raise CheckpointError(f"{checkpoint}: no such folder, expected a checkpoint")
+        found = "is a file" if checkpoint.exists() else "no such folder"
+        raise CheckpointError(f"{checkpoint}: {found}, expected a checkpoint folder")
+    # Without its config or its weights alone it is a broken one, which is told below.
+    if not is_model(checkpoint) and not any((checkpoint / n).is_file() for n in (CONFIG_NAME, WEIGHTS_NAME)):
+        raise CheckpointError(f"{checkpoint}: expected a checkpoint: {without_model(checkpoint)}")
     check_marker(checkpoint)
     try:
         settings = load_settings(LearnSettings, checkpoint / CONFIG_NAME)

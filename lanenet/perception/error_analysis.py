@@ -137,7 +137,7 @@ def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> 
 def figures(analysis: ErrorAnalysis) -> list[tuple[str, str, str]]:
     """Return rows of name, value and the paper's value for its camera, for a table."""
     left, right = analysis.line_pixels
-    sideways = f"{10.0 * analysis.line_cm_per_px[0]:.1f}, {10.0 * analysis.line_cm_per_px[1]:.1f}"
+    sideways = ", ".join(_shown(10.0 * cm) for cm in analysis.line_cm_per_px)
     degrees = math.degrees(analysis.steering_error_rad)
     return [
         (
@@ -146,9 +146,14 @@ def figures(analysis: ErrorAnalysis) -> list[tuple[str, str, str]]:
             "10, 24",
         ),
         ("mm per pixel, sideways, at L and R", sideways, "6"),
-        ("position error with the filter's grid, mm", f"{10.0 * analysis.position_error_cm:.1f}", "<= 10"),
-        (f"steering error at {analysis.settings.lookahead_cm:g} cm, degrees", f"{degrees:.1f}", "3.8"),
+        ("position error with the filter's grid, mm", _shown(10.0 * analysis.position_error_cm), "<= 10"),
+        (f"steering error at {analysis.settings.lookahead_cm:g} cm, degrees", _shown(degrees), "3.8"),
     ]
+
+
+def _shown(value: float) -> str:
+    """A figure, or a dash where the place that it is of is not seen."""
+    return f"{value:.1f}" if math.isfinite(value) else "-"
 
 
 def _cells_of(points_cm: np.ndarray, cell_cm: float, half_columns: int) -> np.ndarray:

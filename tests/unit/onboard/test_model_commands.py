@@ -140,6 +140,26 @@ def test_a_folder_of_checkpoints_is_refused_by_what_is_in_it(tmp_path: Path, dri
         assert named in error_of(run(*words)), words
 
 
+def test_a_model_in_the_place_of_a_source_is_told_where_it_belongs(drive: Path) -> None:
+    for words in (("val", drive, CHECKPOINT), ("val", CHECKPOINT, CHECKPOINT / "model.onnx")):
+        line = error_of(run(*words))
+        assert f"{words[-1]}: is a model" in line and "lanenet val MODEL SOURCE" in line
+
+
+def test_export_says_what_is_no_checkpoint(tmp_path: Path) -> None:
+    file = CHECKPOINT / "model.onnx"
+    assert f"{file}: is a file, expected a checkpoint folder" in error_of(run("export", file))
+    line = error_of(run("export", CHECKPOINT.parent))
+    assert "neither model.onnx nor checkpoint.yaml" in line and "small" in line
+    assert "ends in .onnx" in error_of(run("export", CHECKPOINT, "--out", tmp_path / "m.txt"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_override_is_named(simulation: Path, tmp_path: Path) -> None:
+    line = error_of(run("simulate", simulation, "sed=3", "--out", tmp_path / "d"))
+    assert f"{simulation} sed=3: unknown key 'sed'" in line
+
+
 def test_labels_of_another_camera_are_refused_as_its_frames_are(tmp_path: Path, simulation: Path) -> None:
     known, other = META.camera_hashes[0], "e" * 16
     labels = label_set(tmp_path / "l.parquet", other)
