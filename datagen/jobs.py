@@ -36,7 +36,9 @@ def run_jobs(
         LanenetError: If a process dies or the memory does not suffice; names the job, or those that were
             being done. What ``work`` raises is passed on.
     """
-    if workers == 1 or len(jobs) == 1:
+    # A pool starts all of its processes at once, also those that will have nothing to do.
+    workers = min(workers, len(jobs))
+    if workers <= 1:
         results = []
         for name, job in jobs:
             try:

@@ -21,7 +21,7 @@ def sources(tmp_path_factory) -> list[Opened]:
             SimulationSettings(seed=seed, frames=12, camera=CameraSettings(width=160, height=120)), folder
         )
         opened.append(Opened(folder, read_truth_frames(folder)))
-    # A part of a drive, as `val --frames` takes it.
+    # A part of a drive, as the test part of a recording is.
     opened.append(Opened(opened[0].path, read_truth_frames(opened[0].path).numbered(4, 9)))
     return opened
 
