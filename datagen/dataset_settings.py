@@ -13,6 +13,7 @@ from datagen.world.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings
 from lanenet.config import Settings
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.perception.birdseye import COLOUR_WEIGHT
 
 
 class SyntheticSettings(Settings):
@@ -91,6 +92,7 @@ class DataSettings(Settings):
         drives: Recorded drives.
         map: Settings for mapping the synthetic drives.
         window: The patch of road that the network sees: wide enough for the lane's lines on either side.
+        colour_weight: What colours count beside brightness in the network's edges; maps go by gray.
         workers: Processes that simulate, map and evaluate; 0 takes one per core.
     """
 
@@ -98,6 +100,7 @@ class DataSettings(Settings):
     drives: tuple[RecordedSettings, ...] = ()
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
+    colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)
     workers: int = Field(default=0, ge=0)
 
     @property

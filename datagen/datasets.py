@@ -81,6 +81,7 @@ def prepare(settings: DataSettings, work_dir: Path, progress: Progress | None = 
             "kind": "recorded",
             "settings": drive,
             "window": settings.window,
+            "colour_weight": settings.colour_weight,
             "folder": work_dir / "drives",
         }
         jobs.append(recorded)
@@ -188,6 +189,7 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
         # The simulated camera does not see its car.
         "map": settings.map.model_copy(update={"find_bumper": False}),
         "window": settings.window,
+        "colour_weight": settings.colour_weight,
         "folder": work_dir / "synthetic",
     }
 
@@ -200,7 +202,7 @@ def _run_job(job: dict[str, Any]) -> dict[Role, Path] | str:
     if job["kind"] == "synthetic":
         made = _synthetic_labels(job)
         return made if isinstance(made, str) else {job["role"]: made}
-    return _recorded_labels(job["settings"], job["window"], job["folder"])
+    return _recorded_labels(job["settings"], job["window"], job["colour_weight"], job["folder"])
 
 
 def _synthetic_labels(job: dict[str, Any]) -> Path | str:
@@ -208,7 +210,8 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
     simulation: SimulationSettings = job["simulation"]
     drive, drive_map = folder / "drives" / job["name"], folder / "maps" / job["name"]
     labels = folder / "labels" / f"{job['name']}.parquet"
-    parts = [simulation.model_dump(mode="json"), job["role"], asdict(job["window"])]
+    window, colour_weight = job["window"], job["colour_weight"]
+    parts = [simulation.model_dump(mode="json"), job["role"], asdict(window), colour_weight]
     # The truth needs no map, but its edges are found in the same way.
     mapping: MapSettings = job["map"]
     parts.append((mapping.perception if job["role"] == "test" else mapping).model_dump(mode="json"))
@@ -225,14 +228,12 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
         seed = first_world(simulation).settings.seed
         simulate_drive(simulation.model_copy(update={"seed": seed}), drive)
         if job["role"] == "test":
-            truth = truth_labels(drive, mapping.perception, job["window"], simulation.track.line_width_cm)
-            write_labels(labels, truth)
+            perception = mapping.perception.with_colours(colour_weight)
+            write_labels(labels, truth_labels(drive, perception, window, simulation.track.line_width_cm))
         else:
             lane_cm, pictures = simulation.track.lane_width_cm, job["pictures"]
             map_drive(drive, lane_cm, None, mapping, drive_map, pictures=pictures)
-            label_map(
-                drive_map, labels, perception=mapping.perception, window=job["window"], pictures=pictures
-            )
+            label_map(drive_map, labels, window=window, colour_weight=colour_weight, pictures=pictures)
     except (TrackingLostError, CalibrationError, ConfigError) as error:
         if not job["may_fail"]:
             raise
@@ -243,11 +244,13 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
     return labels
 
 
-def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder: Path) -> dict[Role, Path]:
+def _recorded_labels(
+    settings: RecordedSettings, window: BirdseyeWindow, colour_weight: float, folder: Path
+) -> dict[Role, Path]:
     """Map and label a recorded drive, and split it: to learn from, to choose by, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
-    inputs = [settings.model_dump(mode="json"), asdict(window), fingerprint(settings.path)]
+    inputs = [settings.model_dump(mode="json"), asdict(window), colour_weight, fingerprint(settings.path)]
     if settings.camera is not None and settings.camera.is_file():
         inputs.append(fingerprint(settings.camera))
     key = key_of(inputs)
@@ -257,7 +260,7 @@ def _recorded_labels(settings: RecordedSettings, window: BirdseyeWindow, folder:
     if not (is_done(whole, key) and all(path.is_file() for path in parts.values())):
         forget_done(whole)
         map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
-        label_map(drive_map, whole, window=window)
+        label_map(drive_map, whole, window=window, colour_weight=colour_weight)
         pieces = _split(read_labels(whole), settings)
         for path, piece in zip(parts.values(), pieces, strict=True):
             write_labels(path, piece)

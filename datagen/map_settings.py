@@ -30,7 +30,7 @@ class MapSettings(Settings):
         seed: Of the particle filter.
         find_bumper: Look for the car's own parts at the bottom of the picture and leave those rows out,
             unless ``perception.range.bottom_rows`` says how many they are.
-        perception: How edge points are found.
+        perception: How the map's edge points are found, and but for colours those of its labels.
         guess: First guess of an unknown camera.
         odometry: Motion from picture to picture.
         filter: Particle filter.

@@ -30,7 +30,7 @@ from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.birdseye import COLOUR_WEIGHT, RoadEdgeExtractor
 
 
 def label_map(
@@ -39,7 +39,7 @@ def label_map(
     progress: Progress | None = None,
     *,
     drive_path: Path | None = None,
-    perception: PerceptionSettings | None = None,
+    colour_weight: float = COLOUR_WEIGHT,
     window: BirdseyeWindow | None = None,
     force: bool = False,
     pictures: bool = True,
@@ -53,7 +53,8 @@ def label_map(
         out: Parquet file.
         progress: Called with (done, total).
         drive_path: Where the drive is now, if it has moved since it was mapped.
-        perception: How the network's edge points are found; None takes what the map was made with.
+        colour_weight: What colours count beside brightness in the edges that the network sees; else they are
+            found as the map's were.
         window: The network's window.
         force: Label a map that was rejected, too.
         pictures: Draw the contact sheet.
@@ -62,7 +63,7 @@ def label_map(
     drive_map, drive = mapped.drive_map, mapped.drive
     if not force:
         refuse_rejected(map_folder, drive_map)
-    perception = mapped.perception if perception is None else perception
+    perception = mapped.perception.with_colours(colour_weight)
     window = BirdseyeWindow() if window is None else window
     extractor = RoadEdgeExtractor(drive_map.camera, perception)
     rows: list[int] = []

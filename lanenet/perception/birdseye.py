@@ -16,6 +16,10 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.colour import PixelScale
 from lanenet.perception.edges import EdgePixels, EdgeSettings, check_frame, find_edges, sample_pixels
 
+#: What colours count beside brightness in what networks see. Maps, which see each line in many frames, gain
+#: nothing by colours but the edges of coloured things beside the road.
+COLOUR_WEIGHT = 0.75
+
 
 class RangeSettings(Settings):
     """Which part of the image counts as road.
@@ -40,6 +44,10 @@ class PerceptionSettings(Settings):
 
     edges: EdgeSettings = EdgeSettings()
     range: RangeSettings = RangeSettings()
+
+    def with_colours(self, weight: float = COLOUR_WEIGHT) -> PerceptionSettings:
+        """Return the same with edges by colour as well: what networks see, where maps go by gray alone."""
+        return self.model_copy(update={"edges": self.edges.model_copy(update={"colour_weight": weight})})
 
 
 @dataclass(frozen=True)

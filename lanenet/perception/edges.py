@@ -13,9 +13,12 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.errors import DriveFormatError
 from lanenet.perception.colour import ColourSettings, PixelScale, colour_edges
-from lanenet.perception.edge_pixels import EdgePixels, edge_pixels, gradients
+from lanenet.perception.edge_pixels import EdgePixels, edge_pixels, gradients, prefer_stronger
 
 __all__ = ["EdgePixels", "EdgeSettings", "check_frame", "find_edges", "sample_pixels", "to_gray"]
+
+# Gray is mostly green.
+_BLUE, _RED = 0, 2
 
 
 class EdgeSettings(Settings):
@@ -23,9 +26,10 @@ class EdgeSettings(Settings):
 
     ``canny`` is the paper's detector: fixed thresholds, whole pixels. ``directional`` raises the thresholds
     with the contrast of the frame, so that soft mirror images of lamps fall below them where the tape is
-    bright, and moves each edge along its gradient to the sub-pixel maximum. ``colour`` finds strips that are
-    brighter or yellower than the road beside them, drops those that are too thick, too round or too soft for
-    a marking, and gives the sub-pixel edges of the rest.
+    bright, and moves each edge along its gradient to the sub-pixel maximum; with a weight for colours it
+    finds yellow tape on a floor that is as bright, too. ``colour`` finds strips that are brighter or yellower
+    than the road beside them, drops those that are too thick, too round or too soft for a marking, and gives
+    the sub-pixel edges of the rest.
 
     Attributes:
         method: The detector.
@@ -34,6 +38,9 @@ class EdgeSettings(Settings):
         high: Upper threshold.
         contrast_share: ``directional``: the upper threshold is at least this share of the 99th percentile of
             the frame's Sobel responses; the lower one keeps its ratio.
+        colour_weight: ``directional``: how much yellower or redder the picture gets takes the place of how
+            much brighter where its Sobel response times this is the stronger one; 0 looks at gray alone, as
+            maps do. Below 1, since pictures hold colours more coarsely than brightness.
         colour: ``colour``: what counts as a marking.
     """
 
@@ -42,6 +49,7 @@ class EdgeSettings(Settings):
     low: float = Field(default=40.0, gt=0.0)
     high: float = Field(default=80.0, gt=0.0)
     contrast_share: float = Field(default=0.3, ge=0.0, lt=1.0)
+    colour_weight: float = Field(default=0.0, ge=0.0, le=1.0)
     colour: ColourSettings = ColourSettings()
 
 
@@ -74,6 +82,9 @@ def find_edges(
     dx, dy = gradients(gray, settings.blur_px)
     raised = 1.0
     if settings.method == "directional":
+        if frame_bgr.ndim == 3 and settings.colour_weight > 0.0:
+            for hue_dx, hue_dy in _hue_gradients(frame_bgr, dx, dy, settings.blur_px):
+                prefer_stronger(dx, dy, hue_dx, hue_dy, settings.colour_weight, settings.low)
         if sample is None:
             sample = sample_pixels(np.ones_like(gray) if keep is None else keep)
         raised = max(1.0, settings.contrast_share * _strong_response(dx, dy, sample) / settings.high)
@@ -81,6 +92,21 @@ def find_edges(
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
     return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional")
+
+
+def _hue_gradients(
+    frame_bgr: UInt8[np.ndarray, "h w 3"],
+    dx: Int16[np.ndarray, "h w"],
+    dy: Int16[np.ndarray, "h w"],
+    blur_px: int,
+) -> list[tuple[Int16[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]]:
+    """Sobel responses of yellow and of red, of which white, gray and black have none.
+
+    Gray less blue, and red less gray: both grow towards the inside of yellow tape as brightness does towards
+    that of white tape, so that the direction of an edge means the same.
+    """
+    blue, red = (gradients(cv2.extractChannel(frame_bgr, channel), blur_px) for channel in (_BLUE, _RED))
+    return [(dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)]
 
 
 def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:

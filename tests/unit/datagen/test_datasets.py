@@ -234,7 +234,7 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
     ) -> None:
         made.append("map")
 
-    def label_map(drive_map: Path, out: Path, window: BirdseyeWindow) -> None:
+    def label_map(drive_map: Path, out: Path, window: BirdseyeWindow, colour_weight: float) -> None:
         write_labels(out, _labels(np.arange(400)))
 
     monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
@@ -246,9 +246,11 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
     recorded = RecordedSettings(path=drive, lane_width_cm=40.0, camera=camera)
     window, folder = BirdseyeWindow(), tmp_path / "work"
 
-    def times(recorded: RecordedSettings, window: BirdseyeWindow = window) -> int:
+    def times(
+        recorded: RecordedSettings, window: BirdseyeWindow = window, colour_weight: float = 0.75
+    ) -> int:
         """How often the drive was mapped so far, after asking for its labels once more."""
-        parts = _recorded_labels(recorded, window, folder)
+        parts = _recorded_labels(recorded, window, colour_weight, folder)
         assert [len(read_labels(parts[role])) for role in ("train", "validation", "test")] == [240, 20, 60]
         return len(made)
 
@@ -265,6 +267,7 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
     next((folder / "labels").glob("*.validation.parquet")).unlink()
     assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
     assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0), colour_weight=0.0) == 8
 
 
 def test_a_recording_is_listed_once(tmp_path):

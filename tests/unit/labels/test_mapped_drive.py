@@ -125,7 +125,7 @@ def test_labels_are_those_of_the_label_set(folder, tmp_path):
 
 
 def test_a_test_part_is_opened_with_its_own_frames_only(folder, tmp_path):
-    label_map(folder, tmp_path / "whole.parquet", perception=PerceptionSettings())
+    label_map(folder, tmp_path / "whole.parquet", colour_weight=0.5)
     part = tmp_path / "part.parquet"
     write_labels(part, read_labels(tmp_path / "whole.parquet").subset(slice(18, None)))
     (opened,) = open_tests([part], [folder])
@@ -134,7 +134,7 @@ def test_a_test_part_is_opened_with_its_own_frames_only(folder, tmp_path):
     np.testing.assert_array_equal(opened.frames.frames, labels.frame)
     np.testing.assert_array_equal(opened.frames.points_cm, labels.points_cm)
     # Edges are found as the label set's were, which is how the model was trained.
-    assert opened.frames.perception == PerceptionSettings()
+    assert opened.frames.perception == open_mapped_drive(folder).perception.with_colours(0.5)
     (without,) = open_tests([part], [tmp_path / "gone"])
     assert without.path == part and without.frames is None
 
