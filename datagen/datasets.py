@@ -196,9 +196,6 @@ def _synthetic_job(settings: DataSettings, role: Role, number: int, work_dir: Pa
 
 def _run_job(job: dict[str, Any]) -> dict[Role, Path] | str:
     """Make one drive's label sets, or say why it has none; runs in a process of its own."""
-    import cv2
-
-    cv2.setNumThreads(1)
     if job["kind"] == "synthetic":
         made = _synthetic_labels(job)
         return made if isinstance(made, str) else {job["role"]: made}

@@ -50,7 +50,7 @@ def run_jobs(
         return results
     # Spawned, because forking a process that has started torch's or OpenCV's threads can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_take_one_core) as pool:
         names = {pool.submit(work, job): name for name, job in jobs}
         try:
             for done, future in enumerate(as_completed(names), start=1):
@@ -68,9 +68,19 @@ def run_jobs(
     return [future.result() for future in names]
 
 
+def _take_one_core() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
 def _out_of_memory(name: str, workers: int) -> LanenetError:
-    fewer = f"; fewer at a time need less (data.workers, now {workers})" if workers > 1 else ""
+    fewer = f"; fewer at a time need less ({_at_a_time(workers)})" if workers > 1 else ""
     return LanenetError(f"{name}: the memory does not suffice for this drive{fewer}")
+
+
+def _at_a_time(workers: int) -> str:
+    return f"now {workers}; training takes data.workers, or one per core"
 
 
 def _died(names: dict[Future[ResultT], str], workers: int) -> LanenetError:
@@ -78,9 +88,9 @@ def _died(names: dict[Future[ResultT], str], workers: int) -> LanenetError:
     unfinished = [name for future, name in names.items() if _has_failed(future)]
     begun = " or ".join(unfinished[:workers])
     return LanenetError(
-        f"{begun}: the process that was making this drive was killed, most often because the memory does not "
-        f"suffice; expected {workers} processes at a time to fit (data.workers). What is done is kept: run "
-        "the command again"
+        f"{begun}: the process at work on this drive was killed, most often because the memory does not "
+        f"suffice; fewer at a time need less ({_at_a_time(workers)}). Drives that are done are kept: run the "
+        "command again"
     )
 
 

@@ -12,11 +12,12 @@ from jaxtyping import Float, UInt8
 
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import LabelFormatError
-from lanenet.perception.draw import draw_estimate
+from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR, draw_estimate
 from lanenet.perception.estimate import LaneEstimate
 
 _TILE_WIDTH_PX = 400
 _COLUMNS = 4
+_LEGEND_PX = 24
 #: Neighbours look alike: of frames this close only the worst is shown.
 _APART_FRAMES = 15
 _JPEG_QUALITY = 88
@@ -69,7 +70,9 @@ def draw_worst(
     answers_cm: Sequence[Float[np.ndarray, "_ 6"]],
     worst: Sequence[WorstFrame],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw frames side by side: the labels in magenta, the answer in green (left) and orange (right).
+    """Draw frames side by side, and below them what the colours mean.
+
+    The labels are magenta, the answer is green (left) and orange (right).
 
     Args:
         sources: As for :func:`find_worst`.
@@ -99,7 +102,18 @@ def draw_worst(
     columns = min(_COLUMNS, len(tiles))
     while len(tiles) % columns:
         tiles.append(np.zeros_like(tiles[0]))
-    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    return np.vstack([*rows, _legend(rows[0].shape[1])])
+
+
+def _legend(width_px: int) -> UInt8[np.ndarray, "h w 3"]:
+    strip = np.zeros((_LEGEND_PX, width_px, 3), dtype=np.uint8)
+    x = y = _LEGEND_PX // 3
+    for text, colour in (("labels", TRUTH_BGR), ("answer: left", LEFT_BGR), ("right", RIGHT_BGR)):
+        font, size = cv2.FONT_HERSHEY_SIMPLEX, _LEGEND_PX / 50.0
+        cv2.putText(strip, text, (x, _LEGEND_PX - y), font, size, colour, 1, cv2.LINE_AA)
+        x += cv2.getTextSize(text, font, size, 1)[0][0] + _LEGEND_PX // 2
+    return strip
 
 
 def jpeg_bytes(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:

@@ -14,7 +14,7 @@ from lanenet.onboard.compare import COMPARED, answer_frames, build_compared, cho
 from lanenet.onboard.safety import SafetySettings
 from lanenet.onboard.worst_frames import WorstFrame, draw_worst, find_worst, jpeg_bytes
 from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
-from lanenet.perception.draw import TRUTH_BGR
+from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.hough.tracker import HoughTracker
 from lanenet.perception.lane_filter import LaneFilter
@@ -170,15 +170,18 @@ def test_the_sheet_shows_truth_and_answer():
     worst = find_worst([source], [answer], 2)
     sheet = draw_worst([source], [answer], worst)
     height, width = source.camera.height, source.camera.width
-    assert sheet.shape == (height, 2 * width, 3)
+    tiles, legend = sheet[:height], sheet[height:]
+    assert tiles.shape == (height, 2 * width, 3)
 
     def is_magenta(picture):
         return (np.abs(picture.astype(int) - TRUTH_BGR) < 60).all(axis=2).sum()
 
-    assert is_magenta(sheet) > 100
+    assert is_magenta(tiles) > 100
+    for colour in (TRUTH_BGR, LEFT_BGR, RIGHT_BGR):
+        assert (np.abs(legend.astype(int) - colour) < 60).all(axis=2).sum() > 10
     # Where the answer is exact it covers the truth.
     exact = draw_worst([source], [source.points_cm], [WorstFrame(0, 1, 0.0)])
-    assert is_magenta(exact) < 0.2 * is_magenta(sheet[:, :width])
+    assert is_magenta(exact[:height]) < 0.2 * is_magenta(tiles[:, :width])
     assert jpeg_bytes(sheet)[:2] == b"\xff\xd8"
 
 
@@ -187,6 +190,8 @@ def test_tiles_of_another_camera_are_fitted_in():
     answers = [large.points_cm, small.points_cm]
     five = [WorstFrame(1, 0, 1.0), *(WorstFrame(0, k, 1.0) for k in range(3)), WorstFrame(1, 2, 1.0)]
     sheet = draw_worst([large, small], answers, five)
-    first = draw_worst([large, small], answers, five[:1])
-    assert sheet.shape == (2 * first.shape[0], 4 * first.shape[1], 3)
-    assert not sheet[first.shape[0] :, first.shape[1] :].any()
+    height, width = small.camera.height, small.camera.width
+    scale = draw_worst([large, small], answers, five[:1]).shape[1] // width
+    height, width = scale * height, scale * width
+    assert sheet.shape[1] == 4 * width and 2 * height < sheet.shape[0] < 2 * height + 60
+    assert not sheet[height : 2 * height, width:].any()
