@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
     from lanenet.data.labelled_frames import LabelledFrames
     from lanenet.geometry.birdseye import BirdseyeWindow
+    from lanenet.perception.birdseye import PerceptionSettings
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,13 @@ class Opened:
         return content.meta.lane_width_cm if isinstance(content, LabelSet) else content.lane_width_cm
 
 
-def open_source(path: Path, window: BirdseyeWindow) -> Opened:
+def open_source(path: Path, window: BirdseyeWindow, perception: PerceptionSettings | None = None) -> Opened:
     """Open a label set, a map folder or a simulated drive.
 
     Args:
         path: Where it lies.
         window: Points of drives and maps beside this bird's-eye window have no label.
+        perception: How the edges of a simulated drive's label set are found; None takes the defaults.
 
     Raises:
         LanenetError: If it is none of these, or cannot be read.
@@ -86,7 +88,7 @@ def open_source(path: Path, window: BirdseyeWindow) -> Opened:
         return Opened(path, frames)
     from datagen.labels.truth import truth_labels
 
-    labels = truth_labels(path, window=window)
+    labels = truth_labels(path, perception, window)
     return Opened(path, _as_labelled(frames, labels), labels)
 
 
@@ -142,7 +144,8 @@ def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
             # A recorded drive was cut along its time; the network has learned from its first part.
             part = whole.numbered(int(label_set.frame[0]), int(label_set.frame[-1]))
             meta = label_set.meta
-            part = replace(part, perception=meta.perception, marking_cm=meta.marking_cm)
+            # As wherever the other detectors look at frames, they look at gray.
+            part = replace(part, perception=meta.perception.with_colours(0.0), marking_cm=meta.marking_cm)
             opened = Opened(frames_path, _as_labelled(part, label_set), label_set)
         sources.append(opened)
     return sources

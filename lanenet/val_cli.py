@@ -88,8 +88,9 @@ def val(
     if out is not None:
         for source in source_paths:
             check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
-    window = BirdseyeWindow() if model is None else read_model_meta(model).window
-    sources = [open_source(path, window) for path in source_paths]
+    meta = None if model is None else read_model_meta(model)
+    seen = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
+    sources = [open_source(path, *seen) for path in source_paths]
     names = _chosen(detectors, no_baselines, model, sources)
     if detectors is None and not no_baselines and any(source.frames is None for source in sources):
         console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])

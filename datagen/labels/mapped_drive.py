@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.labels.project import FrameLines, beside_line, label_rows, lines_of_frame
 from datagen.map_folder import DriveMap, read_map
@@ -229,5 +230,10 @@ def read_map_frames(
         frames=drive_map.frames,
         starts=mapped.starts,
         points_cm=points,
-        image=lambda i: drive.image(int(rows[i])),
+        image=partial(_image_of_row, drive, rows),
     )
+
+
+def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Frame i of a map; other processes can be given a module's function only."""
+    return drive.image(int(rows[i]))

@@ -36,6 +36,10 @@ class VideoImages:
         self._next = 0
         self._last: tuple[int, np.ndarray] | None = None
 
+    def __reduce__(self) -> tuple[type[VideoImages], tuple[Path]]:
+        """Another process opens the file again."""
+        return VideoImages, (self.path,)
+
     @property
     def listed_frames(self) -> int:
         """Number of frames as the header says; 0 if it does not."""

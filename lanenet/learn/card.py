@@ -57,8 +57,10 @@ def _what(meta: ModelMeta, metrics: Mapping[str, Any]) -> str:
     window = meta.window
     right_cm = window.left_cm + window.columns * window.cell_cm
     far_cm = window.near_cm + window.rows * window.cell_cm
+    seen = "brightness and colour" if meta.perception.edges.colour_weight else "brightness"
     return (
-        f"A network of {metrics['parameters']:,} weights. In: the bird's-eye edge image of {window.rows} x "
+        f"A network of {metrics['parameters']:,} weights. In: the bird's-eye image of the edges of {seen}, "
+        f"{window.rows} x "
         f"{window.columns} cells of {window.cell_cm:g} cm, from {window.left_cm:g} to {right_cm:g} cm across "
         f"and {window.near_cm:g} to {far_cm:g} cm ahead.\nOut: x of the left and the right line 0, 15 and "
         "30 cm ahead of the front axle, the uncertainty of each, and whether each line is there.\nLines "

@@ -17,7 +17,6 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
 from lanenet.learn.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
 from lanenet.learn.config import AugmentSettings, Balance
-from lanenet.perception.birdseye import PerceptionSettings
 from lanenet.perception.network import ANY_CAMERA
 
 #: From more cameras than this on, what was learned holds for any.
@@ -63,7 +62,7 @@ class LaneSamples:
         first = label_sets[0].meta
         self.window: BirdseyeWindow = first.window
         same = all(labels.meta.perception == first.perception for labels in label_sets)
-        self.perception = first.perception if same else _of_all_rows(first.perception)
+        self.perception = first.perception if same else first.perception.of_all_rows()
         self.reference = reference_of(label_sets)
         kept = [
             np.flatnonzero((labels.quality >= min_quality) & np.isfinite(labels.points_cm).any(axis=1))
@@ -220,17 +219,11 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
         raise LabelFormatError(
             f"{name_b}: window {b.window}, but {name_a} has {a.window}; label both with the same window"
         )
-    if _of_all_rows(a.perception) != _of_all_rows(b.perception):
+    if a.perception.of_all_rows() != b.perception.of_all_rows():
         raise LabelFormatError(
             f"{name_b}: its edges were found with {b.perception}, those of {name_a} with {a.perception}; "
             "label both with the same settings"
         )
-
-
-def _of_all_rows(perception: PerceptionSettings) -> PerceptionSettings:
-    """The same perception without the rows that one car has to leave out."""
-    rows = {"top_row": 0, "bottom_rows": 0}
-    return perception.model_copy(update={"range": perception.range.model_copy(update=rows)})
 
 
 def reference_of(label_sets: Sequence[LabelSet]) -> str:

@@ -12,6 +12,7 @@ from lanenet.data.label_set import LabelSet
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES
+from lanenet.perception.birdseye import PerceptionSettings
 from lanenet.perception.model_file import INPUT_NAME, WIDTH_NAME, open_model
 
 _CHUNK = 64
@@ -142,8 +143,8 @@ class RasterModel:
         # Models of the first kind tell points alone.
         self._names = [name for name in ("points_cm", "sigma_cm", "presence") if name in outputs]
 
-    def check_window(self, window: BirdseyeWindow) -> None:
-        """Refuse rasters of another window.
+    def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
+        """Refuse rasters of another window, or of edges that were found in another way.
 
         Raises:
             ModelMismatchError: Naming both.
@@ -152,6 +153,12 @@ class RasterModel:
             raise ModelMismatchError(
                 f"{self.path}: made for the window {self.meta.window}, but the label set has {window}; "
                 "give the map or the drive itself, which has edges for any window"
+            )
+        if perception.of_all_rows() != self.meta.perception.of_all_rows():
+            raise ModelMismatchError(
+                f"{self.path}: made for edges found with {self.meta.perception.edges}, but those of the "
+                f"label set were found with {perception.edges}; give the map or the drive itself, or label "
+                "it with another --colour-weight"
             )
 
     def answer(
@@ -184,9 +191,9 @@ class RasterModel:
         """Answer the frames of a label set, whose lane's width is known.
 
         Raises:
-            ModelMismatchError: If it has another window.
+            ModelMismatchError: If it has another window or other edges.
         """
-        self.check_window(labels.meta.window)
+        self.check_rasters(labels.meta.window, labels.meta.perception)
         rasters = [labels.raster(i)[None] for i in range(len(labels.points_cm))]
         lane_cm = np.full(len(rasters), labels.meta.lane_width_cm)
         return self.answer(np.array(rasters, np.uint8).reshape(-1, 1, *self._shape), lane_cm)

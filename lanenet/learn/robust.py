@@ -98,14 +98,14 @@ def measure_robustness(
 
     Raises:
         LabelFormatError: If a label set has no lane lines, or two have different windows.
-        ModelMismatchError: If a model has another window.
+        ModelMismatchError: If a model has another window or other edges.
     """
     for labels, name in zip(label_sets, names, strict=True):
         if not can_measure(labels):
             raise LabelFormatError(f"{name}: has no lane lines, expected a label set made of a map or a road")
     samples = LaneSamples(label_sets, names)
     for model in models.values():
-        model.check_window(samples.window)
+        model.check_rasters(samples.window, samples.perception)
     indices, ends = np.arange(len(samples)), samples.set_start[1:-1]
     rows = []
     for done, change in enumerate(CHANGES, start=1):

@@ -9,25 +9,34 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.dataset import hash_files
 from lanenet.learn.export import WEIGHTS_NAME, read_network
 from lanenet.learn.network import LaneNet
+from lanenet.perception.birdseye import PerceptionSettings
 
 
-def load_start_weights(network: LaneNet, folder: Path, window: BirdseyeWindow) -> None:
+def load_start_weights(
+    network: LaneNet, folder: Path, window: BirdseyeWindow, perception: PerceptionSettings
+) -> None:
     """Take over the weights of a checkpoint, with the mean and the spread of the labels that they belong to.
 
     Args:
         network: Network to change.
         folder: Checkpoint folder.
         window: Window of the rasters that the network will see.
+        perception: How their edges were found.
 
     Raises:
         CheckpointError: If the checkpoint cannot be read, is of another network or was made for another
-            window.
+            window or other edges.
     """
     start, meta = read_network(folder)
     if meta.window != window:
         raise CheckpointError(
             f"learn.start_from {folder}: was trained on the window {meta.window}, but the labels have "
             f"{window}; set data.window to the checkpoint's"
+        )
+    if meta.perception.of_all_rows() != perception.of_all_rows():
+        raise CheckpointError(
+            f"learn.start_from {folder}: was trained on edges found with {meta.perception.edges}, but those "
+            f"of the labels were found with {perception.edges}; set data.colour_weight to the checkpoint's"
         )
     weights = start.state_dict()
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}

@@ -138,7 +138,7 @@ class TrainingRun:
         self.network.scale_cm.copy_(torch.from_numpy(scale))
         self.network.spread_bins(samples.window.left_cm, samples.window.right_cm)
         if settings.start_from is not None:
-            load_start_weights(self.network, settings.start_from, samples.window)
+            load_start_weights(self.network, settings.start_from, samples.window, samples.perception)
         self.optimizer = new_optimizer(self.network, settings)
         self.step = 0
         self.history: list[EpochRecord] = []

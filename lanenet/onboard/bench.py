@@ -88,11 +88,12 @@ def time_stages(
     cv2.setNumThreads(threads)
     try:
         frames = example_frames(camera, 16, np.random.default_rng(0))
-        extractor = RoadEdgeExtractor(camera, PerceptionSettings())
-        lane_filter = LaneFilter(extractor, LaneFilterSettings(lane_width_cm=LANE_WIDTH_CM))
         network = None
         if model is not None:
             network = NetworkDetector(model, camera, any_camera=True, threads=threads)
+        perception = network.meta.perception if network is not None else PerceptionSettings()
+        extractor = RoadEdgeExtractor(camera, perception)
+        lane_filter = LaneFilter(extractor, LaneFilterSettings(lane_width_cm=LANE_WIDTH_CM))
         window = network.meta.window if network is not None else BirdseyeWindow()
         times_ms: dict[str, list[float]] = {}
         points: list[int] = []

@@ -49,6 +49,11 @@ class PerceptionSettings(Settings):
         """Return the same with edges by colour as well: what networks see, where maps go by gray alone."""
         return self.model_copy(update={"edges": self.edges.model_copy(update={"colour_weight": weight})})
 
+    def of_all_rows(self) -> PerceptionSettings:
+        """Return the same without the rows that one car has to leave out: what two cars have in common."""
+        rows = {"top_row": 0, "bottom_rows": 0}
+        return self.model_copy(update={"range": self.range.model_copy(update=rows)})
+
 
 @dataclass(frozen=True)
 class RoadEdges:

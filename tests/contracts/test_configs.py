@@ -146,7 +146,7 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
         assert lane_width_cm > 20.0
 
     def label_map(
-        drive_map: Path, out: Path, *, window: Any, perception: Any = None, pictures: bool = True
+        drive_map: Path, out: Path, *, window: Any, colour_weight: float, pictures: bool = True
     ) -> None:
         write_quick_labels(out, window, "map", drive_map.name)
 
@@ -221,8 +221,10 @@ def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> No
     from lanenet.learn.start import load_start_weights
 
     settings = read_training_run(path)
-    folder, window = settings.learn.start_from, settings.data.window
+    folder, data = settings.learn.start_from, settings.data
     if folder is None:
         pytest.skip("starts from random weights")
-    network = new_network(settings.learn.network, window.rows, window.columns, settings.learn.seed)
-    load_start_weights(network, CONFIGS.parent / folder, window)
+    network = new_network(settings.learn.network, data.window.rows, data.window.columns, settings.learn.seed)
+    # As labels are made: like the map, and by colours.
+    seen = data.map.perception.with_colours(data.colour_weight)
+    load_start_weights(network, CONFIGS.parent / folder, data.window, seen)

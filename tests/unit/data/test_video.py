@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import cv2
@@ -41,6 +42,12 @@ def test_frames_come_in_any_order(tmp_path: Path) -> None:
     drive = open_drive(write_video(tmp_path / "lap.avi"))
     order = [0, 1, 2, 2, 10, 39, 38, 0, 20, 21]
     assert [number_of(drive.image(i)) for i in order] == order
+
+
+def test_another_process_opens_the_video_again(tmp_path: Path) -> None:
+    drive = open_drive(write_video(tmp_path / "lap.avi"))
+    sent = pickle.loads(pickle.dumps(drive))
+    assert [number_of(sent.image(i)) for i in (7, 2)] == [7, 2]
 
 
 def test_drawing_on_a_frame_does_not_change_it(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from lanenet.data.label_set import write_labels
 from lanenet.evaluation import evaluate
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.labelled_sources import open_source, open_tests
+from lanenet.perception.birdseye import PerceptionSettings
 
 
 def _truth_of(tmp_path, driver: DriverSettings, seed: int):
@@ -76,7 +77,9 @@ def test_what_is_scored_is_what_the_labels_name(tmp_path):
     labels, _ = _truth_of(tmp_path, driver, 3)
     write_labels(tmp_path / "labels.parquet", labels)
     (source,) = open_tests([tmp_path / "labels.parquet"], [tmp_path / "drive"])
-    opened = open_source(tmp_path / "drive", BirdseyeWindow())
+    seen = PerceptionSettings().with_colours()
+    opened = open_source(tmp_path / "drive", BirdseyeWindow(), seen)
+    assert opened.beside is not None and opened.beside.meta.perception == seen
     assert np.isnan(labels.points_cm).all(axis=1).any()
     for found in (source.frames, opened.frames):
         assert found is not None

@@ -104,6 +104,9 @@ def test_the_file_answers_as_the_network_and_not_for_empty_rasters(checkpoint):
     assert np.isnan(found[1]).all()
     with pytest.raises(ModelMismatchError, match="window"):
         model.answer_labels(make_label_set(1, 0, window=BirdseyeWindow()))
+    in_colour = replace(labels, meta=replace(labels.meta, perception=labels.meta.perception.with_colours()))
+    with pytest.raises(ModelMismatchError, match=r"colour_weight=0\.0.*colour_weight=0\.75"):
+        model.answer_labels(in_colour)
 
 
 def test_a_file_that_differs_never_appears(tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ class ColumnModel(RasterModel):
         self.own_width_cm, self.guess_sigma_cm = own_width_cm, guess_sigma_cm
         self.told = []
 
-    def check_window(self, window):
+    def check_rasters(self, window, perception):
         if window != self.window:
             raise ModelMismatchError("another window")
 

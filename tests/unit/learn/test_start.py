@@ -15,7 +15,9 @@ from lanenet.learn.publish import publish
 from lanenet.learn.run_state import hash_run
 from lanenet.learn.start import load_start_weights
 from lanenet.learn.train import train
+from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 
+SEEN = PerceptionSettings()
 TINY = LearnSettings(epochs=3, batch_size=16, threads=1, network=NetworkSettings(channels=(4, 8), hidden=16))
 
 
@@ -37,7 +39,7 @@ def checkpoint(data, tmp_path_factory):
 
 def test_the_weights_are_those_of_the_checkpoint(checkpoint):
     network = new_network(TINY.network, WINDOW.rows, WINDOW.columns, 7)
-    load_start_weights(network, checkpoint, WINDOW)
+    load_start_weights(network, checkpoint, WINDOW, SEEN)
     expected = read_network(checkpoint)[0].state_dict()
     assert all(torch.equal(value, expected[name]) for name, value in network.state_dict().items())
 
@@ -73,7 +75,12 @@ def test_other_weights_are_another_run(data, checkpoint, tmp_path):
 def test_what_does_not_fit_is_refused(checkpoint):
     network = new_network(TINY.network, WINDOW.rows, WINDOW.columns, 0)
     with pytest.raises(CheckpointError, match=r"data\.window"):
-        load_start_weights(network, checkpoint, BirdseyeWindow(cell_cm=1.0))
+        load_start_weights(network, checkpoint, BirdseyeWindow(cell_cm=1.0), SEEN)
     other = new_network(NetworkSettings(channels=(4, 12), hidden=16), WINDOW.rows, WINDOW.columns, 0)
     with pytest.raises(CheckpointError, match=r"found weights .*shape .*learn.network"):
-        load_start_weights(other, checkpoint, WINDOW)
+        load_start_weights(other, checkpoint, WINDOW, SEEN)
+    # The rows that a car has to leave out are its own affair, how edges are found is not.
+    hidden = SEEN.model_copy(update={"range": RangeSettings(bottom_rows=9)})
+    load_start_weights(network, checkpoint, WINDOW, hidden)
+    with pytest.raises(CheckpointError, match=r"data\.colour_weight"):
+        load_start_weights(network, checkpoint, WINDOW, SEEN.with_colours())

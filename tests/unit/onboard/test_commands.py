@@ -25,6 +25,7 @@ from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.evaluate import RasterAnswers, RasterModel
 from lanenet.onboard.bench import example_camera, example_frames
+from lanenet.perception.birdseye import PerceptionSettings
 from lanenet.perception.model_file import ModelMeta
 
 
@@ -215,9 +216,11 @@ def test_label_hands_on_its_arguments(asked: Asked) -> None:
     result = run("label", "m/one", "--out", "one.parquet")
     assert result.exit_code == 0, result.output
     assert asked.calls["label"][:2] == (Path("m/one"), Path("one.parquet"))
-    assert asked.options["label"] == {"force": False}
+    assert asked.options["label"] == {"force": False, "colour_weight": 0.75}
+    assert run("label", "m/one", "--out", "one.parquet", "--colour-weight", "0").exit_code == 0
+    assert asked.options["label"]["colour_weight"] == 0.0
     assert run("label", "m/one", "--force", "--out", "one.parquet").exit_code == 0
-    assert asked.options["label"] == {"force": True}
+    assert asked.options["label"]["force"]
     assert ".parquet" in error_of(run("label", "m/one", "--out", "one.txt"))
 
 
@@ -283,7 +286,7 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             opened.append(path)
             self.meta = meta
 
-        def check_window(self, window: BirdseyeWindow) -> None:
+        def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
             assert window == BirdseyeWindow()
 
         def answer(self, rasters: np.ndarray, lane_cm: np.ndarray | None = None) -> RasterAnswers:

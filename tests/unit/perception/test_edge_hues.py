@@ -48,6 +48,14 @@ def test_white_tape_is_seen_by_its_brightness_on_any_floor(floor_bgr):
     assert len(gray.uv_px) >= 110
 
 
+def test_on_a_yellow_floor_edges_of_white_tape_face_its_inside():
+    found = find_edges(strip((235, 235, 235), (100, 180, 220)), COLOURS)
+    left = found.uv_px[:, 0] < 40.0
+    assert left.sum() >= 55 and (~left).sum() >= 55
+    np.testing.assert_allclose(found.normals[left, 0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(found.normals[~left, 0], -1.0, atol=1e-6)
+
+
 def test_a_gray_picture_has_no_hues():
     rng = np.random.default_rng(0)
     gray = cv2.GaussianBlur(rng.integers(0, 256, (60, 80), np.uint8), (5, 5), 0)
