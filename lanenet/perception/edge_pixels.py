@@ -48,8 +48,6 @@ def prefer_stronger(
 ) -> None:
     """Replace Sobel responses, in place, where others are stronger.
 
-    Where both are responses to an edge but of opposite directions, that of the replaced one stays.
-
     Args:
         dx: Responses along u, changed.
         dy: Responses along v, changed.
@@ -67,11 +65,8 @@ def prefer_stronger(
     at = np.flatnonzero(strength.reshape(-1) > int(least / weight))
     flat_dx, flat_dy = dx.reshape(-1), dy.reshape(-1)
     at = at[weight * strength.reshape(-1).take(at) > np.abs(flat_dx.take(at)) + np.abs(flat_dy.take(at))]
-    new_dx, new_dy = (np.rint(weight * other.reshape(-1).take(at)) for other in (other_dx, other_dy))
-    old_dx, old_dy = flat_dx.take(at), flat_dy.take(at)
-    opposite = (new_dx * old_dx + new_dy * old_dy < 0.0) & (np.abs(old_dx) + np.abs(old_dy) > least)
-    sign = np.where(opposite, -1.0, 1.0)
-    flat_dx[at], flat_dy[at] = sign * new_dx, sign * new_dy
+    flat_dx[at] = np.rint(weight * other_dx.reshape(-1).take(at))
+    flat_dy[at] = np.rint(weight * other_dy.reshape(-1).take(at))
 
 
 def edge_pixels(

@@ -103,8 +103,8 @@ def _hue_gradients(
     """Sobel responses of yellow and of red, of which white, gray and black have none.
 
     Gray less blue, and red less gray: both grow towards the inside of yellow tape as brightness does towards
-    that of white tape, so that the direction of an edge means the same. Where white tape lies on a yellow
-    floor, brightness has the say (:func:`prefer_stronger`).
+    that of white tape, so that the direction of an edge means the same. White tape on a floor that
+    is yellower than it is darker faces the floor; networks look at the place of edges alone.
     """
     blue, red = (gradients(cv2.extractChannel(frame_bgr, channel), blur_px) for channel in (_BLUE, _RED))
     return [(dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)]

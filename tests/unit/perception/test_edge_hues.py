@@ -40,7 +40,7 @@ def test_tape_as_bright_as_the_floor_shows_both_borders(tape_bgr):
 @pytest.mark.parametrize(
     "floor_bgr", [(60, 60, 60), (60, 100, 150), (150, 120, 40)], ids=["gray", "brown", "blue"]
 )
-def test_white_tape_is_seen_by_its_brightness_on_any_floor(floor_bgr):
+def test_white_tape_is_seen_by_its_brightness_on_floors_that_are_not_yellow(floor_bgr):
     frame = strip((235, 235, 235), floor_bgr)
     with_hues, gray = find_edges(frame, COLOURS), find_edges(frame, GRAY_ALONE)
     np.testing.assert_array_equal(with_hues.uv_px, gray.uv_px)
@@ -48,12 +48,11 @@ def test_white_tape_is_seen_by_its_brightness_on_any_floor(floor_bgr):
     assert len(gray.uv_px) >= 110
 
 
-def test_on_a_yellow_floor_edges_of_white_tape_face_its_inside():
-    found = find_edges(strip((235, 235, 235), (100, 180, 220)), COLOURS)
-    left = found.uv_px[:, 0] < 40.0
-    assert left.sum() >= 55 and (~left).sum() >= 55
-    np.testing.assert_allclose(found.normals[left, 0], 1.0, atol=1e-6)
-    np.testing.assert_allclose(found.normals[~left, 0], -1.0, atol=1e-6)
+def test_white_tape_on_a_yellow_floor_keeps_its_borders():
+    frame = strip((235, 235, 235), (100, 180, 220))
+    with_hues, gray = find_edges(frame, COLOURS), find_edges(frame, GRAY_ALONE)
+    assert len(with_hues.uv_px) >= 110
+    np.testing.assert_allclose(with_hues.uv_px, gray.uv_px, atol=0.5)
 
 
 def test_a_gray_picture_has_no_hues():
