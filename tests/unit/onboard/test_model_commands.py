@@ -86,7 +86,7 @@ def label_set(path: Path, camera_hash: str) -> Path:
     edges = [np.stack([y * 0 + x, y, y * 0 + np.sign(x), y * 0], axis=1) for x in (-20.0, 20.0)]
     line = np.array([[-20.0, -20.0], [-20.0, 60.0]])
     labels = LabelSet(
-        LabelMeta(META.window, camera_hash, 26.0, 40.0, "map"),
+        LabelMeta(META.window, camera_hash, 26.0, 40.0, "map", META.perception),
         drive=["d"] * 2,
         file=[""] * 2,
         frame=np.arange(2),
