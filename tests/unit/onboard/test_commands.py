@@ -220,7 +220,7 @@ def test_label_hands_on_its_arguments(asked: Asked) -> None:
     assert run("label", "m/one", "--out", "one.parquet", "--colour-weight", "0").exit_code == 0
     assert asked.options["label"]["colour_weight"] == 0.0
     assert run("label", "m/one", "--force", "--out", "one.parquet").exit_code == 0
-    assert asked.options["label"]["force"]
+    assert asked.options["label"] == {"force": True, "colour_weight": 0.75}
     assert ".parquet" in error_of(run("label", "m/one", "--out", "one.txt"))
 
 

@@ -21,6 +21,9 @@ from lanenet.perception.lane_filter import LaneFilter
 
 NAN = float("nan")
 
+#: Below the frames of a sheet.
+LEGEND_PX = 24
+
 
 def half_camera() -> Camera:
     whole = example_camera()
@@ -171,7 +174,7 @@ def test_the_sheet_shows_truth_and_answer():
     sheet = draw_worst([source], [answer], worst)
     height, width = source.camera.height, source.camera.width
     tiles, legend = sheet[:height], sheet[height:]
-    assert tiles.shape == (height, 2 * width, 3)
+    assert tiles.shape == (height, 2 * width, 3) and len(legend) == LEGEND_PX
 
     def is_magenta(picture):
         return (np.abs(picture.astype(int) - TRUTH_BGR) < 60).all(axis=2).sum()
@@ -193,5 +196,5 @@ def test_tiles_of_another_camera_are_fitted_in():
     height, width = small.camera.height, small.camera.width
     scale = draw_worst([large, small], answers, five[:1]).shape[1] // width
     height, width = scale * height, scale * width
-    assert sheet.shape[1] == 4 * width and 2 * height < sheet.shape[0] < 2 * height + 60
+    assert sheet.shape == (2 * height + LEGEND_PX, 4 * width, 3)
     assert not sheet[height : 2 * height, width:].any()
