@@ -78,6 +78,7 @@ def train(
     from lanenet.evaluation import default_names, evaluate
     from lanenet.labelled_sources import open_tests
     from lanenet.learn.card import CARD_NAME, model_card
+    from lanenet.learn.dataset import compile_kernels
     from lanenet.learn.publish import publish
     from lanenet.learn.robust import as_dict
     from lanenet.learn.run_state import METRICS_NAME, hash_run
@@ -87,7 +88,7 @@ def train(
     settings: Any = load_settings(run_settings_schema(), config, overrides)
     checkpoint = settings.checkpoints_dir / settings.name
     with console.progress_bar("data") as progress:
-        data = prepare(settings.data, settings.work_folder, progress)
+        data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
     if data.left_out:
         console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
     # A folder per settings and data: a stopped run finds its own state again, and no other.

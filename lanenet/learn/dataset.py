@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.label_set import LabelMeta, LabelSet
+from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
@@ -207,6 +207,12 @@ class LaneSamples:
         mean = clipped.sum(axis=0) / count
         variance = (np.where(known, clipped - mean, 0.0) ** 2).sum(axis=0) / count
         return mean, np.maximum(np.sqrt(variance), 2.0)
+
+
+def compile_kernels(path: Path) -> None:
+    """Draw one sample of a label set, so that numba keeps on disk what training draws its batches with."""
+    samples = LaneSamples([read_labels(path)], [str(path)])
+    samples.augmented_batch(np.arange(1), AugmentSettings(), 0, 0)
 
 
 def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:

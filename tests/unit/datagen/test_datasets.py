@@ -173,13 +173,17 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
     found = prepare(varied(may_fail=0.5), tmp_path / "work")
     assert [path.stem for path in found.train] == ["train_00", "train_03"]
     assert len(found.left_out) == 2 and found.left_out[0].startswith("train_01 (seed")
-    assert len(mapped) == 5 and pictured == mapped
     # Of many drives only the first ones are there to be looked at.
+    assert len(mapped) == 5 and pictured == ["train_00", "train_01", "validation_00"]
     prepare(varied(may_fail=0.5, train=6), tmp_path / "work")
-    assert mapped[5:] == ["train_04", "train_05"] and len(pictured) == 5
+    assert mapped[5:] == ["train_04", "train_05"] and len(pictured) == 3
     # What failed is not tried again, and what is there is kept.
     again = prepare(varied(may_fail=0.5), tmp_path / "work")
     assert again == found and len(mapped) == 7
+    # What comes next is compiled with the first label set that there is, and changes nothing.
+    given: list[Path] = []
+    assert prepare(varied(may_fail=0.5), tmp_path / "work", last=given.append) == found
+    assert given == found.train[:1]
     with pytest.raises(TrackingLostError, match=r"2 of 5 synthetic drives .* expected at most 1"):
         prepare(varied(may_fail=0.2), tmp_path / "work")
 
