@@ -33,7 +33,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Num, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings, load_settings
@@ -135,11 +135,11 @@ class LanePilot:
         path = Path(path).expanduser()
         return LanePilot(load_settings(DonkeySettings, path), path.parent)
 
-    def run(self, image_rgb: UInt8[np.ndarray, "h w 3"] | None) -> tuple[float, float]:
+    def run(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
         """Answer to an image.
 
         Args:
-            image_rgb: Donkeycar's image; None until its camera has one.
+            image_rgb: Donkeycar's image, also of a camera with ``IMAGE_DEPTH = 1``; None until there is one.
 
         Returns:
             Angle, -1 (left) to 1 (right), and throttle; a throttle of 0 when the lane is lost.
@@ -152,11 +152,12 @@ class LanePilot:
         self._run_s = now_s
         if image_rgb is None:
             self.estimate = LaneEstimate()
-        elif self._is_new(image_rgb):
-            # Donkeycar hands out views that OpenCV does not take.
-            bgr = np.ascontiguousarray(image_rgb[:, :, ::-1])
-            self.estimate = self._detector.detect(bgr)
-            self._follow(now_s)
+        else:
+            # A copy: some of Donkeycar's cameras fill the same array again and again.
+            bgr = _bgr_of(image_rgb)
+            if self._is_new(bgr):
+                self.estimate = self._detector.detect(bgr)
+                self._follow(now_s)
         if now_s - self._seen_s > self._settings.hold_s:
             self._wish = (self._wish[0], 0.0)
         steering_rad, speed_cm_s = self._wish
@@ -164,13 +165,11 @@ class LanePilot:
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
 
-    def _is_new(self, image_rgb: UInt8[np.ndarray, "h w 3"]) -> bool:
-        before = self._before
-        # A copy: some of Donkeycar's cameras fill the same array again and again.
-        self._before = image_rgb.copy()
+    def _is_new(self, bgr: UInt8[np.ndarray, "h w 3"]) -> bool:
+        before, self._before = self._before, bgr
         if self._settings.allow_repeated_frames or before is None:
             return True
-        return not same_image(before, image_rgb)
+        return not same_image(before, bgr)
 
     def _follow(self, now_s: float) -> None:
         wish = self._controller.wish(self.estimate, now_s, self._wish[1], self._limiter.steering_rad)
@@ -178,7 +177,7 @@ class LanePilot:
             self._seen_s = now_s
             self._wish = (wish.steering_rad, wish.speed_cm_s)
 
-    def run_threaded(self, image_rgb: UInt8[np.ndarray, "h w 3"] | None) -> tuple[float, float]:
+    def run_threaded(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
         """Do the same as :meth:`run`: the pilot is faster than a camera and needs no thread."""
         return self.run(image_rgb)
 
@@ -186,6 +185,16 @@ class LanePilot:
         """Forget the lane; Donkeycar calls it at the end."""
         self._detector.reset()
         self._controller.reset()
+
+
+def _bgr_of(image: Num[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Copy Donkeycar's image into one of OpenCV's."""
+    if image.ndim == 2 or image.shape[2:] == (1,):
+        # Its gray images are floats, some with a third axis of one.
+        gray = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
+        return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
+    # It hands out views that OpenCV does not take.
+    return np.ascontiguousarray(image[..., ::-1])
 
 
 class CvLaneController:
@@ -207,14 +216,13 @@ class CvLaneController:
         self._overlay = bool(getattr(cfg, "OVERLAY_IMAGE", False))
 
     def run(
-        self, cam_img: UInt8[np.ndarray, "h w 3"] | None
-    ) -> tuple[float, float, UInt8[np.ndarray, "h w 3"] | None]:
+        self, cam_img: Num[np.ndarray, "h w *c"] | None
+    ) -> tuple[float, float, Num[np.ndarray, "h w *d"] | None]:
         """Return angle, throttle, and the image with what was found drawn into it."""
         angle, throttle = self.pilot.run(cam_img)
         if cam_img is None or not self._overlay:
             return angle, throttle, cam_img
-        bgr = cv2.cvtColor(np.ascontiguousarray(cam_img), cv2.COLOR_RGB2BGR)
-        drawn = draw_estimate(np.asarray(bgr), self.pilot.estimate, self.pilot.camera)
+        drawn = draw_estimate(_bgr_of(cam_img), self.pilot.estimate, self.pilot.camera)
         return angle, throttle, np.ascontiguousarray(drawn[:, :, ::-1])
 
     def shutdown(self) -> None:

@@ -109,6 +109,17 @@ def test_detector_sees_blue_first(pilot):
     assert pilot._detector.seen[0, 0].tolist() == [0, 0, 200] and pilot._detector.seen.flags.c_contiguous
 
 
+@pytest.mark.parametrize("shape", [(24, 32), (24, 32, 1)])
+def test_gray_camera(pilot, shape):
+    """With ``IMAGE_DEPTH = 1`` Donkeycar hands out floats."""
+    image = np.full(shape, 99.6)
+    image[0, 0] = 255.4
+    pilot.run(image)
+    seen = pilot._detector.seen
+    assert seen.shape == (24, 32, 3) and seen.dtype == np.uint8
+    assert (seen[0, 0] == 255).all() and (seen[1:] == 100).all()
+
+
 def test_lost_lane_stops_the_car_after_its_time(pilot):
     pilot._detector.estimate = lane(-5.0)
     angle, throttle = pilot.run(IMAGE)
@@ -180,6 +191,8 @@ def test_cv_controller(example_rgb):
     changed = image[(image != before).any(axis=2)].astype(int)
     assert (changed[:, 0] - changed[:, 2]).max() > 100
     assert controller.run(None)[2] is None
+    gray = controller.run(example_rgb.mean(axis=2))[2]
+    assert gray.shape == example_rgb.shape and gray.dtype == np.uint8, "the lane is drawn in colour"
     cfg.OVERLAY_IMAGE = False
     assert CvLaneController(None, cfg).run(example_rgb)[2] is example_rgb
     controller.shutdown()
