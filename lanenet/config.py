@@ -25,6 +25,17 @@ class Settings(BaseModel):
 SettingsT = TypeVar("SettingsT", bound=Settings)
 
 
+def flat_settings(settings: Settings) -> dict[str, Any]:
+    """Return all values of settings under keys as overrides write them, such as ``edges.blur_px``."""
+    flat: dict[str, Any] = {}
+    for key, value in settings:
+        if isinstance(value, Settings):
+            flat |= {f"{key}.{inner}": v for inner, v in flat_settings(value).items()}
+        else:
+            flat[key] = value
+    return flat
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file whose top level is a mapping.
 

@@ -225,10 +225,11 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
         raise LabelFormatError(
             f"{name_b}: window {b.window}, but {name_a} has {a.window}; label both with the same window"
         )
-    if a.perception.of_all_rows() != b.perception.of_all_rows():
+    unlike = b.perception.unlike(a.perception)
+    if unlike:
         raise LabelFormatError(
-            f"{name_b}: its edges were found with {b.perception}, those of {name_a} with {a.perception}; "
-            "label both with the same settings"
+            f"{name_b}: its edges were found in another way than those of {name_a} ({unlike}); label both "
+            "with the same settings"
         )
 
 

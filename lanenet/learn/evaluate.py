@@ -154,11 +154,11 @@ class RasterModel:
                 f"{self.path}: made for the window {self.meta.window}, but the label set has {window}; "
                 "give the map or the drive itself, which has edges for any window"
             )
-        if perception.of_all_rows() != self.meta.perception.of_all_rows():
+        unlike = perception.unlike(self.meta.perception)
+        if unlike:
             raise ModelMismatchError(
-                f"{self.path}: made for edges found with {self.meta.perception.edges}, but those of the "
-                f"label set were found with {perception.edges}; give the map or the drive itself, or label "
-                "it with another --colour-weight"
+                f"{self.path}: made for edges found in another way than those of the label set ({unlike}); "
+                "give the map or the drive itself, or label it with another --colour-weight"
             )
 
     def answer(

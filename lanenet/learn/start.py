@@ -33,10 +33,11 @@ def load_start_weights(
             f"learn.start_from {folder}: was trained on the window {meta.window}, but the labels have "
             f"{window}; set data.window to the checkpoint's"
         )
-    if meta.perception.of_all_rows() != perception.of_all_rows():
+    unlike = perception.unlike(meta.perception)
+    if unlike:
         raise CheckpointError(
-            f"learn.start_from {folder}: was trained on edges found with {meta.perception.edges}, but those "
-            f"of the labels were found with {perception.edges}; set data.colour_weight to the checkpoint's"
+            f"learn.start_from {folder}: was trained on edges found in another way than those of the labels "
+            f"({unlike}); set data.colour_weight to the checkpoint's"
         )
     weights = start.state_dict()
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}

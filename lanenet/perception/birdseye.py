@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from pydantic import Field
 
-from lanenet.config import Settings
+from lanenet.config import Settings, flat_settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.colour import PixelScale
@@ -53,6 +53,11 @@ class PerceptionSettings(Settings):
         """Return the same without the rows that one car has to leave out: what two cars have in common."""
         rows = {"top_row": 0, "bottom_rows": 0}
         return self.model_copy(update={"range": self.range.model_copy(update=rows)})
+
+    def unlike(self, other: PerceptionSettings) -> str:
+        """Say which settings find other edges than ``other``'s; rows that one car leaves out do not count."""
+        own, others = (flat_settings(each.of_all_rows()) for each in (self, other))
+        return ", ".join(f"{key} {own[key]}, not {others[key]}" for key in own if own[key] != others[key])
 
 
 @dataclass(frozen=True)
