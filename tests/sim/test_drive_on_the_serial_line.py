@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -49,13 +50,18 @@ class Board:
                 time.sleep(0.001)
             for line in reader.feed(data):
                 if line.letter == "V":
-                    os.write(self._master, encode("V", VERSION))
+                    self._say(encode("V", VERSION))
                 elif line.letter in "NS":
                     pulses = (line.numbers[0], line.numbers[1])
                     self.told.append((time.monotonic(), line.numbers[1]))
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + REPORT_S
-                os.write(self._master, encode("A", 0, 0, 1, *pulses))
+                self._say(encode("A", 0, 0, 1, *pulses))
+
+    def _say(self, line: bytes) -> None:
+        """Send a line; as on a wire, it is lost while the other end has not read what came before."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, line)
 
     def close(self) -> None:
         self._over.set()
