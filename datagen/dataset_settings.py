@@ -13,7 +13,7 @@ from datagen.world.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings
 from lanenet.config import Settings
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.perception.birdseye import COLOUR_WEIGHT
+from lanenet.perception.birdseye import COLOUR_WEIGHT, PerceptionSettings
 
 
 class SyntheticSettings(Settings):
@@ -107,6 +107,13 @@ class DataSettings(Settings):
     def processes(self) -> int:
         """Processes at a time."""
         return self.workers or os.cpu_count() or 1
+
+    @property
+    def perceptions(self) -> list[PerceptionSettings]:
+        """How edges are found for the network: in synthetic drives, and in each recorded one."""
+        simulated = [self.map] if self.synthetic.train or self.synthetic.validation else []
+        maps = [*simulated, *(drive.map for drive in self.drives)]
+        return [settings.perception.with_colours(self.colour_weight) for settings in maps]
 
     @model_validator(mode="after")
     def _each_drive_once(self) -> DataSettings:

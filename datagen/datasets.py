@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from datagen.dataset_settings import DataSettings, RecordedSettings
-from datagen.done import fingerprint, forget_done, is_done, key_of, mark_done
+from datagen.done import fingerprint, forget_done, is_done, key_of, make_once, mark_done
 from datagen.jobs import run_jobs
 from datagen.labels.truth import truth_labels
 from datagen.pipeline import MapSettings, label_map, map_drive
@@ -242,13 +242,22 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
     try:
         # Of a random road, that of the first seed that leaves room for one.
         seed = first_world(simulation).settings.seed
-        simulate_drive(simulation.model_copy(update={"seed": seed}), drive)
+        driven = [simulation.model_dump(mode="json")]
+        make_once(
+            drive / "drive.yaml",
+            key_of(driven),
+            lambda: simulate_drive(simulation.model_copy(update={"seed": seed}), drive),
+        )
         if job["role"] == "test":
             perception = mapping.perception.with_colours(colour_weight)
             write_labels(labels, truth_labels(drive, perception, window, simulation.track.line_width_cm))
         else:
             lane_cm, pictures = simulation.track.lane_width_cm, job["pictures"]
-            map_drive(drive, lane_cm, None, mapping, drive_map, pictures=pictures)
+            make_once(
+                drive_map / "map.yaml",
+                key_of([*driven, mapping.model_dump(mode="json")]),
+                lambda: map_drive(drive, lane_cm, None, mapping, drive_map, pictures=pictures),
+            )
             label_map(drive_map, labels, window=window, colour_weight=colour_weight, pictures=pictures)
     except (TrackingLostError, CalibrationError, ConfigError) as error:
         if not job["may_fail"]:
@@ -266,16 +275,24 @@ def _recorded_labels(
     """Map and label a recorded drive, and split it: to learn from, to choose by, to judge by."""
     name = _recorded_name(settings)
     drive_map, whole = folder / "maps" / name, folder / "labels" / f"{name}.parquet"
-    inputs = [settings.model_dump(mode="json"), asdict(window), colour_weight, fingerprint(settings.path)]
+    recording = [fingerprint(settings.path)]
     if settings.camera is not None and settings.camera.is_file():
-        inputs.append(fingerprint(settings.camera))
-    key = key_of(inputs)
+        recording.append(fingerprint(settings.camera))
+    key = key_of([settings.model_dump(mode="json"), asdict(window), colour_weight, *recording])
+    # A map takes minutes, and does not change with the window, the colours or the split.
+    mapped = settings.model_dump(mode="json", include={"path", "lane_width_cm", "camera", "map"})
     parts: dict[Role, Path] = {
         role: folder / "labels" / f"{name}.{role}.parquet" for role in ("train", "validation", "test")
     }
     if not (is_done(whole, key) and all(path.is_file() for path in parts.values())):
         forget_done(whole)
-        map_drive(settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map)
+        make_once(
+            drive_map / "map.yaml",
+            key_of([mapped, *recording]),
+            lambda: map_drive(
+                settings.path, settings.lane_width_cm, settings.camera, settings.map, drive_map
+            ),
+        )
         label_map(drive_map, whole, window=window, colour_weight=colour_weight)
         pieces = _split(read_labels(whole), settings)
         for path, piece in zip(parts.values(), pieces, strict=True):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lanenet.data.files import write_json
 from lanenet.errors import DriveFormatError
 
-_VERSION = 15  # of the label sets; raise it when the same settings give others
+_VERSION = 15  # of drives, maps and label sets; raise it when the same settings give others
 
 
 def fingerprint(path: Path) -> str:
@@ -51,3 +52,11 @@ def forget_done(path: Path) -> None:
 def mark_done(path: Path, key: str) -> None:
     """Mark an output as complete; a job that was killed before this is done again."""
     write_json(_marker(path), {"key": key})
+
+
+def make_once(path: Path, key: str, make: Callable[[], object]) -> None:
+    """Make an output that is not there yet, or was made of something else."""
+    if not is_done(path, key):
+        forget_done(path)
+        make()
+        mark_done(path, key)

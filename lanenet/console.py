@@ -20,28 +20,53 @@ from rich.table import Table
 ProgressCall = Callable[..., None]
 
 
+#: A log file gets a line about a stage this often at most, and one at its end.
+_LOG_EVERY_S = 20.0
+
+
+@contextmanager
+def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
+    """Show stages on stderr: bars in a terminal, lines now and then where it is a file or a pipe.
+
+    Yields:
+        Function of a stage's key, its text, the number done and the number in all.
+    """
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        due_s: dict[str, float] = {}
+
+        def log(key: str, text: str, done: int, total: int) -> None:
+            now_s = time.monotonic()
+            if done == total or now_s >= due_s.get(key, 0.0):
+                due_s[key] = now_s + _LOG_EVERY_S
+                _write_stderr(f"{text}: {done} of {total}\n")
+
+        yield log
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        tasks: dict[str, Any] = {}
+
+        def show(key: str, text: str, done: int, total: int) -> None:
+            if key not in tasks:
+                tasks[key] = progress.add_task(text, total=total)
+            progress.update(tasks[key], description=text, completed=done, total=total)
+
+        yield show
+
+
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCall]:
-    """Show a bar on stderr while the body runs; a new stage starts a new bar.
+    """Show on stderr how far the body is; a new stage starts a new bar.
 
     Args:
         title: What is being done; followed by the stage, if there is one.
     """
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    ) as bars:
-        tasks: dict[str, Any] = {}
+    with _bars() as show:
 
         def report(*args: Any) -> None:
             stage = str(args[0]) if args and isinstance(args[0], str) else ""
-            done, total = args[-2:]
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(f"{title}: {stage}" if stage else title, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            show(stage, f"{title}: {stage}" if stage else title, *args[-2:])
 
         yield report
 
@@ -49,24 +74,12 @@ def progress_bar(title: str) -> Iterator[ProgressCall]:
 @contextmanager
 def training_bar() -> Iterator[ProgressCall]:
     """Show epochs with the errors reached and the speed."""
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    ) as bars:
-        task = bars.add_task("train", total=None)
+    with _bars() as show:
 
         def report(*args: Any) -> None:
             epoch, epochs, train_cm, validation_cm, samples_per_s = args
-            bars.update(
-                task,
-                completed=epoch,
-                total=epochs,
-                description=f"train  RMSE {train_cm:.2f} cm, validation {validation_cm:.2f} cm, "
-                f"{samples_per_s:.0f} samples/s",
-            )
+            errors = f"RMSE {train_cm:.2f} cm, validation {validation_cm:.2f} cm"
+            show("train", f"train  {errors}, {samples_per_s:.0f} samples/s", epoch, epochs)
 
         yield report
 

@@ -82,10 +82,12 @@ def train(
     from lanenet.learn.publish import publish
     from lanenet.learn.robust import as_dict
     from lanenet.learn.run_state import METRICS_NAME, hash_run
+    from lanenet.learn.start import check_start
     from lanenet.learn.train import train as train_network
     from lanenet.perception.network import read_model_meta
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)
+    check_start(settings.learn, settings.data.window, settings.data.perceptions)
     checkpoint = settings.checkpoints_dir / settings.name
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
@@ -166,9 +168,11 @@ def sweep(
 ) -> None:
     """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
     from datagen.datasets import prepare
+    from lanenet.learn.start import check_start
     from lanenet.learn.sweep import sweep as sweep_networks
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)
+    check_start(settings.learn, settings.data.window, settings.data.perceptions)
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress)
     out = settings.work_folder / "sweep"

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from lanenet.errors import CheckpointError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.config import LearnSettings
 from lanenet.learn.dataset import hash_files
 from lanenet.learn.export import WEIGHTS_NAME, read_network
-from lanenet.learn.network import LaneNet
+from lanenet.learn.network import LaneNet, new_network
 from lanenet.perception.birdseye import PerceptionSettings
+
+
+def check_start(
+    settings: LearnSettings, window: BirdseyeWindow, perceptions: Sequence[PerceptionSettings]
+) -> None:
+    """Refuse weights to begin with that the training would refuse, before its data is made.
+
+    Args:
+        settings: Of the training.
+        window: Window of the rasters that the network will see.
+        perceptions: How the edges of each drive will be found.
+
+    Raises:
+        CheckpointError: As :func:`load_start_weights`; or pretrained weights cannot be read.
+    """
+    network = new_network(settings.network, window.rows, window.columns, settings.seed)
+    if settings.start_from is not None:
+        for perception in perceptions:
+            load_start_weights(network, settings.start_from, window, perception)
 
 
 def load_start_weights(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -237,8 +238,12 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
         path: Path, lane_width_cm: float, camera: Path | None, map_settings: object, out: Path
     ) -> None:
         made.append("map")
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        (out / "map.yaml").touch()
 
     def label_map(drive_map: Path, out: Path, window: BirdseyeWindow, colour_weight: float) -> None:
+        made.append("label")
         write_labels(out, _labels(np.arange(400)))
 
     monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
@@ -252,26 +257,31 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
 
     def times(
         recorded: RecordedSettings, window: BirdseyeWindow = window, colour_weight: float = 0.75
-    ) -> int:
-        """How often the drive was mapped so far, after asking for its labels once more."""
+    ) -> tuple[int, int]:
+        """How often the drive was mapped and labelled so far, after asking for its labels once more."""
         parts = _recorded_labels(recorded, window, colour_weight, folder)
         assert [len(read_labels(parts[role])) for role in ("train", "validation", "test")] == [240, 20, 60]
-        return len(made)
+        return made.count("map"), made.count("label")
 
-    assert times(recorded) == 1
-    assert times(recorded) == 1
+    assert times(recorded) == (1, 1)
+    assert times(recorded) == (1, 1)
     camera.write_text("height_cm: 15.5\n")
-    assert times(recorded) == 2
+    assert times(recorded) == (2, 2)
     (drive / "frames.csv").write_text("frame\n1\n2\n")
-    assert times(recorded) == 3
-    assert times(recorded.model_copy(update={"lane_width_cm": 41.0})) == 4
-    assert times(recorded) == 5
-    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 6
-    # A part that got lost is made again.
+    assert times(recorded) == (3, 3)
+    assert times(recorded.model_copy(update={"lane_width_cm": 41.0})) == (4, 4)
+    assert times(recorded) == (5, 5)
+    # What the map does not depend on leaves it as it is.
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == (5, 6)
+    assert times(recorded, BirdseyeWindow(cell_cm=1.0), colour_weight=0.0) == (5, 7)
+    assert times(recorded.model_copy(update={"counts_as": 2})) == (5, 8)
+    assert times(recorded) == (5, 9)
+    # A part that got lost is made again, and so is a map that is gone.
     next((folder / "labels").glob("*.validation.parquet")).unlink()
-    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
-    assert times(recorded, BirdseyeWindow(cell_cm=1.0)) == 7
-    assert times(recorded, BirdseyeWindow(cell_cm=1.0), colour_weight=0.0) == 8
+    assert times(recorded) == (5, 10)
+    assert times(recorded) == (5, 10)
+    shutil.rmtree(next((folder / "maps").iterdir()))
+    assert times(recorded, colour_weight=0.5) == (6, 11)
 
 
 def test_a_recording_is_listed_once(tmp_path):

@@ -13,7 +13,7 @@ from lanenet.learn.export import read_network
 from lanenet.learn.network import new_network
 from lanenet.learn.publish import publish
 from lanenet.learn.run_state import hash_run
-from lanenet.learn.start import load_start_weights
+from lanenet.learn.start import check_start, load_start_weights
 from lanenet.learn.train import train
 from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 
@@ -84,3 +84,9 @@ def test_what_does_not_fit_is_refused(checkpoint):
     load_start_weights(network, checkpoint, WINDOW, hidden)
     with pytest.raises(CheckpointError, match=r"data\.colour_weight"):
         load_start_weights(network, checkpoint, WINDOW, SEEN.with_colours())
+    # The same before there are any data; one drive of several is enough.
+    settings = TINY.model_copy(update={"start_from": checkpoint})
+    check_start(settings, WINDOW, [SEEN, hidden])
+    with pytest.raises(CheckpointError, match=r"data\.colour_weight"):
+        check_start(settings, WINDOW, [SEEN, SEEN.with_colours()])
+    check_start(TINY, BirdseyeWindow(cell_cm=1.0), [SEEN.with_colours()])
