@@ -100,7 +100,10 @@ def localise(
         drive = open_drive(given)
         known = read_camera(camera) if camera is not None else drive.camera
         if known is None:
-            raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
+            raise CalibrationError(
+                f"{source}: comes without a camera, expected --camera camera.yaml; "
+                "the folder of its map has one (lanenet map)"
+            )
         with console.progress_bar("localise") as progress:
             moments = moments_of(drive)
             report = run(moments, known, settings, out, start, lambda done: progress(done, len(drive)))

@@ -102,7 +102,10 @@ def detect(
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is None and detector.value not in WITHOUT_CAMERA:
-        raise CalibrationError(f"{source}: comes without a camera, expected --camera camera.yaml")
+        raise CalibrationError(
+            f"{source}: comes without a camera, expected --camera camera.yaml; "
+            "the folder of its map has one (lanenet map)"
+        )
     chosen = build_detector(
         detector.value,
         used_camera,
