@@ -99,8 +99,8 @@ def prepare(
     # go beside it, so that no second process compiles the same.
     jobs[1:] = sorted(jobs[1:], key=lambda job: job.get("role") != "test")
     named = [(_job_name(job), job) for job in jobs]
-    if last is not None:
-        made = [_labels_of(job) for job in jobs if job.get("role") == "train"]
+    made = [_labels_of(job) for job in jobs if job.get("role") == "train"]
+    if last is not None and made:
         named.append(("compiling", {"kind": "last", "call": last, "label_sets": made}))
     results = run_jobs(_run_job, named, settings.processes, progress)[: len(jobs)]
     parts: dict[Role, list[Path]] = {"train": [], "validation": [], "test": []}
