@@ -212,7 +212,8 @@ def _labels_of(job: dict[str, Any]) -> Path:
 def _run_job(job: dict[str, Any]) -> dict[Role, Path] | str:
     """Make one drive's label sets, or say why it has none; runs in a process of its own."""
     if job["kind"] == "last":
-        for path in [path for path in job["label_sets"] if path.is_file()][:1]:
+        path = next((path for path in job["label_sets"] if path.is_file()), None)
+        if path is not None:
             job["call"](path)
         return {}
     if job["kind"] == "synthetic":
@@ -227,7 +228,8 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
     drive, drive_map = folder / "drives" / job["name"], folder / "maps" / job["name"]
     labels = _labels_of(job)
     window, colour_weight = job["window"], job["colour_weight"]
-    parts = [simulation.model_dump(mode="json"), job["role"], asdict(window), colour_weight]
+    driven = simulation.model_dump(mode="json")
+    parts = [driven, job["role"], asdict(window), colour_weight]
     # The truth needs no map, but its edges are found in the same way.
     mapping: MapSettings = job["map"]
     parts.append((mapping.perception if job["role"] == "test" else mapping).model_dump(mode="json"))
@@ -239,15 +241,14 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
         return failure.read_text(encoding="utf-8")
     # From here on, what lies there is neither the old labels nor the new ones.
     forget_done(labels)
-    try:
+
+    def simulate() -> None:
         # Of a random road, that of the first seed that leaves room for one.
         seed = first_world(simulation).settings.seed
-        driven = [simulation.model_dump(mode="json")]
-        make_once(
-            drive / "drive.yaml",
-            key_of(driven),
-            lambda: simulate_drive(simulation.model_copy(update={"seed": seed}), drive),
-        )
+        simulate_drive(simulation.model_copy(update={"seed": seed}), drive)
+
+    try:
+        make_once(drive / "drive.yaml", key_of([driven]), simulate)
         if job["role"] == "test":
             perception = mapping.perception.with_colours(colour_weight)
             write_labels(labels, truth_labels(drive, perception, window, simulation.track.line_width_cm))
@@ -255,7 +256,7 @@ def _synthetic_labels(job: dict[str, Any]) -> Path | str:
             lane_cm, pictures = simulation.track.lane_width_cm, job["pictures"]
             make_once(
                 drive_map / "map.yaml",
-                key_of([*driven, mapping.model_dump(mode="json")]),
+                key_of([driven, mapping.model_dump(mode="json")]),
                 lambda: map_drive(drive, lane_cm, None, mapping, drive_map, pictures=pictures),
             )
             label_map(drive_map, labels, window=window, colour_weight=colour_weight, pictures=pictures)
