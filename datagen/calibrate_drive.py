@@ -8,24 +8,24 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.kept_images import keep_images
-from datagen.lane_scale import LaneScale, measure_lane
-from datagen.map_settings import MapSettings
-from datagen.pictures import straight_frames
+from datagen.lanes.scale import LaneScale, measure_lane
 from datagen.pipeline import hide_bumper, split_segments
-from datagen.report.mappable import check_moving
-from datagen.self_calibration import (
+from datagen.quality.mappable import check_moving
+from datagen.quality.pictures import straight_frames
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import Candidate, with_known_scale
+from datagen.slam.camera.self_calibration import (
     DRIVE_INSTEAD,
     MIN_FRAMES,
     FoundCamera,
     check_observable,
     find_camera,
 )
-from datagen.slam.calibrate import Candidate, with_known_scale
-from datagen.slam.scans import Progress
-from datagen.slam.stillness import following_frames
+from datagen.slam.kept_images import keep_images
+from datagen.slam.odometry.scans import Progress
+from datagen.slam.odometry.stillness import following_frames
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drive import Drive, open_drive
+from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
 

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from datagen.kept_images import keep_images
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import MappedDrive, points_text
-from datagen.lane_scale import fitted_width_cm
-from datagen.map_folder import FORMAT, DriveMap, MapMeta, write_map
-from datagen.map_report import (
+from datagen.lanes.find import map_stretches
+from datagen.lanes.scale import fitted_width_cm
+from datagen.quality.agreement import contradicted_lines
+from datagen.quality.figures import (
     MappedSegment,
     Report,
     free_lane_cm,
@@ -24,31 +23,29 @@ from datagen.map_report import (
     map_figures,
     map_notes,
 )
-from datagen.map_settings import SETTINGS_NAME, MapSettings, with_wheelbase
-from datagen.pictures import draw_contact_sheet, draw_map
-from datagen.report.agreement import contradicted_lines
-from datagen.report.held_out import held_out_frames
-from datagen.report.mappable import check_edges, check_lines_seen, check_moving
-from datagen.report.page import PAGE_NAME, report_page
-from datagen.report.quality import measure_map, quality_figures
-from datagen.report.refusal import kept_map
-from datagen.report.residuals import ResidualSettings
-from datagen.report.verdict import judge
-from datagen.self_calibration import DRIVE_INSTEAD, find_camera
-from datagen.slam.calibrate import with_known_scale
-from datagen.slam.scans import Progress
+from datagen.quality.mappable import check_edges, check_lines_seen, check_moving
+from datagen.quality.measure import held_out_frames, measure_map, quality_figures
+from datagen.quality.page import PAGE_NAME, kept_map, report_page
+from datagen.quality.pictures import draw_contact_sheet, draw_map
+from datagen.quality.residuals import ResidualSettings
+from datagen.quality.verdict import judge
+from datagen.settings import MapSettings, with_wheelbase
+from datagen.slam.camera.coarse import with_known_scale
+from datagen.slam.camera.self_calibration import DRIVE_INSTEAD, find_camera
+from datagen.slam.kept_images import keep_images
+from datagen.slam.odometry.scans import Progress
+from datagen.slam.odometry.stillness import following_frames
 from datagen.slam.segment import SolvedSegment
-from datagen.slam.stillness import following_frames
-from datagen.stretches import map_stretches
-from datagen.unfinished import clear_unfinished
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drive import Drive, open_drive
-from lanenet.data.files import atomic_folder, check_replaceable, write_text
+from lanenet.data.drives import Drive, open_drive
+from lanenet.data.files import atomic_folder, check_replaceable, clear_unfinished, write_text
+from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, write_map
+from lanenet.data.maps.mapped_drive import MappedDrive, points_text
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.static import find_static, spread_frames
+from lanenet.perception.edges.static import find_static, spread_frames
 
 __all__ = ["MapSettings", "Report", "label_map", "map_drive"]
 

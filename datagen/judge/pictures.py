@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from datagen.judge.run import RunResult, Trajectory
-from datagen.world.track import Track
-from datagen.world.track_picture import FIXED_BITS, box_corners_cm, paint_track, painted_bounds_cm
+from datagen.world.road.track import Track
+from datagen.world.road.track_picture import FIXED_BITS, box_corners_cm, paint_track, painted_bounds_cm
 
 _SIDE_PX = 1100  # of the longer side of the road
 _MARGIN_CM = 50.0

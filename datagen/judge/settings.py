@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from datagen.world.pilot import PilotSettings
-from datagen.world.script import DriverSettings
-from datagen.world.track import TrackSettings, load_track_settings, preset, preset_names
+from datagen.world.car.driver import DriverSettings
+from datagen.world.car.pilot import PilotSettings
+from datagen.world.road.track import TrackSettings, load_track_settings, preset, preset_names
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.errors import ConfigError, did_you_mean

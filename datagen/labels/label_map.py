@@ -6,7 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.labels.mapped_drive import (
+from datagen.labels.quality import frame_residual_cm, label_report
+from datagen.quality.figures import Report
+from datagen.quality.page import refuse_rejected
+from datagen.quality.pictures import draw_contact_sheet
+from datagen.slam.odometry.scans import Progress
+from lanenet.data.files import atomic_file, write_json
+from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
     CONTRADICTED,
@@ -20,17 +27,10 @@ from datagen.labels.mapped_drive import (
     points_in_window,
     points_text,
 )
-from datagen.labels.quality import frame_residual_cm, label_report
-from datagen.map_report import Report
-from datagen.pictures import draw_contact_sheet
-from datagen.report.refusal import refuse_rejected
-from datagen.slam.scans import Progress
-from lanenet.data.files import atomic_file, write_json
-from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS
-from lanenet.perception.birdseye import COLOUR_WEIGHT, RoadEdgeExtractor
+from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
 
 
 def label_map(

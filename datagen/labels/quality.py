@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from datagen.labels.project import FrameLines
 from lanenet.data.label_set import LabelSet
+from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.lane import POINT_NAMES
 
 REPORT_FORMAT = "lanenet-label-report/1"
@@ -66,7 +66,7 @@ def label_report(
         residual_cm: What each frame's markings miss, see :func:`frame_residual_cm`.
         mapped_frames: Frames of the map.
         skipped: How many of them have no labels, and why.
-        point_shares: See :func:`datagen.labels.mapped_drive.labelled_points`.
+        point_shares: See :func:`lanenet.data.maps.mapped_drive.labelled_points`.
     """
     known = np.isfinite(labels.points_cm)
     finite = residual_cm[np.isfinite(residual_cm)]

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from datagen.world.track_file import read_track
-from lanenet.data.drive import open_drive, read_truth
+from datagen.world.road.track_file import read_track
+from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, POINT_NAMES, SIDES
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 
 _SAMPLE_CM = 2.0
 
@@ -90,7 +90,7 @@ def true_lines(
 
     Args:
         drive_path: Simulated drive; without a road there are no lines.
-        truth: Its truth, see :func:`lanenet.data.drive.read_truth`.
+        truth: Its truth, see :func:`lanenet.data.drives.read_truth`.
         wheelbase_cm: Distance between the axles.
     """
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)

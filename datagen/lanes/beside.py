@@ -12,12 +12,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.lanes.follow import follow_line
-from datagen.lanes.line import Side
+from datagen.lanes.follow import TraceSettings, follow_line
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TracedLane, known_middle, profile_along
-from datagen.lanes.trace_settings import TraceSettings
-from datagen.runs import true_runs
+from lanenet.data.maps.line import Side
+from lanenet.data.segments import true_runs
 
 #: How far from the line between two lanes a car is that drives in the further one, in lane widths.
 _VISITS = (0.1, 1.0)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.path import Path, left_of
-from datagen.slam.places import path_lengths
+from datagen.slam.loops.places import path_lengths
 from lanenet.geometry.frames import wrap_angle
 
 #: Frames whose heading is further than this from the road's, either way round, have no place on it: cosine.

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.slam.places import path_lengths
-from datagen.slam.scans import Scans
+from datagen.slam.loops.places import path_lengths
+from datagen.slam.odometry.scans import Scans
 from lanenet.errors import TrackingLostError
 
 _SHORTEST_CM = 20.0

@@ -13,13 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from datagen.lanes.follow import best_lane, follow_line
-from datagen.lanes.line import Side
+from datagen.lanes.follow import TraceSettings, best_lane, follow_line
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.profile import EdgeProfile, edge_profile
-from datagen.lanes.trace_settings import TraceSettings
 from datagen.lanes.width import find_lane_width, find_tape_width
-from datagen.runs import true_runs
+from lanenet.data.maps.line import Side
+from lanenet.data.segments import true_runs
 from lanenet.errors import TrackingLostError
 
 __all__ = ["TraceSettings", "TracedLane", "trace_lane"]

@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.lanes.follow import best_lane, follow_line
+from datagen.lanes.follow import TraceSettings, best_lane, follow_line
 from datagen.lanes.path import Path
 from datagen.lanes.profile import EdgeProfile, shifted
-from datagen.lanes.trace_settings import TraceSettings
 from lanenet.errors import TrackingLostError
 
 #: Shares of the distance of two lines within which a third one lies in the middle between them.

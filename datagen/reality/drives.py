@@ -11,15 +11,15 @@ import numpy as np
 from pydantic import Field
 
 from datagen.reality.measure import MeasuredDrive, measure_frames
-from datagen.world.drive_loop import scripted_states
-from datagen.world.render_pool import prepare_process
+from datagen.world.driving import scripted_states
+from datagen.world.simulate import prepare_process
 from datagen.world.variety import camera_like, first_world, vary_simulation
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings
 
 
 class RealitySettings(Settings):

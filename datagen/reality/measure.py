@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from datagen.reality.statistics import FrameFigures, drive_statistics, edge_statistics
-from lanenet.data.drive import Drive
+from lanenet.data.drives import Drive
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.birdseye import PerceptionSettings, RoadTable
-from lanenet.perception.static import find_static, spread_frames
+from lanenet.perception.edges.road import PerceptionSettings, RoadTable
+from lanenet.perception.edges.static import find_static, spread_frames
 
 #: Height at which every camera is taken to be: real heights are rarely known, and a frame does not tell.
 HEIGHT_CM = 20.0

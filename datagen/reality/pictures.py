@@ -14,8 +14,8 @@ from datagen.reality.drives import RealitySettings
 from datagen.reality.measure import MeasuredDrive
 from datagen.reality.report import Row, nearest_synthetic
 from datagen.reality.statistics import STATISTICS
-from lanenet.perception.birdseye import RoadTable
-from lanenet.perception.edges import find_edges
+from lanenet.perception.edges.canny import find_edges
+from lanenet.perception.edges.road import RoadTable
 
 _TILE_PX = 240  # width of one picture of a sheet
 _HEADER_PX, _GAP_PX = 20, 6

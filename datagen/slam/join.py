@@ -13,16 +13,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.map_settings import MapSettings
-from datagen.runs import equal_runs
-from datagen.slam.bundle import adjust
-from datagen.slam.calibrate import mapping_range
-from datagen.slam.filter import Trajectory
-from datagen.slam.key_frames import key_pairs
-from datagen.slam.loop_pairs import loop_pairs, side_by_side
-from datagen.slam.mapper import commands_of
-from datagen.slam.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
-from datagen.slam.places import (
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import adjust
+from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.filter.dp_slam import Trajectory
+from datagen.slam.keyframes import key_pairs
+from datagen.slam.loops.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
+from datagen.slam.loops.places import (
     Revisit,
     alike,
     diagonal_mean,
@@ -31,11 +28,13 @@ from datagen.slam.places import (
     relative_pose,
     thumbnails,
 )
-from datagen.slam.posegraph import borne_out, close_loops
-from datagen.slam.scans import Scans, scans_of
+from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
+from datagen.slam.odometry.scans import Scans, scans_of
 from datagen.slam.seen import road_edges
 from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment
-from lanenet.data.drive import Drive
+from datagen.slam.track import commands_of
+from lanenet.data.drives import Drive
+from lanenet.data.segments import equal_runs
 from lanenet.geometry.frames import wrap_angle
 
 #: Frames beside a break whose surroundings belong to both stretches.
@@ -182,7 +181,7 @@ def _shared_places(
     """Pairs of frames, one of either stretch, that look alike, each the other's most similar one.
 
     Args:
-        base: A picture per frame of the first stretch, see :func:`datagen.slam.places.thumbnails`.
+        base: A picture per frame of the first stretch, see :func:`datagen.slam.loops.places.thumbnails`.
         other: Likewise of the second, whose frames count on from those of the first.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
         max_pairs: Pairs at most, spread over the second stretch.

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from datagen.map_settings import MapSettings
-from datagen.slam.calibrate import mapping_range
-from datagen.slam.key_frames import alongside
-from datagen.slam.mapper import CommandedMotion
-from datagen.slam.odometry import UsualWay, usual_way
-from datagen.slam.picture_pairs import Pictures
-from datagen.slam.reflections import without_reflections
-from datagen.slam.scans import Scans, edges_of_drive, scans_of
-from lanenet.data.drive import Drive
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.keyframes import alongside
+from datagen.slam.odometry.image_pairs import Pictures
+from datagen.slam.odometry.odometry import UsualWay, usual_way
+from datagen.slam.odometry.reflections import without_reflections
+from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
+from datagen.slam.track import CommandedMotion
+from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import RangeSettings, RoadTable
-from lanenet.perception.edges import EdgePixels
+from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 
 @dataclass(frozen=True)

@@ -15,18 +15,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.furniture import FurnitureRates
-from datagen.world.ground import PixelGround
-from datagen.world.look import LookSettings
-from datagen.world.renderer import Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.track import Track, TrackSettings, preset, preset_names, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.ground import PixelGround
+from datagen.world.render.look import LookSettings
+from datagen.world.render.renderer import Renderer
+from datagen.world.road.furniture import FurnitureRates
+from datagen.world.road.track import Track, TrackSettings, preset, preset_names, random_track
 from datagen.world.world import SimulationSettings, assemble_world, resolve_length
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 
 Bgr = tuple[int, int, int]
 Image = UInt8[np.ndarray, "_ _ 3"]

@@ -11,14 +11,12 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from datagen.world.car import Car, CarSettings
-from datagen.world.donkey import DonkeyCommands, DonkeySettings, draw_donkey
-from datagen.world.driver import Driver
-from datagen.world.look import LookSettings, random_look
-from datagen.world.renderer import Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.script import DriverSettings
-from datagen.world.track import Track, TrackSettings, check_drivable, random_track
+from datagen.world.car.car import Car, CarSettings, DonkeyCommands, DonkeySettings, draw_donkey
+from datagen.world.car.driver import Driver, DriverSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings, random_look
+from datagen.world.render.renderer import Renderer
+from datagen.world.road.track import Track, TrackSettings, check_drivable, random_track
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera

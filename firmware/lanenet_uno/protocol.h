@@ -1,4 +1,4 @@
-// What the board does with the lines it gets: the protocol of lanenet/onboard/actuators/line_protocol.py,
+// What the board does with the lines it gets: the protocol of lanenet/onboard/actuators/serial_board.py,
 // version 1, and the watchdog. No Arduino header is needed, so that it is tested on a computer, too.
 
 #ifndef LANENET_PROTOCOL_H

@@ -9,8 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.lens import N_DISTORTION, N_INTRINSIC, camera_of_lens, project_points
-from lanenet.calibration.pose import moved_points, plane_points, pose_of_plane
+from lanenet.calibration.lens import (
+    N_DISTORTION,
+    N_INTRINSIC,
+    camera_of_lens,
+    moved_points,
+    plane_points,
+    pose_of_plane,
+    project_points,
+)
 from lanenet.geometry.camera import CameraModel
 
 #: Angle between the axis and the picture's corner, [deg], from which a search starts.

@@ -11,7 +11,13 @@ from jaxtyping import Float
 
 from lanenet.calibration.bundle import LensFit, poses_of_views
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.lens import camera_of_lens, project_points
+from lanenet.calibration.lens import (
+    camera_of_lens,
+    moved_points,
+    plane_points,
+    project_points,
+    rotation_from_vector,
+)
 from lanenet.calibration.lens_choice import (
     angles_rad,
     check_wanted_model,
@@ -19,9 +25,7 @@ from lanenet.calibration.lens_choice import (
     folds_inside,
     judged_fits,
 )
-from lanenet.calibration.pose import moved_points, plane_points, rotation_from_vector
-from lanenet.calibration.two_lenses import best_split, focal_scales
-from lanenet.calibration.views import check_count, usable_views
+from lanenet.calibration.views import best_split, check_count, focal_scales, usable_views
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
 

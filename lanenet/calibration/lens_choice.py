@@ -18,8 +18,7 @@ from lanenet.calibration.bundle import (
     start_fit,
 )
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens
-from lanenet.calibration.pose import moved_points, plane_points
+from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens, moved_points, plane_points
 from lanenet.calibration.views import MIN_VIEWS
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lanenet.calibration.pose import moved_points
+from lanenet.calibration.lens import moved_points
 from lanenet.geometry.camera import Camera
-from lanenet.perception.views import View, undistorting_view
+from lanenet.perception.edges.views import View, undistorting_view
 
 #: BGR of the grid's lines, of its axes, of measured and of projected points.
 GRID_BGR, AXIS_BGR, MEASURED_BGR, PROJECTED_BGR = (200, 160, 60), (60, 60, 230), (60, 220, 60), (40, 60, 240)

@@ -2,6 +2,8 @@
 
 Everything is written under a temporary name beside its destination and moved into place at the end, so that
 a crash, a full disk or Ctrl-C never leaves half a file under the name that others read.
+
+What a killed run leaves beside its output, cleared away by the next one.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import importlib
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -239,3 +242,27 @@ def _move_folder(temporary: Path, path: Path) -> None:
         raise LanenetError(f"{path}: cannot be written ({error})") from None
     if old is not None:
         shutil.rmtree(old, ignore_errors=True)
+
+
+def clear_unfinished(out: Path) -> None:
+    """Remove the temporary folders of killed runs beside an output folder.
+
+    A run that was killed between setting the old folder aside and moving the new one into place leaves the
+    old one under its temporary name: it comes back.
+
+    Args:
+        out: The folder as :func:`lanenet.data.files.atomic_folder` is to write it.
+    """
+    out = out.resolve()
+    if not out.parent.is_dir():
+        return
+    # As atomic_folder names them; a name that only begins the same is another output's.
+    pattern = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]{{8}}(\.old)?\.tmp")
+    for left in sorted(out.parent.iterdir()):
+        found = pattern.fullmatch(left.name)
+        if found is None or not left.is_dir():
+            continue
+        if found[1] and not out.exists():
+            left.rename(out)
+        else:
+            shutil.rmtree(left, ignore_errors=True)

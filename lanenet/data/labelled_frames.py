@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_folder import TRUTH_FILE, read_truth
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES
-from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,8 @@
 """Parquet tables: columns in and out of NumPy, with errors that name the file and the column.
 
 pyarrow comes with the extra ``data`` and is imported inside the functions, so that the car can do without it.
+
+PNG pictures as bytes, as tables hold them.
 """
 
 from __future__ import annotations
@@ -9,8 +11,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.files import atomic_file, require
 from lanenet.errors import LabelFormatError
@@ -198,3 +201,16 @@ def list_array(values: list[np.ndarray]) -> Any:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+def png_bytes(image: UInt8[np.ndarray, "h w *c"]) -> bytes:
+    """Encode a picture; the same picture always gives the same bytes."""
+    _, data = cv2.imencode(".png", image)
+    return bytes(data.tobytes())
+
+
+def png_size(data: bytes) -> tuple[int, int] | None:
+    """Read width and height from the header of a PNG; None if it is not one."""
+    if len(data) < 24 or data[:8] != b"\x89PNG\r\n\x1a\n":
+        return None
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")

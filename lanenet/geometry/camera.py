@@ -14,8 +14,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.fisheye import fisheye_radius, fisheye_slope, invert_fisheye
-from lanenet.geometry.pinhole import distort_pinhole, invert_pinhole, pinhole_radius
+from lanenet.geometry.lenses import (
+    distort_pinhole,
+    fisheye_radius,
+    fisheye_slope,
+    invert_fisheye,
+    invert_pinhole,
+    pinhole_radius,
+)
 
 CameraModel = Literal["fisheye", "pinhole"]
 

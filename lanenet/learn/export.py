@@ -25,9 +25,15 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
-from lanenet.perception.checkpoint import MARKER_NAME, MODEL_NAME, is_model, without_model
-from lanenet.perception.model_file import BATCH_NAME, WIDTH_NAME
-from lanenet.perception.network import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
+from lanenet.perception.network.detector import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
+from lanenet.perception.network.model_file import (
+    BATCH_NAME,
+    MARKER_NAME,
+    MODEL_NAME,
+    WIDTH_NAME,
+    is_model,
+    without_model,
+)
 
 #: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
 OPSET = 18

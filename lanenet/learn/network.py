@@ -1,17 +1,94 @@
-"""The networks: a trunk, and a head that answers six points in cm, their spread and which lines are there."""
+"""The networks: a trunk, and a head that answers six points in cm, their spread and which lines are there.
+
+The paper's network as a trunk: torchvision's AlexNet up to its last hidden layer.
+"""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, UInt8
+from safetensors.torch import load_file
 from torch import Tensor, nn
+from torchvision.models import alexnet
 
+from lanenet.errors import CheckpointError
 from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM, SIDES
-from lanenet.learn.alexnet import N_FEATURES, AlexNetTrunk
 from lanenet.learn.config import NetworkSettings
+
+#: Side of the picture that AlexNet takes, [px].
+SIDE_PX = 224
+#: Values of AlexNet's last hidden layer.
+N_FEATURES = 4096
+
+#: Mean and spread of the colours of the pictures that the published weights were trained on.
+_MEAN, _SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class AlexNetTrunk(nn.Module):
+    """AlexNet without its last fully connected layer, fed with rasters.
+
+    A raster is stretched to 224 x 224 and stands in all three colours, as the published weights need it.
+
+    Source:
+        Kozlowski et al. 2024, section 2.4: the last four layers (dropout, classes, softmax and their output)
+        are replaced. Krizhevsky 2014 in torchvision's version.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        whole = alexnet(weights=None)
+        self.features = whole.features
+        self.avgpool = whole.avgpool
+        # Without its last layer, whose name in the published file is classifier.6.
+        self.classifier = whole.classifier[:6]
+        self.colour_mean: Tensor
+        self.colour_spread: Tensor
+        self.register_buffer("colour_mean", torch.tensor(_MEAN).reshape(1, 3, 1, 1))
+        self.register_buffer("colour_spread", torch.tensor(_SPREAD).reshape(1, 3, 1, 1))
+
+    def forward(self, raster: Float[Tensor, "n 1 r c"]) -> Float[Tensor, "n f"]:
+        """Return the last hidden layer's values for rasters with values 0..1."""
+        size = (SIDE_PX, SIDE_PX)
+        stretched = nn.functional.interpolate(raster, size=size, mode="bilinear", align_corners=False)
+        picture = (stretched - self.colour_mean) / self.colour_spread
+        features: Tensor = self.classifier(torch.flatten(self.avgpool(self.features(picture)), 1))
+        return features
+
+    def load_pretrained(self, path: Path) -> None:
+        """Read weights as torchvision publishes them, without their last layer.
+
+        Args:
+            path: State dict, as a PyTorch file or as safetensors.
+
+        Raises:
+            CheckpointError: If the file is missing, cannot be read or is not of AlexNet.
+        """
+        if not path.is_file():
+            raise CheckpointError(f"{path}: no such file, expected weights of torchvision's AlexNet")
+        try:
+            if path.suffix == ".safetensors":
+                state = load_file(path)
+            else:
+                state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # the unpickler raises whatever damaged bytes lead it to
+            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+            raise CheckpointError(f"{path}: cannot be read as weights ({reason})") from None
+        own = {name: value for name, value in self.state_dict().items() if not name.startswith("colour_")}
+        if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+            raise CheckpointError(f"{path}: expected a dict of tensors, found {type(state).__name__}")
+        for name, value in own.items():
+            found = state.get(name)
+            if found is None or found.shape != value.shape:
+                what = "nothing" if found is None else f"shape {tuple(found.shape)}"
+                raise CheckpointError(
+                    f"{path}: expected AlexNet's {name!r} of shape {tuple(value.shape)}, found {what}"
+                )
+        self.load_state_dict({name: state[name] for name in own}, strict=False)
+
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from lanenet.learn.dataset import LaneSamples
-from lanenet.learn.evaluate import ErrorTable, point_errors
+from lanenet.evaluation.errors import ErrorTable, point_errors
 from lanenet.learn.network import LaneNet, LaneOutput, input_of_rasters
+from lanenet.samples.dataset import LaneSamples
 
 _BATCH = 256
 #: Share of the errors that :func:`trimmed_rmse_cm` looks at.

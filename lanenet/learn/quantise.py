@@ -16,8 +16,8 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from lanenet.data.files import atomic_file, write_json
 from lanenet.errors import CheckpointError
 from lanenet.learn.export import CALIBRATION_NAME, RASTERS_NAME, quiet, read_rasters
-from lanenet.perception.checkpoint import MODEL_NAME
-from lanenet.perception.network import INPUT_NAME, open_model
+from lanenet.perception.network.detector import INPUT_NAME, open_model
+from lanenet.perception.network.model_file import MODEL_NAME
 
 INT8_NAME = "model-int8.onnx"
 #: Largest change of the points, root of the mean square, that the smaller numbers may cost.

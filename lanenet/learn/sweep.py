@@ -1,24 +1,89 @@
-"""A recorded search for the window, the size, the loss and the learning rate, judged on validation drives."""
+"""A recorded search for the window, the size, the loss and the learning rate, judged on validation drives.
+
+The trials of a sweep as tables: all as CSV, the best and what each choice was worth as Markdown.
+"""
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lanenet.data.files import require, write_text
 from lanenet.data.label_set import LabelSet, read_labels
 from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings, NetworkSettings
-from lanenet.learn.dataset import LaneSamples, check_same
 from lanenet.learn.run_state import best_record, hash_run
-from lanenet.learn.sweep_table import trials_csv, trials_table
 from lanenet.learn.train import TrainingRun, torch_threads
+from lanenet.samples.dataset import LaneSamples, check_same
+
+_BEST = 10
+_NAMES = {
+    "val_rmse_cm": "RMSE, cm",
+    "cell_cm": "cell, cm",
+    "far_cm": "far, cm",
+    "half_width_cm": "half width, cm",
+    "first_channels": "channels",
+    "layers": "layers",
+    "hidden": "hidden",
+    "loss": "loss",
+    "evenness": "evenness",
+    "learning_rate": "rate",
+    "parameters": "parameters",
+    "epochs": "epochs",
+    "cpu_s": "CPU, s",
+}
+
+
+def trials_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return trials as CSV, a row each, in their order."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, ["trial", "state", *_NAMES], lineterminator="\n", restval="")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def trials_table(rows: Sequence[Mapping[str, Any]], choices: Sequence[str]) -> str:
+    """Return the best trials, and for each choice the errors of the trials that made it, as Markdown.
+
+    Args:
+        rows: Trials by the names of the CSV; ``state`` is ``complete``, or ``pruned`` for those that were
+            given up early, which do not count.
+        choices: Names of what was chosen from a few values.
+    """
+    whole = sorted((row for row in rows if row["state"] == "complete"), key=lambda row: row["val_rmse_cm"])
+    lines = [
+        f"{len(whole)} trials to the end, {len(rows) - len(whole)} given up early. RMSE over the six points "
+        "of the validation drives.",
+        "",
+        "| " + " | ".join(_NAMES.values()) + " |",
+        "|" + "---|" * len(_NAMES),
+    ]
+    lines += ["| " + " | ".join(_shown(row[key]) for key in _NAMES) + " |" for row in whole[:_BEST]]
+    lines += ["", "| choice | value | trials | best RMSE, cm | median RMSE, cm |", "|---|---|---|---|---|"]
+    for key in choices:
+        for value in sorted({row[key] for row in whole}, key=str):
+            errors = [row["val_rmse_cm"] for row in whole if row[key] == value]
+            figures = f"{len(errors)} | {min(errors):.3f} | {np.median(errors):.3f}"
+            lines.append(f"| {_NAMES[key].removesuffix(', cm')} | {_shown(value)} | {figures} |")
+    return "\n".join(lines) + "\n"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "" if value is None else str(value)
+
 
 #: Called with (finished trials, trials).
 Progress = Callable[[int, int], None]

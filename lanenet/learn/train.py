@@ -1,4 +1,7 @@
-"""Train a network on label sets: one call from Parquet files to a checkpoint folder."""
+"""Train a network on label sets: one call from Parquet files to a checkpoint folder.
+
+What is set right after the training, on frames that the network did not learn from: doubt and presence.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +18,55 @@ from torch import Tensor
 
 from lanenet.data.label_set import read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
-from lanenet.learn.augment import Batch
-from lanenet.learn.calibrate import calibrate_presence, calibrate_sigma
+from lanenet.learn.checkpoint import tensorboard_curve, write_checkpoint
 from lanenet.learn.config import LearnSettings
-from lanenet.learn.dataset import LaneSamples, check_same
-from lanenet.learn.loss import lane_loss
+from lanenet.learn.loss import lane_loss, sigma_factors
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
-from lanenet.learn.predict import predict, trimmed_rmse_cm
-from lanenet.learn.report import tensorboard_curve, write_checkpoint
+from lanenet.learn.predict import answer_rasters, predict, trimmed_rmse_cm
 from lanenet.learn.run_state import (
     STATE_NAME,
     EpochRecord,
     RunState,
     best_record,
     hash_run,
+    load_start_weights,
     read_finished,
     read_state,
     write_state,
 )
-from lanenet.learn.start import load_start_weights
-from lanenet.perception.checkpoint import MODEL_NAME
+from lanenet.perception.network.model_file import MODEL_NAME
+from lanenet.samples.augment import Batch
+from lanenet.samples.dataset import LaneSamples, check_same
+from lanenet.samples.settings import AugmentSettings
+
+#: Share of the missing lines that are to be called absent, with a margin to the 95 % that are asked for.
+_ABSENT_FOUND = 0.96
+#: A network that needs more has not learned to tell lines, and would call most of them absent.
+_MOST_SHIFT = 2.0
+
+
+def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
+    """Scale a network's spread so that 68 % of its errors on frames it did not learn from lie within it."""
+    answers = predict(network, val)
+    factors = sigma_factors(answers.points_cm - answers.truth_cm, answers.sigma_cm)
+    network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
+
+
+def calibrate_presence(network: LaneNet, val: LaneSamples) -> None:
+    """Shift what a network says of lines so that it calls those absent that are.
+
+    How often lines are missing in the training is no more than a setting, and with it where a probability of
+    one half lies. It is put where 96 % of the lines that are taken out of frames it did not learn from are
+    called absent, if it does not lie there already.
+    """
+    gone = AugmentSettings.only(missing_line=0.8, missing_both=0.2)
+    batch = val.augmented_batch(np.arange(len(val)), gone, seed=0, epoch=0)
+    odds = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.double().cpu().numpy()
+    absent = odds[batch.present == 0.0]
+    if absent.size:
+        network.lower_presence(min(max(float(np.quantile(absent, _ABSENT_FOUND)), 0.0), _MOST_SHIFT))
+
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]

@@ -37,19 +37,18 @@ from jaxtyping import Num, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings, load_settings
-from lanenet.control.controller import ControlSettings, LaneController
-from lanenet.control.speed import throttle_of
+from lanenet.control.controller import ControlSettings, LaneController, throttle_of
 from lanenet.data.camera_file import read_camera
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.drive_settings import DriveDetectorSettings
 from lanenet.onboard.masks import read_mask
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.draw import draw_estimate
+from lanenet.perception.edges.views import birdseye_view, undistorting_view
 from lanenet.perception.estimate import Detector, LaneEstimate
-from lanenet.perception.views import birdseye_view, undistorting_view
+from lanenet.perception.registry import build_detector
 
 #: Donkeycar asks its pilot in every turn of its loop, unless a person drives.
 _PAUSE_S = 0.5

@@ -9,14 +9,13 @@ import cv2
 
 from lanenet.control.controller import LaneController
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drive_recorder import DriveRecorder, new_drive_folder
+from lanenet.data.drives.recorder import DriveRecorder, new_drive_folder
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
-from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.drive_report import Step
 from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
@@ -24,6 +23,7 @@ from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.masks import read_mask
 from lanenet.onboard.safety import CommandLimiter
 from lanenet.perception.estimate import Detector
+from lanenet.perception.registry import build_detector
 
 #: Longer than any rehearsal: a dry run stops for a fault, and does not end for it.
 _NEVER_S = 1e9
@@ -80,7 +80,7 @@ def build_loop(
 
 
 def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Detector:
-    """Build the detector that the settings name; see :func:`lanenet.onboard.detectors.build_detector`."""
+    """Build the detector that the settings name; see :func:`lanenet.perception.registry.build_detector`."""
     chosen = settings.detector
     return build_detector(
         chosen.kind,

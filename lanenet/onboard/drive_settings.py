@@ -10,11 +10,11 @@ from pydantic import Field
 from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
 from lanenet.control.controller import ControlSettings
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drive_recorder import RecordingSettings
+from lanenet.data.drives.recorder import RecordingSettings
 from lanenet.onboard.actuators import ActuatorSettings
 from lanenet.onboard.cameras import SourceSettings
-from lanenet.onboard.detectors import DetectorName
 from lanenet.onboard.safety import LimitSettings, SafetySettings
+from lanenet.perception.registry import DetectorName
 
 
 class DriveDetectorSettings(Settings):

@@ -1,28 +1,63 @@
-"""The drive loop: frame -> detector -> steering and speed -> safety -> actuator, in one thread."""
+"""The drive loop: frame -> detector -> steering and speed -> safety -> actuator, in one thread.
+
+Signals that end a drive: Ctrl-C, a service that is stopped, a terminal that is gone.
+"""
 
 from __future__ import annotations
 
 import gc
 import logging
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from types import FrameType
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.control.controller import LaneController
-from lanenet.control.speed import SpeedSettings, throttle_of
+from lanenet.control.controller import LaneController, SpeedSettings, throttle_of
 from lanenet.errors import HardwareError
 from lanenet.onboard.drive_report import DriveReport, Step
 from lanenet.onboard.guard import CommandSink
 from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
 from lanenet.onboard.safety import CommandLimiter, FrameCheck, SafetyJudge, SafetySettings, State, Verdict
-from lanenet.onboard.signals import ending_signals
 from lanenet.perception.estimate import Detector, LaneEstimate
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
+    """Call ``stop`` with the signal's name instead of dying; a second signal raises KeyboardInterrupt.
+
+    A hang-up that is ignored, as under ``nohup``, stays ignored. Elsewhere than in the main thread, where
+    Python allows no handlers, nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = False
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        stop(signal.Signals(number).name)
+
+    wanted = [n for n in ENDING if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+    before: dict[signal.Signals, Any] = {number: signal.signal(number, handle) for number in wanted}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from lanenet.data.drives.sources import Source
 from lanenet.errors import ConfigError, DriveFormatError
-from lanenet.onboard.sources import Source
-from lanenet.perception.static import find_static, spread_frames
+from lanenet.perception.edges.static import find_static, spread_frames
 
 
 def find_mask(source: Source) -> tuple[UInt8[np.ndarray, "h w"] | None, str]:

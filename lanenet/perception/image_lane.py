@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
-from lanenet.perception.edges import check_frame
+from lanenet.perception.edges.canny import check_frame
 
 #: A line is continued towards the car by no more than this, nor by more than the length that is seen.
 _MAX_CONTINUED_CM = 30.0

@@ -8,8 +8,7 @@ from collections import deque
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.lane import lane_width_cm
-from lanenet.geometry.parallel import parallel_points
+from lanenet.geometry.lane import lane_width_cm, parallel_points
 
 #: A line with a probability below this counts as not seen; above the other one, as seen beyond doubt.
 _SEEN, _SURE = 0.5, 0.9

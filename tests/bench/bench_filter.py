@@ -16,14 +16,18 @@ import time
 
 import numpy as np
 
-from datagen.slam.condense import condense
-from datagen.slam.field import DirectionField
-from datagen.slam.filter import FilterSettings, ParticleFilter
-from datagen.slam.motion import MotionModel
-from datagen.slam.resampling import effective_number, reweigh, systematic_resample
-from datagen.slam.scans import Scans, pack_scans
+from datagen.slam.filter.dp_slam import (
+    FilterSettings,
+    ParticleFilter,
+    effective_number,
+    reweigh,
+    systematic_resample,
+)
+from datagen.slam.filter.field import DirectionField
+from datagen.slam.filter.motion import MotionModel
+from datagen.slam.odometry.scans import Scans, condense, pack_scans
 from lanenet.geometry.frames import car_from_map, map_from_car, map_from_car_directions
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 HEIGHT_CM, WHEELBASE_CM, STEP_CM, RADIUS_CM = 15.0, 17.0, 3.0, 150.0
 PARTICLES = 200

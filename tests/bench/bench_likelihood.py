@@ -19,20 +19,21 @@ from typing import Any
 
 import numpy as np
 
-from datagen.labels.mapped_drive import MappedDrive, open_mapped_drive
-from datagen.map_settings import SETTINGS_NAME, MapSettings
+from datagen.localise.live_filter import live_motion
 from datagen.pipeline import map_drive
-from datagen.slam.calibrate import mapping_range
-from datagen.slam.filter import Trajectory, run_filter
-from datagen.slam.live_motion import live_motion
-from datagen.slam.mapper import commands_of, delayed, fit_steering
-from datagen.slam.odometry import Evidence
-from datagen.slam.picture_pairs import Pictures
-from datagen.slam.places import path_lengths
-from datagen.slam.scans import scans_of
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.filter.dp_slam import Trajectory, run_filter
+from datagen.slam.loops.places import path_lengths
+from datagen.slam.odometry.image_pairs import Pictures
+from datagen.slam.odometry.odometry import Evidence
+from datagen.slam.odometry.scans import scans_of
 from datagen.slam.seen import road_edges
+from datagen.slam.track import commands_of, delayed, fit_steering
 from lanenet.config import load_settings
-from lanenet.data.drive import read_truth
+from lanenet.data.drives import read_truth
+from lanenet.data.maps.folder import SETTINGS_NAME
+from lanenet.data.maps.mapped_drive import MappedDrive, open_mapped_drive
 from lanenet.errors import LanenetError
 from lanenet.geometry.frames import wrap_angle
 

@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from datagen.labels.mapped_drive import read_map_frames
 from datagen.labels.truth import true_lines
-from datagen.map_folder import read_map
-from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.slam.places import path_lengths
-from datagen.slam.stillness import following_frames
+from datagen.settings import MapSettings
+from datagen.slam.loops.places import path_lengths
+from datagen.slam.odometry.stillness import following_frames
+from datagen.world.road.track_settings import preset_names
 from datagen.world.simulate import simulate_drive
-from datagen.world.track_settings import preset_names
 from datagen.world.world import SimulationSettings
-from lanenet.data.drive import open_drive, read_truth
+from lanenet.data.drives import open_drive, read_truth
+from lanenet.data.maps.folder import read_map
+from lanenet.data.maps.mapped_drive import read_map_frames
 from lanenet.data.trajectory import read_tum
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow

@@ -27,10 +27,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from datagen.world.look import LookSettings
-from datagen.world.renderer import PixelGround, Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.track import Track, TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings
+from datagen.world.render.renderer import PixelGround, Renderer
+from datagen.world.road.track import Track, TrackSettings, random_track
 
 EVERY_EFFECT = LookSettings(
     floor="asphalt", texture_level=8.0, verge_bgr=(120.0, 140.0, 60.0), joint_u_cm=30.0, joint_v_cm=30.0,

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from lanenet.cli.train import run_settings_schema
 from lanenet.config import load_settings
 from lanenet.data.label_set import read_labels
 from lanenet.errors import LanenetError
 from lanenet.learn.config import LearnSettings
-from lanenet.learn.dataset import LaneSamples
 from lanenet.learn.train import TrainingRun
-from lanenet.train_cli import run_settings_schema
+from lanenet.samples.dataset import LaneSamples
 
 _WARM_UP = 10
 

@@ -21,9 +21,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from datagen import pipeline, self_calibration, stretches
-from datagen.map_settings import MapSettings
-from datagen.slam import mapper, seen, segment
+from datagen import pipeline
+from datagen.lanes import find as stretches
+from datagen.settings import MapSettings
+from datagen.slam import seen, segment
+from datagen.slam import track as mapper
+from datagen.slam.camera import self_calibration
 
 #: Outermost first.
 STAGES: list[tuple[ModuleType, str]] = [

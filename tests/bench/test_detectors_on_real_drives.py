@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.sources import open_source
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.onboard.detectors import build_detector
 from lanenet.onboard.masks import find_mask
-from lanenet.onboard.sources import open_source
 from lanenet.perception.estimate import Detector
-from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
-from lanenet.perception.painter.painter import LanePainter, PainterSettings
+from lanenet.perception.hough.detector import HoughSettings, HoughTracker
+from lanenet.perception.painter.detector import LanePainter, PainterSettings
+from lanenet.perception.registry import build_detector
 
 pytestmark = pytest.mark.slow
 PAPER = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "lane_filter_paper.yaml"

@@ -11,7 +11,7 @@ import pytest
 from datagen.reality.drives import RealitySettings, measure_all_synthetic
 from datagen.reality.measure import measure_drive
 from datagen.reality.report import compare, summary, table
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
 from lanenet.geometry.camera import Camera, Mounting
 
 pytestmark = pytest.mark.slow

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.geometry.camera import Camera, Mounting
 
 

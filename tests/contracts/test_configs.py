@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from lanenet.cli.train import run_settings_schema
 from lanenet.config import check_settings, load_settings, read_yaml
 from lanenet.errors import ConfigError
-from lanenet.train_cli import run_settings_schema
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ALL_FILES = sorted(CONFIGS.rglob("*.y*ml"))
@@ -24,7 +24,7 @@ def read_simulation(path: Path) -> Any:
 
 
 def read_track(path: Path) -> Any:
-    from datagen.world.track import load_track
+    from datagen.world.road.track import load_track
 
     return load_track(path)
 
@@ -36,7 +36,7 @@ def read_camera_file(path: Path) -> Any:
 
 
 def read_detector_settings(path: Path) -> Any:
-    from lanenet.onboard.detectors import build_detector, lane_filter_settings
+    from lanenet.perception.registry import build_detector, lane_filter_settings
 
     # The detector's name comes first in the file's.
     if path.stem.startswith("lane_filter"):
@@ -131,8 +131,8 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
 
     So the window, the split, the network, the augmentation and what it starts from are those of the file.
     """
-    from datagen import datasets
-    from lanenet.learn.publish import publish
+    from datagen.datasets import build as datasets
+    from lanenet.learn.checkpoint import publish
     from lanenet.learn.train import train
 
     def map_drive(
@@ -199,8 +199,8 @@ def read_labels_of(path: Path) -> Any:
 
 
 def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
-    from lanenet.perception.birdseye import PerceptionSettings
-    from lanenet.perception.lane_filter import PAPER, LaneFilterSettings
+    from lanenet.perception.edges.road import PerceptionSettings
+    from lanenet.perception.lane_filter.detector import PAPER, LaneFilterSettings
 
     default = read_detector_settings(CONFIGS / "detectors" / "lane_filter.yaml")
     assert default == (LaneFilterSettings(lane_width_cm=40.0), PerceptionSettings())
@@ -218,7 +218,7 @@ def test_a_misspelt_key_is_named() -> None:
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
 def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> None:
     from lanenet.learn.network import new_network
-    from lanenet.learn.start import load_start_weights
+    from lanenet.learn.run_state import load_start_weights
 
     settings = read_training_run(path)
     folder, data = settings.learn.start_from, settings.data

@@ -13,7 +13,7 @@ REPO = Path(__file__).resolve().parents[2]
 LINT_IMPORTS = Path(sys.executable).parent / "lint-imports"
 #: Modules that start on the car, and the packages that the base installation does not have.
 ONBOARD_MODULES = (
-    *("lanenet.cli", "lanenet.onboard.detect", "lanenet.perception.network"),
+    *("lanenet.cli.app", "lanenet.evaluation.detect", "lanenet.perception.network.detector"),
     *("lanenet.onboard.drive", "lanenet.onboard.guard_process"),
 )
 HEAVY = (

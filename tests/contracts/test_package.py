@@ -16,7 +16,7 @@ import typer
 from typer.testing import CliRunner
 
 import lanenet
-from lanenet.cli import app
+from lanenet.cli.app import app
 
 REPO = Path(__file__).resolve().parents[2]
 VERBS = (

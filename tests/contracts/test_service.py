@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lanenet.cli import app
+from lanenet.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 UNIT = ROOT / "contrib" / "lanenet.service"

@@ -26,8 +26,9 @@ from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.hardware import Frame
 from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
-from lanenet.perception import birdseye, network
+from lanenet.perception.edges import road as birdseye
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.network import detector as network
 
 MODEL = Path(__file__).resolve().parents[2] / "checkpoints" / "small" / "model.onnx"
 RATE_HZ = 30.0

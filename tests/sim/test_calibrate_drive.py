@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from datagen.calibrate_drive import calibrate_drive
-from datagen.map_settings import MapSettings
+from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.camera_file import read_camera, write_camera

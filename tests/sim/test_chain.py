@@ -12,9 +12,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.data.detections import read_detections
-from lanenet.data.drive import read_truth
+from lanenet.data.drives import read_truth
 from lanenet.data.label_set import read_labels
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.learn.export import read_network

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.labels.mapped_drive import open_mapped_drive, read_map_frames
 from datagen.pipeline import MapSettings, map_drive
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
-from lanenet.data.drive import open_drive, read_truth
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives import open_drive, read_truth
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.maps.mapped_drive import open_mapped_drive, read_map_frames
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 

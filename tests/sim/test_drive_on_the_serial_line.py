@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import yaml
 
-from lanenet.data.drive_writer import DriveWriter
-from lanenet.onboard.actuators.line_protocol import REPORT_S, VERSION, LineReader, encode
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.onboard.actuators.serial_board import REPORT_S, VERSION, LineReader, encode
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 
 STOPPED_US, FORWARD_US = 1500, 2000

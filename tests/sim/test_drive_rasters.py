@@ -11,14 +11,14 @@ from datagen.labels.truth import truth_labels
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.parquet import ParquetTable
 from lanenet.onboard.cameras.replay import ReplaySettings, ReplaySource
 from lanenet.onboard.guard import NoActuator
 from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
-from lanenet.perception.network import INPUT_NAME, NetworkDetector
+from lanenet.perception.network.detector import INPUT_NAME, NetworkDetector
 
 MODEL = Path(__file__).resolve().parents[2] / "checkpoints" / "small" / "model.onnx"
 
@@ -37,7 +37,7 @@ class Tap:
 
 def test_the_car_shows_the_network_what_training_showed_it(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from lanenet.learn.dataset import LaneSamples
+    from lanenet.samples.dataset import LaneSamples
 
     path = simulate_drive(SimulationSettings(seed=4, frames=12), tmp_path / "drive")
     camera = open_drive(path).camera

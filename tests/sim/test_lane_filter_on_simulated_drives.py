@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from datagen.world.simulate import SimulationSettings, build_world, frames_of
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.lane_filter import PAPER, LaneFilter, LaneFilterSettings
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.lane_filter.detector import PAPER, LaneFilter, LaneFilterSettings
 
 pytestmark = pytest.mark.slow
 LOG = logging.getLogger(__name__)

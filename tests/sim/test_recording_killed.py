@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
 from lanenet.onboard.bench import example_camera, example_frames
 
 RATE_HZ = 60.0
@@ -20,7 +20,7 @@ PROGRAM = """
 import sys, time
 from pathlib import Path
 import cv2
-from lanenet.data.drive_recorder import DriveRecorder, RecordingSettings
+from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings
 frames = [cv2.imread(str(p)) for p in sorted(Path(sys.argv[2]).glob("*.png"))]
 recorder = DriveRecorder(Path(sys.argv[1]), RecordingSettings(queue_frames=30))
 told = open(sys.argv[3], "w", buffering=1)

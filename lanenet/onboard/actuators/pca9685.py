@@ -19,8 +19,7 @@ from pydantic import Field
 
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
-from lanenet.onboard.actuators.brief_lock import brief_lock
-from lanenet.onboard.actuators.pulses import PulseSettings, command_pulses, neutral_pulses
+from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
 RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10

@@ -1,8 +1,14 @@
-"""From a steering angle and a throttle to the pulses of a servo and of an electronic speed controller."""
+"""From a steering angle and a throttle to the pulses of a servo and of an electronic speed controller.
+
+A lock that is waited for only briefly: a command that hangs must not keep the motor running.
+"""
 
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from pydantic import Field, model_validator
@@ -99,3 +105,21 @@ def neutral_pulses(settings: PulseSettings) -> Pulses:
 
 def _clip(share: float) -> float:
     return min(max(share, -1.0), 1.0)
+
+
+_LONGEST_WAIT_S = 0.02
+
+
+@contextmanager
+def brief_lock(lock: threading.Lock) -> Iterator[None]:
+    """Hold a lock if it can be had at once or nearly so; go on without it if not.
+
+    Args:
+        lock: Held by commands while they are sent.
+    """
+    locked = lock.acquire(timeout=_LONGEST_WAIT_S)
+    try:
+        yield
+    finally:
+        if locked:
+            lock.release()

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.data.drive import Drive, open_drive
+from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import DriveFormatError, HardwareError
 from lanenet.onboard.hardware import Frame, SourceEnded
 

@@ -9,15 +9,23 @@ import numpy as np
 from jaxtyping import Float
 
 from lanenet.perception.image_lane import Polyline, sample_segment
-from lanenet.perception.painter.curves import Curve, CurveSettings, fit_curve, slide_windows
-from lanenet.perception.painter.evidence import (
+from lanenet.perception.painter.curves import (
+    Curve,
+    CurveSettings,
+    Plane,
+    fit_curve,
+    move_lines,
+    slide_windows,
+)
+from lanenet.perception.painter.lines import (
     EdgeField,
     EvidenceSettings,
     LineEvidence,
+    PainterLineSettings,
+    SolidLine,
+    are_apart,
     measure_evidence,
 )
-from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, are_apart
-from lanenet.perception.painter.plane import Plane, move_lines
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from lanenet.calibration.chessboard import Board, BoardView
-from lanenet.calibration.pose import rotation_from_vector
+from lanenet.calibration.lens import rotation_from_vector
 from lanenet.geometry.camera import Camera, Mounting
 
 BOARD = Board(9, 6, 2.5)

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from lanenet.calibration.chessboard import BoardView, find_view, find_views, list_pictures, parse_board
 from lanenet.calibration.chessboard_camera import calibrate_lens
+from lanenet.calibration.lens import pose_from_mounting
 from lanenet.calibration.pictures import plane_picture
-from lanenet.calibration.pose import pose_from_mounting
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.errors import CalibrationError, ConfigError
 

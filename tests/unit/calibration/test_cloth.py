@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from cloth import CLICKED, NAMES, bends, real_corners, reference, side_lengths
 
-from lanenet.calibration.ground import calibrate_ground
-from lanenet.calibration.ground_fit import pixel_residuals
-from lanenet.calibration.pose import pose_from_mounting
+from lanenet.calibration.ground import calibrate_ground, pixel_residuals
+from lanenet.calibration.lens import pose_from_mounting
 
 #: From pixels of the image to the frame car and back: the picture from above has y downwards, 1 px per cm.
 FLIP = np.array([1.0, -1.0])

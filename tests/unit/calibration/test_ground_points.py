@@ -7,10 +7,8 @@ import pytest
 from boards import BOARD, MOUNTING, fisheye_of
 
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.ground import calibrate_ground
-from lanenet.calibration.ground_points import points_of_floor_board
-from lanenet.calibration.lens import project_points
-from lanenet.calibration.pose import moved_points, pose_from_mounting
+from lanenet.calibration.ground import calibrate_ground, points_of_floor_board
+from lanenet.calibration.lens import moved_points, pose_from_mounting, project_points
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
 

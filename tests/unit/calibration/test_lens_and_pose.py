@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lanenet.calibration.lens import camera_of_lens, project_points
-from lanenet.calibration.pose import (
+from lanenet.calibration.lens import (
+    camera_of_lens,
     mounting_from_pose,
     moved_points,
     pose_from_mounting,
     pose_of_plane,
+    project_points,
     rotation_from_vector,
     vector_from_rotation,
 )

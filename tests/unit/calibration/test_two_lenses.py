@@ -11,7 +11,7 @@ from lanenet.calibration.bundle import LensFit, free_numbers, poses_of_views, re
 from lanenet.calibration.chessboard import BoardView, find_views, list_pictures
 from lanenet.calibration.chessboard_camera import calibrate_lens
 from lanenet.calibration.lens import N_DISTORTION
-from lanenet.calibration.two_lenses import FocalScales, best_split, focal_scales
+from lanenet.calibration.views import FocalScales, best_split, focal_scales
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lanenet.config import check_settings
-from lanenet.control.controller import ControlSettings, LaneController
-from lanenet.control.speed import (
+from lanenet.control.controller import (
+    ControlSettings,
+    LaneController,
     SpeedSettings,
     curve_speed_cm_s,
     lane_curvature_per_cm,

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drive import Drive, open_drive, read_truth
-from lanenet.data.drive_folder import TRUTH_NAMES
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives import Drive, open_drive, read_truth
+from lanenet.data.drives.folder import TRUTH_NAMES
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LanenetError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import POINT_NAMES

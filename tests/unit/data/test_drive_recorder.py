@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lanenet.data import drive_recorder
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_folder import FRAMES_FILE
-from lanenet.data.drive_recorder import DriveRecorder, RecordingSettings, new_drive_folder
+from lanenet.data.drives import open_drive
+from lanenet.data.drives import recorder as drive_recorder
+from lanenet.data.drives.folder import FRAMES_FILE
+from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_drive_folder
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.geometry.camera import Camera, Mounting
 

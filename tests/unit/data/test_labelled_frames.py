@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lanenet.data.drive_folder import TRUTH_NAMES
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.folder import TRUTH_NAMES
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.data.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow

@@ -1,6 +1,6 @@
 import numpy as np
 
-from lanenet.data.pieces import map_pieces
+from lanenet.data.segments import map_pieces
 
 
 def test_pieces_begin_where_poses_jump():

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
 from lanenet.errors import DriveFormatError
 
 

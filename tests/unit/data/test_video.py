@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drive import open_drive
-from lanenet.data.video import VideoImages
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.video import VideoImages
 from lanenet.errors import DriveFormatError
 
 N = 40

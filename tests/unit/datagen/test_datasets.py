@@ -12,8 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from datagen.dataset_settings import DataSettings, RecordedSettings, SyntheticSettings
-from datagen.datasets import (
+from datagen.datasets.build import (
     _frames_of,
     _job_name,
     _recorded_labels,
@@ -22,6 +21,7 @@ from datagen.datasets import (
     prepare,
     split_along_time,
 )
+from datagen.datasets.settings import DataSettings, RecordedSettings, SyntheticSettings
 from datagen.world.simulate import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.errors import ConfigError, TrackingLostError
@@ -163,10 +163,10 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
     def label_map(drive_map: Path, out: Path, **_: object) -> None:
         write_labels(out, _labels(np.arange(30)))
 
-    monkeypatch.setattr("datagen.datasets.simulate_drive", lambda simulation, out: out)
-    monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
-    monkeypatch.setattr("datagen.datasets.label_map", label_map)
-    monkeypatch.setattr("datagen.datasets.truth_labels", lambda *_: _labels(np.arange(30)))
+    monkeypatch.setattr("datagen.datasets.build.simulate_drive", lambda simulation, out: out)
+    monkeypatch.setattr("datagen.datasets.build.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.build.label_map", label_map)
+    monkeypatch.setattr("datagen.datasets.build.truth_labels", lambda *_: _labels(np.arange(30)))
     with pytest.raises(TrackingLostError, match="train_01: no lane"):
         prepare(varied(), tmp_path / "strict")
     mapped.clear()
@@ -193,7 +193,7 @@ def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
     def recorded_labels(settings: RecordedSettings, *_: object) -> dict[str, Path]:
         return {role: tmp_path / f"{role}.parquet" for role in ("train", "validation", "test")}
 
-    monkeypatch.setattr("datagen.datasets._recorded_labels", recorded_labels)
+    monkeypatch.setattr("datagen.datasets.build._recorded_labels", recorded_labels)
     drives = (RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0, counts_as=3),)
     # A recording alone needs no other process, nor does it leave one idle that could compile.
     given: list[Path] = []
@@ -249,8 +249,8 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
         made.append("label")
         write_labels(out, _labels(np.arange(400)))
 
-    monkeypatch.setattr("datagen.datasets.map_drive", map_drive)
-    monkeypatch.setattr("datagen.datasets.label_map", label_map)
+    monkeypatch.setattr("datagen.datasets.build.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.build.label_map", label_map)
     drive, camera = tmp_path / "drive", tmp_path / "camera.yaml"
     drive.mkdir()
     (drive / "frames.csv").write_text("frame\n1\n")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.done import fingerprint, forget_done, is_done, key_of, mark_done
+from datagen.datasets.done import fingerprint, forget_done, is_done, key_of, mark_done
 from lanenet.errors import DriveFormatError
 
 

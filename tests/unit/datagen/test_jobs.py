@@ -7,8 +7,8 @@ import os
 
 import pytest
 
-from datagen.jobs import run_jobs
 from lanenet.errors import LanenetError
+from lanenet.processes import run_jobs
 
 HUGE = 2**60  # bytes
 

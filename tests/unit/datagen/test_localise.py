@@ -12,19 +12,19 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from datagen.live_picture import LiveCanvas
-from datagen.localise import HEADER, localise
-from datagen.map_settings import MapSettings
-from datagen.slam.filter import FilterSettings
-from datagen.slam.moments import Moment, StartSettings, moments_of
+from datagen.localise.live_filter import Moment, StartSettings, moments_of
+from datagen.localise.localise import HEADER, localise
+from datagen.localise.picture import LiveCanvas
+from datagen.settings import MapSettings
+from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
-from lanenet.cli import app
+from lanenet.cli.app import app
+from lanenet.cli.research.localise import LiveMoments
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drive import open_drive, read_truth
+from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.trajectory import read_tum
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
-from lanenet.localise_cli import LiveMoments
 from lanenet.onboard.hardware import Frame, SourceEnded
 
 SETTINGS = MapSettings(filter=FilterSettings(particles=60))

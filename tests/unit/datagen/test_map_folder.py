@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.lanes.line import LaneLine, Side
-from datagen.lanes.spline import CubicBasis
-from datagen.map_folder import FORMAT, DriveMap, MapMeta, read_map, write_map
+from datagen.lanes.offset import CubicBasis
 from lanenet.data.files import require
+from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import LanenetError, MapFormatError
 from lanenet.geometry.camera import Camera, Mounting
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from datagen.lanes.trace import TracedLane
-from datagen.map_report import MappedSegment, map_edges
-from datagen.slam.bundle import BundleResult
-from datagen.slam.calibrate import GuessSettings, guessed_camera
-from datagen.slam.filter import Trajectory
-from datagen.slam.scans import pack_scans
+from datagen.quality.figures import MappedSegment, map_edges
+from datagen.slam.adjustment.adjust import BundleResult
+from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.filter.dp_slam import Trajectory
+from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 90.0, 15.0, GuessSettings())
 #: The drive's own numbers of its frames that count: the car stood in 2 to 4, and 8 is missing.

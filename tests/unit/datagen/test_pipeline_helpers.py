@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.map_settings import MapSettings
 from datagen.pipeline import _check_size, hide_bumper, split_segments
-from datagen.slam.calibrate import GuessSettings, guessed_camera
-from datagen.slam.places import Revisit
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.loops.places import Revisit
 from datagen.slam.segment import count_laps
-from lanenet.data.drive import open_drive
-from lanenet.data.recording import Commands, Drive
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 
 

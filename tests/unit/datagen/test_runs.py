@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from datagen.runs import equal_runs, true_runs
+from lanenet.data.segments import equal_runs, true_runs
 
 
 def plain(runs: list[np.ndarray]) -> list[list[int]]:

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import datagen.self_calibration
+import datagen.slam.camera.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera
-from datagen.lane_scale import fitted_width_cm, spacing_cm, width_sigma
-from datagen.lanes.line import LaneLine
+from datagen.lanes.scale import fitted_width_cm, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
-from datagen.map_settings import MapSettings
-from datagen.pictures import straight_frames
-from datagen.self_calibration import (
+from datagen.quality.pictures import straight_frames
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult, BundleSettings
+from datagen.slam.camera.coarse import GuessSettings, guessed_camera, nudged
+from datagen.slam.camera.self_calibration import (
     SIGMA_FACTOR,
     FoundCamera,
     check_observable,
@@ -25,17 +26,16 @@ from datagen.self_calibration import (
     prior_strain,
     refining,
 )
-from datagen.slam.bundle import CAMERA_NAMES, BundleResult, BundleSettings
-from datagen.slam.calibrate import GuessSettings, guessed_camera, nudged
-from datagen.slam.filter import Trajectory
-from datagen.slam.places import Revisit
-from datagen.slam.scans import pack_scans
+from datagen.slam.filter.dp_slam import Trajectory
+from datagen.slam.loops.places import Revisit
+from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drive_writer import DriveWriter
-from lanenet.data.recording import Commands, Drive, ImageFiles
+from lanenet.data.drives.recording import Commands, Drive, ImageFiles
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.maps.line import LaneLine
 from lanenet.errors import CalibrationError
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 SIGMA = dict(zip(CAMERA_NAMES, (0.01, 0.4, 0.4, 0.004, 0.004, 0.003, 0.006, 0.04), strict=True))
@@ -210,8 +210,8 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
         bundle = replace(solved.bundle, camera=adjusted)
         return replace(solved, camera=adjusted, bundle=bundle)
 
-    monkeypatch.setattr(datagen.self_calibration, "solve_segment", solve)
-    monkeypatch.setattr(datagen.self_calibration, "coarse_camera", lambda *_: (CAMERA, []))
+    monkeypatch.setattr(datagen.slam.camera.self_calibration, "solve_segment", solve)
+    monkeypatch.setattr(datagen.slam.camera.self_calibration, "coarse_camera", lambda *_: (CAMERA, []))
     result = find_camera(made_up_drive(400), None, MapSettings(), np.random.default_rng(0))
     assert asked == pytest.approx(starts)
     closed = [focal_px for focal_px, was_closed in answers if was_closed]

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.dataset_settings import RecordedSettings
-from datagen.datasets import _split
-from datagen.splits import split_along_time, split_by_lap, way_cm
+from datagen.datasets.build import _split
+from datagen.datasets.settings import RecordedSettings
+from datagen.datasets.splits import split_along_time, split_by_lap, way_cm
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow

@@ -8,20 +8,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datagen import pipeline, stretches
-from datagen.lanes.line import LaneLine, Side
+from datagen import pipeline
+from datagen.lanes import find as stretches
 from datagen.lanes.trace import TracedLane
-from datagen.map_report import MappedSegment
-from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleResult
-from datagen.slam.calibrate import GuessSettings, guessed_camera
-from datagen.slam.filter import Trajectory
+from datagen.quality.figures import MappedSegment
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import BundleResult
+from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.join import Stretch
-from datagen.slam.scans import pack_scans
+from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
-from lanenet.data.recording import Commands, Drive, ImageFiles
+from lanenet.data.drives.recording import Commands, Drive, ImageFiles
+from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import CalibrationError, TrackingLostError
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 SETTINGS = MapSettings(find_bumper=False)

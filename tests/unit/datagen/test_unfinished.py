@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.unfinished import clear_unfinished
-from lanenet.data.files import atomic_folder
+from lanenet.data.files import atomic_folder, clear_unfinished
 
 
 def _folder(path: Path) -> Path:

@@ -7,9 +7,9 @@ import inspect
 import numpy as np
 import pytest
 
-from datagen.map_settings import MapSettings, with_wheelbase
-from datagen.slam.calibrate import guessed_camera
-from lanenet.cli import map_
+from datagen.settings import MapSettings, with_wheelbase
+from datagen.slam.camera.coarse import guessed_camera
+from lanenet.cli.app import map_
 from lanenet.config import dump_settings, load_settings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, MapSettings().guess)

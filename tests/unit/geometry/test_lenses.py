@@ -3,8 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lanenet.geometry.fisheye import fisheye_radius, fisheye_slope, invert_fisheye
-from lanenet.geometry.pinhole import distort_pinhole, invert_pinhole, pinhole_radius
+from lanenet.geometry.lenses import (
+    distort_pinhole,
+    fisheye_radius,
+    fisheye_slope,
+    invert_fisheye,
+    invert_pinhole,
+    pinhole_radius,
+)
 
 FISHEYE = np.array([-0.03, 0.004, -0.002, 0.0003])
 PINHOLE = np.array([-0.25, 0.06, 0.002, -0.003, -0.005])

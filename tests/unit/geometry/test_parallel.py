@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS
-from lanenet.geometry.parallel import parallel_points
+from lanenet.geometry.lane import PARABOLA_FROM_POINTS, parallel_points
 
 ROWS = np.array([0.0, 15.0, 30.0])
 

@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from datagen.judge.contest import contest_jobs, judge, run_job
-from datagen.judge.files import read_run, read_trajectory
+from datagen.judge.contest import contest_jobs, judge, read_run, read_trajectory, run_job
 from datagen.judge.pictures import COLOURS_BGR, draw_top_view
 from datagen.judge.report import summarise, tables, write_report
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings
-from datagen.world.rig import CameraSettings
-from datagen.world.track import TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.road.track import TrackSettings, random_track
 from datagen.world.world import SimulationSettings, draw_track
-from lanenet.cli import app
+from lanenet.cli.app import app
+from lanenet.cli.research.judge import NamedDetector
 from lanenet.errors import ConfigError, LanenetError
-from lanenet.judge_cli import NamedDetector
 
 # Short open roads: a run is a few dozen frames.
 COMMON = SimulationSettings(

@@ -7,13 +7,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.dataset_settings import DataSettings, SyntheticSettings
-from datagen.datasets import _synthetic_job
-from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
+from datagen.datasets.build import _synthetic_job
+from datagen.datasets.settings import DataSettings, SyntheticSettings
+from datagen.judge.run import (
+    TRUE_POINTS,
+    TRUTH,
+    DepartureCounter,
+    Entrant,
+    RunResult,
+    Trajectory,
+    drive_run,
+    wheel_offsets_cm,
+)
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
-from datagen.judge.wheels import DepartureCounter, wheel_offsets_cm
-from datagen.world.rig import CameraSettings
-from datagen.world.track import Track, TrackSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.road.track import Track, TrackSettings
 from datagen.world.world import SimulationSettings
 from lanenet.errors import ConfigError
 from lanenet.perception.estimate import LaneEstimate

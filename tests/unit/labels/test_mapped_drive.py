@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 from datagen.labels.label_map import label_map
-from datagen.labels.mapped_drive import (
+from datagen.settings import MapSettings
+from lanenet.config import dump_settings
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.label_set import read_labels, write_labels
+from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.line import LaneLine, Side
+from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
     CONTRADICTED,
@@ -24,17 +30,11 @@ from datagen.labels.mapped_drive import (
     points_in_window,
     read_map_frames,
 )
-from datagen.lanes.line import LaneLine, Side
-from datagen.map_folder import FORMAT, DriveMap, MapMeta, read_map, write_map
-from datagen.map_settings import SETTINGS_NAME, MapSettings
-from lanenet.config import dump_settings
-from lanenet.data.drive_writer import DriveWriter
-from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CalibrationError, DriveFormatError, MapFormatError
+from lanenet.evaluation.sources import open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.labelled_sources import open_tests
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
+from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 
 N = 30
 K = np.array([[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 1.0]])

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.labels.project import label_rows, lines_of_frame
-from datagen.lanes.line import LaneLine, Side
+from lanenet.data.maps.frame_lines import label_rows, lines_of_frame
+from lanenet.data.maps.line import LaneLine, Side
 from lanenet.geometry.lane import ROWS_CM, mirror_points
 
 WHEELBASE_CM = 17.0

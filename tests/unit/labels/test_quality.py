@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from datagen.labels.project import FrameLines
 from datagen.labels.quality import frame_residual_cm, label_report
 from lanenet.data.label_set import LabelMeta, LabelSet
+from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from datagen.labels.truth import truth_labels
-from datagen.world.driver import DriverSettings
-from datagen.world.rig import CameraSettings
+from datagen.world.car.driver import DriverSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
-from datagen.world.track_settings import TrackSettings
-from lanenet.data.drive import read_truth
+from lanenet.data.drives import read_truth
 from lanenet.data.label_set import write_labels
-from lanenet.evaluation import evaluate
+from lanenet.evaluation.report import evaluate
+from lanenet.evaluation.sources import open_source, open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.labelled_sources import open_source, open_tests
-from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings
 
 
 def _truth_of(tmp_path, driver: DriverSettings, seed: int):
@@ -78,7 +78,7 @@ def test_what_is_scored_is_what_the_labels_name(tmp_path):
     write_labels(tmp_path / "labels.parquet", labels)
     (source,) = open_tests([tmp_path / "labels.parquet"], [tmp_path / "drive"])
     seen = PerceptionSettings().with_colours()
-    opened = open_source(tmp_path / "drive", BirdseyeWindow(), seen)
+    opened = open_source(tmp_path / "drive", BirdseyeWindow(), seen, truth_labels)
     assert opened.beside is not None and opened.beside.meta.perception == seen
     assert np.isnan(labels.points_cm).all(axis=1).any()
     for found in (source.frames, opened.frames):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from lane_edges import FRAME_CM, joined, paint, ring_path, speckle
 
-from datagen.labels.project import FrameLines, lines_of_frame
-from datagen.lanes.assign import FrameLanes, assign_lanes
 from datagen.lanes.beside import trace_beside
 from datagen.lanes.fit import FitSettings, fit_lines
-from datagen.lanes.line import LaneLine
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TraceSettings, trace_lane
+from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame
+from lanenet.data.maps.lanes import FrameLanes, assign_lanes
+from lanenet.data.maps.line import LaneLine
 from lanenet.geometry.frames import car_from_map
 from lanenet.geometry.lane import ROWS_CM
 

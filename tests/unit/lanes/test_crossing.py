@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from lane_edges import arc_path, joined, paint, speckle
 
-from datagen.lanes.crossing import without_crossings
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.profile import without_crossings
 from datagen.lanes.trace import TraceSettings, trace_lane
 
 HEIGHT_CM, LANE_CM, SIDE_CM = 15.0, 40.0, 100.0

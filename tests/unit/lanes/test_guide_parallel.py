@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lane_edges import arc_path, ring_path
 
-from datagen.lanes.parallel import distance_across, parallel_offset
+from datagen.lanes.fit import distance_across, parallel_offset
 from datagen.lanes.path import Path
 
 APART_CM = 60.0

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_edges import arc_path
 
-from datagen.lanes.assign import assign_lanes
 from datagen.lanes.lap import lap_path, places_on_lap
-from datagen.lanes.line import LaneLine, Side
+from datagen.lanes.offset import CubicBasis, adapted_breaks
 from datagen.lanes.path import edges_along_path
-from datagen.lanes.spline import CubicBasis, adapted_breaks
-from datagen.slam.scans import pack_scans
+from datagen.slam.odometry.scans import pack_scans
+from lanenet.data.maps.lanes import assign_lanes
+from lanenet.data.maps.line import LaneLine, Side
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 HEIGHT_CM, WHEELBASE_CM = 15.0, 17.0
 LONG_CM, SHORT_CM = 150.0, 90.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from datagen.lanes.path import Path, edges_along_path, path_of_poses
-from datagen.slam.scans import pack_scans
+from datagen.slam.odometry.scans import pack_scans
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 HEIGHT_CM = 15.0
 WHEELBASE_CM = 17.0

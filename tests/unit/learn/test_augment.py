@@ -11,14 +11,14 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import mirror_points, rows_of_polyline
-from lanenet.learn.augment import (
+from lanenet.samples.augment import (
     augment_batch,
     join_frames,
     make_view,
     misplaced,
     plain_batch,
 )
-from lanenet.learn.config import AugmentSettings
+from lanenet.samples.settings import AugmentSettings
 
 NOTHING = AugmentSettings.only()
 LABELS = make_label_set(12, seed=5)

@@ -7,9 +7,8 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.png import png_size
-from lanenet.geometry.lane import points_from_parabolas
-from lanenet.learn.breakdown import (
+from lanenet.data.parquet import png_size
+from lanenet.evaluation.breakdown import (
     RELIABILITY_SHARES,
     doubt_of,
     drawn_parts,
@@ -19,9 +18,10 @@ from lanenet.learn.breakdown import (
     presence_of,
     rmse_interval_cm,
 )
-from lanenet.learn.breakdown_picture import breakdown_picture
-from lanenet.learn.compare import SourceAnswers, compare_detectors
-from lanenet.learn.error_tables import as_markdown, lay_out
+from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
+from lanenet.evaluation.pictures import breakdown_picture
+from lanenet.evaluation.tables import as_markdown, lay_out
+from lanenet.geometry.lane import points_from_parabolas
 
 NAN = float("nan")
 TRUTH = np.zeros((200, 6))

@@ -6,11 +6,11 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.png import png_size
+from lanenet.data.parquet import png_size
 from lanenet.errors import LabelFormatError
-from lanenet.learn.compare import FORMAT, SourceAnswers, compare_detectors
-from lanenet.learn.error_picture import error_picture
-from lanenet.learn.error_tables import as_markdown, lay_out
+from lanenet.evaluation.comparison import FORMAT, SourceAnswers, compare_detectors
+from lanenet.evaluation.pictures import error_picture
+from lanenet.evaluation.tables import as_markdown, lay_out
 
 NAN = float("nan")
 TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (5, 1))

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 from synthetic_labels import make_label_set
 
+from lanenet.evaluation.conditions import at_frames, lines_seen, nearest_pose_cm, way_to_training_cm
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.conditions import at_frames, lines_seen, nearest_pose_cm, way_to_training_cm
 
 
 def test_lines_are_seen_where_their_edges_are():

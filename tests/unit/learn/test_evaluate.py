@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from lanenet.evaluation.errors import point_errors
 from lanenet.geometry.lane import mirror_points
-from lanenet.learn.evaluate import point_errors
 
 NAN = float("nan")
 

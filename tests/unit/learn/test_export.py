@@ -14,13 +14,13 @@ from synthetic_labels import WINDOW, make_label_set
 from lanenet.config import dump_settings
 from lanenet.data.label_set import write_labels
 from lanenet.errors import CheckpointError, ModelMismatchError
+from lanenet.evaluation.errors import RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
-from lanenet.learn.evaluate import RasterModel
 from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
-from lanenet.perception.network import ModelMeta, read_model_meta
+from lanenet.perception.network.detector import ModelMeta, read_model_meta
 
 torch.set_num_threads(1)
 

@@ -3,11 +3,12 @@ import pytest
 import torch
 from synthetic_labels import WINDOW, make_label_set
 
-from lanenet.learn.calibrate import calibrate_presence, calibrate_sigma
-from lanenet.learn.config import AugmentSettings, NetworkSettings
-from lanenet.learn.dataset import LaneSamples
+from lanenet.learn.config import NetworkSettings
 from lanenet.learn.network import new_network
 from lanenet.learn.predict import answer_rasters, predict
+from lanenet.learn.train import calibrate_presence, calibrate_sigma
+from lanenet.samples.dataset import LaneSamples
+from lanenet.samples.settings import AugmentSettings
 
 SAMPLES = LaneSamples([make_label_set(400, 3)], ["set"])
 

@@ -4,7 +4,8 @@ from pydantic import ValidationError
 
 from lanenet.config import check_settings, dump_settings
 from lanenet.errors import ConfigError
-from lanenet.learn.config import AugmentSettings, LearnSettings, NetworkSettings
+from lanenet.learn.config import LearnSettings, NetworkSettings
+from lanenet.samples.settings import AugmentSettings
 
 
 def test_hash_ignores_what_does_not_decide_the_result():

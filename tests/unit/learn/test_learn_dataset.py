@@ -5,9 +5,9 @@ import pytest
 from synthetic_labels import WINDOW, make_label_set
 
 from lanenet.errors import LabelFormatError
-from lanenet.learn.config import AugmentSettings
-from lanenet.learn.dataset import LaneSamples, hash_files
-from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.samples.dataset import LaneSamples, hash_files
+from lanenet.samples.settings import AugmentSettings
 
 
 def other_edges():

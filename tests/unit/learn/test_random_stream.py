@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from lanenet.learn.random_stream import (
+from lanenet.samples.random_stream import (
     next_amount,
     next_bell,
     next_number,

@@ -9,9 +9,9 @@ from synthetic_labels import make_label_set
 
 from lanenet.data.files import write_json
 from lanenet.errors import LabelFormatError, ModelMismatchError
+from lanenet.evaluation.errors import RasterAnswers, RasterModel
+from lanenet.evaluation.robustness import CHANGES, as_dict, change_settings, measure_robustness, robust_table
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.evaluate import RasterAnswers, RasterModel
-from lanenet.learn.robust import CHANGES, as_dict, change_settings, measure_robustness, robust_table
 
 FINE = BirdseyeWindow()
 LABELS = make_label_set(40, 0, window=FINE)

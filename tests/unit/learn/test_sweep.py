@@ -10,8 +10,7 @@ from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
 from lanenet.learn.config import LearnSettings, LossSettings, NetworkSettings
-from lanenet.learn.sweep import sweep
-from lanenet.learn.sweep_table import trials_csv, trials_table
+from lanenet.learn.sweep import sweep, trials_csv, trials_table
 
 torch.set_num_threads(1)
 

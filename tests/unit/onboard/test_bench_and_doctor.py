@@ -11,7 +11,7 @@ from lanenet.data.camera_file import write_camera
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, time_stages
-from lanenet.onboard.doctor import check_camera, run_checks
+from lanenet.onboard.doctor.installation import check_camera, run_checks
 
 
 def test_bench_reports_every_stage_with_its_ratio() -> None:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from lanenet.errors import ModelMismatchError
-from lanenet.onboard.bench import example_camera
-from lanenet.onboard.bench_paths import smaller_camera, time_paths
+from lanenet.onboard.bench import example_camera, smaller_camera, time_paths
 
 MODEL = Path(__file__).resolve().parents[3] / "checkpoints" / "small" / "model.onnx"
 

@@ -13,12 +13,12 @@ from typer.testing import CliRunner, Result
 
 import datagen.calibrate_drive
 from datagen.calibrate_drive import CalibratedDrive
-from datagen.map_settings import MapSettings
-from lanenet import cli
+from datagen.settings import MapSettings
+from lanenet.cli import app as cli
 from lanenet.config import read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError
 from lanenet.onboard.bench import example_camera, example_frames
 

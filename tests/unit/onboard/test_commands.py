@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from lanenet import cli
+from lanenet.cli import app as cli
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.detections import read_detections
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
+from lanenet.evaluation.errors import RasterAnswers, RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.evaluate import RasterAnswers, RasterModel
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.perception.birdseye import PerceptionSettings
-from lanenet.perception.model_file import ModelMeta
+from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.perception.network.model_file import ModelMeta
 
 
 def run(*words: str | Path) -> Result:
@@ -120,7 +120,7 @@ def test_faults_of_the_program_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -
 def test_missing_extra_names_the_pip_command(tmp_path: Path) -> None:
     program = (
         "import sys; sys.modules['torch'] = None; sys.argv = ['lanenet', 'export', sys.argv[1]]\n"
-        "from lanenet.cli import main; main()"
+        "from lanenet.cli.app import main; main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, tmp_path], capture_output=True, text=True, timeout=60, check=False
@@ -297,8 +297,8 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             n = len(labels)
             return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
-    monkeypatch.setattr("lanenet.learn.evaluate.RasterModel", OneOff)
-    monkeypatch.setattr("lanenet.perception.network.read_model_meta", lambda path: meta)
+    monkeypatch.setattr("lanenet.evaluation.errors.RasterModel", OneOff)
+    monkeypatch.setattr("lanenet.perception.network.detector.read_model_meta", lambda path: meta)
     return opened
 
 

@@ -7,17 +7,17 @@ import pytest
 
 from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
+from lanenet.evaluation.answers import COMPARED, answer_frames, build_compared, choose_names
+from lanenet.evaluation.breakdown import GROUPS
+from lanenet.evaluation.pictures import WorstFrame, draw_worst, find_worst, jpeg_bytes
 from lanenet.geometry.camera import Camera
-from lanenet.learn.breakdown import GROUPS
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.compare import COMPARED, answer_frames, build_compared, choose_names
 from lanenet.onboard.safety import SafetySettings
-from lanenet.onboard.worst_frames import WorstFrame, draw_worst, find_worst, jpeg_bytes
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings
 from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR
+from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.hough.tracker import HoughTracker
-from lanenet.perception.lane_filter import LaneFilter
+from lanenet.perception.hough.detector import HoughTracker
+from lanenet.perception.lane_filter.detector import LaneFilter
 
 NAN = float("nan")
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from lanenet.data.detections import read_detections
+from lanenet.data.drives.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
+from lanenet.evaluation.answers import lane_filter_points_cm
+from lanenet.evaluation.detect import run_detector
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
-from lanenet.onboard.detect import run_detector
-from lanenet.onboard.detectors import lane_filter_points_cm
-from lanenet.onboard.sources import Source
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
+from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings
 
 CAMERA = example_camera()
 

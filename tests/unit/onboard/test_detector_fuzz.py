@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from typer.testing import CliRunner
 
-from lanenet import cli
+from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.detectors import build_detector
 from lanenet.perception.estimate import Detector, LaneEstimate
-from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
+from lanenet.perception.hough.detector import HoughSettings, HoughTracker
+from lanenet.perception.registry import build_detector
 
 NAMES = ("hough", "painter")
 

@@ -9,13 +9,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.config import check_settings
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import HardwareError
-from lanenet.onboard import doctor, doctor_car
 from lanenet.onboard.bench import example_camera
-from lanenet.onboard.doctor_car import check_car, check_source, check_temperature, check_throttling
+from lanenet.onboard.doctor import car as doctor_car
+from lanenet.onboard.doctor import installation as doctor
+from lanenet.onboard.doctor.car import check_car, check_source, check_temperature, check_throttling
 from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.hardware import Frame
 

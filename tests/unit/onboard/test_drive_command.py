@@ -8,9 +8,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from lanenet.cli import app
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.cli.app import app
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.onboard.drive import build_loop

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from lanenet.onboard.signals import ENDING, ending_signals
+from lanenet.onboard.loop import ENDING, ending_signals
 
 
 @pytest.mark.usefixtures("hang_up_ends")

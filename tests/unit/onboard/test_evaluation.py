@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.rig import CameraSettings
+from datagen.world.car.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
-from lanenet import evaluation
 from lanenet.data.files import json_text
 from lanenet.data.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError
-from lanenet.labelled_sources import Opened
+from lanenet.evaluation import report as evaluation
+from lanenet.evaluation.sources import Opened
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_few_frames_are_not_worth_processes(sources, monkeypatch):
     def refuse(*_):
         raise AssertionError("processes were started")
 
-    monkeypatch.setattr("datagen.jobs.run_jobs", refuse)
+    monkeypatch.setattr("lanenet.processes.run_jobs", refuse)
     found = evaluation.evaluate(sources, ("hough",), None, workers=2).comparison.as_dict()
     assert np.isfinite(found["detectors"]["hough"]["groups"]["all"]["rmse_cm"])
 

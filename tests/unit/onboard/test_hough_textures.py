@@ -11,10 +11,10 @@ import pytest
 from textured_frames import GENERATORS
 from typer.testing import CliRunner
 
-from lanenet import cli
+from lanenet.cli import app as cli
 from lanenet.config import load_settings
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
+from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 
 SHIPPED_FILE = Path(__file__).resolve().parents[3] / "configs" / "detectors" / "hough_value.yaml"
 SETTINGS = {

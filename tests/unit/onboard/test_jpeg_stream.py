@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanenet.onboard.cameras.jpeg_stream import JpegStream
+from lanenet.onboard.cameras.rpicam import JpegStream
 
 
 def jpeg(value, quality=90, progressive=False):

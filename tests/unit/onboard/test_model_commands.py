@@ -11,14 +11,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from lanenet import cli
+from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.detections import read_detections
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import LanenetError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_frames
-from lanenet.perception.network import read_model_meta
+from lanenet.perception.network.detector import read_model_meta
 
 CHECKPOINT = Path(__file__).resolve().parents[3] / "checkpoints" / "small"
 CAMERA = CHECKPOINT / "camera.yaml"

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lanenet.cli import app
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.cli.app import app
+from lanenet.cli.outputs import check_ending, check_not_source
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import ConfigError
-from lanenet.outputs import check_ending, check_not_source
 
 
 def touched(folder: Path, *names: str) -> Path:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from textured_frames import GENERATORS
 
-from lanenet.perception.painter.painter import LanePainter, PainterSettings
+from lanenet.perception.painter.detector import LanePainter, PainterSettings
 
 SIZES = ((240, 320), (120, 160))
 SEEDS = 20

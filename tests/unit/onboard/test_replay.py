@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import HardwareError
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.cameras.replay import ReplaySettings

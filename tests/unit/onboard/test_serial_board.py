@@ -16,8 +16,15 @@ from hypothesis import strategies as st
 
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.actuators import make_actuator
-from lanenet.onboard.actuators.line_protocol import MAX_LINE, Line, LineReader, crc8, decode, encode
-from lanenet.onboard.actuators.serial_board import SerialBoardSettings
+from lanenet.onboard.actuators.serial_board import (
+    MAX_LINE,
+    Line,
+    LineReader,
+    SerialBoardSettings,
+    crc8,
+    decode,
+    encode,
+)
 from lanenet.onboard.hardware import Actuator
 
 CORE = Path("/usr/share/arduino/hardware/arduino/avr")

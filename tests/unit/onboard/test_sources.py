@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives.sources import open_source
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import DriveFormatError
 from lanenet.onboard.bench import example_camera
-from lanenet.onboard.sources import open_source
 
 
 def picture(value: int) -> np.ndarray:

@@ -8,8 +8,8 @@ import pytest
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError, HardwareError
 from lanenet.onboard.actuators.pulses import PulseSettings, command_pulses
+from lanenet.onboard.doctor.wheel_trial import try_wheels
 from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.wheel_trial import try_wheels
 
 PULSES = {
     "max_steering_rad": 0.4,

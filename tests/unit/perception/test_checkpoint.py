@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lanenet.errors import ModelMismatchError
-from lanenet.perception.checkpoint import find_model, is_model, without_model
+from lanenet.perception.network.model_file import find_model, is_model, without_model
 
 
 def make_checkpoint(folder: Path, *names: str) -> Path:

@@ -9,11 +9,10 @@ from hypothesis.extra.numpy import arrays
 
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadEdgeExtractor
-from lanenet.perception.colour import ColourSettings
-from lanenet.perception.components import measure_components
-from lanenet.perception.edge_pixels import EdgePixels
-from lanenet.perception.edges import EdgeSettings, find_edges
+from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.markings_only import ColourSettings, measure_components
+from lanenet.perception.edges.pixels import EdgePixels
+from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadEdgeExtractor
 
 COLOUR = EdgeSettings(method="colour")
 CAMERA = Camera(

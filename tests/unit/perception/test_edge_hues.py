@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.perception.birdseye import PerceptionSettings
-from lanenet.perception.edges import EdgeSettings, find_edges
+from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.road import PerceptionSettings
 
 GRAY_ALONE, COLOURS = EdgeSettings(), PerceptionSettings().with_colours().edges
 #: The strip from the left border to the right one, px.

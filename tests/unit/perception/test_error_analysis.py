@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.data.camera_file import write_camera
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.analysis_picture import draw_analysis, figure_lines
-from lanenet.perception.error_analysis import AnalysisSettings, analyse_errors, figures, steering_error_rad
+from lanenet.perception.error_analysis import (
+    AnalysisSettings,
+    analyse_errors,
+    draw_analysis,
+    figure_lines,
+    figures,
+    steering_error_rad,
+)
 
 DOWN = Camera(
     "pinhole",

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanenet.perception.hough import choice, lines, steering
+from lanenet.perception.hough import lines, steering
+from lanenet.perception.hough import lines as choice
 from lanenet.perception.hough.edges import binarise
 from lanenet.perception.hough.lines import HoughLineSettings, Line, Segment
 from lanenet.perception.hough.steering import HoughSteeringSettings

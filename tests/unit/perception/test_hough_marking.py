@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from lane_frames import CAMERA, lane_frame
 
+from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.hough.edges import Contours, HoughEdgeSettings, binarise, crowded_share, gray_of
 from lanenet.perception.hough.lines import (
     HoughLineSettings,
@@ -16,7 +17,6 @@ from lanenet.perception.hough.lines import (
     x_at,
 )
 from lanenet.perception.hough.marking import centre_on_marking
-from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
 
 LINES = HoughLineSettings()
 ROWS = np.array([0.0, 15.0, 30.0])

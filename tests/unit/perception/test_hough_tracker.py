@@ -10,9 +10,9 @@ from lanenet.config import check_settings
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.lane import mirror_points
 from lanenet.perception.estimate import Detector
+from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.hough.edges import HoughEdgeSettings, cut_roi, find_contours
 from lanenet.perception.hough.lines import Segment, find_segments, split_sides
-from lanenet.perception.hough.tracker import HoughSettings, HoughTracker
 
 BOTTOM = HoughSettings.model_validate({"steering": {"distance_row": "bottom"}})
 

@@ -13,8 +13,8 @@ from lanenet.geometry.camera import Camera, Mounting
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.network import ModelMeta, NetworkDetector, read_model_meta
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.network.detector import ModelMeta, NetworkDetector, read_model_meta
 
 torch.set_num_threads(1)
 

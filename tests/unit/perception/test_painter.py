@@ -17,28 +17,33 @@ from lanenet.perception.estimate import Detector
 from lanenet.perception.painter.curves import (
     Curve,
     CurveSettings,
+    RoadPlane,
+    SquarePlane,
     curvature_radius,
+    finite_rows,
     fit_curve,
+    move_lines,
     slide_windows,
 )
+from lanenet.perception.painter.detector import LanePainter, PainterSettings, find_aim_cm, measure_lane
 from lanenet.perception.painter.edges import (
     PainterEdgeSettings,
     find_painter_edges,
     find_trapezoid,
     value_channel,
 )
-from lanenet.perception.painter.evidence import (
+from lanenet.perception.painter.lines import (
     EdgeField,
     EvidenceSettings,
     LineEvidence,
+    PainterLineSettings,
+    SolidLine,
     find_edge_field,
+    find_two_lines,
+    join_side,
     measure_evidence,
 )
-from lanenet.perception.painter.lines import PainterLineSettings, SolidLine, find_two_lines, join_side
 from lanenet.perception.painter.markings import Marking, can_bound_the_lane, choose_lane, straight_px
-from lanenet.perception.painter.measure import find_aim_cm, measure_lane
-from lanenet.perception.painter.painter import LanePainter, PainterSettings
-from lanenet.perception.painter.plane import RoadPlane, SquarePlane, finite_rows, move_lines
 
 TRAPEZOID = np.array([[120.0, 100.0], [200.0, 100.0], [320.0, 200.0], [0.0, 200.0]])
 LINES = PainterLineSettings()

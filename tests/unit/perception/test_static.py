@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lanenet.errors import DriveFormatError
-from lanenet.perception.static import find_static, spread_frames, static_mask
+from lanenet.perception.edges.static import find_static, spread_frames, static_mask
 
 
 def drive(count: int, bumper: bool, seed: int = 0) -> list[np.ndarray]:

@@ -8,7 +8,7 @@ from lanenet.errors import CalibrationError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.bench import example_camera
-from lanenet.perception.views import birdseye_view, undistorting_view
+from lanenet.perception.edges.views import birdseye_view, undistorting_view
 
 WINDOW = BirdseyeWindow(left_cm=-40.0, near_cm=12.0, cell_cm=0.5, rows=100, columns=160)
 

@@ -15,10 +15,10 @@ from datagen.reality.measure import MeasuredDrive, at_nominal_height
 from datagen.reality.pictures import histograms, sheet
 from datagen.reality.report import compare, nearest_synthetic, summary, table, write_report
 from datagen.reality.statistics import STATISTICS
-from datagen.world.rig import CameraSettings
+from datagen.world.car.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from datagen.world.world import assemble_world
-from lanenet.cli import app
+from lanenet.cli.app import app
 
 CAMERA = at_nominal_height(CameraSettings(width=64, height=48).build(26.0))
 SMALL = RealitySettings(

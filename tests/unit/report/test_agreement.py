@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.labels.mapped_drive import MappedDrive
-from datagen.lanes.line import LaneLine, Side
-from datagen.map_folder import FORMAT, DriveMap, MapMeta
-from datagen.report.agreement import contradicted_lines
-from lanenet.data.recording import Commands, Drive
+from datagen.quality.agreement import contradicted_lines
+from lanenet.data.drives.recording import Commands, Drive
+from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.data.maps.line import LaneLine, Side
+from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.birdseye import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings
 
 N, STEP_CM, TAPE_CM = 72, 3.0, 2.4
 CAMERA = Camera(

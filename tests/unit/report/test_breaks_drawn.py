@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.labels.mapped_drive import MappedDrive
-from datagen.map_folder import FORMAT, DriveMap, MapMeta
-from datagen.pictures import draw_map
-from datagen.report import plots
-from datagen.slam.calibrate import GuessSettings, guessed_camera
-from datagen.slam.mapper import SteeringFit
-from datagen.slam.scans import pack_scans
-from lanenet.data.recording import Commands, Drive, ImageFiles
-from lanenet.perception.birdseye import PerceptionSettings, RoadEdges
+from datagen.quality import plots
+from datagen.quality.pictures import draw_map
+from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.odometry.scans import pack_scans
+from datagen.slam.track import SteeringFit
+from lanenet.data.drives.recording import Commands, Drive, ImageFiles
+from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 #: Frames of the drive; of its four stretches the third is not on the map, and the second in one of its own.

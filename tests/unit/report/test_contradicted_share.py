@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.map_report import contradicted_share
+from datagen.quality.figures import contradicted_share
 
 
 def test_deleted_frames_say_nothing_of_the_map():

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.map_settings import MapSettings
-from datagen.report.held_out import held_out_frames, without_frames
-from datagen.slam.scans import pack_scans
+from datagen.quality.measure import held_out_frames, without_frames
+from datagen.settings import MapSettings
+from datagen.slam.odometry.scans import pack_scans
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 
 @given(st.integers(1, 300), st.integers(2, 40), st.integers(0, 1000))

@@ -19,12 +19,12 @@ import pytest
 import yaml
 
 from datagen.labels.label_map import label_map
-from datagen.map_folder import read_map
-from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.report.refusal import refuse_rejected
+from datagen.quality.page import refuse_rejected
+from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
+from lanenet.data.maps.folder import read_map
 from lanenet.errors import TrackingLostError
 
 FRAMES = 80

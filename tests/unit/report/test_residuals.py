@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.labels.project import FrameLines
-from datagen.report.residuals import (
+from datagen.quality.residuals import (
     BorderSamples,
     ResidualSettings,
     border_samples,
     join_samples,
     summarise,
 )
+from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.edges import EdgePixels
+from lanenet.perception.edges.canny import EdgePixels
 
 CAMERA = Camera(
     "fisheye",

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from datagen.calibrate_drive import calibrate_drive
-from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.report.mappable import check_edges, check_lines_seen, check_moving
-from datagen.report.quality import MapQuality
-from datagen.report.residuals import BorderSamples, join_samples
+from datagen.quality.mappable import check_edges, check_lines_seen, check_moving
+from datagen.quality.measure import MapQuality
+from datagen.quality.residuals import BorderSamples, join_samples
+from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_writer import DriveWriter
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
-from lanenet.perception.edges import EdgeSettings
+from lanenet.perception.edges.canny import EdgeSettings
 
 CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
 SETTINGS = MapSettings(find_bumper=False)

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from datagen.report.evidence import LineEvidence, MapEvidence
-from datagen.report.verdict import VerdictSettings, judge
+from datagen.quality.verdict import LineEvidence, MapEvidence, VerdictSettings, judge
 
 LINE = LineEvidence(samples=2000, coverage=0.8, robust_sd_px=0.4, p95_px=1.2)
 GOOD = MapEvidence(

@@ -9,7 +9,7 @@ import numpy as np
 from pixel_road import HEIGHT, WIDTH, bean, tape_loop
 from tape_road import TAPE_CM, WHEELBASE_CM, dashes_along
 
-from lanenet.data.recording import Commands, Drive
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from datagen.slam.condense import condense
-from datagen.slam.filter import FilterSettings
-from datagen.slam.motion import MotionModel, widen_steps
-from datagen.slam.resampling import effective_number, reweigh, systematic_resample
-from datagen.slam.scans import Scans
+from datagen.slam.filter.dp_slam import FilterSettings, effective_number, reweigh, systematic_resample
+from datagen.slam.filter.motion import MotionModel, widen_steps
+from datagen.slam.odometry.scans import Scans, condense
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 #: Cell of the unbounded plane -> what was seen there: frame and vector.

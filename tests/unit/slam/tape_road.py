@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datagen.slam.scans import Scans, pack_scans
+from datagen.slam.odometry.scans import Scans, pack_scans
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.birdseye import RoadEdges
+from lanenet.perception.edges.road import RoadEdges
 
 HEIGHT_CM = 15.0
 WHEELBASE_CM = 17.0

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from reference_filter import reference_filter
 from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, tape_road
 
-from datagen.slam.ancestry import AncestryMap, Likelihood
-from datagen.slam.filter import FilterSettings, ParticleFilter
-from datagen.slam.motion import MotionModel
-from datagen.slam.resampling import systematic_resample
+from datagen.slam.filter.ancestry import AncestryMap, Likelihood
+from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter, systematic_resample
+from datagen.slam.filter.motion import MotionModel
 
 CELL_CM = 0.8
 MEMORY = 30.0

@@ -7,12 +7,11 @@ import pytest
 from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixels
 from tape_road import tape_road
 
-from datagen.slam import bundle_problem
-from datagen.slam.bundle import BundleSettings, adjust
-from datagen.slam.bundle_priors import frame_priors
-from datagen.slam.bundle_problem import BundleProblem, inner_pixels, point_trust
-from datagen.slam.bundle_state import start_state
-from datagen.slam.places import path_lengths
+from datagen.slam.adjustment import problem as bundle_problem
+from datagen.slam.adjustment.adjust import BundleSettings, adjust
+from datagen.slam.adjustment.problem import BundleProblem, frame_priors, inner_pixels, point_trust
+from datagen.slam.adjustment.state import start_state
+from datagen.slam.loops.places import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
 SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))

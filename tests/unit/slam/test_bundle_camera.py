@@ -7,7 +7,7 @@ import pytest
 from pixel_road import camera_numbers, fisheye, pixels, tape_loop
 from tape_road import TapeRoad, tape_road
 
-from datagen.slam.bundle import CAMERA_NAMES, BundleSettings, adjust
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings, adjust
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
 SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))

@@ -9,12 +9,12 @@ import pytest
 from pixel_road import HEIGHT, WIDTH, fisheye, pinhole, pixels
 from tape_road import HEIGHT_CM, tape_road
 
-from datagen.slam.bundle import CAMERA_NAMES, BundleSettings
-from datagen.slam.bundle_problem import BundleProblem
-from datagen.slam.bundle_state import start_state
-from datagen.slam.lens_kernels import N_VIEW, lift_pixel, project_point, project_with_slopes, set_view
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
+from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_slopes, set_view
+from datagen.slam.adjustment.problem import BundleProblem
+from datagen.slam.adjustment.state import start_state
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges import EdgePixels
+from lanenet.perception.edges.canny import EdgePixels
 
 CAMERAS = {"fisheye": fisheye(), "pinhole": pinhole()}
 SMALL = BundleSettings(lags=(1, 4), points=40)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.bundle_kernels import N_FRAME
-from datagen.slam.bundle_solve import Equations, FramePattern
+from datagen.slam.adjustment.kernels import N_FRAME
+from datagen.slam.adjustment.problem import Equations, FramePattern
 
 FRAMES = 9
 

@@ -9,7 +9,7 @@ import pytest
 from picture_road import loop_drive
 from pixel_road import fisheye
 
-from datagen.slam.calibrate import (
+from datagen.slam.camera.coarse import (
     NOMINAL_HEIGHT_CM,
     GuessSettings,
     clearest_step,
@@ -19,11 +19,11 @@ from datagen.slam.calibrate import (
     mapping_range,
     with_known_scale,
 )
-from datagen.slam.odometry import STEPS_HEIGHTS, usual_step
-from datagen.slam.picture_pairs import OdometrySettings, Pictures
-from datagen.slam.scans import seen_edges
-from lanenet.perception.birdseye import PerceptionSettings, RangeSettings, RoadTable
-from lanenet.perception.edges import EdgeSettings, find_edges
+from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.odometry.scans import seen_edges
+from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadTable
 
 GUESS = GuessSettings()
 

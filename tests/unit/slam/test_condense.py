@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.condense import condense
+from datagen.slam.odometry.scans import condense
 
 
 def _points(seed: int, n: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.places import Revisit, RevisitSettings, consistent_revisits, path_lengths
+from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits, path_lengths
 
 LAP = 80
 STEP_CM = 5.0

@@ -9,16 +9,15 @@ import pytest
 from picture_road import loop_drive, made_up_drive
 from pixel_road import fisheye
 
-from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleResult, BundleSettings
-from datagen.slam.crawl import _with_frames_between, solve_segment
-from datagen.slam.filter import FilterSettings, Trajectory
-from datagen.slam.key_frames import key_pairs
-from datagen.slam.mapper import commands_of
-from datagen.slam.places import Revisit, path_lengths
-from datagen.slam.scans import pack_scans
-from datagen.slam.segment import SolvedSegment
-from lanenet.data.recording import Commands, Drive
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
+from datagen.slam.filter.dp_slam import FilterSettings, Trajectory
+from datagen.slam.keyframes import key_pairs
+from datagen.slam.loops.places import Revisit, path_lengths
+from datagen.slam.odometry.scans import pack_scans
+from datagen.slam.segment import SolvedSegment, _with_frames_between, solve_segment
+from datagen.slam.track import commands_of
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 
 SMALL = MapSettings(filter=FilterSettings(particles=80, max_points=80), bundle=BundleSettings(points=40))
@@ -100,7 +99,7 @@ def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypa
         held.extend(args[6])
         raise _StopError
 
-    monkeypatch.setattr("datagen.slam.crawl.adjust", adjust)
+    monkeypatch.setattr("datagen.slam.segment.adjust", adjust)
     with pytest.raises(_StopError):
         _with_frames_between(
             solved, keys, np.full(301, 0.05), drive, commands_of(drive, 17.0), SMALL, np.random.default_rng(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tape_road import WHEELBASE_CM, tape_road
 
-from datagen.slam.field import DirectionField
+from datagen.slam.filter.field import DirectionField
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 CELL_CM = 0.8

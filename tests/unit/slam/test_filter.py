@@ -10,18 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, TapeRoad, tape_road
 
-from datagen.slam.ancestry import AncestryMap
-from datagen.slam.filter import (
+from datagen.slam.filter.ancestry import AncestryMap
+from datagen.slam.filter.dp_slam import (
     FilterSettings,
     ParticleFilter,
     Survivors,
     Trajectory,
+    effective_number,
+    reweigh,
     run_filter,
     smooth_lineages,
+    systematic_resample,
 )
-from datagen.slam.motion import MotionModel
-from datagen.slam.resampling import effective_number, reweigh, systematic_resample
-from datagen.slam.scans import thin_scan
+from datagen.slam.filter.motion import MotionModel
+from datagen.slam.odometry.scans import thin_scan
 
 SETTINGS = FilterSettings(particles=250)
 FRAMES = 100

@@ -9,16 +9,16 @@ import pytest
 from picture_road import Pictures, loop_drive, made_up_drive
 from pixel_road import fisheye
 
-from datagen.map_settings import MapSettings
-from datagen.slam.bundle import BundleResult, BundleSettings
-from datagen.slam.crawl import solve_segment
-from datagen.slam.filter import FilterSettings
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
+from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
-from datagen.slam.key_frames import key_pairs
-from datagen.slam.loop_pairs import loop_pairs
-from datagen.slam.places import Revisit, RevisitSettings, relative_pose
+from datagen.slam.keyframes import key_pairs
+from datagen.slam.loops.places import Revisit, RevisitSettings, relative_pose
+from datagen.slam.loops.pose_graph import loop_pairs
 from datagen.slam.seen import SeenRoad, road_edges
-from lanenet.data.recording import Commands, Drive
+from datagen.slam.segment import solve_segment
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 
 SMALL = MapSettings(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.key_frames import (
+from datagen.slam.keyframes import (
     alongside,
     commands_between,
     key_frames,
@@ -13,7 +13,7 @@ from datagen.slam.key_frames import (
     poses_between,
     values_between,
 )
-from datagen.slam.mapper import CommandedMotion
+from datagen.slam.track import CommandedMotion
 
 
 def _arc(ways_cm: np.ndarray, radius_cm: float, slip_rad: float = 0.0) -> np.ndarray:

@@ -10,17 +10,22 @@ import pytest
 from picture_road import Pictures, loop_drive
 from pixel_road import bean, fisheye
 
-from datagen.map_settings import MapSettings
-from datagen.slam.calibrate import mapping_range
-from datagen.slam.filter import FilterSettings, ParticleFilter, run_filter
-from datagen.slam.live import LiveLocaliser
-from datagen.slam.live_motion import live_motion
-from datagen.slam.mapper import commands_of
-from datagen.slam.moments import LivePose, Moment, StartSettings, moments_of
-from datagen.slam.scans import edges_of_drive, scans_of
-from lanenet.data.recording import Commands, Drive
+from datagen.localise.live_filter import (
+    LiveLocaliser,
+    LivePose,
+    Moment,
+    StartSettings,
+    live_motion,
+    moments_of,
+)
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter, run_filter
+from datagen.slam.odometry.scans import edges_of_drive, scans_of
+from datagen.slam.track import commands_of
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
-from lanenet.perception.birdseye import RoadTable
+from lanenet.perception.edges.road import RoadTable
 
 LAP_FRAMES, LAP_CM = 100, 400.0
 STEP_CM = LAP_CM / LAP_FRAMES

@@ -10,12 +10,12 @@ import pytest
 from picture_road import loop_drive
 from pixel_road import fisheye
 
-from datagen.map_folder import read_map
-from datagen.map_settings import MapSettings
 from datagen.pipeline import map_drive
-from datagen.slam.bundle import BundleSettings
-from datagen.slam.filter import FilterSettings
-from lanenet.data.drive_writer import DriveWriter
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import BundleSettings
+from datagen.slam.filter.dp_slam import FilterSettings
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.maps.folder import read_map
 
 
 def test_repeated_frames_are_not_mapped_and_do_not_cut_the_drive(tmp_path: Path):

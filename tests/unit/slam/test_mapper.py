@@ -9,8 +9,11 @@ import pytest
 from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
-from datagen.slam.filter import FilterSettings
-from datagen.slam.mapper import (
+from datagen.slam.filter.dp_slam import FilterSettings
+from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
+from datagen.slam.odometry.odometry import Odometry, usual_way
+from datagen.slam.odometry.scans import scans_of
+from datagen.slam.track import (
     CommandedMotion,
     MotionSettings,
     commands_of,
@@ -19,11 +22,8 @@ from datagen.slam.mapper import (
     motion_about,
     track,
 )
-from datagen.slam.odometry import Odometry, usual_way
-from datagen.slam.picture_pairs import OdometrySettings, Pictures
-from datagen.slam.scans import scans_of
-from lanenet.data.recording import Commands, Drive
-from lanenet.perception.birdseye import RangeSettings
+from lanenet.data.drives.recording import Commands, Drive
+from lanenet.perception.edges.road import RangeSettings
 
 
 class _NoImages:

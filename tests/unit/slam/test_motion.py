@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.motion import FACTOR, HEADING, OFFSET, MotionModel, X, Y, widen_steps
+from datagen.slam.filter.motion import FACTOR, HEADING, OFFSET, MotionModel, X, Y, widen_steps
 
 N = 20_000
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.motion_grid import MotionGrid, follow_motion
-from datagen.slam.picture_pairs import turns_up_to
+from datagen.slam.odometry.image_pairs import turns_up_to
+from datagen.slam.odometry.motion_grid import MotionGrid, follow_motion
 
 TURNS = turns_up_to(0.09, 0.006)
 WALK_RAD = 0.008

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.mutual import compose, separate_places, with_supported, without_contradicted
-from datagen.slam.places import Revisit, RevisitSettings, consistent_revisits, relative_pose
+from datagen.slam.loops.mutual import compose, separate_places, with_supported, without_contradicted
+from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits, relative_pose
 
 HEIGHT_CM, LAP = 15.0, 90
 SETTINGS = RevisitSettings()

@@ -7,10 +7,9 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
-from datagen.slam.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
-from datagen.slam.odometry_kernels import SECTORS, index_edges
-from datagen.slam.picture_pairs import OdometrySettings, Pictures, turns_up_to
-from lanenet.perception.edges import EdgePixels
+from datagen.slam.odometry.image_pairs import SECTORS, OdometrySettings, Pictures, index_edges, turns_up_to
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
+from lanenet.perception.edges.canny import EdgePixels
 
 SETTINGS = OdometrySettings()
 STEP = STEP_CM / HEIGHT_CM
@@ -257,7 +256,7 @@ def test_half_precision_follows_the_same_motion_in_half_the_memory(edges, monkey
     def in_full(fits, temper):
         return temper * (fits.astype(np.float64) - fits.max(axis=(1, 2), keepdims=True))
 
-    monkeypatch.setattr("datagen.slam.odometry._likelihood", in_full)
+    monkeypatch.setattr("datagen.slam.odometry.odometry._likelihood", in_full)
     full = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM).motion()
     np.testing.assert_allclose(kept.ways_cm[1:], full.ways_cm[1:], rtol=2e-3)
     np.testing.assert_allclose(kept.turns_rad[1:], full.turns_rad[1:], atol=1e-4)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from picture_road import made_up_drive
 from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
-from datagen.slam.places import (
+from datagen.slam.loops.places import (
     RevisitSettings,
     alike,
     diagonal_mean,
@@ -20,8 +20,8 @@ from datagen.slam.places import (
     relative_pose,
     thumbnails,
 )
-from datagen.slam.scans import Scans, pack_scans
-from lanenet.perception.birdseye import RoadEdges
+from datagen.slam.odometry.scans import Scans, pack_scans
+from lanenet.perception.edges.road import RoadEdges
 
 LAP = 100
 POSE = st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-20.0, 20.0)).map(np.array)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.places import Revisit, relative_pose
-from datagen.slam.posegraph import borne_out, close_loops, missed_by
+from datagen.slam.loops.places import Revisit, relative_pose
+from datagen.slam.loops.pose_graph import borne_out, close_loops, missed_by
 
 HEIGHT_CM = 15.0
 LAP = 100

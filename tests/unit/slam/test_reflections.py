@@ -8,9 +8,9 @@ import tape_road as tape_road_module
 from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
-from datagen.slam.reflections import without_reflections
-from lanenet.perception.birdseye import RangeSettings, RoadTable
-from lanenet.perception.edges import EdgePixels
+from datagen.slam.odometry.reflections import without_reflections
+from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 CAMERA = fisheye()
 TABLE = RoadTable(CAMERA, RangeSettings(far_cm=75.0, side_cm=60.0))

@@ -10,19 +10,17 @@ import pytest
 from picture_road import loop_drive, made_up_drive
 from pixel_road import camera_numbers, fisheye
 
-from datagen.map_settings import MapSettings
-from datagen.self_calibration import SIGMA_FACTOR
-from datagen.slam.bundle import BundleSettings
-from datagen.slam.crawl import solve_segment
-from datagen.slam.filter import FilterSettings
-from datagen.slam.loop_pairs import loop_pairs, side_by_side
-from datagen.slam.mapper import CommandedMotion
-from datagen.slam.places import Revisit, RevisitSettings, path_lengths
-from datagen.slam.posegraph import missed_by
-from datagen.slam.segment import SolvedSegment
+from datagen.settings import MapSettings
+from datagen.slam.adjustment.adjust import BundleSettings
+from datagen.slam.camera.self_calibration import SIGMA_FACTOR
+from datagen.slam.filter.dp_slam import FilterSettings
+from datagen.slam.loops.places import Revisit, RevisitSettings, path_lengths
+from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
+from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.track import CommandedMotion
 from datagen.world.simulate import SimulationSettings, simulate_drive
-from lanenet.data.drive import open_drive, read_truth
-from lanenet.data.recording import Commands, Drive
+from lanenet.data.drives import open_drive, read_truth
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from picture_road import made_up_drive
 
-from datagen.slam.stillness import (
+from datagen.slam.odometry.stillness import (
     SMALL_HEIGHT,
     SMALL_WIDTH,
     following_frames,
@@ -16,7 +16,7 @@ from datagen.slam.stillness import (
     small_pictures,
     standing_frames,
 )
-from lanenet.data.recording import Commands, Drive
+from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import TrackingLostError
 
 

@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from datagen.world import sheets
-from datagen.world.furniture import COLOURS, Furniture, Junction
-from datagen.world.look import LookSettings
-from datagen.world.objects import place_objects
+from datagen.world.render.look import LookSettings
+from datagen.world.render.objects import place_objects
+from datagen.world.road.furniture import COLOURS, Furniture, Junction
+from datagen.world.road.track import TrackSettings, preset, preset_names, random_track
 from datagen.world.sheets import EFFECT_SHEETS, Effect, draw_sheet, encode_sheet, sheet_names
-from datagen.world.track import TrackSettings, preset, preset_names, random_track
-from lanenet.cli import app
+from lanenet.cli.app import app
 from lanenet.errors import ConfigError
 
 
@@ -108,7 +108,7 @@ def test_a_thing_without_room_leaves_the_others_as_they_are(monkeypatch: pytest.
         return {row.tobytes() for row in place_objects(track, LookSettings(objects_per_m=6.0), *rngs).solids}
 
     apart = rows()
-    monkeypatch.setattr("datagen.world.objects._overlap", lambda one, other: False)
+    monkeypatch.setattr("datagen.world.render.objects._overlap", lambda one, other: False)
     assert apart < rows()
 
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from datagen.world.car import CarSettings
-from datagen.world.track_settings import load_track_settings
+from datagen.world.car.car import CarSettings
+from datagen.world.road.track_settings import load_track_settings
 from datagen.world.world import SimulationSettings, build_world, draw_track
 from lanenet.errors import ConfigError
 

@@ -10,9 +10,16 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.world.pieces import Piece, lay_out, length_of
+from datagen.world.road.pieces import Piece, lay_out, length_of
+from datagen.world.road.track import (
+    TrackSettings,
+    check_drivable,
+    load_track,
+    preset,
+    preset_names,
+    random_track,
+)
 from datagen.world.simulate import SimulationSettings, build_world
-from datagen.world.track import TrackSettings, check_drivable, load_track, preset, preset_names, random_track
 from lanenet.config import check_settings, dump_settings
 from lanenet.errors import ConfigError
 

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from datagen.world.furniture import Furniture, Junction, StopLine
-from datagen.world.nearest_grid import NearestGrid
-from datagen.world.paint import is_painted, paint_solid, subtract, wear_off
-from datagen.world.track import MarkingSettings, Track, TrackSettings, preset, random_track
-from datagen.world.track_file import read_track, write_track
-from datagen.world.track_picture import draw_track, picture_scale
-from lanenet.cli import app
+from datagen.world.render.nearest import NearestGrid
+from datagen.world.road.furniture import Furniture, Junction, StopLine
+from datagen.world.road.road import is_painted, paint_solid, subtract, wear_off
+from datagen.world.road.track import MarkingSettings, Track, TrackSettings, preset, random_track
+from datagen.world.road.track_file import read_track, write_track
+from datagen.world.road.track_picture import draw_track, picture_scale
+from lanenet.cli.app import app
 from lanenet.geometry.lane import mirror_points
 
 WHEELBASE_CM = 26.0

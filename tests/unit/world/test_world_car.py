@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.world.car import Car, CarSettings, advance, driven_curvature_per_cm
+from datagen.world.car.car import Car, CarSettings, advance, driven_curvature_per_cm
 
 EXACT = CarSettings(
     steering_gain=1.0,

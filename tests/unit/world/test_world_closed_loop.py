@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.world.closed_loop import ClosedLoop
-from datagen.world.look import LookSettings
-from datagen.world.pilot import (
+from datagen.world.car.pilot import (
     DetectorPilot,
     DriverPilot,
     LostLane,
@@ -20,12 +18,14 @@ from datagen.world.pilot import (
     TruePointsPilot,
     control_settings,
 )
-from datagen.world.rig import CameraSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.driving import ClosedLoop
+from datagen.world.render.look import LookSettings
+from datagen.world.road.track import TrackSettings
 from datagen.world.simulate import simulate_drive
-from datagen.world.track import TrackSettings
 from datagen.world.world import SimulationSettings, World, assemble_world
 from lanenet.control.controller import ControlSettings, LaneController
-from lanenet.data.drive import open_drive
+from lanenet.data.drives import open_drive
 from lanenet.perception.estimate import LaneEstimate
 
 SMALL = CameraSettings(width=64, height=48)

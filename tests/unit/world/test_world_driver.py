@@ -7,21 +7,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.world.donkey import DonkeyCommands, DonkeySettings, draw_donkey
-from datagen.world.drive_loop import scripted_states
-from datagen.world.driver import place_on_track
-from datagen.world.rig import CameraSettings
-from datagen.world.script import (
+from datagen.world.car.car import DonkeyCommands, DonkeySettings, draw_donkey
+from datagen.world.car.driver import (
     DriverSettings,
     Script,
+    place_on_track,
     shortest_excursion_spacing_cm,
     shortest_lane_change_cm,
 )
-from datagen.world.track import TrackSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.driving import scripted_states
+from datagen.world.road.track import TrackSettings
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_folder import read_truth
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.folder import read_truth
 from lanenet.errors import ConfigError
 from lanenet.geometry.frames import map_from_car
 

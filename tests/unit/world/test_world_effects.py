@@ -8,17 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from datagen.world.bare_floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
-from datagen.world.ground import FAR, NOT_FLOOR, TEXTURE_SIDE, TILE
-from datagen.world.look import LookSettings, random_look
-from datagen.world.motion import row_poses, shake_rotation
-from datagen.world.nearby import Nearby
-from datagen.world.renderer import PixelGround, Renderer
-from datagen.world.rig import CameraSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.bare_floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
+from datagen.world.render.ground import FAR, NOT_FLOOR, TEXTURE_SIDE, TILE, row_poses, shake_rotation
+from datagen.world.render.look import LookSettings, random_look
+from datagen.world.render.nearest import Nearby
+from datagen.world.render.renderer import PixelGround, Renderer
+from datagen.world.render.scene import Steps, Wander
+from datagen.world.render.textures import PATTERN_BGR, floor_pattern, level_starts, pack_levels
+from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
 from datagen.world.simulate import SimulationSettings, drive_frames
-from datagen.world.textures import PATTERN_BGR, floor_pattern, level_starts, pack_levels
-from datagen.world.track import MarkingSettings, Track, TrackSettings, random_track
-from datagen.world.variation import Steps, Wander
 
 CAMERA = CameraSettings().build(26.0)
 GROUND = PixelGround.of(CAMERA)

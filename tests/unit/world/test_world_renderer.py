@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.world.coverage import box_share, painted_share
-from datagen.world.kernels import locate
-from datagen.world.light import mirror_lamps
-from datagen.world.look import LookSettings, random_look
-from datagen.world.renderer import PixelGround, Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.scene import build_scene
-from datagen.world.track import MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.coverage import box_share, painted_share
+from datagen.world.render.floor import locate
+from datagen.world.render.light import mirror_lamps
+from datagen.world.render.look import LookSettings, random_look
+from datagen.world.render.renderer import PixelGround, Renderer
+from datagen.world.render.scene import build_scene
+from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.look import LookSettings, random_look
-from datagen.world.renderer import PixelGround, Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.scatter import glints, prints, specks
-from datagen.world.scene import build_scene
-from datagen.world.textures import cracks, stains
-from datagen.world.track import TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings, random_look
+from datagen.world.render.objects import glints, prints, specks
+from datagen.world.render.renderer import PixelGround, Renderer
+from datagen.world.render.scene import build_scene
+from datagen.world.render.textures import cracks, stains
+from datagen.world.road.track import TrackSettings, random_track
 
 TRACK = random_track(TrackSettings(length_cm=900.0), np.random.default_rng(2))
 CAMERA = CameraSettings(width=160, height=120).build(26.0)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.car import CarSettings, advance
-from datagen.world.look import LookSettings
-from datagen.world.rig import CameraSettings
+from datagen.world.car.car import CarSettings, advance
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings
+from datagen.world.road.track import TrackSettings
+from datagen.world.road.track_file import read_track
 from datagen.world.simulate import SimulationSettings, build_world, drive_frames, frames_of, simulate_drive
-from datagen.world.track import TrackSettings
-from datagen.world.track_file import read_track
 from lanenet.config import check_settings, load_settings
-from lanenet.data.drive import open_drive
-from lanenet.data.drive_folder import read_truth
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.folder import read_truth
 from lanenet.errors import ConfigError
 from lanenet.geometry.lane import POINT_NAMES, rows_of_polyline
 

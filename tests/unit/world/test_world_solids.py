@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.world.look import LookSettings
-from datagen.world.nearby import Nearby
-from datagen.world.objects import place_objects
-from datagen.world.renderer import Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.solid_shapes import BOX, CONE, CYLINDER, SOLID_COLUMNS
-from datagen.world.track import TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings
+from datagen.world.render.nearest import Nearby
+from datagen.world.render.objects import place_objects
+from datagen.world.render.renderer import Renderer
+from datagen.world.render.solids import BOX, CONE, CYLINDER, SOLID_COLUMNS
+from datagen.world.road.track import TrackSettings, random_track
 from lanenet.geometry.camera import Camera
 
 TRACK = random_track(TrackSettings(length_cm=900.0), np.random.default_rng(2))

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.world.centre_line import comes_near_itself, integrate_curvature
-from datagen.world.paint import interrupt, paint_dashes
-from datagen.world.track import Marking, MarkingSettings, Track, TrackSettings, random_track
-from datagen.world.track_file import read_track, write_track
+from datagen.world.road.centre_line import comes_near_itself, integrate_curvature
+from datagen.world.road.road import interrupt, paint_dashes
+from datagen.world.road.track import Marking, MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.road.track_file import read_track, write_track
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.lane import mirror_points

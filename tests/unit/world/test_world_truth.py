@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.look import LookSettings
-from datagen.world.renderer import Renderer
-from datagen.world.rig import CameraSettings
-from datagen.world.track import MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.car.rig import CameraSettings
+from datagen.world.render.look import LookSettings
+from datagen.world.render.renderer import Renderer
+from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map
 

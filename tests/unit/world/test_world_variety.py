@@ -7,13 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from datagen.world.car import CarSettings
-from datagen.world.driver import Driver
-from datagen.world.rig import CameraSettings
-from datagen.world.script import DriverSettings
-from datagen.world.sight import line_in_bend_car, sees_lane
-from datagen.world.track import random_track
-from datagen.world.track_settings import TrackSettings
+from datagen.world.car.car import CarSettings
+from datagen.world.car.driver import Driver, DriverSettings
+from datagen.world.car.rig import CameraSettings, line_in_bend_car, sees_lane
+from datagen.world.road.track import random_track
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.variety import (
     camera_like,
     first_world,

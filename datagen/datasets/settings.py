@@ -1,0 +1,124 @@
+"""Settings of a training run's data: which drives, and how they are made, mapped and split."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from datagen.settings import MapSettings
+from datagen.world.car.rig import CameraSettings
+from datagen.world.simulate import SimulationSettings
+from lanenet.config import Settings
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.perception.edges.road import COLOUR_WEIGHT, PerceptionSettings
+
+
+class SyntheticSettings(Settings):
+    """Synthetic drives, each on a road, and with a look, of its own.
+
+    Attributes:
+        seed: Every drive's seed follows from this, its role and its number.
+        train: Drives to learn from.
+        validation: Drives to choose the epoch by.
+        test: Drives whose truth scores the result.
+        variety: ``none``: all drives are those of ``simulation``; ``roads``: every drive has a kind of road
+            and a driver of its own; ``all``: a camera near one of ``cameras``, and a car of its own size.
+        cameras: Lenses and mountings that the drives' cameras are drawn near, by turns; none takes the
+            simulation's.
+        may_fail: Up to this share of the drives that are mapped may be left out because their map is rejected
+            or their road cannot be driven. Random roads do not all make good drives.
+        simulation: What all drives share; their ``seed`` is set here.
+    """
+
+    seed: int = Field(default=0, ge=0)
+    train: int = Field(default=0, ge=0)
+    validation: int = Field(default=0, ge=0)
+    test: int = Field(default=0, ge=0)
+    variety: Literal["none", "roads", "all"] = "none"
+    cameras: tuple[CameraSettings, ...] = ()
+    may_fail: float = Field(default=0.0, ge=0.0, le=1.0)
+    simulation: SimulationSettings = SimulationSettings()
+
+    @model_validator(mode="after")
+    def _cameras_are_used(self) -> SyntheticSettings:
+        if self.cameras and self.variety != "all":
+            raise ValueError(f"cameras are drawn with variety 'all' only, found {self.variety!r}")
+        return self
+
+
+class RecordedSettings(Settings):
+    """A recorded drive, split along its time or by its laps.
+
+    Attributes:
+        path: Drive folder, tub or video, from the folder in which the command runs.
+        lane_width_cm: Between the middles of the lines of the driven lane.
+        camera: Camera file; left out, the camera is found from the drive.
+        split: ``time`` cuts at the shares below; ``lap`` keeps the last lap for the test, the one before it
+            for the validation and all earlier ones to learn from.
+        train_share: Share of the labelled frames, from the start, to learn from.
+        validation_share: Share of the frames after them to choose the epoch by; the rest is for the test.
+        gap_frames: Frames left out between the parts, so that neighbours are never on both sides.
+        gap_cm: Way left out between the parts, likewise; of the two gaps the longer counts.
+        counts_as: As many drives to learn from, beside many synthetic ones: its frames come so often.
+        map: Settings for mapping this drive.
+    """
+
+    path: Path
+    lane_width_cm: float = Field(gt=0.0)
+    camera: Path | None = None
+    split: Literal["time", "lap"] = "time"
+    train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
+    validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
+    gap_frames: int = Field(default=40, ge=0)
+    gap_cm: float = Field(default=0.0, ge=0.0)
+    counts_as: int = Field(default=1, ge=1, le=100)
+    map: MapSettings = MapSettings()
+
+    @model_validator(mode="after")
+    def _leave_some_for_the_test(self) -> RecordedSettings:
+        if self.train_share + self.validation_share > 0.999:
+            raise ValueError("train_share and validation_share must sum to less than 1: the rest is the test")
+        return self
+
+
+class DataSettings(Settings):
+    """Where the label sets of a run come from.
+
+    Attributes:
+        synthetic: Synthetic drives.
+        drives: Recorded drives.
+        map: Settings for mapping the synthetic drives.
+        window: The patch of road that the network sees: wide enough for the lane's lines on either side.
+        colour_weight: What colours count beside brightness in the network's edges; maps go by gray.
+        workers: Processes that simulate, map and evaluate; 0 takes one per core.
+    """
+
+    synthetic: SyntheticSettings = SyntheticSettings()
+    drives: tuple[RecordedSettings, ...] = ()
+    map: MapSettings = MapSettings()
+    window: BirdseyeWindow = BirdseyeWindow()
+    colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)
+    workers: int = Field(default=0, ge=0)
+
+    @property
+    def processes(self) -> int:
+        """Processes at a time."""
+        return self.workers or os.cpu_count() or 1
+
+    @property
+    def perceptions(self) -> list[PerceptionSettings]:
+        """How edges are found for the network: in synthetic drives, and in each recorded one."""
+        simulated = [self.map] if self.synthetic.train or self.synthetic.validation else []
+        maps = [*simulated, *(drive.map for drive in self.drives)]
+        return [settings.perception.with_colours(self.colour_weight) for settings in maps]
+
+    @model_validator(mode="after")
+    def _each_drive_once(self) -> DataSettings:
+        paths = [drive.path.resolve() for drive in self.drives]
+        twice = next((drive.path for drive in self.drives if paths.count(drive.path.resolve()) > 1), None)
+        if twice is not None:
+            raise ValueError(f"drives: {twice} is listed twice; counts_as shows one drive more often")
+        return self

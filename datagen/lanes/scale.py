@@ -1,0 +1,122 @@
+"""Scale from the lane: how wide it is in the scale of a camera, and how well that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from datagen.lanes.fit import fit_lines
+from datagen.lanes.path import Path, PathEdges, edges_along_path, path_of_poses
+from datagen.lanes.trace import TracedLane, trace_lane
+from datagen.settings import MapSettings
+from datagen.slam.camera.coarse import nudged
+from datagen.slam.odometry.scans import Scans
+from datagen.slam.segment import SolvedSegment
+from lanenet.data.maps.line import LaneLine
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import SIDES
+
+#: Step of the path along which lines are looked for, how far it goes on ahead of the last frame, and how far
+#: from each frame its edges count, in camera heights.
+STEP_HEIGHTS, _AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
+#: Way along which the width of the lane is one measurement: what one frame shows of it.
+_ALIKE_HEIGHTS = 3.0
+#: Where a lane is looked at for what a wrong camera does to its width, ahead of the lens.
+_ROWS_HEIGHTS = np.linspace(1.0, 3.5, 11)
+
+
+@dataclass(frozen=True)
+class LaneScale:
+    """The driven lane's width in the scale of a camera.
+
+    Attributes:
+        width_cm: Between the middles of its two lines.
+        sigma: Relative standard deviation, the camera's own uncertainties included.
+    """
+
+    width_cm: float
+    sigma: float
+
+
+def spacing_cm(lines: list[LaneLine], s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "k"]:
+    """Distances between the two fitted lines of the driven lane at path positions where both are seen."""
+    left, right = (next(x for x in lines if x.side == side and x.rank == 0) for side in SIDES)
+    apart = np.linalg.norm(left.points(s_cm) - right.points(s_cm), axis=1)
+    return apart[np.isfinite(apart)]
+
+
+def fitted_width_cm(lines: list[LaneLine], lane: TracedLane, s_cm: Float[np.ndarray, "m"]) -> float:
+    """Width of a lane from its fitted lines: tracing alone knows it to the width of a cell, 2 % and more."""
+    apart = spacing_cm(lines, s_cm)
+    return float(np.median(apart)) if apart.size else lane.lane_cm
+
+
+def edges_beside(
+    solved: SolvedSegment, scans: Scans, path: Path | None = None, least_reach_cm: float = 0.0
+) -> tuple[Path, PathEdges]:
+    """Lay the edges of a segment out along the way that was driven, in the scale of its camera.
+
+    Args:
+        solved: The segment.
+        scans: Its edge points, or those of some of its frames.
+        path: The way, where it is not simply that of the poses.
+        least_reach_cm: Edges up to this far from a frame count in any case.
+    """
+    height = solved.camera.mounting.height_cm
+    if path is None:
+        path = path_of_poses(solved.poses, STEP_HEIGHTS * height, _AHEAD_HEIGHTS * height)
+    reach_cm = max(_REACH_HEIGHTS * height, least_reach_cm)
+    return path, edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach_cm)
+
+
+def measure_lane(solved: SolvedSegment, settings: MapSettings, sigma: dict[str, float]) -> LaneScale:
+    """Find the driven lane of a segment and measure how wide it is.
+
+    Args:
+        solved: The segment, with its camera.
+        settings: How lines are looked for and fitted.
+        sigma: Standard deviations of the camera's numbers, see
+            :class:`datagen.slam.adjustment.adjust.BundleResult`.
+
+    Raises:
+        TrackingLostError: If no two lines run along the drive.
+    """
+    height = solved.camera.mounting.height_cm
+    path, edges = edges_beside(solved, solved.scans)
+    lane = trace_lane(path, edges, height, None, settings.trace)
+    lines = fit_lines(path, edges, lane, height, settings.fit)
+    width_cm = fitted_width_cm(lines, lane, path.s_frames_cm)
+    both = spacing_cm(lines, path.s_cm)
+    spread = 1.4826 * float(np.median(np.abs(both - width_cm))) if both.size else 0.1 * width_cm
+    count = max(1.0, both.size * STEP_HEIGHTS / _ALIKE_HEIGHTS)
+    by_camera = width_sigma(solved.camera, sigma, width_cm)
+    return LaneScale(width_cm, float(np.hypot(spread / width_cm / np.sqrt(count), by_camera)))
+
+
+def width_sigma(camera: Camera, sigma: dict[str, float], lane_cm: float) -> float:
+    """What the uncertainty of a camera's numbers does to the width of a lane, relative.
+
+    A straight lane is projected and seen again by a camera with one number changed. The numbers are taken as
+    independent, which they are not: errors of focal length and pitch cancel in part, so this is an upper
+    bound.
+
+    Args:
+        camera: The camera.
+        sigma: Standard deviations of its numbers.
+        lane_cm: Width of the lane.
+
+    Source:
+        Own derivation, checked against the widths found in simulated drives.
+    """
+    m = camera.mounting
+    y_cm = m.ahead_of_front_axle_cm + _ROWS_HEIGHTS * m.height_cm
+    sides = [np.stack([np.full(y_cm.shape, 0.5 * sign * lane_cm), y_cm], axis=1) for sign in (-1.0, 1.0)]
+    pixels = camera.project_ground(np.concatenate(sides))
+    changes = []
+    for name, spread in sigma.items():
+        left, right = np.split(nudged(camera, name, spread).intersect_ground(pixels), 2)
+        widths = np.linalg.norm(right - left, axis=1) / lane_cm
+        changes.append(float(np.nanmean(widths)) - 1.0 if np.isfinite(widths).any() else 1.0)
+    return float(np.linalg.norm(changes))

@@ -1,0 +1,242 @@
+"""What a map's report says: figures for machines, sentences for people, and the edges as a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from datagen.lanes.trace import TracedLane
+from datagen.quality.verdict import LineEvidence, MapEvidence
+from datagen.slam.loops.pose_graph import missed_by
+from datagen.slam.segment import SolvedSegment
+from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.line import LaneLine
+from lanenet.data.maps.mapped_drive import known_lines
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car, map_from_car_directions
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a stage found, for people (lines) and for machines (figures)."""
+
+    lines: tuple[str, ...]
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class MappedSegment:
+    """A segment with its lane, in the scale of its camera.
+
+    Attributes:
+        rows: Frames of the drive that it covers, as positions among those that count.
+        solved: Poses and scans.
+        s_frames_cm: Position of each frame along the driven path.
+        lane: The traced lane.
+        lines: Its two lines, then those of the lanes beside it.
+        free_lane_cm: Width of the lane as found without the user's number; None where that fails, or where
+            the user's number was not used in the first place.
+    """
+
+    rows: Int[np.ndarray, "n"]
+    solved: SolvedSegment
+    s_frames_cm: Float[np.ndarray, "n"]
+    lane: TracedLane
+    lines: list[LaneLine]
+    free_lane_cm: float | None = None
+
+
+def map_edges(
+    parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], camera: Camera, factor: float
+) -> dict[str, np.ndarray]:
+    """Every edge point with its direction, frame map, float32, and the number of its frame.
+
+    Args:
+        parts: Segments.
+        numbers: Frame number, as the drive counts, by the positions that the segments know.
+        camera: The map's camera.
+        factor: Turns the segments' lengths into centimetres.
+    """
+    points, normals, frames, segments = [], [], [], []
+    for i, part in enumerate(parts):
+        solved = part.solved
+        for k in range(len(solved.poses)):
+            points_of = solved.scans.frame(k)
+            pose = solved.poses[k] * [factor, factor, 1.0]
+            points.append(map_from_car(factor * solved.scans.points_cm[points_of], pose, camera.wheelbase_cm))
+            normals.append(map_from_car_directions(solved.scans.normals[points_of], pose[2]))
+            frames.append(np.full(points_of.stop - points_of.start, numbers[part.rows[k]]))
+            segments.append(np.full(points_of.stop - points_of.start, i))
+    xy, normal = np.concatenate(points).astype(np.float32), np.concatenate(normals).astype(np.float32)
+    return {
+        "frame": np.concatenate(frames),
+        "segment": np.concatenate(segments),
+        "x_cm": xy[:, 0],
+        "y_cm": xy[:, 1],
+        "normal_x": normal[:, 0],
+        "normal_y": normal[:, 1],
+    }
+
+
+def map_figures(
+    drive_map: DriveMap, parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], factor: float
+) -> dict[str, Any]:
+    """Collect a map's figures; ``numbers`` and ``factor`` as for :func:`map_edges`."""
+    camera = drive_map.camera
+    segments = []
+    for part in parts:
+        solved, lane = part.solved, part.lane
+        residual = np.abs(missed_by(solved.poses, solved.revisits))
+        segments.append(
+            {
+                "first_frame": int(numbers[part.rows[0]]),
+                "frames": len(solved.poses),
+                "path_cm": factor * float(solved.path_cm[-1]),
+                "median_match": float(np.nanmedian(solved.trajectory.match)),
+                "revisits": len(solved.revisits),
+                "closure_residual_median": {
+                    "along_cm": factor * float(np.median(residual[:, 0])) if len(residual) else None,
+                    "across_cm": factor * float(np.median(residual[:, 1])) if len(residual) else None,
+                    "heading_rad": float(np.median(residual[:, 2])) if len(residual) else None,
+                },
+                "heading_drift_rad_per_m": None
+                if solved.drift_rad_per_cm is None
+                else 100.0 * solved.drift_rad_per_cm / factor,
+                "reprojection_robust_sd_px": solved.bundle.robust_sd_px,
+                "steering": None if solved.steering is None else vars(solved.steering),
+                "lane_cm": factor * lane.lane_cm,
+                "tape_cm": factor * lane.tape_cm,
+                "line_residual_cm": {
+                    line.side: factor * line.residual_cm for line in part.lines if line.rank == 0
+                },
+                "lines": sorted(line.index for line in part.lines),
+                "closed": part.lines[0].period_cm is not None,
+            }
+        )
+    m = camera.mounting
+    return {
+        "camera": {
+            "focal_px": float(camera.K[0, 0]),
+            "height_cm": m.height_cm,
+            "pitch_down_deg": float(np.rad2deg(m.pitch_down_rad)),
+            "yaw_deg": float(np.rad2deg(m.yaw_rad)),
+        },
+        "laps": drive_map.meta.laps,
+        "segments_mapped": segments,
+    }
+
+
+def free_lane_cm(parts: list[MappedSegment]) -> float | None:
+    """Width of the lane as found without the user's number, over all segments; None where there is none."""
+    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    return float(np.median(free)) if free else None
+
+
+def contradicted_share(
+    contradicted: Bool[np.ndarray, "n 2"] | None,
+    known: Bool[np.ndarray, "n 2"],
+    deleted: Bool[np.ndarray, "n"],
+) -> float:
+    """Share of the frames' lines with which the pictures disagree.
+
+    A line that a frame does not have is neither right nor wrong. Frames that the driver deleted get no
+    labels: where the car leaves the road, it says nothing of the map.
+
+    Args:
+        contradicted: Left and right line of the map's frames; None where nobody has looked.
+        known: Which of them the frames have, see :func:`lanenet.data.maps.mapped_drive.known_lines`.
+        deleted: Which frames the driver deleted.
+    """
+    counted = known & ~deleted[:, None]
+    if contradicted is None or not counted.any():
+        return 0.0
+    return float(contradicted[counted].mean())
+
+
+def map_evidence(
+    drive_map: DriveMap,
+    figures: dict[str, Any],
+    deleted: Bool[np.ndarray, "n"],
+    free_cm: float | None,
+) -> MapEvidence:
+    """Collect what the verdict rests on.
+
+    Args:
+        drive_map: The map.
+        figures: Those of the map and of its quality.
+        deleted: Which frames of the map the driver deleted.
+        free_cm: See :func:`free_lane_cm`.
+    """
+    meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
+    held = figures["held_out"]
+    both, reach = held["both_lines"], f"0-{held['reach_cm']:g} cm"
+    across = [
+        (segment["closure_residual_median"]["across_cm"], segment["revisits"])
+        for segment in figures["segments_mapped"]
+        if segment["revisits"]
+    ]
+    revisits = sum(count for _, count in across)
+    # A camera that was given stays known when the drive has refined it: no search has guessed its lens.
+    known = not figures.get("calibration", {}).get("candidates")
+    return MapEvidence(
+        lines={
+            side: LineEvidence(
+                samples=line[reach]["samples"],
+                coverage=line[reach]["coverage"],
+                robust_sd_px=line[reach]["robust_sd_px_at_160"],
+                p95_px=line[reach]["p95_px_at_160"],
+            )
+            for side, line in held["lines"].items()
+        },
+        p95_px=both["p95_px_at_160"],
+        coverage=both["coverage"],
+        labelled_share=figures["labelled"]["share"],
+        point_shares=figures["labelled"]["points_in_window"],
+        contradicted_share=contradicted_share(drive_map.contradicted, known_lines(drive_map), deleted),
+        not_labelled=figures["labelled"]["why_not"],
+        revisits=revisits,
+        closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm
+        if revisits
+        else None,
+        camera_known=known,
+        sigma={} if known else figures["calibration"]["sigma"],
+        given_lane_cm=meta.lane_width_cm,
+        # Where the free search finds nothing better, the lane that was traced at the given width is it.
+        found_lane_cm=None
+        if meta.scale_from == "lane width"
+        else meta.mapped_lane_cm
+        if free_cm is None
+        else free_cm,
+    )
+
+
+def map_notes(
+    drive_map: DriveMap, figures: dict[str, Any], camera_known: bool, free_cm: float | None
+) -> list[str]:
+    """Say what was mapped, in sentences.
+
+    Args:
+        drive_map: The map.
+        figures: Its figures.
+        camera_known: Whether the camera was given.
+        free_cm: See :func:`free_lane_cm`; where there is such a lane, that of the map is not the road's.
+    """
+    meta = drive_map.meta
+    revisits = sum(segment["revisits"] for segment in figures["segments_mapped"])
+    path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
+    lane = "lane" if free_cm is None else "mapped lines, apart by"
+    notes = [
+        f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
+        f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, nothing to close"),
+        f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
+        f"scale from the {meta.scale_from}",
+    ]
+    if camera_known and free_cm is None and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:
+        notes.append(
+            f"the lane measures {meta.mapped_lane_cm:.1f} cm with this camera, "
+            f"{meta.lane_width_cm:.1f} cm was given"
+        )
+    return notes

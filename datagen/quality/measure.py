@@ -1,0 +1,197 @@
+"""A finished map against the frames that had no say in its lines, and which frames get labels.
+
+Frames that have no say in the lines of the map, so that the map can be checked against them.
+
+A held-out frame keeps its place in the chain: its edges take part in finding its own pose, or it would have
+none. What it is held out from is the lines. So the check sees what is wrong with the lines and with the poses
+of its neighbours relative to its own, and not what all of them have in common.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from datagen.quality.residuals import BorderSamples, ResidualSettings, border_samples, join_samples, summarise
+from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.odometry.scans import Scans
+from lanenet.data.maps.mapped_drive import (
+    DELETED,
+    NOT_TO_LABEL,
+    MappedDrive,
+    label_frame,
+    labelled_points,
+    lines_at,
+    points_in_window,
+)
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import N_POINTS, SIDES
+from lanenet.perception.edges.canny import EdgePixels, find_edges
+from lanenet.perception.edges.road import RoadTable
+
+NOT_MAPPED, LABELLED = "stretch not mapped", "labelled"
+#: The residuals of the verdict reach this far; beyond, a pixel is more than a centimetre on most cars.
+VERDICT_REACH_CM = 45.0
+#: Fewer samples than this give no median of a frame.
+_MIN_SAMPLES = 10
+
+
+@dataclass(frozen=True, eq=False)
+class MapQuality:
+    """What the frames say of a map.
+
+    Attributes:
+        held_out: Rows of the map's frames that were looked at.
+        samples: Their samples on the borders of the lines, per frame.
+        chance: Samples of one line moved into the middle of the lane, where no marking is.
+        status: Per frame of the drive: labelled, or why not.
+        points_cm: Six labels per frame of the map.
+        in_window: Which of them a map that lacks nothing would give; none of frames not to be labelled.
+    """
+
+    held_out: Int[np.ndarray, "h"]
+    samples: list[BorderSamples]
+    chance: BorderSamples
+    status: list[str]
+    points_cm: Float[np.ndarray, "n 6"]
+    in_window: Bool[np.ndarray, "n 6"]
+
+    @property
+    def near(self) -> BorderSamples:
+        """Samples that count for the verdict, of all held-out frames."""
+        every = join_samples(self.samples)
+        return every.part(every.ahead_cm < VERDICT_REACH_CM)
+
+    @property
+    def frame_median_px(self) -> Float[np.ndarray, "h"]:
+        """Median size of the near residuals of each held-out frame; NaN where few were found."""
+        medians = np.full(len(self.samples), np.nan)
+        for i, samples in enumerate(self.samples):
+            found = samples.residual_px[samples.found & (samples.ahead_cm < VERDICT_REACH_CM)]
+            if found.size >= _MIN_SAMPLES:
+                medians[i] = np.median(np.abs(found))
+        return medians
+
+    @property
+    def labelled_share(self) -> float:
+        """Share of the frames that get labels, of those that are not deleted nor between two lanes."""
+        kept = [status for status in self.status if status not in NOT_TO_LABEL]
+        return sum(status == LABELLED for status in kept) / max(len(kept), 1)
+
+    @property
+    def point_shares(self) -> dict[str, float]:
+        """Share of each line's points in the window that are labelled, of the same frames."""
+        return labelled_points(self.points_cm, self.in_window, self.status.count(NOT_MAPPED))
+
+    @property
+    def not_labelled(self) -> dict[str, int]:
+        """Why frames have no labels, and how many, the most frequent reason first."""
+        counts = Counter(status for status in self.status if status != LABELLED)
+        return dict(counts.most_common())
+
+
+def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
+    """Compare the map's lines with its held-out frames, and see which frames get labels."""
+    drive_map, drive = mapped.drive_map, mapped.drive
+    camera = drive_map.camera
+    limits = mapping_range(camera.mounting.height_cm, mapped.perception.range)
+    table = RoadTable(camera, limits)
+    held = np.zeros(0, dtype=bool) if drive_map.held_out is None else drive_map.held_out
+    rows = np.flatnonzero(held)
+    samples, chance = [], []
+    tape_cm, lane_cm = drive_map.meta.tape_cm, drive_map.meta.mapped_lane_cm
+    for k in rows.tolist():
+        image = drive.image(int(mapped.rows[k]))
+        edges: EdgePixels = find_edges(image, mapped.perception.edges, table.keep, table.scale)
+        lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
+        samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep, settings))
+        left = lines.without(np.array([False, True]))
+        chance.append(
+            border_samples(edges, left, tape_cm, nodded, table.keep, settings, aside_cm=0.5 * lane_cm)
+        )
+    window = BirdseyeWindow()
+    status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
+    points = np.full((len(mapped.rows), N_POINTS), np.nan)
+    in_window = np.zeros(points.shape, dtype=bool)
+    for k, row in enumerate(mapped.rows.tolist()):
+        labelled = label_frame(mapped, k, window)
+        status[row] = labelled if isinstance(labelled, str) else LABELLED
+        if not isinstance(labelled, str):
+            points[k] = labelled[1]
+        if labelled not in NOT_TO_LABEL:
+            in_window[k] = points_in_window(drive_map, k, window)
+    return MapQuality(rows, samples, join_samples(chance), status, points, in_window)
+
+
+def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings) -> dict[str, Any]:
+    """Figures for the report: residuals per line and distance, coverage, and the labelled share."""
+    every, near = join_samples(quality.samples), quality.near
+    chance = quality.chance.part(quality.chance.ahead_cm < VERDICT_REACH_CM)
+    lines: dict[str, Any] = {}
+    for side in SIDES:
+        part = every.part(every.right == (side == "right"))
+        bands = {
+            f"{low:g}-{high:g} cm": summarise(
+                part.part((part.ahead_cm >= low) & (part.ahead_cm < high))
+            ).as_dict(width)
+            for low, high in pairwise(settings.bands_cm)
+        }
+        within = part.part(part.ahead_cm < VERDICT_REACH_CM)
+        lines[side] = {f"0-{VERDICT_REACH_CM:g} cm": summarise(within).as_dict(width), "bands": bands}
+    medians = quality.frame_median_px
+    known = medians[np.isfinite(medians)]
+    return {
+        "held_out": {
+            "frames": len(quality.samples),
+            "what": "edges of these frames had no say in the lines; their poses come from the chain",
+            "reach_cm": VERDICT_REACH_CM,
+            "gate_px_at_160": settings.gate_px,
+            "both_lines": summarise(near).as_dict(width),
+            "coverage_by_chance": summarise(chance).coverage,
+            "lines": lines,
+            "frame_median_px": {
+                "median": float(np.median(known)) if known.size else None,
+                "p95": float(np.percentile(known, 95.0)) if known.size else None,
+                "below_1_px_share": float((known < 1.0).mean()) if known.size else None,
+            },
+        },
+        "labelled": {
+            "share": quality.labelled_share,
+            "share_of_all_frames": quality.status.count(LABELLED) / max(len(quality.status), 1),
+            "why_not": quality.not_labelled,
+            "points_in_window": quality.point_shares,
+            "points_share": np.isfinite(quality.points_cm).mean(axis=0).tolist(),
+        },
+    }
+
+
+#: A stream of its own, so that holding frames out changes nothing else that is drawn.
+_STREAM = 1
+
+
+def held_out_frames(count: int, every: int, seed: int) -> Bool[np.ndarray, "n"]:
+    """Choose one of every so many frames, from a first one that the seed decides.
+
+    Args:
+        count: Frames of the drive.
+        every: Distance between the chosen ones; 0 for none.
+        seed: Of the drive's settings.
+    """
+    chosen = np.zeros(count, dtype=bool)
+    if every:
+        first = int(np.random.default_rng((seed, _STREAM)).integers(every))
+        chosen[first::every] = True
+    return chosen
+
+
+def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
+    """Return the scans with some frames emptied; the others stay at their index."""
+    kept = ~left_out[scans.frame_of_point]
+    counts = np.where(left_out, 0, np.diff(scans.starts))
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Scans(scans.points_cm[kept], scans.normals[kept], scans.weights[kept], starts)

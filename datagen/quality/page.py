@@ -1,0 +1,325 @@
+"""The report for people: one HTML file that needs no other, readable on a phone.
+
+The report's tables as rows of text, the first one the header.
+
+Refusals: of labels of a rejected map, which is kept to be looked at, and beside an older map.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from datagen.quality import plots
+from datagen.quality.measure import MapQuality
+from datagen.quality.pictures import contact_sheets
+from datagen.quality.residuals import REFERENCE_WIDTH
+from datagen.quality.verdict import Verdict, VerdictSettings
+from datagen.slam.track import SteeringFit
+from lanenet.config import read_yaml
+from lanenet.data.maps.folder import DriveMap, MapMeta
+from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.errors import ConfigError, TrackingLostError
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import POINT_NAMES, SIDES
+
+Row = tuple[str, ...]
+
+
+def _number(value: float | None, decimals: int = 2) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
+    """Residuals per line and distance; in the image's pixels and those of an image 160 px wide."""
+    wide = width != REFERENCE_WIDTH
+    own = ("sd, px", "p95, px", "offset, px")
+    header = ("", "places", "found, %", *own, *(f"{name} at 160" for name in own if wide))
+    keys = ("robust_sd_px", "p95_px", "median_px")
+    rows: list[Row] = [header]
+    reach = f"0-{held_out['reach_cm']:g} cm"
+    parts = [(f"both lines, {reach}", held_out["both_lines"])]
+    for side in SIDES:
+        line = held_out["lines"][side]
+        parts.append((f"{side} line, {reach}", line[reach]))
+        parts += [(f"{side} line, {band}", figures) for band, figures in line["bands"].items()]
+    for name, figures in parts:
+        values = [_number(figures[key]) for key in keys]
+        values += [_number(figures[f"{key}_at_160"]) for key in keys if wide]
+        coverage = _number(100.0 * figures["coverage"], 0)
+        rows.append((name, str(figures["samples"]), coverage, *values))
+    return rows
+
+
+def share_rows(labelled: dict[str, Any]) -> list[Row]:
+    """Which frames have labels, and why others have none."""
+    rows: list[Row] = [
+        ("frames", ""),
+        ("labelled, of those not deleted", f"{100.0 * labelled['share']:.1f} %"),
+        ("labelled, of all", f"{100.0 * labelled['share_of_all_frames']:.1f} %"),
+        *(
+            (f"{side} points labelled, of those in the window", f"{100.0 * share:.1f} %")
+            for side, share in labelled["points_in_window"].items()
+        ),
+    ]
+    rows += [(f"left out: {reason}", str(count)) for reason, count in labelled["why_not"].items()]
+    return rows + [
+        (f"{name} known", f"{100.0 * share:.1f} %")
+        for name, share in zip(POINT_NAMES, labelled["points_share"], strict=True)
+    ]
+
+
+def loop_rows(segments: list[dict[str, Any]]) -> list[Row]:
+    """Way, revisits, closure and residuals between frames of each segment."""
+    rows: list[Row] = [
+        (
+            "first frame",
+            "frames",
+            "way, m",
+            "revisits",
+            "closure along, cm",
+            "across, cm",
+            "heading, deg",
+            "drift, deg/m",
+            "between frames, px",
+        )
+    ]
+    for segment in segments:
+        closure = segment["closure_residual_median"]
+        heading, drift = closure["heading_rad"], segment["heading_drift_rad_per_m"]
+        rows.append(
+            (
+                str(segment["first_frame"]),
+                str(segment["frames"]),
+                _number(0.01 * segment["path_cm"], 1),
+                str(segment["revisits"]),
+                _number(closure["along_cm"]),
+                _number(closure["across_cm"]),
+                _number(None if heading is None else math.degrees(heading)),
+                _number(None if drift is None else math.degrees(drift)),
+                _number(segment["reprojection_robust_sd_px"]),
+            )
+        )
+    return rows
+
+
+def camera_rows(camera: Camera, calibration: dict[str, Any] | None) -> list[Row]:
+    """The camera's numbers, with their uncertainty where the drive told them."""
+    m, height_cm = camera.mounting, camera.mounting.height_cm
+    sigma: dict[str, float] = {} if calibration is None else calibration["sigma"]
+    focal = float(camera.K[0, 0])
+    degree = math.degrees(1.0)
+    # Name, value, decimals, name of the uncertainty and the factor that turns it into this unit.
+    values = [
+        ("focal length, px", focal, 2, "focal", focal),
+        ("principal point u, px", float(camera.K[0, 2]), 2, "cx", 1.0),
+        ("principal point v, px", float(camera.K[1, 2]), 2, "cy", 1.0),
+        ("k1", float(camera.D[0]) if len(camera.D) else 0.0, 4, "k1", 1.0),
+        ("pitch down, deg", math.degrees(m.pitch_down_rad), 2, "pitch", degree),
+        ("roll, deg", math.degrees(m.roll_rad), 2, "roll", degree),
+        ("yaw, deg", math.degrees(m.yaw_rad), 2, "yaw", degree),
+        ("ahead of the rear axle, cm", m.ahead_of_front_axle_cm + camera.wheelbase_cm, 2, "lever", height_cm),
+        ("height, cm", height_cm, 2, None, 1.0),
+    ]
+    rows: list[Row] = [(f"camera ({camera.model})", "value", "sigma")]
+    for name, value, decimals, key, factor in values:
+        known = None if key is None or key not in sigma else sigma[key] * factor
+        rows.append((name, _number(value, decimals), _number(known, decimals)))
+    return rows
+
+
+def scale_rows(meta: MapMeta) -> list[Row]:
+    """What sets the scale, and the widths that follow."""
+    return [
+        ("scale from", meta.scale_from),
+        ("lane width given, cm", f"{meta.lane_width_cm:.1f}"),
+        ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
+        ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
+    ]
+
+
+#: The report in a map's folder.
+PAGE_NAME = "report.html"
+
+_PAGE = Template(
+    """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>
+body{font:16px/1.45 system-ui,sans-serif;max-width:60rem;margin:0 auto;padding:0 1rem 3rem;color:#222}
+h1{font-size:1.4rem}h2{font-size:1.15rem;margin-top:2rem;border-bottom:1px solid #ddd}
+img{max-width:100%;height:auto;display:block;margin:.5rem 0}
+.verdict{padding:.6rem 1rem;border-radius:.5rem;color:#fff}
+.verdict strong{font-size:1.5rem;text-transform:uppercase}
+.good{background:#2e7d32}.usable{background:#b26a00}.reject{background:#b71c1c}
+.scroll{overflow-x:auto}table{border-collapse:collapse;font-size:.9rem}
+td,th{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}
+td:first-child,th:first-child{text-align:left;white-space:normal}
+p.note{color:#555;font-size:.9rem}
+</style></head><body>
+<h1>$title</h1>
+<div class="verdict $grade"><strong>$grade</strong><ul>$reasons</ul></div>
+$body
+</body></html>
+"""
+)
+
+
+def report_page(
+    mapped: MappedDrive,
+    quality: MapQuality,
+    verdict: Verdict,
+    figures: dict[str, Any],
+    opened_poses: Float[np.ndarray, "n 3"],
+    map_png: bytes,
+    settings: VerdictSettings,
+) -> str:
+    """Write the report of a map as HTML.
+
+    Args:
+        mapped: The map with its drive.
+        quality: What the held-out frames say.
+        verdict: What it amounts to.
+        figures: Everything that ``report.json`` holds.
+        opened_poses: Poses before the loops were closed, in the map's scale.
+        map_png: Picture of the map from above.
+        settings: Bounds of the verdict, drawn beside the residuals.
+    """
+    drive, drive_map = mapped.drive, mapped.drive_map
+    fits = [
+        None if s["steering"] is None else SteeringFit(**s["steering"]) for s in figures["segments_mapped"]
+    ]
+    held = figures["held_out"]
+    chance = held["coverage_by_chance"]
+    body = [
+        _list(figures["notes"]),
+        _section("Held-out frames"),
+        _note(
+            f"Distance in pixels between the projected borders of the two lines of the driven lane and the "
+            f"edges in {held['frames']} frames that had no say in the lines; their poses come from the "
+            f"chain, as all do. An edge counts within {held['gate_px_at_160']:g} px (of an image 160 px "
+            "wide) and if it brightens the same way. “Found” is the share of the borders in view that met "
+            f"one. In the middle of the lane it is {_percent(chance)}: by chance, or because something is "
+            "painted there."
+        ),
+        _table(residual_rows(held, drive.width)),
+        _picture(plots.residual_plot(quality, drive.width, settings.max_sd_px, settings.max_p95_px)),
+        *(
+            f"<h3>{sheet.title.capitalize()} held-out frames</h3>{_jpeg(sheet.picture)}"
+            for sheet in contact_sheets(mapped, quality)
+        ),
+        _section("Labels"),
+        _table(share_rows(figures["labelled"])),
+        _picture(plots.frames_plot(quality, drive, drive_map, drive.width)),
+        _section("Map"),
+        _note("Edges by time (hue), driven path (white), left line (green), right line (magenta)."),
+        _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
+        _section("Path and loops"),
+        _table(loop_rows(figures["segments_mapped"])),
+        _picture(plots.trajectory_plot(mapped, opened_poses)),
+        _section("Camera and scale"),
+        _table(camera_rows(drive_map.camera, figures.get("calibration"))),
+        _table(scale_rows(drive_map.meta)),
+        _list(verdict.remarks),
+        _section("Steering and speed"),
+        _picture(plots.steering_plot(mapped, fits))
+        or _note("The steering command does not explain the path, or there is none."),
+        _picture(plots.speed_plot(mapped)),
+    ]
+    return _PAGE.substitute(
+        title=html.escape(f"Map of {drive.name}"),
+        grade=verdict.grade,
+        reasons="".join(f"<li>{html.escape(reason)}</li>" for reason in verdict.reasons),
+        body="\n".join(part for part in body if part),
+    )
+
+
+def _percent(share: float) -> str:
+    return "unknown" if share != share else f"{100.0 * share:.0f} %"
+
+
+def _section(title: str) -> str:
+    return f"<h2>{html.escape(title)}</h2>"
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{html.escape(text)}</p>'
+
+
+def _list(lines: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
+def _table(rows: list[Row]) -> str:
+    """Lay out rows of text; the first one is the header."""
+    head, *rest = ("".join(f"<T>{html.escape(cell)}</T>" for cell in row) for row in rows)
+    lines = [head.replace("T>", "th>"), *(row.replace("T>", "td>") for row in rest)]
+    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+
+
+def _picture(png: bytes | None) -> str:
+    return "" if png is None else _inline(png, "png")
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> str:
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    return _inline(data.tobytes(), "jpeg")
+
+
+def _inline(data: bytes, kind: str) -> str:
+    return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(data).decode("ascii")}">'
+
+
+def kept_map(out: Path) -> str:
+    """Say, after a refusal, that the map which lies where the new one was to be written is an older one.
+
+    Args:
+        out: Where the new one was to be written.
+
+    Returns:
+        The end of a sentence; empty where no map lies there.
+    """
+    if not (out / "map.yaml").is_file():
+        return ""
+    try:
+        verdict = read_yaml(out / "map.yaml").get("verdict")
+    except ConfigError:  # it was kept, whatever it is
+        verdict = None
+    return f"; the map at {out} is an older one, which was kept (verdict: {verdict or 'none'})"
+
+
+def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
+    """Raise if the map was rejected.
+
+    Args:
+        map_folder: Where it lies, with its report.
+        drive_map: The map.
+
+    Raises:
+        TrackingLostError: With the first reason, and where the others stand.
+    """
+    if drive_map.meta.verdict != "reject":
+        return
+    try:
+        reasons = json.loads((map_folder / "report.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
+        reason = str(reasons[0])
+    except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
+        reason = "its report cannot be read"
+    page = map_folder / PAGE_NAME
+    # Maps of which nobody wants pictures have no page.
+    told_by = page if page.is_file() else map_folder / "report.json"
+    raise TrackingLostError(
+        f"{map_folder}: the map was rejected: {reason}; see {told_by}, and label it with --force if it is to "
+        "be used all the same"
+    )

@@ -1,0 +1,238 @@
+"""Pictures for the eye: the map from above, and projected lines on frames.
+
+Contact sheet of held-out frames: the best, those in the middle, and the worst.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from datagen.quality.measure import MapQuality
+from datagen.quality.residuals import REFERENCE_WIDTH
+from datagen.slam.loops.places import path_lengths
+from datagen.slam.odometry.scans import Scans
+from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.frame_lines import FrameLines
+from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
+from lanenet.data.segments import true_runs
+from lanenet.errors import LanenetError
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+from lanenet.geometry.lane import ROWS_CM
+
+_LEFT, _RIGHT, _POINT = (80, 220, 80), (220, 80, 220), (60, 60, 255)
+_BESIDE = (200, 200, 80)
+_TILE_WIDTH = 400
+
+
+def draw_map(
+    path: Path,
+    drive_map: DriveMap,
+    parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
+    starts: Bool[np.ndarray, "f"],
+    size_px: int = 1600,
+) -> None:
+    """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right), a metre of scale.
+
+    Args:
+        path: PNG to write.
+        drive_map: The map.
+        parts: Scans, poses in map scale and scale factor of the scans, per segment.
+        starts: Frames of the map that do not follow the one before them; the path is not drawn to them.
+        size_px: Longer side of the picture.
+    """
+    clouds = []
+    for scans, poses, factor in parts:
+        reach = 3.0 * drive_map.camera.mounting.height_cm
+        points = scans.points_cm * factor
+        for k in range(len(poses)):
+            seen = points[scans.frame(k)]
+            seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach]
+            clouds.append(map_from_car(seen, poses[k], drive_map.camera.wheelbase_cm))
+    lanes = []
+    for segment, lines in drive_map.lines.items():
+        s = drive_map.s_cm[drive_map.segment == segment]
+        for line in lines:
+            end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
+            colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
+            lanes.append((line.points(np.arange(s.min(), end, 2.0)), colour))
+    # A line of the next lane may lie beyond all edges that are drawn.
+    known = [points[np.isfinite(points[:, 0])] for points, _ in lanes]
+    xy = np.concatenate([*clouds, *known, drive_map.poses[:, :2]])
+    low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
+    scale = size_px / float((high - low).max())
+    width, height = ((high - low) * scale).astype(int) + 1
+    image = np.full((height, width, 3), 24, np.uint8)
+
+    def pixels(points: Float[np.ndarray, "m 2"]) -> np.ndarray:
+        p = (points - low) * scale
+        return np.stack([p[:, 0], height - 1 - p[:, 1]], axis=1).astype(np.int32)
+
+    hues = cv2.cvtColor(
+        np.stack(
+            [np.linspace(0, 150, len(clouds)), np.full(len(clouds), 200), np.full(len(clouds), 200)], axis=1
+        ).astype(np.uint8)[None],
+        cv2.COLOR_HSV2BGR,
+    )[0]
+    for cloud, colour in zip(clouds, hues, strict=True):
+        at = pixels(cloud)
+        image[at[:, 1], at[:, 0]] = colour
+    for points, colour in lanes:
+        _polyline(image, pixels, points, colour)
+    for stretch in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
+        _polyline(image, pixels, stretch, (255, 255, 255))
+    draw_metre(image, scale)
+    write_png(path, image)
+
+
+def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
+    """Draw a metre of scale into the lower left corner."""
+    y, end = image.shape[0] - 20, 20 + int(100.0 * px_per_cm)
+    cv2.line(image, (20, y), (end, y), (255, 255, 255), 2)
+    cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]
+    for run in true_runs(np.isfinite(points[:, 0])):
+        if len(run) > 1:
+            cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
+
+
+def draw_contact_sheet(
+    path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"], columns: int = 4
+) -> None:
+    """Draw some frames of a map with their projected lines (green left, magenta right) and six points."""
+    drive_map = mapped.drive_map
+    tiles = [
+        draw_lines(
+            mapped.drive.image(int(mapped.rows[k])),
+            lines_at(drive_map, k),
+            drive_map.camera,
+            f"{drive_map.frames[k]}",
+        )
+        for k in map(int, chosen)
+    ]
+    while len(tiles) % columns:
+        tiles.append(np.zeros_like(tiles[0]))
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    write_png(path, np.vstack(rows))
+
+
+def draw_lines(
+    image: UInt8[np.ndarray, "h w 3"], lines: FrameLines, camera: Camera, text: str
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Enlarge a frame and draw its lane."""
+    zoom = max(1, round(_TILE_WIDTH / camera.width))
+    big = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+
+    def pixels(points_cm: Float[np.ndarray, "m 2"]) -> np.ndarray:
+        # Pixel centres are at integers, so that an enlarged pixel's middle moves by half the zoom less one.
+        return camera.project_ground(points_cm) * zoom + 0.5 * (zoom - 1)
+
+    for line, colour in ((lines.left_cm, _LEFT), (lines.right_cm, _RIGHT)):
+        at = pixels(line)
+        # Behind the bumper a fisheye still projects; what lies outside the picture is not drawn.
+        inside = (
+            np.isfinite(at).all(axis=1) & (np.abs(at) < 4 * big.shape[1]).all(axis=1) & (line[:, 1] > -5.0)
+        )
+        for k in np.flatnonzero(inside[:-1] & inside[1:]):
+            a, b = (tuple(int(v) for v in np.rint(at[i])) for i in (k, k + 1))
+            cv2.line(big, a, b, colour, 1, cv2.LINE_AA)
+    rows = np.tile(ROWS_CM, 2)
+    for u, v in pixels(np.stack([lines.points_cm, rows], axis=1)):
+        if np.isfinite(u) and np.isfinite(v) and abs(u) < 9999 and abs(v) < 9999:
+            cv2.circle(big, (round(u), round(v)), 5, _POINT, 1, cv2.LINE_AA)
+    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 2, cv2.LINE_AA)
+    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(big)
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
+    """Write a picture.
+
+    Raises:
+        LanenetError: If the disk refuses it.
+    """
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise LanenetError(f"{path}: the picture could not be encoded")
+    path.write_bytes(data.tobytes())
+
+
+def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int) -> tuple[int, ...]:
+    """Pick the frame of each part of a drive from which the car drives straightest: its lines are straight.
+
+    Args:
+        poses: Poses, heading unwrapped.
+        ahead_cm: Way that has to be straight, from the frame on.
+        count: Number of equal parts.
+    """
+    n = len(poses)
+    path = path_lengths(poses)
+    last = np.minimum(np.searchsorted(path, path + ahead_cm), n - 1)
+    turn = np.array([np.ptp(poses[k : last[k] + 1, 2]) for k in range(n)])
+    # Near the end, less than the whole way is known.
+    turn[path + ahead_cm > path[-1]] += 2.0 * np.pi
+    parts = np.array_split(np.arange(n), count)
+    return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))
+
+
+_TILES = 8
+_SHEET_TILE_WIDTH, _TITLE_HEIGHT, _COLUMNS = 320, 22, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """One row of the contact sheet: its title and its picture."""
+
+    title: str
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> list[Sheet]:
+    """Draw best, median and worst held-out frames, each with its lines and its median residual.
+
+    A frame in which no residual was found counts as worst: there the map expects a line that is not seen.
+    """
+    medians = quality.frame_median_px
+    order = np.argsort(np.nan_to_num(medians, nan=np.inf), kind="stable")
+    if not order.size:
+        return []
+    count = min(_TILES, max(1, len(order) // 3))
+    middle = (len(order) - count) // 2
+    picks = {
+        "best": order[:count],
+        "median": order[middle : middle + count],
+        "worst": order[::-1][:count],
+    }
+    return [Sheet(name, _sheet(mapped, quality, medians, rows)) for name, rows in picks.items()]
+
+
+def _sheet(
+    mapped: MappedDrive, quality: MapQuality, medians: np.ndarray, picks: np.ndarray
+) -> UInt8[np.ndarray, "h w 3"]:
+    drive_map, scale = mapped.drive_map, REFERENCE_WIDTH / mapped.drive.width
+    tiles = []
+    for i in picks:
+        k = int(quality.held_out[i])
+        known = np.isfinite(medians[i])
+        text = f"frame {drive_map.frames[k]}: " + (
+            f"{medians[i] * scale:.2f} px" if known else "nothing found"
+        )
+        image = mapped.drive.image(int(mapped.rows[k]))
+        tile = draw_lines(image, lines_at(drive_map, k), drive_map.camera_at(k), "")
+        height = round(tile.shape[0] * _SHEET_TILE_WIDTH / tile.shape[1])
+        title = np.full((_TITLE_HEIGHT, _SHEET_TILE_WIDTH, 3), 255, np.uint8)
+        cv2.putText(title, text, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        tiles.append(
+            np.vstack([title, cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)])
+        )
+    while len(tiles) % _COLUMNS:
+        tiles.append(np.full_like(tiles[0], 255))
+    rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
+    return np.asarray(np.vstack(rows), dtype=np.uint8)

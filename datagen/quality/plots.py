@@ -1,0 +1,195 @@
+"""Curves of the report, as PNG; without Matplotlib there are none."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
+from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
+from datagen.slam.track import SteeringFit, commands_of, delayed
+from lanenet.data.drives import Drive
+from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
+from lanenet.geometry.lane import SIDES
+
+#: One colour per line, that of the pictures: left green, right magenta.
+COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
+_BIN_CM = 5.0
+
+
+def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]] | None:
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return None
+    # The figure is made without pyplot, which would pick a window system and keep global state.
+    figure = Figure(figsize=(width, height), dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(panels, 1, sharex=panels > 1, squeeze=False)[:, 0]
+    for ax in axes:
+        ax.grid(True, alpha=0.3)
+    return figure, list(axes)
+
+
+def _png(figure: Any) -> bytes:
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", bbox_inches="tight")
+    return picture.getvalue()
+
+
+def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
+    """Put a row of NaN before each row that does not follow the one before it: no line is drawn across."""
+    return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
+
+
+def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes | None:
+    """Driven path before and after the loops were closed."""
+    made = _figure(6.5, 5.0)
+    if made is None:
+        return None
+    figure, (axes,) = made
+    drive_map = mapped.drive_map
+    for poses, style, name in (
+        (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
+        (drive_map.poses, {"color": "#2060c0", "lw": 1.3}, "closed"),
+    ):
+        axes.plot(*_interrupted(0.01 * poses[:, :2], mapped.starts).T, label=name, **style)
+    axes.plot(*(0.01 * drive_map.poses[0, :2]), "ko", ms=4)
+    axes.annotate(" start", 0.01 * drive_map.poses[0, :2], fontsize=8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes | None:
+    """Residuals and coverage over the distance ahead, per line."""
+    made = _figure(6.5, 4.6, 2)
+    if made is None:
+        return None
+    figure, (axes, below) = made
+    every = join_samples(quality.samples)
+    scale = REFERENCE_WIDTH / width
+    edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
+    centres = 0.5 * (edges[:-1] + edges[1:])
+    for side in SIDES:
+        part = every.part(every.right == (side == "right"))
+        bins = [
+            summarise(part.part((part.ahead_cm >= a) & (part.ahead_cm < b)))
+            for a, b in pairwise(edges.tolist())
+        ]
+        for name, style, values in (
+            ("p95", ".--", [scale * b.p95_px for b in bins]),
+            ("robust sd", "o-", [scale * b.robust_sd_px for b in bins]),
+        ):
+            axes.plot(centres, values, style, color=COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
+        below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=COLOURS[side], label=side, ms=3)
+    for bound in (max_sd_px, max_p95_px):
+        axes.axhline(bound, color="gray", lw=0.8, ls=":")
+    for ax in (axes, below):
+        ax.axvline(VERDICT_REACH_CM, color="gray", lw=0.8, ls=":")
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("px at 160 px width")
+    axes.legend(fontsize=7, ncol=2)
+    below.set_ylim(0.0, 105.0)
+    below.set_ylabel("edge found, %")
+    below.set_xlabel("ahead of the front axle, cm")
+    return _png(figure)
+
+
+def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes | None:
+    """Along the drive: which frames have labels and why others have none, and the held-out residuals."""
+    made = _figure(6.5, 3.8, 2)
+    if made is None:
+        return None
+    figure, (axes, strip) = made
+    axes.plot(
+        drive_map.frames[quality.held_out],
+        quality.frame_median_px * REFERENCE_WIDTH / width,
+        ".",
+        color="#2060c0",
+        ms=4,
+    )
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("median residual\nof held-out frame, px", fontsize=8)
+    status = np.array(quality.status)
+    names = [LABELLED, *(reason for reason in quality.not_labelled)]
+    for i, name in enumerate(names):
+        colour = "#2e9e2e" if name == LABELLED else "#999999" if name == DELETED else f"C{(i + 2) % 10}"
+        at = drive.frames[status == name]
+        strip.plot(at, np.full(len(at), i), "|", color=colour, ms=9)
+    strip.set_yticks(range(len(names)), [f"{n} ({int((status == n).sum())})" for n in names], fontsize=8)
+    strip.set_ylim(len(names) - 0.5, -0.5)
+    strip.set_xlabel("frame")
+    return _png(figure)
+
+
+def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
+    """Curvature of the driven path against the steering command, with the line that was fitted."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
+    if turn is None or not any(fits):
+        return None
+    made = _figure(6.5, 3.6)
+    if made is None:
+        return None
+    figure, (axes,) = made
+    for segment, fit in enumerate(fits):
+        part = np.flatnonzero(drive_map.segment == segment)
+        if fit is None or len(part) < 3:
+            continue
+        delta = np.diff(drive_map.poses[part], axis=0)
+        step = np.hypot(delta[:, 0], delta[:, 1])
+        moving = (step > 0.3 * np.median(step)) & ~mapped.starts[part[1:]]
+        command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
+        curvature = 100.0 * delta[moving, 2] / step[moving]
+        axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
+        if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
+            continue
+        # Once more, since the filter's own fit came before the adjustment, with another camera and speed.
+        gain, trim = np.polyfit(command, curvature, 1)
+        r = float(np.corrcoef(command, curvature)[0, 1])
+        ends = np.array([command.min(), command.max()])
+        axes.plot(
+            ends,
+            gain * ends + trim,
+            "k-",
+            lw=1.0,
+            label=f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}",
+        )
+    axes.set_xlabel("steering command, positive left")
+    axes.set_ylabel("curvature, 1/m")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def speed_plot(mapped: MappedDrive) -> bytes | None:
+    """Way per frame as found, with the commanded speed or throttle beside it."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    made = _figure(6.5, 2.8)
+    if made is None:
+        return None
+    figure, (axes,) = made
+    step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
+    # A step across a break was not driven.
+    step[mapped.starts[1:]] = np.nan
+    axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("way per frame, cm", color="#2060c0")
+    commands = drive.commands
+    for values, name in ((commands.speed_cm_s, "commanded speed, cm/s"), (commands.throttle, "throttle")):
+        if values is not None:
+            other = axes.twinx()
+            other.plot(drive.frames[rows], values[rows], "-", color="#d08020", lw=0.6, alpha=0.7)
+            other.set_ylabel(name, color="#d08020")
+            break
+    return _png(figure)

@@ -1,0 +1,1 @@
+"""Self-calibration: a coarse camera from the images, then camera and poses refined together."""

@@ -1,0 +1,1 @@
+"""Loop closure: frames that show the same place, which of them to believe, and the pose graph."""

@@ -1,0 +1,205 @@
+"""What the mapper sees of a drive: the edge points of every frame, packed for the numba kernels.
+
+Fewer edge points that say the same: those of one small patch and one direction become one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from lanenet.data.drives import Drive
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, find_edges
+from lanenet.perception.edges.road import RangeSettings, RoadEdges, RoadTable
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Edge points of all frames in one array.
+
+    Attributes:
+        points_cm: Edge points, frame car, all frames one after the other.
+        normals: Unit vectors across the edges, towards the brighter side, frame car.
+        weights: Trust in each point: 1 near the car, falling with the road that one pixel spans.
+        starts: Index of the first point of each frame, with the total at the end.
+    """
+
+    points_cm: Float[np.ndarray, "m 2"]
+    normals: Float[np.ndarray, "m 2"]
+    weights: Float[np.ndarray, "m"]
+    starts: Int[np.ndarray, "n1"]
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    def frame(self, k: int) -> slice:
+        """Return the slice of frame k's points."""
+        return slice(int(self.starts[k]), int(self.starts[k + 1]))
+
+    @property
+    def frame_of_point(self) -> Int[np.ndarray, "m"]:
+        """Frame index of every point."""
+        return np.repeat(np.arange(len(self)), np.diff(self.starts))
+
+
+def edges_of_drive(drive: Drive, settings: EdgeSettings, table: RoadTable) -> list[EdgePixels]:
+    """Find the edge pixels of every frame that see the road."""
+    return [find_edges(drive.image(k), settings, table.keep, table.scale) for k in range(len(drive))]
+
+
+def scans_of(
+    edges: list[EdgePixels],
+    camera: Camera,
+    range_settings: RangeSettings,
+    tilt_rad: Float[np.ndarray, "n 2"] | None = None,
+) -> Scans:
+    """Move the edge pixels of all frames to the road.
+
+    Args:
+        edges: Edge pixels per frame.
+        camera: The camera.
+        range_settings: Which part of the road counts.
+        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for none.
+    """
+    table = RoadTable(camera, range_settings)
+    frames = []
+    for k, pixels in enumerate(edges):
+        kept = seen_edges(pixels, table)
+        frames.append(table.lift(kept) if tilt_rad is None else _lift_tilted(kept, camera, tilt_rad[k]))
+    return pack_scans(frames, camera.mounting.height_cm)
+
+
+def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
+    """Return the edge pixels that see the part of the road that counts."""
+    nearest = np.rint(pixels.uv_px).astype(np.intp)
+    seen = table.keep[nearest[:, 1], nearest[:, 0]] > 0
+    return EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
+
+
+def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
+    """Lift with the camera as it nodded in this frame."""
+    m = camera.mounting
+    nodded = camera.with_mounting(
+        pitch_down_rad=m.pitch_down_rad + float(tilt_rad[0]), roll_rad=m.roll_rad + float(tilt_rad[1])
+    )
+    n = len(pixels.uv_px)
+    along = np.stack([-pixels.normals[:, 1], pixels.normals[:, 0]], axis=1)
+    ends = np.concatenate([pixels.uv_px, pixels.uv_px + 0.5 * along, pixels.uv_px + 0.5 * pixels.normals])
+    road = nodded.intersect_ground(ends).reshape(3, n, 2)
+    tangent, towards = road[1] - road[0], road[2] - road[0]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    # Of the two normals the one on the brighter side.
+    normal *= np.where(np.sum(normal * towards, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    good = np.isfinite(road[0]).all(axis=1) & np.isfinite(normal).all(axis=1)
+    return RoadEdges(road[0][good], normal[good])
+
+
+def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
+    """Pack per-frame edge points; weights halve where a point is about four camera heights away.
+
+    One pixel spans road in proportion to the squared distance, so that the position of a far edge is worth
+    less; the smooth fall keeps far points useful for the heading.
+    """
+    counts = [len(frame.points_cm) for frame in frames]
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    points = np.concatenate([np.empty((0, 2)), *(frame.points_cm for frame in frames)])
+    normals = np.concatenate([np.empty((0, 2)), *(frame.normals for frame in frames)])
+    distance = np.hypot(points[:, 0], points[:, 1]) / (4.0 * camera_height_cm)
+    return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
+
+
+def thin_scan(
+    scans: Scans, k: int, max_points: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
+    frame = scans.frame(k)
+    size = frame.stop - frame.start
+    if size <= max_points:
+        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
+    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
+    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]
+
+
+_SECTORS = 4  # directions that are kept apart, so that both edges of a tape are
+
+
+def condense(
+    points_cm: Float[np.ndarray, "m 2"],
+    normals: Float[np.ndarray, "m 2"],
+    weights: Float[np.ndarray, "m"],
+    patch_cm: float,
+    most: int,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+    """Take the points of each patch together, and of the patches the heaviest.
+
+    Near the car many pixels see one patch of road; a random choice of them would say as little of the rest as
+    it says of that patch.
+
+    Args:
+        points_cm: Edge points, frame car.
+        normals: Their unit normals.
+        weights: Trust in each.
+        patch_cm: Side of a patch.
+        most: How many patches to keep.
+
+    Returns:
+        Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
+        that normals that disagree weigh less.
+    """
+    # At most half of the slots are taken, so that a search for a free one is short.
+    slots = np.full(2 << max(len(weights), 1).bit_length(), -1, np.int64)
+    sums, keys = np.zeros((len(weights), 5)), np.empty((len(weights), 2), np.int64)
+    count = _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums)
+    weight, length = sums[:count, 0], np.hypot(sums[:count, 3], sums[:count, 4])
+    kept = np.flatnonzero(length > 1e-9 * weight)
+    if len(kept) > most:
+        kept = np.sort(kept[np.argpartition(-length[kept], most)[:most]])
+    mean, length = sums[kept], length[kept]
+    return mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums):
+    """Sum weight, weighted point and weighted normal of each patch and sector.
+
+    Args:
+        points_cm: Edge points.
+        normals: Their normals.
+        weights: Their weights.
+        patch_cm: Side of a patch.
+        slots: Which patch stands in each slot of a hash table, -1 for none; a power of two.
+        keys: Filled: column, and row with sector, of each patch.
+        sums: Filled.
+
+    Returns:
+        Number of patches.
+    """
+    count, mask = 0, len(slots) - 1
+    for i in range(len(weights)):
+        x, y, nx, ny, weight = points_cm[i, 0], points_cm[i, 1], normals[i, 0], normals[i, 1], weights[i]
+        sector = int(np.rint(np.arctan2(ny, nx) * (_SECTORS / (2.0 * np.pi)))) % _SECTORS
+        column, row = int(np.floor(x / patch_cm)), int(np.floor(y / patch_cm)) * _SECTORS + sector
+        slot = (column * 40503 + row * 30011) & mask
+        while slots[slot] >= 0 and (keys[slots[slot], 0] != column or keys[slots[slot], 1] != row):
+            slot = (slot + 1) & mask
+        patch = slots[slot]
+        if patch < 0:
+            patch = slots[slot] = count
+            keys[count, 0], keys[count, 1] = column, row
+            count += 1
+        sums[patch, 0] += weight
+        sums[patch, 1] += weight * x
+        sums[patch, 2] += weight * y
+        sums[patch, 3] += weight * nx
+        sums[patch, 4] += weight * ny
+    return count

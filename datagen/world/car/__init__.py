@@ -1,0 +1,1 @@
+"""The simulated car: its motion, its camera, its scripted driver, and who else may steer it."""

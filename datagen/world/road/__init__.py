@@ -1,0 +1,1 @@
+"""Synthetic roads: centre line, lane lines, furniture, and the truth that follows from them."""

@@ -1,0 +1,399 @@
+"""The road of a synthetic drive: one object that is painted and that answers for the truth.
+
+Which stretches of a line are painted: intervals along the road.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lanenet.geometry.frames import car_from_map, map_from_car
+from lanenet.geometry.lane import rows_of_polyline
+
+_MIN_INTERRUPTION_CM = 10.0
+_FLAKE_CM = 1.5  # mean length of what flakes off a worn line
+
+
+def paint_solid(length_cm: float) -> Float[np.ndarray, "1 2"]:
+    """Return one stretch over the whole length, [cm]."""
+    return np.array([[0.0, length_cm]])
+
+
+def paint_dashes(
+    length_cm: float, closed: bool, dash_cm: float, gap_cm: float, phase: float
+) -> Float[np.ndarray, "k 2"]:
+    """Return the stretches of a dashed line.
+
+    Args:
+        length_cm: Length of the road.
+        closed: On a loop the period is stretched a little, so that a whole number of dashes fits.
+        dash_cm: Painted length.
+        gap_cm: Unpainted length.
+        phase: Where the pattern starts, 0..1 of a period.
+
+    Returns:
+        Start and end of each dash within 0..length, [cm], ascending.
+    """
+    period_cm = dash_cm + gap_cm
+    if closed:
+        period_cm = length_cm / max(1, round(length_cm / period_cm))
+    start = (np.arange(int(length_cm / period_cm) + 2) + phase - 1.0) * period_cm
+    end = start + period_cm * dash_cm / (dash_cm + gap_cm)
+    dashes = np.clip(np.stack([start, end], axis=1), 0.0, length_cm)
+    return dashes[dashes[:, 1] - dashes[:, 0] > 1e-9]
+
+
+def interrupt(
+    painted_cm: Float[np.ndarray, "k 2"],
+    length_cm: float,
+    per_m: float,
+    max_cm: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "m 2"]:
+    """Scratch random stretches off the paint.
+
+    Args:
+        painted_cm: Painted stretches, ascending.
+        length_cm: Length of the road.
+        per_m: Expected number of interruptions per metre.
+        max_cm: Longest interruption; the shortest is 10 cm.
+        rng: Source of randomness.
+
+    Returns:
+        What is left of the paint, ascending.
+    """
+    for _ in range(rng.poisson(per_m * length_cm / 100.0)):
+        start_cm = rng.uniform(0.0, length_cm)
+        painted_cm = cut(painted_cm, start_cm, start_cm + rng.uniform(_MIN_INTERRUPTION_CM, max_cm))
+    return painted_cm
+
+
+def wear_off(
+    painted_cm: Float[np.ndarray, "k 2"], length_cm: float, share: float, rng: np.random.Generator
+) -> Float[np.ndarray, "m 2"]:
+    """Let short stretches flake off.
+
+    Args:
+        painted_cm: Painted stretches, ascending.
+        length_cm: Length of the road.
+        share: Of the paint that is lost, on average.
+        rng: Source of randomness.
+    """
+    if share <= 0.0:
+        return painted_cm
+    n = int(2.0 * length_cm * share / _FLAKE_CM) + 20
+    lost = rng.exponential(_FLAKE_CM, n)
+    kept = rng.exponential(_FLAKE_CM * (1.0 - share) / share, n)
+    ends = np.cumsum(np.stack([kept, lost], axis=1).ravel())
+    holes = ends.reshape(-1, 2)
+    return subtract(painted_cm, holes[holes[:, 0] < length_cm])
+
+
+def cut(painted_cm: Float[np.ndarray, "k 2"], from_cm: float, to_cm: float) -> Float[np.ndarray, "m 2"]:
+    """Take one stretch off the paint."""
+    before = np.stack([painted_cm[:, 0], np.minimum(painted_cm[:, 1], from_cm)], axis=1)
+    after = np.stack([np.maximum(painted_cm[:, 0], to_cm), painted_cm[:, 1]], axis=1)
+    pieces = np.concatenate([before, after])
+    pieces = pieces[pieces[:, 1] - pieces[:, 0] > 1e-9]
+    return pieces[np.argsort(pieces[:, 0])]
+
+
+def subtract(
+    painted_cm: Float[np.ndarray, "k 2"], holes_cm: Float[np.ndarray, "h 2"]
+) -> Float[np.ndarray, "m 2"]:
+    """Take many stretches off the paint; both lists are ascending and without overlap."""
+    bounds = np.unique(np.concatenate([painted_cm.ravel(), holes_cm.ravel()]))
+    middle = 0.5 * (bounds[1:] + bounds[:-1])
+    keep = is_painted(painted_cm, middle) & ~is_painted(holes_cm, middle)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    pieces = bounds[edges].reshape(-1, 2)
+    return pieces[pieces[:, 1] - pieces[:, 0] > 1e-9]
+
+
+def is_painted(painted_cm: Float[np.ndarray, "k 2"], s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+    """Tell for each place whether it lies on a painted stretch."""
+    if not len(painted_cm):
+        return np.zeros(len(s_cm), bool)
+    i = np.searchsorted(painted_cm[:, 0], s_cm, side="right") - 1
+    return (i >= 0) & (s_cm < painted_cm[np.maximum(i, 0), 1])
+
+
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+Bgr = tuple[float, float, float]
+
+_BEHIND_CM, _AHEAD_CM = 60.0, 150.0
+
+
+@dataclass(frozen=True, eq=False)
+class Marking:
+    """One painted line, parallel to the centre line.
+
+    Attributes:
+        offset_cm: Of its middle, left of the centre line positive.
+        width_cm: Of the tape.
+        colour_bgr: Nominal colour, 0..255.
+        painted_cm: Start and end of each painted stretch along the centre line, ascending.
+    """
+
+    offset_cm: float
+    width_cm: float
+    colour_bgr: Bgr
+    painted_cm: Float[np.ndarray, "k 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A road: the centre line of the driven lane and the markings beside it.
+
+    Attributes:
+        s_cm: Distance along the centre line, evenly spaced, about 1 cm.
+        xy_cm: Centre line, frame map.
+        heading_rad: Direction of travel, unwrapped.
+        curvature_per_cm: Positive to the left.
+        closed: Whether the last sample is followed by the first.
+        lane_width_cm: Of the driven lane, between the middles of its two lines.
+        markings: What is painted along the road.
+        boxes: Painted rectangles (stop lines, bars, arrows, side roads, bays): x, y, cos and sin of the
+            direction, half length, half width, blue, green, red; frame map.
+        oncoming_cm: Offset of the middle of the oncoming lane, left positive; None on a road of one lane.
+    """
+
+    s_cm: Float[np.ndarray, "n"]
+    xy_cm: Float[np.ndarray, "n 2"]
+    heading_rad: Float[np.ndarray, "n"]
+    curvature_per_cm: Float[np.ndarray, "n"]
+    closed: bool
+    lane_width_cm: float
+    markings: tuple[Marking, ...]
+    boxes: Float[np.ndarray, "b 9"] = field(default_factory=lambda: np.empty((0, 9)))
+    oncoming_cm: float | None = None
+
+    @property
+    def step_cm(self) -> float:
+        """Distance between samples, [cm]."""
+        return float(self.s_cm[1] - self.s_cm[0])
+
+    @property
+    def length_cm(self) -> float:
+        """Length of the centre line, [cm]; of a loop, once around."""
+        return float(self.s_cm[-1]) + (self.step_cm if self.closed else 0.0)
+
+    @property
+    def middle_cm(self) -> float:
+        """Offset of the middle of the whole road from the centre line of the driven lane, left positive."""
+        return 0.5 * (self.oncoming_cm or 0.0)
+
+    @property
+    def half_width_cm(self) -> float:
+        """Half the width of the whole road, between the middles of its outer lines."""
+        return 0.5 * (self.lane_width_cm + abs(self.oncoming_cm or 0.0))
+
+    def line_offset_cm(self, side: Side) -> float:
+        """Offset of a line of the driven lane, left positive, [cm]."""
+        return 0.5 * self.lane_width_cm if side == "left" else -0.5 * self.lane_width_cm
+
+    def line_xy(self, side: Side) -> Float[np.ndarray, "n 2"]:
+        """Return the middle of the left or right line of the driven lane at each sample, [cm], frame map.
+
+        The line is where the road has it, painted or not.
+        """
+        return self._beside(np.arange(len(self.s_cm)), self.line_offset_cm(side))
+
+    def line_painted(self, side: Side, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+        """Tell where along the road a line of the driven lane is painted."""
+        if self.closed:
+            s_cm = np.mod(s_cm, self.length_cm)
+        painted = np.zeros(len(s_cm), bool)
+        for marking in self.markings:
+            # Both tapes of a double line lie near its middle.
+            if abs(marking.offset_cm - self.line_offset_cm(side)) < 0.25 * self.lane_width_cm:
+                painted |= is_painted(marking.painted_cm, s_cm)
+        return painted
+
+    def curvature(self, s_cm: float) -> float:
+        """Return the curvature of the centre line at a place, [1/cm], positive left."""
+        return float(self.curvature_per_cm[self._nearest_sample(s_cm)[1]])
+
+    def lap(self, s_cm: float) -> tuple[int, float]:
+        """Return how often a loop has been driven round and the place on it, [cm]; an open road has lap 0."""
+        if not self.closed:
+            return 0, s_cm
+        laps, place_cm = divmod(s_cm, self.length_cm)
+        return int(laps), float(place_cm)
+
+    def point(self, s_cm: float, offset_cm: float = 0.0) -> tuple[Float[np.ndarray, "2"], float]:
+        """Return the point at a place along the road and the road's heading there, [cm], [rad], frame map.
+
+        On a loop any distance counts, over as many laps as it takes; beyond the ends of an open road it goes
+        on along the circle that the end lies on.
+        """
+        lap, i = self._nearest_sample(s_cm)
+        along_cm = s_cm - lap * self.length_cm - float(self.s_cm[i])
+        turn = float(self.curvature_per_cm[i]) * along_cm
+        direction = float(self.heading_rad[i]) + 0.5 * turn
+        heading = float(self.heading_rad[i]) + turn
+        chord_cm = along_cm * float(np.sinc(0.5 * turn / np.pi))
+        xy_cm = self.xy_cm[i] + chord_cm * np.array([np.cos(direction), np.sin(direction)])
+        return xy_cm + offset_cm * np.array([-np.sin(heading), np.cos(heading)]), heading
+
+    def points(
+        self, s_cm: Float[np.ndarray, "m"], offset_cm: float = 0.0
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+        """Return many points at once; see :meth:`point`."""
+        i = np.rint(s_cm / self.step_cm).astype(int)
+        index = i % len(self.s_cm) if self.closed else np.clip(i, 0, len(self.s_cm) - 1)
+        along_cm = s_cm - (i if self.closed else index) * self.step_cm
+        turn = self.curvature_per_cm[index] * along_cm
+        heading = self.heading_rad[index] + turn
+        direction = heading - 0.5 * turn
+        chord_cm = along_cm * np.sinc(0.5 * turn / np.pi)
+        xy_cm = self.xy_cm[index] + chord_cm[:, None] * np.stack(
+            [np.cos(direction), np.sin(direction)], axis=1
+        )
+        return xy_cm + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1), heading
+
+    def nearest(
+        self, xy_cm: Float[np.ndarray, "2"], near_s_cm: float | None = None, reach_cm: float = 60.0
+    ) -> tuple[float, float]:
+        """Find a point's place along the road.
+
+        Args:
+            xy_cm: The point, [cm], frame map.
+            near_s_cm: Search only within ``reach_cm`` of this place along the road.
+            reach_cm: Half the length of that stretch.
+
+        Returns:
+            Distance along the centre line and offset from it (left positive), [cm]. Beyond the ends of an
+            open road both continue along the circle that the end lies on.
+        """
+        if near_s_cm is None:
+            index = np.arange(len(self.s_cm))
+        else:
+            index = self._samples(near_s_cm - reach_cm, near_s_cm + reach_cm)
+        i = index[np.argmin(np.sum((self.xy_cm[index] - xy_cm) ** 2, axis=1))]
+        ahead, left = xy_cm - self.xy_cm[i], 0.0
+        c, s = np.cos(self.heading_rad[i]), np.sin(self.heading_rad[i])
+        ahead, left = ahead[0] * c + ahead[1] * s, -ahead[0] * s + ahead[1] * c
+        k = float(self.curvature_per_cm[i])
+        # On the circle through the sample: the same as the foot of the perpendicular, without the corners
+        # that the polyline has.
+        inward = 1.0 - k * left
+        along_cm = np.arctan2(k * ahead, inward) / k if abs(k) > 1e-9 else ahead
+        offset_cm = (2.0 * left - k * (ahead**2 + left**2)) / (1.0 + np.hypot(k * ahead, inward))
+        return float(self.s_cm[i] + along_cm), float(offset_cm)
+
+    def lines_car(
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+        """Return the left and right line around the car, [cm], frame car, in the direction of travel.
+
+        Only the stretch from 60 cm behind the front axle to 150 cm ahead along the road, so that no other
+        stretch of the road answers.
+
+        Args:
+            pose: Rear-axle centre x, y and heading, frame map.
+            wheelbase_cm: Distance between the axles.
+            near_s_cm: Where along the road the car is known to be, when it may have left its lane.
+            lane_cm: Offset of the lane whose lines are asked for, left positive; 0 for the driven one.
+        """
+        front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
+        s_cm, _ = self.nearest(front, near_s_cm)
+        index = self._samples(s_cm - _BEHIND_CM, s_cm + _AHEAD_CM)
+        left, right = (self._beside(index, self.line_offset_cm(side) + lane_cm) for side in SIDES)
+        return car_from_map(left, pose, wheelbase_cm), car_from_map(right, pose, wheelbase_cm)
+
+    def truth(
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
+    ) -> Float[np.ndarray, "6"]:
+        """Return the six points of the label contract, [cm], frame car; NaN where a line misses a row.
+
+        The points follow the road, also where its paint is interrupted; arguments as :meth:`lines_car`.
+        """
+        left, right = self.lines_car(pose, wheelbase_cm, near_s_cm, lane_cm)
+        return np.concatenate([rows_of_polyline(left), rows_of_polyline(right)])
+
+    def mirrored(self) -> Track:
+        """Return the track with left and right exchanged (y changes sign in the map)."""
+        return replace(
+            self,
+            xy_cm=self.xy_cm * [1.0, -1.0],
+            heading_rad=-self.heading_rad,
+            curvature_per_cm=-self.curvature_per_cm,
+            markings=tuple(replace(m, offset_cm=-m.offset_cm) for m in self.markings),
+            boxes=self.boxes * [1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0],
+            oncoming_cm=None if self.oncoming_cm is None else -self.oncoming_cm,
+        )
+
+    def moved(self, pose: Float[np.ndarray, "3"]) -> Track:
+        """Return the track turned by ``pose[2]`` about the origin and then moved by ``pose[:2]``."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        turn = np.array([[c, s], [-s, c]])
+        boxes = self.boxes.copy()
+        boxes[:, :2] = boxes[:, :2] @ turn + pose[:2]
+        boxes[:, 2:4] = boxes[:, 2:4] @ turn
+        xy_cm = self.xy_cm @ turn + pose[:2]
+        return replace(self, xy_cm=xy_cm, heading_rad=self.heading_rad + pose[2], boxes=boxes)
+
+    def reversed(self) -> Track:
+        """Return the same road driven the other way: on two lanes in the other lane, with the same paint."""
+        offset_cm = self.oncoming_cm or 0.0
+        end = [self.length_cm] if self.closed else []
+        s_cm = np.append(self.s_cm, end)
+        # The other lane is longer in one bend and shorter in the next.
+        per_cm = np.append(self.curvature_per_cm, self.curvature_per_cm[: len(end)])
+        stretch = 1.0 - offset_cm * per_cm
+        along_cm = np.concatenate([[0.0], np.cumsum(0.5 * (stretch[1:] + stretch[:-1]) * np.diff(s_cm))])
+        length_cm = float(along_cm[-1])
+        n = len(s_cm) - 1 if offset_cm == 0.0 else max(2, round(length_cm / self.step_cm))
+        new_s_cm = np.arange(n if self.closed else n + 1) * (length_cm / n)
+        places_cm = np.interp(length_cm - new_s_cm, along_cm, s_cm)
+        xy_cm, heading_rad = self.points(places_cm, offset_cm)
+        curvature = np.interp(places_cm, s_cm, per_cm)
+        return replace(
+            self,
+            s_cm=new_s_cm,
+            xy_cm=xy_cm,
+            heading_rad=np.unwrap(heading_rad + np.pi),
+            curvature_per_cm=-curvature / (1.0 - offset_cm * curvature),
+            markings=tuple(
+                replace(
+                    m,
+                    offset_cm=offset_cm - m.offset_cm,
+                    painted_cm=length_cm - np.interp(m.painted_cm[::-1, ::-1], s_cm, along_cm),
+                )
+                for m in self.markings
+            ),
+        )
+
+    def _beside(self, index: Int[np.ndarray, "m"], offset_cm: float) -> Float[np.ndarray, "m 2"]:
+        """Points beside the given samples, left positive."""
+        heading = self.heading_rad[index]
+        return self.xy_cm[index] + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+
+    def _nearest_sample(self, s_cm: float) -> tuple[int, int]:
+        """Lap and sample nearest to a place along the road."""
+        n, i = len(self.s_cm), round(s_cm / self.step_cm)
+        return divmod(i, n) if self.closed else (0, min(max(i, 0), n - 1))
+
+    def _samples(self, from_cm: float, to_cm: float) -> Int[np.ndarray, "m"]:
+        """Indices of a stretch in the direction of travel; cut at the ends of an open road."""
+        first, last = int(np.floor(from_cm / self.step_cm)), int(np.ceil(to_cm / self.step_cm))
+        n = len(self.s_cm)
+        if self.closed:
+            return np.arange(first, min(last, first + n - 1) + 1) % n
+        # Never empty: beyond an end the last two samples stand for the road.
+        first = min(max(first, 0), n - 2)
+        return np.arange(first, min(max(last, first + 1), n - 1) + 1)

@@ -1,0 +1,58 @@
+"""``lanenet drive``: the car."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet.cli import console
+from lanenet.errors import LanenetError
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet drive configs/car/replay.yaml --dry-run")
+def drive(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML of the car.", show_default=False)],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
+    ] = None,
+    arm: Annotated[bool, typer.Option("--arm", help="Let the motor turn, after a countdown.")] = False,
+    steering_only: Annotated[
+        bool, typer.Option("--steering-only", help="Move the wheels, never the motor.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Touch no actuator; show what would be sent.")
+    ] = False,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="End after this many frames.", show_default=False)
+    ] = None,
+) -> None:
+    """Drive the car by what its camera sees; without --arm the motor stays in neutral."""
+    from lanenet.onboard.drive import build_loop
+    from lanenet.onboard.drive_report import Step
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    settings = load_drive_settings(config, overrides)
+    with console.live_line() as show:
+
+        def watch(step: Step) -> None:
+            show(lambda: f"{loop.report.text}  {step.text}")
+
+        loop = build_loop(settings, arm=arm, steering_only=steering_only, dry_run=dry_run, watch=watch)
+        console.show_problems(loop.problems)
+        report = loop.run(frames)
+    console.show_lines(report.lines())
+    console.wrote(report.recording)
+    if report.by_fault:
+        raise LanenetError(f"the car had to stop: {report.ended}; it does not start again by itself")
+    if report.recording is not None:
+        console.next_command("map", report.recording, "--lane-width", "CM", "--out", "MAP")
+    elif settings.actuator is not None and not arm:
+        console.next_command(
+            "drive", config, *(overrides or []), "--arm" if steering_only else "--steering-only"
+        )
+    else:
+        console.next_command("bench")

@@ -1,0 +1,59 @@
+"""The verb that makes the files which the car runs: export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet.cli import console
+from lanenet.cli.outputs import check_ending
+from lanenet.errors import ConfigError
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet export checkpoints/small --out runs/small.onnx")
+def export(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.", show_default=False)
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Model to write; default CHECKPOINT/model.onnx, with --int8 model-int8.onnx."),
+    ] = None,
+    check: Annotated[
+        list[Path] | None,
+        typer.Option(help="Labels on whose frames the file is checked as well.", metavar="LABELS.parquet"),
+    ] = None,
+    int8: Annotated[
+        bool,
+        typer.Option(
+            "--int8", help="Quantise CHECKPOINT/model.onnx, and say what that costs and brings here."
+        ),
+    ] = False,
+) -> None:
+    """Write a checkpoint as one ONNX file, checked against PyTorch."""
+    if out is not None:
+        check_ending(out, ".onnx")
+    if int8 and check:
+        raise ConfigError("--check: compares with PyTorch, expected it without --int8")
+    if int8:
+        from lanenet.learn.quantise import export_int8
+        from lanenet.perception.network.model_file import MODEL_NAME
+
+        path, report = export_int8(checkpoint, out)
+        console.show_lines(report.lines)
+        console.wrote(path, path.with_suffix(".json"))
+        path = path if report.recommended else checkpoint / MODEL_NAME
+    else:
+        from lanenet.learn.export import export_checkpoint
+
+        done = export_checkpoint(checkpoint, out, check or ())
+        path = done.path
+        typer.echo(
+            f"onnxruntime and PyTorch differ by {done.difference:.1g} cm at most, on {done.rasters} rasters"
+        )
+        console.wrote(path)
+    console.next_command("bench", "--model", path)

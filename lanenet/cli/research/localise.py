@@ -1,0 +1,225 @@
+"""The verb for localising a car as it drives."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from lanenet.cli import console
+from lanenet.cli.outputs import check_ending, check_not_source
+from lanenet.errors import CalibrationError, ConfigError, HardwareError
+
+if TYPE_CHECKING:
+    from datagen.localise.live_filter import Moment
+    from datagen.localise.localise import LiveReport
+    from lanenet.onboard.hardware import FrameSource
+
+app = typer.Typer()
+log = logging.getLogger(__name__)
+
+#: The longest wait for a frame; a signal is answered at least this often.
+_WAIT_S = 0.1
+
+
+@app.command(
+    epilog="Example: lanenet localise data/tub --camera runs/tub/camera.yaml "
+    "--config runs/tub/settings.yaml --out runs/poses.csv; "
+    "lanenet localise --live car.yaml --out runs/poses.csv"
+)
+def localise(
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Poses to write, frame by frame (.csv); beside it a .tum and a .png.", show_default=False
+        ),
+    ],
+    source: Annotated[
+        Path | None,
+        typer.Argument(metavar="SOURCE", help="Drive, tub or video; none with --live.", show_default=False),
+    ] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CONFIG", help="YAML of the car, as for drive: its camera as it runs.", show_default=False
+        ),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", help="Camera YAML; default: the drive's or the car's.", show_default=False),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML with the mapping's settings, or a map's settings.yaml.")
+    ] = None,
+    factor: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="Usual way per frame, cm; with a recorded speed its gain. Default: found at the start.",
+            show_default=False,
+        ),
+    ] = None,
+    start_frames: Annotated[
+        int, typer.Option(min=60, help="Frames in which speed and steering are found.")
+    ] = 300,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            help="With --live: how fast the car is driven, cm/s. Default: the CONFIG's cruise_cm_s.",
+            show_default=False,
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="With --live: end after this many frames.", show_default=False)
+    ] = None,
+) -> None:
+    """Run the particle filter alone, as on the car: a pose per frame as it comes, memory bounded."""
+    from datagen.localise.live_filter import StartSettings, moments_of
+    from datagen.localise.localise import localise as run
+    from datagen.settings import MapSettings
+    from lanenet.config import load_settings
+    from lanenet.data.camera_file import read_camera
+    from lanenet.data.drives import open_drive
+
+    check_ending(out, ".csv")
+    given = source if live is None else live
+    if given is None or (source is not None and live is not None):
+        raise ConfigError(
+            "expected either SOURCE or --live CONFIG, found " + ("both" if given else "neither")
+        )
+    check_not_source(given, out, out.with_suffix(".tum"), out.with_suffix(".png"))
+    settings = MapSettings() if config is None else load_settings(MapSettings, config)
+    start = StartSettings(frames=start_frames, factor=factor)
+    if live is None:
+        drive = open_drive(given)
+        known = read_camera(camera) if camera is not None else drive.camera
+        if known is None:
+            raise CalibrationError(
+                f"{source}: comes without a camera, expected --camera camera.yaml; "
+                "the folder of its map has one (lanenet map)"
+            )
+        with console.progress_bar("localise") as progress:
+            moments = moments_of(drive)
+            report = run(moments, known, settings, out, start, lambda done: progress(done, len(drive)))
+        _show(report)
+        console.next_command("map", given, "--lane-width", "CM", "--out", "MAP")
+        return
+    from lanenet.onboard.cameras import open_source
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    car = load_drive_settings(live)
+    chosen = camera if camera is not None else car.camera
+    if chosen is None:
+        raise CalibrationError(f"{live}: key 'camera' is missing: expected one, or --camera camera.yaml")
+    cruise_cm_s = car.control.speed.cruise_cm_s if speed is None else speed
+    running = LiveMoments(open_source(car.source), cruise_cm_s, frames)
+    with console.live_line() as show:
+        report = run(
+            running,
+            read_camera(chosen),
+            settings,
+            out,
+            start,
+            lambda done: show(lambda: f"{done} frames, {running.skipped} left out"),
+        )
+    _show(report)
+    if running.failure is not None:
+        raise running.failure
+    console.next_command("drive", live, "--dry-run")
+
+
+class LiveMoments:
+    """Frames of a running camera, as the filter takes them, with the speed that the car is meant to hold.
+
+    The filter is given the newest frame each time it asks: those that it was too slow for are left out, and
+    the car has come further by so much time. Ctrl-C and the other signals that end a drive end the frames,
+    and so does a camera that is gone for good: what was localised by then is kept.
+
+    Attributes:
+        failure: Why the camera gave no more frames; None where it did not fail.
+        skipped: Frames of the camera that were left out.
+    """
+
+    def __init__(self, source: FrameSource, speed_cm_s: float, most: int | None = None) -> None:
+        """Take the frames of a source, which is opened when the first is asked for.
+
+        Args:
+            source: Camera, or a recording that plays one.
+            speed_cm_s: Speed that whoever drives the car holds, about; what it really is the filter finds.
+            most: Ends after so many frames; None goes on.
+        """
+        self._source, self._speed_cm_s = source, speed_cm_s
+        self._most = math.inf if most is None else most
+        self.failure: HardwareError | None = None
+        self.skipped = 0
+        self._asked = ""
+
+    def __iter__(self) -> Iterator[Moment]:
+        """Yield frames until a signal, an end or a failure.
+
+        Raises:
+            HardwareError: If the camera is not there to begin with.
+            MissingExtraError: If its driver is not installed.
+        """
+        from lanenet.onboard.loop import ending_signals
+
+        with ending_signals(self._stop):
+            self._source.open()
+            try:
+                yield from self._frames()
+            finally:
+                self._source.close()
+
+    def _stop(self, why: str) -> None:
+        self._asked = why
+
+    def _frames(self) -> Iterator[Moment]:
+        from datagen.localise.live_filter import Moment
+        from lanenet.data.drives.recording import Commands
+        from lanenet.onboard.hardware import SourceEnded
+
+        commands = Commands(speed_cm_s=np.array([self._speed_cm_s]))
+        taken, number, t_s = 0, -1, -math.inf
+        while taken < self._most and not self._asked:
+            try:
+                frame = self._source.read(_WAIT_S)
+            except SourceEnded:
+                return
+            except HardwareError as error:
+                log.error("the camera is gone: %s", error)
+                self.failure = error
+                return
+            # A driver that corrects its clock may stamp a frame before the last one.
+            if frame is None or frame.t_s <= t_s:
+                continue
+            self.skipped += max(0, frame.number - number - 1) if taken else 0
+            taken, number, t_s = taken + 1, frame.number, frame.t_s
+            yield Moment(frame.number, frame.t_s, frame.image_bgr, commands)
+
+
+def _show(report: LiveReport) -> None:
+    lines = [
+        f"{report.poses} poses of {report.frames} frames, {report.segments} segment(s); "
+        f"{report.unreadable} unreadable, {report.standing} standing, {report.dropped} left out",
+        f"{1e3 / report.median_ms:.0f} frames/s: {report.median_ms:.2f} ms per frame (median), "
+        f"{report.p99_ms:.2f} ms (p99)",
+        f"map {report.map_mb:.0f} MB"
+        + ("" if report.process_mb is None else f", process {report.process_mb:.0f} MB at most"),
+        f"gain of the speed {report.factor:.3f}"
+        if report.speed_known
+        else f"usual way per frame {report.factor:.2f} cm",
+        f"median match {report.match:.2f}",
+    ]
+    if report.steering is not None:
+        lines.append(
+            f"steering found: correlation {report.steering.correlation:.2f}, "
+            f"delay {report.steering.lag_frames} frames"
+        )
+    console.show_lines(lines)
+    console.wrote(report.out, report.trajectory, report.picture)

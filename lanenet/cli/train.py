@@ -1,0 +1,183 @@
+"""``lanenet train`` and ``lanenet sweep``: from a config to a checkpoint with its tables and its model card.
+
+Imports ``datagen`` and ``lanenet.learn`` inside the commands, since the car has neither torch nor numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from pydantic import Field
+
+from lanenet.cli import console
+from lanenet.cli import val as val_cli
+from lanenet.cli.car.verbs import MarkingOption
+from lanenet.config import Settings, dump_settings, load_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lanenet.evaluation.robustness import RobustRow
+    from lanenet.evaluation.sources import Opened
+
+app = typer.Typer()
+
+_Config = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
+]
+_Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
+]
+
+
+@functools.cache
+def run_settings_schema() -> type[Settings]:
+    """Return the schema of ``lanenet train CONFIG``; built here because its parts need the workstation."""
+    from datagen.datasets.settings import DataSettings
+    from lanenet.learn.config import LearnSettings
+
+    class RunSettings(Settings):
+        """Everything that one training run needs.
+
+        Attributes:
+            name: Names the checkpoint.
+            data: Where the label sets come from.
+            learn: How the network is trained.
+            work_dir: Drives, maps and label sets; None stands for ``runs/<name>``.
+            checkpoints_dir: Parent of the checkpoint's folder.
+        """
+
+        name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+        data: DataSettings = Field(default_factory=DataSettings)
+        learn: LearnSettings = Field(default_factory=LearnSettings)
+        work_dir: Path | None = None
+        checkpoints_dir: Path = Path("checkpoints")
+
+        @property
+        def work_folder(self) -> Path:
+            """Folder of the drives, maps and label sets."""
+            return Path("runs") / self.name if self.work_dir is None else self.work_dir
+
+    return RunSettings
+
+
+@app.command(epilog="Example: lanenet train configs/small.yaml learn.epochs=5")
+def train(
+    config: _Config,
+    overrides: _Overrides = None,
+    marking: MarkingOption = None,
+) -> None:
+    """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
+    from datagen.datasets.build import prepare
+    from lanenet.data.files import json_text
+    from lanenet.data.label_set import read_labels
+    from lanenet.evaluation.card import CARD_NAME, model_card
+    from lanenet.evaluation.report import default_names, evaluate
+    from lanenet.evaluation.robustness import as_dict
+    from lanenet.evaluation.sources import open_tests
+    from lanenet.learn.checkpoint import publish
+    from lanenet.learn.run_state import METRICS_NAME, check_start, hash_run
+    from lanenet.learn.train import train as train_network
+    from lanenet.perception.network.detector import read_model_meta
+    from lanenet.samples.dataset import compile_kernels
+
+    settings: Any = load_settings(run_settings_schema(), config, overrides)
+    check_start(settings.learn, settings.data.window, settings.data.perceptions)
+    checkpoint = settings.checkpoints_dir / settings.name
+    with console.progress_bar("data") as progress:
+        data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
+    if data.left_out:
+        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
+    # A folder per settings and data: a stopped run finds its own state again, and no other.
+    run_hash = hash_run(settings.learn, data.train, data.validation)
+    run_folder = settings.work_folder / f"train-{run_hash}"
+    with console.training_bar() as progress:
+        model = train_network(settings.learn, data.train, data.validation, run_folder, progress).model_path
+    if not data.test:
+        console.show_problems(["the data has no test part: the table is over the validation labels"])
+    sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
+    training = [read_labels(path) for path in dict.fromkeys(data.train)]
+    with console.progress_bar("test") as progress:
+        evaluation = evaluate(
+            sources,
+            default_names(sources, with_model=True),
+            model,
+            training=training,
+            marking_cm=marking,
+            # Which camera made which test drive is settled by the config.
+            any_camera=True,
+            workers=settings.data.processes,
+            progress=progress,
+        )
+    val_cli.show(evaluation.comparison)
+    robustness = _robustness(model, sources)
+    card = model_card(
+        settings.name,
+        read_model_meta(model),
+        json.loads((run_folder / METRICS_NAME).read_text(encoding="utf-8")),
+        training,
+        evaluation.comparison,
+        robustness,
+    )
+    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card}
+    files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
+    if robustness:
+        files["robustness.json"] = json_text(as_dict(robustness))
+    if data.camera is not None:
+        files["camera.yaml"] = data.camera.read_bytes()
+    if data.example is not None:
+        files[f"example{data.example.suffix}"] = data.example.read_bytes()
+    publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
+    console.wrote(checkpoint)
+    options = {
+        "--detector": "network",
+        "--model": checkpoint,
+        "--camera": checkpoint / "camera.yaml" if data.camera is not None else None,
+        "--out": "runs/lanes.csv",
+    }
+    source = checkpoint / f"example{data.example.suffix}" if data.example is not None else "SOURCE"
+    console.next_command("detect", source, *console.given(options))
+
+
+def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:
+    """Errors of a model on changed test frames; none if a label set knows no lines to change."""
+    from lanenet.evaluation.errors import RasterModel
+    from lanenet.evaluation.robustness import can_measure, measure_robustness
+
+    known = [(source.labels, str(source.path)) for source in sources if source.labels is not None]
+    known = [(labels, name) for labels, name in known if can_measure(labels)]
+    if not known:
+        return []
+    label_sets, names = zip(*known, strict=True)
+    return measure_robustness({"network": RasterModel(model)}, label_sets, names)
+
+
+@app.command(epilog="Example: lanenet sweep configs/small.yaml learn.epochs=10 --minutes 60")
+def sweep(
+    config: _Config,
+    overrides: _Overrides = None,
+    minutes: Annotated[
+        float, typer.Option(min=0.0, help="No longer than this; goes on when called again.")
+    ] = 60.0,
+    trials: Annotated[int, typer.Option(min=1, help="No more finished trials than this, in all.")] = 100,
+) -> None:
+    """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
+    from datagen.datasets.build import prepare
+    from lanenet.learn.run_state import check_start
+    from lanenet.learn.sweep import sweep as sweep_networks
+
+    settings: Any = load_settings(run_settings_schema(), config, overrides)
+    check_start(settings.learn, settings.data.window, settings.data.perceptions)
+    with console.progress_bar("data") as progress:
+        data = prepare(settings.data, settings.work_folder, progress)
+    out = settings.work_folder / "sweep"
+    with console.progress_bar("trials") as progress:
+        table = sweep_networks(
+            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
+        )
+    console.show_lines(table.splitlines()[:14])
+    console.wrote(out / "sweep.md", out / "trials.csv")

@@ -1,0 +1,251 @@
+"""``lanenet val``: a thin shell over :mod:`lanenet.evaluation.report`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lanenet.cli import console
+from lanenet.cli.car.verbs import MarkingOption
+from lanenet.cli.outputs import check_not_source
+from lanenet.errors import ConfigError
+from lanenet.evaluation.report import default_names, evaluate
+from lanenet.evaluation.sources import Opened, open_source
+from lanenet.perception.network.model_file import find_model, is_model
+
+if TYPE_CHECKING:
+    from lanenet.evaluation.answers import ComparedName
+    from lanenet.evaluation.comparison import Comparison
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet val checkpoints/small runs/drive7 runs/my_map --out runs/errors")
+def val(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[MODEL] SOURCE...",
+            help="Model (.onnx) or checkpoint folder; simulated drives, maps, or label sets (.parquet).",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write the report under this name: .md, .json, .png, -breakdown.png, -worst.jpg."
+        ),
+    ] = None,
+    detectors: Annotated[
+        str | None,
+        typer.Option(
+            help="Which to compare, as in network,painter; all: network, lane-filter, hough, "
+            "hough-value, painter. Default: all that the sources allow.",
+            show_default=False,
+        ),
+    ] = None,
+    no_baselines: Annotated[bool, typer.Option("--no-baselines", help="The network only.")] = False,
+    marking: MarkingOption = None,
+    any_camera: Annotated[
+        bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
+    ] = False,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(help="Another model or checkpoint for the same tables; may be given again."),
+    ] = None,
+    trained_on: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Label set that MODEL has learned from; may be given again. Parts of the same map are told "
+            "by their distance from it.",
+        ),
+    ] = None,
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust",
+            help="Also change the frames: lines missing, clutter, unknown objects, a wrong calibration.",
+        ),
+    ] = False,
+) -> None:
+    """Show errors in cm of a model and of the other detectors on the same frames.
+
+    Simulated drives are compared with their truth, maps and the label sets made of them with the map. Label
+    sets hold no frames, so that hough and painter cannot be run on them. Without the network no MODEL is
+    needed.
+    """
+    from datagen.labels.truth import truth_labels
+    from lanenet.data.files import atomic_file, write_json, write_text
+    from lanenet.data.label_set import read_labels
+    from lanenet.geometry.birdseye import BirdseyeWindow
+    from lanenet.perception.network.detector import read_model_meta
+
+    model, source_paths = _split_paths(paths)
+    more = _more_models(also or [])
+    if out is not None:
+        for source in source_paths:
+            check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
+    meta = None if model is None else read_model_meta(model)
+    window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
+    sources = [open_source(path, window, perception, truth_labels) for path in source_paths]
+    names = _chosen(detectors, no_baselines, model, sources)
+    if detectors is None and not no_baselines and any(source.frames is None for source in sources):
+        console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
+    if robust:
+        _check_robust(model, sources)
+    networks = more if model is None or "network" not in names else {"network": model, **more}
+    for path in networks.values():
+        widths_cm = [source.lane_width_cm for source in sources]
+        console.show_problems(read_model_meta(path).untrained_widths(widths_cm, str(path)))
+    with console.progress_bar("val") as progress:
+        evaluation = evaluate(
+            sources,
+            names,
+            model,
+            also=more,
+            training=[read_labels(path) for path in trained_on or []],
+            marking_cm=marking,
+            any_camera=any_camera,
+            workers=os.cpu_count() or 1,
+            progress=progress,
+        )
+    show(evaluation.comparison)
+    robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
+    if out is not None:
+        write_json(Path(f"{out}.json"), evaluation.comparison.as_dict())
+        console.wrote(Path(f"{out}.json"))
+        for ending, content in evaluation.files.items():
+            path = Path(f"{out}{ending}")
+            if isinstance(content, str):
+                write_text(path, content)
+            else:
+                with atomic_file(path) as temporary:
+                    temporary.write_bytes(content)
+            console.wrote(path)
+        if robustness is not None:
+            table, figures = robustness
+            write_text(Path(f"{out}-robust.md"), table)
+            write_json(Path(f"{out}-robust.json"), figures)
+            console.wrote(Path(f"{out}-robust.md"), Path(f"{out}-robust.json"))
+        if ".png" not in evaluation.files:
+            console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
+    best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
+    shown = "network" if "network" in names else best
+    console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
+
+
+def show(comparison: Comparison) -> None:
+    """Print the tables of a comparison."""
+    from rich.console import Console
+
+    from lanenet.evaluation.tables import lay_out
+
+    for table in lay_out(comparison):
+        Console().print(table.as_rich())
+
+
+def _next_words(
+    sources: Sequence[Opened], shown: str, model: Path | None, marking: float | None, any_camera: bool
+) -> list[str | Path]:
+    """A command that runs as it stands: the lanes that a detector finds in the first source with frames."""
+    with_frames = [source for source in sources if source.frames is not None]
+    if not with_frames:
+        return ["bench", *console.given({"--model": model})]
+    source, detector = with_frames[0], "network" if model is not None else shown.removesuffix("-value")
+    is_map, needs_width = source.drive != source.path, detector in ("network", "lane-filter")
+    options = {
+        "--detector": detector,
+        "--model": model,
+        "--camera": source.path / "camera.yaml" if is_map else None,
+        "--lane-width": round(source.lane_width_cm, 2) if is_map and needs_width else None,
+        "--marking": marking if detector == "lane-filter" else None,
+        "--any-camera": any_camera and model is not None,
+        "--out": "runs/lanes.csv",
+    }
+    return ["detect", source.drive, *console.given(options)]
+
+
+def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
+    """Models by the names that they get in the tables: those of their folders or files."""
+    from lanenet.evaluation.answers import COMPARED
+
+    models: dict[str, Path] = {}
+    for path in paths:
+        if path.is_file() and not is_model(path):
+            raise ConfigError(f"--also {path}: expected a model (.onnx) or a checkpoint folder")
+        model = find_model(path)
+        name = path.resolve().stem
+        if path.is_dir() or name == "model":
+            # A checkpoint's file is called as every other one's.
+            name = model.resolve().parent.name
+        if name in models or name in COMPARED:
+            raise ConfigError(f"--also {path}: the name {name!r} is taken, expected another one")
+        models[name] = model
+    return models
+
+
+def _check_robust(model: Path | None, sources: Sequence[Opened]) -> None:
+    if model is None:
+        raise ConfigError("--robust: expected a model before the sources (lanenet val MODEL SOURCE --robust)")
+    without = [source.path for source in sources if source.labels is None]
+    if without:
+        raise ConfigError(
+            f"--robust: {without[0]} is a map; expected simulated drives or label sets (lanenet label)"
+        )
+
+
+def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[str, dict[str, object]]:
+    """Measure, show and return the table as Markdown and as plain values."""
+    from rich.console import Console
+
+    from lanenet.evaluation.errors import RasterModel
+    from lanenet.evaluation.robustness import as_dict, measure_robustness, robust_table
+
+    opened = {name: RasterModel(path) for name, path in models.items()}
+    label_sets = [source.labels for source in sources if source.labels is not None]
+    with console.progress_bar("robust") as progress:
+        rows = measure_robustness(opened, label_sets, [str(source.path) for source in sources], progress)
+    table = robust_table(rows)
+    Console().print(table.as_rich())
+    return table.as_markdown(), as_dict(rows)
+
+
+def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
+    """The model, if the first path is one, and the sources."""
+    first, *sources = paths
+    misplaced = next((path for path in sources if path.exists() and is_model(path)), None)
+    if misplaced is not None:
+        raise ConfigError(
+            f"{misplaced}: is a model, expected a simulated drive, map or label set; the model comes first "
+            "(lanenet val MODEL SOURCE), more of them with --also"
+        )
+    if not is_model(first):
+        return None, paths
+    if not sources:
+        raise ConfigError(f"{first}: expected a SOURCE after the model: a simulated drive, map or label set")
+    return find_model(first), sources
+
+
+def _chosen(
+    text: str | None, no_baselines: bool, model: Path | None, sources: Sequence[Opened]
+) -> tuple[ComparedName, ...]:
+    from lanenet.evaluation.answers import ON_LABEL_SETS, choose_names
+
+    if no_baselines and text is not None:
+        raise ConfigError("--no-baselines: is the same as --detectors network, expected one of the two")
+    names = default_names(sources, model is not None) if text is None else choose_names(text)
+    names = ("network",) if no_baselines else names
+    if "network" in names and model is None:
+        raise ConfigError("detector network: expected a model before the sources (lanenet val MODEL SOURCE)")
+    without_frames = [source.path for source in sources if source.frames is None]
+    refused = [name for name in names if without_frames and name not in ON_LABEL_SETS]
+    if refused:
+        raise ConfigError(
+            f"detector {refused[0]}: needs frames, but {without_frames[0]} is a label set; give the "
+            "simulated drive or the map that it was made of"
+        )
+    return names

@@ -1,0 +1,141 @@
+"""A drive as a video, with an optional CSV of the same name beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.data.drives.folder import drive_of, read_times
+from lanenet.data.drives.recording import Commands, Drive
+from lanenet.errors import DriveFormatError
+
+VIDEO_ENDINGS: tuple[str, ...] = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
+
+#: Up to this many frames ahead, decoding on is faster than a jump to the next key frame before them.
+_MAX_FORWARD = 60
+_DEFAULT_FPS = 20.0
+_MAX_FPS = 1000.0
+
+
+class VideoImages:
+    """Frames of a video file: in order at full speed, out of order by seeking."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a video.
+
+        Raises:
+            DriveFormatError: If OpenCV cannot open it.
+        """
+        self.path = path
+        self._capture = self._opened()
+        #: Frame that the decoder answers next.
+        self._next = 0
+        self._last: tuple[int, np.ndarray] | None = None
+
+    def __reduce__(self) -> tuple[type[VideoImages], tuple[Path]]:
+        """Another process opens the file again."""
+        return VideoImages, (self.path,)
+
+    @property
+    def listed_frames(self) -> int:
+        """Number of frames as the header says; 0 if it does not."""
+        return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+    @property
+    def fps(self) -> float:
+        """Frames per second as the header says; 0 if it does not."""
+        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+        return fps if 0.0 < fps <= _MAX_FPS else 0.0
+
+    def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Read one frame; see :class:`lanenet.data.drives.recording.ImageSource`."""
+        if self._last is not None and self._last[0] == row:
+            return self._last[1].copy()
+        if not self._next <= row <= self._next + _MAX_FORWARD:
+            self._seek(row)
+        while self._next < row and self._capture.grab():
+            self._next += 1
+        ok, image = self._capture.read() if self._next == row else (False, None)
+        if not ok or image is None:
+            # Where the decoder stands after a failure is not defined.
+            self._rewind()
+            raise DriveFormatError(
+                f"{self.path}: video frame {row} cannot be decoded (is the video cut off?)"
+            )
+        self._next = row + 1
+        self._last = (row, image)
+        return np.asarray(image.copy())
+
+    def count(self) -> int:
+        """Count the frames that can be decoded.
+
+        The last one listed is tried first; only if it fails is the whole video walked through.
+        """
+        listed = self.listed_frames
+        if listed and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1) and self._capture.grab():
+            self._rewind()
+            return listed
+        self._rewind()
+        n = 0
+        while self._capture.grab():
+            n += 1
+        self._rewind()
+        return n
+
+    def _opened(self) -> Any:
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise DriveFormatError(f"{self.path}: not a video that OpenCV can open (or cut off at its end)")
+        return capture
+
+    def _rewind(self) -> None:
+        self._capture.release()
+        self._capture = self._opened()
+        self._next = 0
+
+    def _seek(self, row: int) -> None:
+        if self._capture.set(cv2.CAP_PROP_POS_FRAMES, row):
+            self._next = int(self._capture.get(cv2.CAP_PROP_POS_FRAMES))
+        # A jump that does not land there is replaced by decoding from the start.
+        if self._next != row:
+            self._rewind()
+
+
+def open_video(path: Path) -> Drive:
+    """Open a video; ``<name>.csv`` beside it may give times and commands of its frames, counted from 0.
+
+    Raises:
+        DriveFormatError: If the video or its CSV cannot be read, or it has no frame.
+    """
+    images = VideoImages(path)
+    problems: list[str] = []
+    n = images.count()
+    if n == 0:
+        raise DriveFormatError(f"{path}: no frame of the video can be decoded")
+    if n < images.listed_frames:
+        problems.append(f"{path}: the video is cut off: {n} of {images.listed_frames} frames can be decoded")
+    table = path.with_suffix(".csv")
+    if table.is_file():
+        columns, commands = read_times(table, with_files=False)
+        frames, t_s, trusted = columns["frame"], columns["t_s"], True
+        inside = np.flatnonzero(frames < n)
+        if len(inside) == 0:
+            raise DriveFormatError(f"{table}: no row belongs to one of the video's {n} frames")
+        if len(inside) < len(frames):
+            problems.append(
+                f"{table}: {len(frames) - len(inside)} rows lie beyond the video's {n} frames (first: frame "
+                f"{frames[len(inside)]})"
+            )
+            frames, t_s, commands = frames[inside], t_s[inside], commands.subset(inside)
+    else:
+        fps, trusted = images.fps, images.fps > 0.0
+        if not trusted:
+            problems.append(f"{path}: the video does not tell its rate; taking {_DEFAULT_FPS:.0f} frames/s")
+        frames = np.arange(n)
+        t_s = frames / (fps or _DEFAULT_FPS)
+        commands = Commands()
+    return drive_of(path, frames, t_s, commands, images, problems, rows=frames, times_trusted=trusted)

@@ -1,0 +1,240 @@
+"""A map together with the drive that it was made of: the lane of each frame, and where it counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from lanenet.config import check_settings, read_yaml
+from lanenet.data.drives import Drive, open_drive
+from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
+from lanenet.data.maps.frame_lines import FrameLines, beside_line, label_rows, lines_of_frame
+from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES
+from lanenet.perception.edges.road import PerceptionSettings
+
+_MIN_MATCH = 0.15
+#: Uncertainty of a line's position from which it gives no label, in lane widths.
+_MAX_SIGMA_LANES = 0.04
+#: Why a frame gets no labels.
+DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
+CONTRADICTED = "the pictures disagree with the map"
+BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
+#: A map that is wrong puts the car there, too, so that these frames count against it.
+AWAY = "far beside the lane"
+#: Frames that even a map that lacks nothing would not label.
+NOT_TO_LABEL = (DELETED, BETWEEN_LANES)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedDrive:
+    """A map and its drive.
+
+    Attributes:
+        drive_map: The map.
+        drive: The drive.
+        rows: Position in the drive of each of the map's frames.
+        perception: How the map's edge points were found.
+    """
+
+    drive_map: DriveMap
+    drive: Drive
+    rows: Int[np.ndarray, "n"]
+    perception: PerceptionSettings
+
+    @property
+    def starts(self) -> Bool[np.ndarray, "n"]:
+        """Frames of the map that do not follow the one before them, though they may lie on the same map."""
+        rows, segment = self.rows, self.drive_map.segment
+        # Stretches that could not be mapped are left out of the map, so that their neighbours do not touch.
+        starts = self.drive.breaks[rows] | (np.diff(rows, prepend=rows[0] - 2) != 1)
+        return np.asarray(starts | (np.diff(segment, prepend=segment[0]) != 0))
+
+
+def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> MappedDrive:
+    """Open a map folder and the drive that it names.
+
+    Args:
+        map_folder: Folder that :func:`datagen.pipeline.map_drive` wrote.
+        drive_path: Where the drive is now, if it has moved since it was mapped.
+
+    Raises:
+        MapFormatError: If the map cannot be read.
+        DriveFormatError: If the drive is not there, or lacks a frame of the map.
+        CalibrationError: If the map's camera is for images of another size.
+    """
+    drive_map = read_map(map_folder)
+    source = drive_path if drive_path is not None else Path(drive_map.meta.drive)
+    if not source.exists():
+        hint = "" if source.is_absolute() else f", looked for from {Path.cwd()}"
+        raise DriveFormatError(f"{source}: the drive of {map_folder} is not there{hint}")
+    drive = open_drive(source)
+    if (drive_map.camera.width, drive_map.camera.height) != (drive.width, drive.height):
+        raise CalibrationError(
+            f"{map_folder / 'camera.yaml'}: is for {drive_map.camera.width}x{drive_map.camera.height} px, "
+            f"the images of {source} have {drive.width}x{drive.height}"
+        )
+    missing = np.setdiff1d(drive_map.frames, drive.frames)
+    if missing.size:
+        raise DriveFormatError(f"{source}: frame {int(missing[0])} of {map_folder} is not in it")
+    settings_path = map_folder / SETTINGS_NAME
+    found = read_yaml(settings_path).get("perception", {})
+    perception = check_settings(PerceptionSettings, found, f"{settings_path}: perception")
+    return MappedDrive(drive_map, drive, np.searchsorted(drive.frames, drive_map.frames), perception)
+
+
+def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LANES) -> FrameLines:
+    """Return the lane of the map's k-th frame: the one that it is in, in its direction of travel.
+
+    A line that is known worse than to ``max_sigma_lanes`` lane widths is left out.
+    """
+    segment = int(drive_map.segment[k])
+    return lines_of_frame(
+        drive_map.lines[segment],
+        drive_map.poses[k],
+        float(drive_map.s_cm[k]),
+        drive_map.camera.wheelbase_cm,
+        int(drive_map.lanes.lane[k]),
+        bool(drive_map.lanes.forward[k]),
+        max_sigma_lanes * drive_map.meta.mapped_lane_cm,
+    )
+
+
+def known_lines(drive_map: DriveMap) -> Bool[np.ndarray, "n 2"]:
+    """Tell which of the map's frames have their left, their right line at one label row at least."""
+    points = [lines_at(drive_map, k).points_cm for k in range(len(drive_map.frames))]
+    return np.asarray(np.isfinite(points).reshape(-1, 2, N_POINTS // 2).any(axis=2))
+
+
+def label_frame(
+    mapped: MappedDrive, k: int, window: BirdseyeWindow
+) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:
+    """Return the lane of the map's k-th frame and its six labels, or why it gets none.
+
+    A frame gets no labels where its pose is uncertain (few edges match the map), where the car is between two
+    lanes or far beside its own, where the pictures disagree with both of the map's lines, or where the driver
+    has deleted it; a point is masked where they disagree with its line, where the map does not support it, or
+    where it lies beside the window.
+    """
+    if mapped.drive.deleted[mapped.rows[k]]:
+        return DELETED
+    # The first frame of a segment has no map to match yet, so that its match is NaN.
+    if mapped.drive_map.match[k] < _MIN_MATCH:
+        return UNCERTAIN
+    if mapped.drive_map.lanes.between[k]:
+        return BETWEEN_LANES
+    if mapped.drive_map.lanes.away[k]:
+        return AWAY
+    seen = lines_at(mapped.drive_map, k)
+    visible = window.labelled(seen.points_cm)
+    if not np.isfinite(visible).any():
+        return NO_LINE
+    if mapped.drive_map.contradicted is not None:
+        seen = seen.without(mapped.drive_map.contradicted[k])
+        visible = window.labelled(seen.points_cm)
+    return (seen, visible) if np.isfinite(visible).any() else CONTRADICTED
+
+
+def points_in_window(drive_map: DriveMap, k: int, window: BirdseyeWindow) -> Bool[np.ndarray, "6"]:
+    """Tell which of the six points of the map's k-th frame a map that lacks nothing would label.
+
+    Where the map does not know a line, it is expected beside the other one, at the lane's width. A point
+    counts unless its line is known to lie beside the window, or to turn away before the row.
+    """
+    lines = lines_at(drive_map, k, np.inf)
+    lane_cm = drive_map.meta.mapped_lane_cm
+    sides = [
+        np.where(np.isfinite(own), own, beside_line(other, across_cm))
+        for own, other, across_cm in (
+            (lines.left_cm, lines.right_cm, -lane_cm),
+            (lines.right_cm, lines.left_cm, lane_cm),
+        )
+    ]
+    points = window.labelled(np.concatenate([label_rows(line) for line in sides]))
+    unknown = np.concatenate([_rows_in_gaps(line) for line in sides])
+    return np.asarray(np.isfinite(points) | unknown)
+
+
+def _rows_in_gaps(line_car_cm: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, "3"]:
+    """Tell at which label rows a line may be where nothing is known of it."""
+    y_cm, known = line_car_cm[:, 1], np.isfinite(line_car_cm).all(axis=1)
+    joined = known[:-1] & known[1:]
+    met = [bool((joined & ((y_cm[:-1] <= row) != (y_cm[1:] <= row))).any()) for row in ROWS_CM]
+    return np.array([not (known.all() or row_is_met) for row_is_met in met])
+
+
+def labelled_points(
+    points_cm: Float[np.ndarray, "n 6"], in_window: Bool[np.ndarray, "n 6"], not_mapped: int = 0
+) -> dict[str, float]:
+    """Share of each line's points in the window that are labelled.
+
+    Args:
+        points_cm: Labels of the frames that count; NaN where there is none.
+        in_window: See :func:`points_in_window`.
+        not_mapped: Frames beside these of which nothing is known: none of their points is labelled.
+
+    Returns:
+        By side; a line of which no point lies in the window has no share.
+    """
+    half = N_POINTS // 2
+    shares = {}
+    for side, part in zip(SIDES, (slice(half), slice(half, None)), strict=True):
+        wanted = in_window[:, part]
+        count = int(wanted.sum()) + half * not_mapped
+        if count:
+            shares[side] = float((np.isfinite(points_cm[:, part]) & wanted).sum()) / count
+    return shares
+
+
+def points_text(shares: dict[str, float]) -> str:
+    """Say what :func:`labelled_points` found."""
+    said = " and ".join(f"{100.0 * share:.0f} % of the {side} line's" for side, share in shares.items())
+    return f"{said} points in the window have labels"
+
+
+def read_map_frames(
+    map_folder: Path, window: BirdseyeWindow | None = None, drive_path: Path | None = None
+) -> LabelledFrames:
+    """Read the frames of a mapped drive with the labels that the map gives them.
+
+    The labels are those of :func:`datagen.labels.label_map.label_map`; frames that get none are kept.
+
+    Args:
+        map_folder: Folder of the map.
+        window: Points beside this bird's-eye window have no label; None takes the default.
+        drive_path: Where the drive is now, if it has moved since it was mapped.
+
+    Raises:
+        LanenetError: As :func:`open_mapped_drive`.
+    """
+    mapped = open_mapped_drive(map_folder, drive_path)
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    window = BirdseyeWindow() if window is None else window
+    points = np.full((len(rows), N_POINTS), np.nan)
+    for k in range(len(rows)):
+        labelled = label_frame(mapped, k, window)
+        if not isinstance(labelled, str):
+            points[k] = labelled[1]
+    return LabelledFrames(
+        name=str(map_folder),
+        reference="map",
+        camera=drive_map.camera,
+        lane_width_cm=drive_map.meta.lane_cm,
+        marking_cm=drive_map.meta.tape_cm,
+        perception=mapped.perception,
+        frames=drive_map.frames,
+        starts=mapped.starts,
+        points_cm=points,
+        image=partial(_image_of_row, drive, rows),
+    )
+
+
+def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Frame i of a map; other processes can be given a module's function only."""
+    return drive.image(int(rows[i]))

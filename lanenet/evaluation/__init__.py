@@ -1,0 +1,1 @@
+"""Any detector on any labelled source: errors, tables, pictures, robustness, and the model card."""

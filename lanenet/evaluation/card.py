@@ -1,0 +1,158 @@
+"""The model card: what a network was trained on, how good it is, and where it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lanenet.data.label_set import LabelSet
+from lanenet.evaluation.breakdown import GROUPS
+from lanenet.evaluation.comparison import Comparison
+from lanenet.evaluation.errors import ErrorStats
+from lanenet.evaluation.robustness import RobustRow, robust_table
+from lanenet.evaluation.tables import show_cm, show_share
+from lanenet.geometry.lane import POINT_NAMES
+from lanenet.perception.network.detector import ModelMeta
+
+CARD_NAME = "MODEL_CARD.md"
+#: What is so much worse than the whole is told as a weakness.
+_WORSE = 1.5
+#: Errors beyond this make a lane hard to follow: a tenth of a lane of 40 cm.
+_LARGE_CM = 4.0
+_N_SOURCES = 3
+
+
+def model_card(
+    name: str,
+    meta: ModelMeta,
+    metrics: Mapping[str, Any],
+    training: Sequence[LabelSet],
+    comparison: Comparison,
+    robustness: Sequence[RobustRow],
+) -> str:
+    """Write the card of a trained network as Markdown.
+
+    Args:
+        name: Of the checkpoint.
+        meta: Description in the model's file.
+        metrics: Content of ``metrics.json``.
+        training: The label sets that it has learned from, each once.
+        comparison: Its errors on the test drives; the network is the first detector.
+        robustness: Its errors when something is wrong; may be empty.
+    """
+    parts = [
+        f"# {name}\n\n{_what(meta, metrics)}",
+        f"## What it was trained on\n\n{_training(meta, metrics, training)}",
+        f"## How good it is\n\n{_errors(comparison)}",
+        f"## Where it fails\n\n{_failures(meta, comparison)}",
+    ]
+    if robustness:
+        parts.append("## " + robust_table(robustness).as_markdown())
+    return "\n\n".join(part.rstrip() for part in parts) + "\n"
+
+
+def _what(meta: ModelMeta, metrics: Mapping[str, Any]) -> str:
+    window = meta.window
+    right_cm = window.left_cm + window.columns * window.cell_cm
+    far_cm = window.near_cm + window.rows * window.cell_cm
+    seen = "brightness and colour" if meta.perception.edges.colour_weight else "brightness"
+    return (
+        f"A network of {metrics['parameters']:,} weights. In: the bird's-eye image of the edges of {seen}, "
+        f"{window.rows} x "
+        f"{window.columns} cells of {window.cell_cm:g} cm, from {window.left_cm:g} to {right_cm:g} cm across "
+        f"and {window.near_cm:g} to {far_cm:g} cm ahead.\nOut: x of the left and the right line 0, 15 and "
+        "30 cm ahead of the front axle, the uncertainty of each, and whether each line is there.\nLines "
+        "beside the window, and what lies further ahead, it does not see."
+    )
+
+
+def _training(meta: ModelMeta, metrics: Mapping[str, Any], training: Sequence[LabelSet]) -> str:
+    sources = " and ".join(sorted({labels.meta.source for labels in training}))
+    low, high = _widths_cm(meta)
+    widths = f"{low} cm" if low == high else f"{low} to {high} cm"
+    count = len({labels.meta.camera_hash for labels in training})
+    return (
+        f"{sum(map(len, training))} frames of {_plural(len(training), 'label set')}, labels from the "
+        f"{sources}; {_plural(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} passes, the best "
+        f"one ({metrics['best_epoch']}) chosen by {metrics['val_frames']} frames of other drives or laps "
+        f"(RMSE {show_cm(metrics['val_rmse_cm'])} cm).\nThe whole config is `run.yaml`."
+    )
+
+
+def _errors(comparison: Comparison) -> str:
+    name, rest = comparison.first, comparison.breakdown
+    stats, interval = comparison.tables[name].all, rest.interval_cm[name]
+    frames = sum(source.frames for source in comparison.sources)
+    spread = ""
+    if interval is not None:
+        spread = f" ({show_cm(interval[0])} to {show_cm(interval[1])} over {rest.interval_over})"
+    lines = [
+        f"On {frames} frames of {_plural(len(comparison.sources), 'test drive')} that it has not seen, "
+        f"against the {comparison.reference}: RMSE {show_cm(stats.rmse_cm)} cm{spread}, median "
+        f"{show_cm(stats.median_cm)}, 95 % below {show_cm(stats.p95_cm)}, worst {show_cm(stats.worst_cm)}."
+    ]
+    doubt, presence = rest.doubt.get(name), rest.presence.get(name)
+    if doubt is not None:
+        lines.append(f"{show_share(doubt.coverage['68'])} of the errors lie within its standard deviation.")
+    if presence is not None:
+        found, gaps = show_share(presence.recall), show_share(presence.absent_recall)
+        absent = f"; of the {presence.absent} that are not, it calls {gaps} absent" if presence.absent else ""
+        lines.append(f"Of the lines that are there it finds {found}{absent}.")
+    lines.append("All tables, with the other detectors: `results.md`.")
+    return "\n".join(lines)
+
+
+def _failures(meta: ModelMeta, comparison: Comparison) -> str:
+    errors = comparison.errors_cm[comparison.first]
+    known = np.isfinite(errors)
+    share = float((errors[known] > _LARGE_CM).mean()) if known.any() else 0.0
+    lines = [
+        f"{100.0 * share:.2f} % of the points are off by more than {_LARGE_CM:g} cm; the worst frames are in "
+        "`results-worst.jpg`."
+    ]
+    weak = _weak_spots(comparison)
+    if weak:
+        lines += [f"More than {_WORSE:g} times as wrong as on the whole:", "\n".join(weak)]
+    else:
+        lines.append(f"No group of frames, point or drive is {_WORSE:g} times as wrong as the whole.")
+    low, high = _widths_cm(meta)
+    other = (
+        f"of another width than {low} cm" if low == high else f"narrower than {low} or wider than {high} cm"
+    )
+    lines.append(f"Lanes {other}, and roads without painted lines, were not in its training.")
+    return "\n\n".join(lines)
+
+
+def _weak_spots(comparison: Comparison) -> list[str]:
+    """Where the network is much worse than on the whole, a line each."""
+    name = comparison.first
+    groups = comparison.tables[name].groups
+    spots = [
+        # Here only one detector is spoken of.
+        (f"{GROUPS[condition][0].replace('the first detector', 'the network')} {group}", stats)
+        for condition, by_detector in comparison.breakdown.groups.items()
+        for group, stats in by_detector[name].items()
+    ]
+    spots += [(f"{p.removesuffix('_cm').replace('_', ' line, ')} cm ahead", groups[p]) for p in POINT_NAMES]
+    ranked = sorted(comparison.sources, key=lambda source: -source.detectors[name].rmse_cm)
+    spots += [(f"`{s.name.rsplit('/', 1)[-1]}`", s.detectors[name]) for s in ranked[:_N_SOURCES]]
+    return [
+        f"- {where}: RMSE {show_cm(stats.rmse_cm)} cm, median {show_cm(stats.median_cm)}"
+        for where, stats in spots
+        if _is_worse(stats, groups["all"])
+    ]
+
+
+def _widths_cm(meta: ModelMeta) -> tuple[str, str]:
+    low, high = meta.lane_width_range_cm or (meta.lane_width_cm, meta.lane_width_cm)
+    return f"{low:.0f}", f"{high:.0f}"
+
+
+def _is_worse(stats: ErrorStats, whole: ErrorStats) -> bool:
+    return stats.count > 0 and stats.rmse_cm > _WORSE * whole.rmse_cm
+
+
+def _plural(count: int, word: str) -> str:
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"

@@ -1,0 +1,201 @@
+"""Run a detector over recorded frames: a table of detections and, on request, an annotated video."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.data.detections import DetectionTable, check_table_path
+from lanenet.data.drives.sources import Source
+from lanenet.data.files import atomic_file, check_destination
+from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.geometry.camera import Camera
+from lanenet.perception.draw import draw_estimate
+from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.image_lane import ImageLane
+
+#: Annotated frames are enlarged to at least this width, so that the text can be read.
+VIDEO_WIDTH_PX = 640
+VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class DetectReport:
+    """What a run did.
+
+    Attributes:
+        out: The table of detections.
+        video: The annotated video, if one was asked for.
+        frames: Rows of the table.
+        complete: Frames with all six points.
+        steered: Frames with a steering target.
+        median_ms: Median time of the detector per frame.
+        p99_ms: 99th percentile of it.
+        problems: A line for each frame that could not be read; its row is empty.
+    """
+
+    out: Path
+    video: Path | None
+    frames: int
+    complete: int
+    steered: int
+    median_ms: float
+    p99_ms: float
+    problems: tuple[str, ...]
+
+
+def run_detector(
+    source: Source,
+    detector: Detector,
+    camera: Camera | None,
+    out: Path,
+    video: Path | None = None,
+    progress: Progress | None = None,
+    *,
+    skip_unreadable: bool = False,
+) -> DetectReport:
+    """Run a detector over every frame of a source and write what it finds.
+
+    Files are moved into place when they are complete. The detector forgets its state where the source is
+    interrupted.
+
+    Args:
+        source: The frames.
+        detector: Any detector.
+        camera: Camera of the frames, for drawing; None where the detector does without.
+        out: Table of detections, ``.parquet`` or ``.csv``.
+        video: Annotated video (mp4v), or None.
+        progress: Called with (frames done, frames).
+        skip_unreadable: Give a frame that cannot be read an empty row and name it in the report.
+
+    Returns:
+        Counts, timings and problems.
+
+    Raises:
+        DriveFormatError: If a frame cannot be read; with ``skip_unreadable``, if none can.
+        CalibrationError: If a frame does not fit the camera; the message names it.
+        LabelFormatError: If the ending of ``out`` is unknown.
+        LanenetError: If ``out`` or ``video`` cannot be written there; found before the first frame.
+    """
+    # Before the work, which may take an hour, and not after it.
+    check_table_path(out)
+    if video is not None:
+        if video.suffix.lower() not in VIDEO_ENDINGS:
+            raise DriveFormatError(f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}")
+        check_destination(video)
+    table = DetectionTable()
+    times_s: list[float] = []
+    problems: list[str] = []
+    complete = steered = 0
+    with ExitStack() as stack:
+        writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None
+        detector.reset()
+        for i in range(len(source)):
+            if source.starts[i]:
+                detector.reset()
+            frame, estimate = None, LaneEstimate()
+            try:
+                frame = source.image(i)
+            except DriveFormatError as error:
+                if not skip_unreadable:
+                    raise
+                problems.append(str(error))
+            if frame is not None:
+                start_s = time.perf_counter()
+                try:
+                    estimate = detector.detect(frame)
+                except CalibrationError as error:
+                    raise CalibrationError(f"{source.name}, frame {source.frames[i]}: {error}") from None
+                times_s.append(time.perf_counter() - start_s)
+            complete += bool(estimate.mask.all())
+            steered += bool(np.isfinite(estimate.steering_rad))
+            table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
+            if writer is not None:
+                rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
+                lane = getattr(detector, "last", None) if frame is not None else None
+                writer.add(frame, estimate, f"{source.frames[i]}{rate}", lane)
+            if progress is not None:
+                progress(i + 1, len(source))
+        if not times_s:
+            raise DriveFormatError(
+                f"{source.name}: none of its {len(source)} frames can be read; the first: {problems[0]}"
+            )
+        table.write(out)
+    median_ms, p99_ms = (1e3 * float(np.percentile(times_s, q)) for q in (50, 99))
+    return DetectReport(
+        out, video, len(source), complete, steered, median_ms, p99_ms, (*source.problems, *problems)
+    )
+
+
+class _AnnotatedVideo:
+    """Writes annotated frames to a temporary name; the stack moves the file into place or removes it."""
+
+    def __init__(self, stack: ExitStack, path: Path, camera: Camera | None, rate_hz: float) -> None:
+        self.path, self.camera, self.rate_hz = path, camera, rate_hz
+        self._temporary = stack.enter_context(atomic_file(path))
+        self._writer: Any = None
+        #: Width and height of the frames; without a camera those of the first that can be read.
+        self._size: tuple[int, int] | None = None
+        #: Captions of the unreadable frames before that one.
+        self._waiting: list[str] = []
+        # Released before the file is moved: the stack undoes in reverse.
+        stack.callback(self._release)
+        if camera is not None:
+            self._open(camera.width, camera.height)
+
+    def _open(self, width: int, height: int) -> None:
+        self._size = (width, height)
+        self.scale = max(1, -(-VIDEO_WIDTH_PX // width))
+        size = (width * self.scale, height * self.scale)
+        codec = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer = cv2.VideoWriter(str(self._temporary), codec, self.rate_hz, size)
+        if not self._writer.isOpened():
+            raise DriveFormatError(f"{self.path}: OpenCV cannot write mp4v video of {size[0]}x{size[1]} here")
+
+    def _release(self) -> None:
+        if self._writer is not None:
+            self._writer.release()
+
+    def add(
+        self,
+        frame_bgr: UInt8[np.ndarray, "h w *c"] | None,
+        estimate: LaneEstimate,
+        caption: str,
+        image_lane: ImageLane | None = None,
+    ) -> None:
+        if frame_bgr is None:
+            caption += "  unreadable"
+            if self._size is None:
+                self._waiting.append(caption)
+                return
+            # A black frame keeps the video in step with the table.
+            frame_bgr = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        if self._size is None:
+            self._open(frame_bgr.shape[1], frame_bgr.shape[0])
+            for text in self._waiting:
+                self._write(np.zeros_like(frame_bgr), LaneEstimate(), text, None)
+        self._write(frame_bgr, estimate, caption, image_lane)
+
+    def _write(
+        self,
+        frame_bgr: UInt8[np.ndarray, "h w *c"],
+        estimate: LaneEstimate,
+        caption: str,
+        image_lane: ImageLane | None,
+    ) -> None:
+        assert self._size is not None
+        picture = draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption, image_lane)
+        size = (self._size[0] * self.scale, self._size[1] * self.scale)
+        if (picture.shape[1], picture.shape[0]) != size:
+            # Photos of a folder may differ in size.
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+        self._writer.write(picture)

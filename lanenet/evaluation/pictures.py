@@ -1,0 +1,259 @@
+"""A comparison as a picture: how the errors of each detector spread, by row.
+
+A comparison's breakdown as a picture: errors by bend, and whether the doubt of each detector is right.
+
+Pictures by Matplotlib, where it is installed.
+
+A picture of the frames that a detector got most wrong: its lane beside the one that is there.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.errors import LabelFormatError
+from lanenet.evaluation.breakdown import GROUPS, RELIABILITY_SHARES
+from lanenet.evaluation.comparison import Comparison
+from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR, draw_estimate
+from lanenet.perception.estimate import LaneEstimate
+
+
+def new_figure(width_in: float, height_in: float) -> Any | None:
+    """Return an empty figure; None where Matplotlib is not installed.
+
+    It is made without pyplot, which would pick a window system and keep global state.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return None
+    figure = Figure(figsize=(width_in, height_in), dpi=100)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def png_bytes(figure: Any) -> bytes:
+    """Return a figure as a PNG, cut to what is drawn."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", bbox_inches="tight")
+    return picture.getvalue()
+
+
+#: Below this the simulator's own rounding shows; on a logarithmic axis it would only stretch the picture.
+_LEAST_CM = 0.01
+
+
+def error_picture(comparison: Comparison) -> bytes | None:
+    """Draw a box per detector and row: quartiles and median of the error, whiskers at 5 and 95 %.
+
+    Below each box stands the share of the labelled points that were answered.
+
+    Returns:
+        A PNG, or None where Matplotlib is not installed.
+    """
+    figure = new_figure(9.0, 5.0)
+    if figure is None:
+        return None
+    from matplotlib.patches import Patch
+
+    names = list(comparison.tables)
+    axes = figure.add_subplot()
+    for i, name in enumerate(names):
+        for k in range(len(ROWS_CM)):
+            x = k + (i + 0.5) / (len(names) + 1.0) - 0.5 + 0.5 / (len(names) + 1.0)
+            found = _row_errors(comparison.errors_cm[name], k)
+            if found.size:
+                axes.boxplot(
+                    [found],
+                    positions=[x],
+                    widths=0.8 / (len(names) + 1.0),
+                    whis=(5, 95),
+                    showfliers=False,
+                    patch_artist=True,
+                    boxprops={"facecolor": f"C{i}"},
+                    medianprops={"color": "black"},
+                )
+            stats = comparison.tables[name].groups[f"y = {ROWS_CM[k]:.0f} cm"]
+            share = "-" if np.isnan(stats.coverage) else f"{100.0 * stats.coverage:.0f}%"
+            axes.annotate(
+                share, (x, 0.01), xycoords=("data", "axes fraction"), ha="center", fontsize=8, color=f"C{i}"
+            )
+    axes.set_yscale("log")
+    axes.set_xlim(-0.5, len(ROWS_CM) - 0.5)
+    axes.set_xticks(range(len(ROWS_CM)), [f"y = {row:.0f} cm" for row in ROWS_CM])
+    axes.set_ylabel("error, cm")
+    axes.set_title(
+        f"Against the {comparison.reference}. Quartiles, whiskers at 5 and 95 %; below: points answered",
+        fontsize=10,
+    )
+    axes.grid(True, axis="y", which="major", alpha=0.3)
+    # The boxes of a log axis end where they end; the shares need room below them.
+    low, high = axes.get_ylim()
+    axes.set_ylim(low * (low / high) ** 0.08, high)
+    handles = [Patch(facecolor=f"C{i}", label=name) for i, name in enumerate(names)]
+    # Under the axes, where no box can lie below it.
+    axes.legend(
+        handles=handles, fontsize=9, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, -0.07)
+    )
+    return png_bytes(figure)
+
+
+def _row_errors(errors_cm: Float[np.ndarray, "n 6"], row: int) -> Float[np.ndarray, "_"]:
+    """The answered errors of both lines on a row."""
+    found = errors_cm[:, [side * len(ROWS_CM) + row for side in range(len(SIDES))]].ravel()
+    return np.maximum(found[np.isfinite(found)], _LEAST_CM)
+
+
+def breakdown_picture(comparison: Comparison) -> bytes | None:
+    """Draw the RMSE by curvature of the lane, and the reliability diagram of the standard deviations.
+
+    Returns:
+        A PNG, or None where Matplotlib is not installed.
+    """
+    figure = new_figure(10.0, 4.5)
+    if figure is None:
+        return None
+    bend, doubt = figure.subplots(1, 2)
+    names = list(comparison.tables)
+    groups = [name for name, _ in GROUPS["bend"][1]]
+    width = 0.8 / len(names)
+    for i, name in enumerate(names):
+        stats = comparison.breakdown.groups["bend"][name]
+        places = [k + (i - 0.5 * (len(names) - 1)) * width for k in range(len(groups))]
+        bend.bar(places, [stats[group].rmse_cm for group in groups], width, color=f"C{i}", label=name)
+    bend.set_xticks(range(len(groups)), groups, fontsize=8)
+    bend.set_ylabel("RMSE, cm")
+    bend.set_title(f"By bend, against the {comparison.reference}", fontsize=10)
+    bend.grid(True, axis="y", alpha=0.3)
+    bend.legend(fontsize=8)
+    doubt.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linestyle="--", label="right")
+    for i, name in enumerate(names):
+        own = comparison.breakdown.doubt.get(name)
+        if own is not None:
+            doubt.plot(RELIABILITY_SHARES, own.reliability, marker="o", color=f"C{i}", label=name)
+    doubt.set_xlabel("share of the errors that the interval promises")
+    doubt.set_ylabel("share that lies in it")
+    doubt.set_title("Above the line: too careful; below: too sure", fontsize=10)
+    doubt.set_xlim(0.0, 1.0)
+    doubt.set_ylim(0.0, 1.0)
+    doubt.grid(True, alpha=0.3)
+    doubt.legend(fontsize=8)
+    return png_bytes(figure)
+
+
+_TILE_WIDTH_PX = 400
+_COLUMNS = 4
+_LEGEND_PX = 24
+#: Neighbours look alike: of frames this close only the worst is shown.
+_APART_FRAMES = 15
+_JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class WorstFrame:
+    """A frame and how wrong the answer is.
+
+    Attributes:
+        source: Position of its source.
+        row: Position of the frame in its source.
+        error_cm: Largest error of its answered points.
+    """
+
+    source: int
+    row: int
+    error_cm: float
+
+
+def find_worst(
+    sources: Sequence[LabelledFrames], answers_cm: Sequence[Float[np.ndarray, "_ 6"]], count: int = 12
+) -> list[WorstFrame]:
+    """Return the frames with the largest errors, the worst first, no two of them neighbours.
+
+    Args:
+        sources: Frames and labels.
+        answers_cm: A detector's six points for each frame of each source; NaN where it has no answer.
+        count: How many, at most.
+    """
+    candidates = []
+    for k, (source, answer) in enumerate(zip(sources, answers_cm, strict=True)):
+        if answer.shape != source.points_cm.shape:
+            raise LabelFormatError(
+                f"{source.name}: answers of shape {answer.shape}, expected {source.points_cm.shape}"
+            )
+        error = np.nan_to_num(np.abs(answer - source.points_cm), nan=-1.0).max(axis=1)
+        candidates += [WorstFrame(k, int(i), float(error[i])) for i in np.flatnonzero(error >= 0.0)]
+    candidates.sort(key=lambda frame: -frame.error_cm)
+    chosen: list[WorstFrame] = []
+    for frame in candidates:
+        near = (f for f in chosen if f.source == frame.source and abs(f.row - frame.row) < _APART_FRAMES)
+        if len(chosen) < count and not any(near):
+            chosen.append(frame)
+    return chosen
+
+
+def draw_worst(
+    sources: Sequence[LabelledFrames],
+    answers_cm: Sequence[Float[np.ndarray, "_ 6"]],
+    worst: Sequence[WorstFrame],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw frames side by side, and below them what the colours mean.
+
+    The labels are magenta, the answer is green (left) and orange (right).
+
+    Args:
+        sources: As for :func:`find_worst`.
+        answers_cm: As for :func:`find_worst`.
+        worst: At least one frame.
+
+    Raises:
+        DriveFormatError: If a frame cannot be read.
+    """
+    tiles: list[UInt8[np.ndarray, "h w 3"]] = []
+    for item in worst:
+        source = sources[item.source]
+        answer = answers_cm[item.source][item.row]
+        picture = draw_estimate(
+            source.image(item.row),
+            LaneEstimate(points_cm=answer),
+            source.camera,
+            max(1, round(_TILE_WIDTH_PX / source.camera.width)),
+            f"{Path(source.name).name} {source.frames[item.row]}: {item.error_cm:.1f} cm",
+            truth_cm=source.points_cm[item.row],
+        )
+        if tiles and picture.shape != tiles[0].shape:
+            # Cameras of different sources may differ in size.
+            height, width = tiles[0].shape[:2]
+            picture = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+        tiles.append(picture)
+    columns = min(_COLUMNS, len(tiles))
+    while len(tiles) % columns:
+        tiles.append(np.zeros_like(tiles[0]))
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    return np.vstack([*rows, _legend(rows[0].shape[1])])
+
+
+def _legend(width_px: int) -> UInt8[np.ndarray, "h w 3"]:
+    strip = np.zeros((_LEGEND_PX, width_px, 3), dtype=np.uint8)
+    x = y = _LEGEND_PX // 3
+    for text, colour in (("labels", TRUTH_BGR), ("answer: left", LEFT_BGR), ("right", RIGHT_BGR)):
+        font, size = cv2.FONT_HERSHEY_SIMPLEX, _LEGEND_PX / 50.0
+        cv2.putText(strip, text, (x, _LEGEND_PX - y), font, size, colour, 1, cv2.LINE_AA)
+        x += cv2.getTextSize(text, font, size, 1)[0][0] + _LEGEND_PX // 2
+    return strip
+
+
+def jpeg_bytes(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Encode a picture as JPEG: a sheet of photographs is a tenth of its size as PNG."""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return bytes(data.tobytes())

@@ -1,0 +1,206 @@
+"""A comparison as tables, for a terminal and for a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich import box
+from rich.table import Table
+
+from lanenet.evaluation.breakdown import GROUPS, INTERVALS
+from lanenet.evaluation.comparison import Comparison
+from lanenet.evaluation.errors import ErrorStats
+from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
+
+_STATS = ("RMSE", "median", "p95", "worst")
+_PRESENCE = ("line precision", "line recall", "absent recall")
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of words.
+
+    Attributes:
+        title: What it shows.
+        header: One word or more per column.
+        lines: Cells.
+        note: What has to be known to read it.
+        texts: How many columns, from the left, are text and not figures.
+        grouped: Set lines apart where the first cell changes; an empty cell goes on with the group.
+    """
+
+    title: str
+    header: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    note: str
+    texts: int = 1
+    grouped: bool = False
+
+    def as_markdown(self) -> str:
+        """Return title, table and note as Markdown."""
+        figures = len(self.header) - self.texts
+        rule = [*["---"] * self.texts, *["---:"] * figures]
+        rows = "\n".join("| " + " | ".join(line) + " |" for line in [self.header, rule, *self.lines])
+        return f"{self.title}\n\n{rows}\n\n{self.note}\n"
+
+    def as_rich(self) -> Table:
+        """Return a table narrow enough for a terminal of 80 columns."""
+        table = Table(
+            title=self.title, title_justify="left", caption=self.note, box=box.SIMPLE, pad_edge=False
+        )
+        for i, name in enumerate(self.header):
+            justify = "left" if i < self.texts else "right"
+            table.add_column(name.replace(" ", "\n"), justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        nexts = [line[0] for line in self.lines[1:]]
+        for line, following in zip(self.lines, [*nexts, ""], strict=True):
+            table.add_row(*line, end_section=self.grouped and following not in ("", line[0]))
+        return table
+
+
+def lay_out(comparison: Comparison) -> list[TextTable]:
+    """Lay out a comparison: by point, on shared points, by source and by condition (of several)."""
+    tables = [_by_point(comparison)]
+    if comparison.shared:
+        tables.append(_on_shared_points(comparison))
+    if len(comparison.sources) > 1:
+        tables.append(_by_source(comparison))
+    for condition, by_detector in comparison.breakdown.groups.items():
+        groups = by_detector[comparison.first].values()
+        # All in one group is what the first table says.
+        if sum(stats.truth_count > 0 for stats in groups) > 1:
+            tables.append(_by_condition(comparison, condition))
+    if comparison.breakdown.doubt or comparison.breakdown.presence:
+        tables.append(_doubt_and_presence(comparison))
+    return tables
+
+
+def as_markdown(comparison: Comparison) -> str:
+    """Return all tables of a comparison as Markdown."""
+    return "\n".join(table.as_markdown() for table in lay_out(comparison))
+
+
+def _by_point(comparison: Comparison) -> TextTable:
+    lines = []
+    for name, table in comparison.tables.items():
+        groups = [table.groups[group] for group in ("all", *POINT_NAMES)]
+        values = zip(*(_values(stats) for stats in groups), strict=True)
+        rows = [[label, *map(show_cm, row)] for label, row in zip(_STATS, values, strict=True)]
+        rows.append(["answered", *map(_percent, groups)])
+        lines += [[name if i == 0 else "", *row] for i, row in enumerate(rows)]
+    counts = {table.all.truth_count for table in comparison.tables.values()}
+    frames = sum(source.frames for source in comparison.sources)
+    note = (
+        f"{counts.pop()} labelled points of {frames} frames; the columns are the line and the distance ahead "
+        "in cm"
+    )
+    intervals = [
+        f"{name} {show_cm(ends[0])} to {show_cm(ends[1])}"
+        for name, ends in comparison.breakdown.interval_cm.items()
+        if ends is not None
+    ]
+    if intervals:
+        over = comparison.breakdown.interval_over
+        note += f". 95 % intervals of the RMSE over {over}: {', '.join(intervals)}"
+    return TextTable(
+        title=f"Errors in cm against the {comparison.reference}",
+        header=["detector", "", "all", *(f"{side} {row:.0f}" for side in SIDES for row in ROWS_CM)],
+        lines=lines,
+        note=note,
+        texts=2,
+        grouped=True,
+    )
+
+
+def _on_shared_points(comparison: Comparison) -> TextTable:
+    first = comparison.first
+    lines = []
+    for name, shared in comparison.shared.items():
+        for label, stats in ((name, shared.own), (first, shared.first)):
+            share = _percent(stats) if label == name else ""
+            lines.append([label, share, *map(show_cm, _values(stats))])
+    return TextTable(
+        title=f"Each detector and {first} on the points that both answered, in cm",
+        header=["detector", "shared", *_STATS],
+        lines=lines,
+        note=f"two lines each: a detector, and {first} on the same points; shared: of the labelled points",
+    )
+
+
+def _by_source(comparison: Comparison) -> TextTable:
+    names = list(comparison.tables)
+    mixed = len({source.reference for source in comparison.sources}) > 1
+    lines = []
+    for source in comparison.sources:
+        cells = (source.detectors[name] for name in names)
+        shown = [f"{show_cm(s.rmse_cm)} {_percent(s)}" for s in cells]
+        # Where all sources are alike, the title of the first table says it.
+        name = Path(source.name).name + (f" ({source.reference})" if mixed else "")
+        lines.append([name, *shown])
+    return TextTable(
+        title="RMSE in cm by source, with the share of points that were answered",
+        header=["source", *names],
+        lines=lines,
+        note="a detector that answers less may show a smaller error",
+    )
+
+
+def _by_condition(comparison: Comparison, condition: str) -> TextTable:
+    unit, groups = GROUPS[condition]
+    by_detector = comparison.breakdown.groups[condition]
+    lines = []
+    for name, _ in groups:
+        cells = [by_detector[detector][name] for detector in comparison.tables]
+        lines.append([name, str(cells[0].truth_count), *(show_cm(stats.rmse_cm) for stats in cells)])
+    return TextTable(
+        title=f"RMSE in cm by {condition}",
+        header=[condition, "points", *comparison.tables],
+        lines=lines,
+        note=unit,
+    )
+
+
+def _doubt_and_presence(comparison: Comparison) -> TextTable:
+    breakdown, lines = comparison.breakdown, []
+    for name in comparison.tables:
+        doubt, presence = breakdown.doubt.get(name), breakdown.presence.get(name)
+        if doubt is None and presence is None:
+            continue
+        shares: list[float | None] = [None, None] if doubt is None else list(doubt.coverage.values())
+        shares += (
+            [None, None, None]
+            if presence is None
+            else [presence.precision, presence.recall, presence.absent_recall]
+        )
+        sigma = "-" if doubt is None else show_cm(doubt.median_sigma_cm)
+        lines.append([name, sigma, *map(show_share, shares)])
+    return TextTable(
+        title="What detectors say of themselves",
+        header=["detector", "sigma", *(f"{name}% interval" for name in INTERVALS), *_PRESENCE],
+        lines=lines,
+        note="median standard deviation in cm; share of the errors within the intervals; of the lines said "
+        "to be there, those that are, of those that are there, those found, and of those that are not, those "
+        "said to be absent",
+    )
+
+
+def show_share(value: float | None) -> str:
+    """Show a share in per cent; a dash where it is unknown."""
+    return "-" if value is None or math.isnan(value) else f"{100.0 * value:.0f}%"
+
+
+def _values(stats: ErrorStats) -> tuple[float, float, float, float]:
+    return stats.rmse_cm, stats.median_cm, stats.p95_cm, stats.worst_cm
+
+
+def _percent(stats: ErrorStats) -> str:
+    return f"{100.0 * stats.coverage:.0f}%" if stats.truth_count else "-"
+
+
+def show_cm(value: float) -> str:
+    """Show a length with three digits or so: a tenth of a millimetre is nothing beside a metre."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"

@@ -1,0 +1,186 @@
+"""Checks of a whole car: camera, model, actuator, and the computer's own state."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from lanenet.data.camera_file import read_camera
+from lanenet.errors import LanenetError
+from lanenet.geometry.camera import Camera
+from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.cameras import open_source
+from lanenet.onboard.doctor.installation import Check, State, check_camera_file
+from lanenet.onboard.drive import build_drive_detector
+from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
+
+#: The camera is watched for so long.
+_WATCH_S = 2.0
+#: Below this share of the asked rate something is wrong.
+_LEAST_RATE_SHARE = 0.8
+_HOT_C, _WARM_C = 80.0, 70.0
+_THERMAL_ZONE = Path("/sys/class/thermal/thermal_zone0/temp")
+#: Bits of ``vcgencmd get_throttled``; 16 higher they tell that it happened since the start.
+_THROTTLE_BITS = {
+    0: "the supply's voltage is too low",
+    1: "the processor's clock is capped",
+    2: "the processor is throttled",
+    3: "the processor is near its limit of temperature",
+}
+
+
+def check_car(settings: DriveSettings) -> list[Check]:
+    """Check what a car's file describes; opens the camera and the actuator for a moment.
+
+    The actuator goes to neutral, which may straighten the wheels; the motor does not turn.
+
+    Args:
+        settings: Of the car.
+
+    Returns:
+        All checks in the order in which people read them; nothing is raised for what is found.
+    """
+    checks = [] if settings.camera is None else check_camera_file(settings.camera)
+    camera = None
+    if settings.camera is not None and checks[0].state != "problem":
+        camera = read_camera(settings.camera)
+    checks += check_source(open_source(settings.source), getattr(settings.source, "rate_hz", None), camera)
+    checks.append(_detector(settings, camera))
+    checks.append(_actuator(settings))
+    return [*checks, check_temperature(), check_throttling()]
+
+
+def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | None) -> list[Check]:
+    """Watch a camera for two seconds.
+
+    Args:
+        source: Not open yet; it is closed again.
+        rate_hz: Frames per second that were asked for, if they were.
+        camera: Camera file that its images have to fit.
+    """
+    try:
+        source.open()
+        frames, arrived_s = _watch(source)
+    except LanenetError as error:
+        return [Check("camera", "problem", str(error))]
+    finally:
+        source.close()
+    if len(frames) < 2:
+        return [Check("camera", "problem", f"{len(frames)} frames in {_WATCH_S:g} s, expected a stream")]
+    height, width = frames[-1].image_bgr.shape[:2]
+    checks = [_rate(frames, rate_hz)]
+    if camera is not None and (camera.width, camera.height) != (width, height):
+        text = f"images of {width}x{height} px, but the camera file is for {camera.width}x{camera.height}"
+        checks.append(Check("image size", "problem", f"{text}: set width and height, or calibrate again"))
+    else:
+        checks.append(Check("image size", "ok", f"{width}x{height} px"))
+    late_ms = 1e3 * float(np.median([a - f.t_s for f, a in zip(frames, arrived_s, strict=True)]))
+    state: State = "note" if late_ms > 60.0 else "ok"
+    checks.append(Check("delay", state, f"{late_ms:.0f} ms from exposure, as the driver tells it, to here"))
+    brightness = float(np.mean([f.image_bgr.mean() for f in frames[-5:]]))
+    if not 20.0 <= brightness <= 235.0:
+        text = f"mean brightness {brightness:.0f} of 255: is the lens covered, the room dark?"
+        checks.append(Check("image", "note", text))
+    return checks
+
+
+def check_temperature(sensor: Path = _THERMAL_ZONE) -> Check:
+    """Read the processor's temperature."""
+    try:
+        degrees_c = 1e-3 * float(sensor.read_text())
+    except (OSError, ValueError):
+        return Check("temperature", "note", f"{sensor}: cannot be read")
+    text = f"{degrees_c:.0f} degrees Celsius"
+    if degrees_c >= _HOT_C:
+        return Check("temperature", "problem", f"{text}: the processor slows down; give it a cooler")
+    if degrees_c >= _WARM_C:
+        return Check("temperature", "note", f"{text}: it slows down from 80 on")
+    return Check("temperature", "ok", text)
+
+
+def check_throttling(ask: Callable[[], str] | None = None) -> Check:
+    """Ask a Raspberry Pi whether its supply and its temperature held so far.
+
+    Args:
+        ask: Returns what ``vcgencmd get_throttled`` says; by default runs it.
+    """
+    if ask is None:
+        if shutil.which("vcgencmd") is None:
+            return Check("throttling", "note", "vcgencmd is not here: not a Raspberry Pi?")
+        ask = _vcgencmd
+    said = ask()
+    match = re.search(r"throttled=0x([0-9a-fA-F]+)", said)
+    if match is None:
+        return Check("throttling", "note", f"vcgencmd get_throttled says {said.strip()!r}")
+    bits = int(match[1], 16)
+    now = [text for bit, text in _THROTTLE_BITS.items() if bits >> bit & 1]
+    before = [text for bit, text in _THROTTLE_BITS.items() if bits >> (bit + 16) & 1]
+    if now:
+        hint = "; use a supply of 5 V and at least 3 A, apart from the motor's" if bits & 1 else ""
+        return Check("throttling", "problem", f"{' and '.join(now)}{hint}")
+    if before:
+        return Check("throttling", "note", f"since the start it happened that {' and '.join(before)}")
+    return Check("throttling", "ok", "supply and temperature held since the start")
+
+
+def _watch(source: FrameSource) -> tuple[list[Frame], list[float]]:
+    frames, arrived_s = [], []
+    end_s = time.monotonic() + _WATCH_S
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        try:
+            frame = source.read(min(left_s, 0.2))
+        except SourceEnded:
+            break
+        if frame is not None:
+            frames.append(frame)
+            arrived_s.append(time.monotonic())
+    return frames, arrived_s
+
+
+def _rate(frames: list[Frame], wanted_hz: float | None) -> Check:
+    steps_s = np.diff([f.t_s for f in frames])
+    found_hz = (frames[-1].number - frames[0].number) / max(frames[-1].t_s - frames[0].t_s, 1e-9)
+    text = f"{found_hz:.1f} frames per second, longest pause {1e3 * steps_s.max():.0f} ms"
+    if wanted_hz is not None and found_hz < _LEAST_RATE_SHARE * wanted_hz:
+        text += (
+            f": {wanted_hz:g} were asked for; a dark room lengthens the exposure, a large image costs time"
+        )
+        return Check("camera", "problem", text)
+    return Check("camera", "ok", text)
+
+
+def _detector(settings: DriveSettings, camera: Camera | None) -> Check:
+    name = f"detector {settings.detector.kind}"
+    try:
+        detector = build_drive_detector(settings, camera)
+    except LanenetError as error:
+        return Check(name, "problem", str(error))
+    if problems := getattr(detector, "problems", ()):
+        return Check(name, "note", "; ".join(problems))
+    model = settings.detector.model
+    return Check(name, "ok", f"{model} fits this camera" if model is not None else "ready")
+
+
+def _actuator(settings: DriveSettings) -> Check:
+    if settings.actuator is None:
+        return Check("actuator", "note", "none in this file: only dry runs")
+    name = f"actuator {settings.actuator.kind}"
+    try:
+        actuator = make_actuator(settings.actuator)
+        actuator.open()
+    except LanenetError as error:
+        return Check(name, "problem", str(error))
+    actuator.close()
+    return Check(name, "ok", "answers, and stands in neutral")
+
+
+def _vcgencmd() -> str:
+    done = subprocess.run(["vcgencmd", "get_throttled"], capture_output=True, text=True, timeout=5.0)
+    return done.stdout + done.stderr

@@ -1,0 +1,160 @@
+"""Edge pixels of a frame, with the direction of their gradient and sub-pixel positions."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Int, Int16, UInt8
+from pydantic import Field
+
+from lanenet.config import Settings
+from lanenet.errors import DriveFormatError
+from lanenet.perception.edges.markings_only import ColourSettings, PixelScale, colour_edges
+from lanenet.perception.edges.pixels import EdgePixels, edge_pixels, gradients, prefer_stronger
+
+__all__ = ["EdgePixels", "EdgeSettings", "check_frame", "find_edges", "sample_pixels", "to_gray"]
+
+# Gray is mostly green.
+_BLUE, _RED = 0, 2
+
+
+class EdgeSettings(Settings):
+    """How edges are found in a frame.
+
+    ``canny`` is the paper's detector: fixed thresholds, whole pixels. ``directional`` raises the thresholds
+    with the contrast of the frame, so that soft mirror images of lamps fall below them where the tape is
+    bright, and moves each edge along its gradient to the sub-pixel maximum; with a weight for colours it
+    finds yellow tape on a floor that is as bright, too. ``colour`` finds strips that are brighter or yellower
+    than the road beside them, drops those that are too thick, too round or too soft for a marking, and gives
+    the sub-pixel edges of the rest.
+
+    Attributes:
+        method: The detector.
+        blur_px: Size of the Gauss kernel; 0 for none.
+        low: Lower threshold of the hysteresis on Sobel responses.
+        high: Upper threshold.
+        contrast_share: ``directional``: the upper threshold is at least this share of the 99th percentile of
+            the frame's Sobel responses; the lower one keeps its ratio.
+        colour_weight: ``directional``: how much yellower or redder the picture gets takes the place of how
+            much brighter where its Sobel response times this is the stronger one; 0 looks at gray alone, as
+            maps do. Below 1, since pictures hold colours more coarsely than brightness.
+        colour: ``colour``: what counts as a marking.
+    """
+
+    method: Literal["canny", "directional", "colour"] = "directional"
+    blur_px: Literal[0, 3, 5] = 3
+    low: float = Field(default=40.0, gt=0.0)
+    high: float = Field(default=80.0, gt=0.0)
+    contrast_share: float = Field(default=0.3, ge=0.0, lt=1.0)
+    colour_weight: float = Field(default=0.0, ge=0.0, le=1.0)
+    colour: ColourSettings = ColourSettings()
+
+
+def find_edges(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    settings: EdgeSettings,
+    keep: UInt8[np.ndarray, "h w"] | None = None,
+    scale: PixelScale | None = None,
+    sample: Int[np.ndarray, " n"] | None = None,
+) -> EdgePixels:
+    """Find the edge points of a frame.
+
+    Args:
+        frame_bgr: Colour or gray image.
+        settings: The detector and its thresholds (of OpenCV's Canny, on Sobel responses).
+        keep: Mask of pixels that may be edges (0 elsewhere).
+        scale: Road per pixel, for ``colour``; without it the filters by centimetres are left out.
+        sample: What :func:`sample_pixels` gives for ``keep``, from callers with many frames; None finds it.
+
+    Returns:
+        Edge points with directions; empty when the frame has none.
+
+    Source:
+        Canny 1986; sub-pixel step: parabola through the gradient magnitude at the edge and at its two
+        neighbours along the gradient (Devernay 1995).
+    """
+    if settings.method == "colour":
+        return colour_edges(check_frame(frame_bgr), settings.colour, settings.blur_px, keep, scale)
+    gray = to_gray(frame_bgr)
+    dx, dy = gradients(gray, settings.blur_px)
+    raised = 1.0
+    if settings.method == "directional":
+        if frame_bgr.ndim == 3 and settings.colour_weight > 0.0:
+            for hue_dx, hue_dy in _hue_gradients(frame_bgr, dx, dy, settings.blur_px):
+                prefer_stronger(dx, dy, hue_dx, hue_dy, settings.colour_weight, settings.low)
+        if sample is None:
+            sample = sample_pixels(np.ones_like(gray) if keep is None else keep)
+        raised = max(1.0, settings.contrast_share * _strong_response(dx, dy, sample) / settings.high)
+    edges = cv2.Canny(dx, dy, raised * settings.low, raised * settings.high, L2gradient=True)
+    if keep is not None:
+        cv2.bitwise_and(edges, keep, dst=edges)
+    return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional")
+
+
+def _hue_gradients(
+    frame_bgr: UInt8[np.ndarray, "h w 3"],
+    dx: Int16[np.ndarray, "h w"],
+    dy: Int16[np.ndarray, "h w"],
+    blur_px: int,
+) -> list[tuple[Int16[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]]:
+    """Sobel responses of yellow and of red, of which white, gray and black have none.
+
+    Gray less blue, and red less gray: both grow towards the inside of yellow tape as brightness does towards
+    that of white tape, so that the direction of an edge means the same. White tape on a floor that
+    is yellower than it is darker faces the floor; networks look at the place of edges alone.
+    """
+    blue, red = (gradients(cv2.extractChannel(frame_bgr, channel), blur_px) for channel in (_BLUE, _RED))
+    return [(dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)]
+
+
+def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:
+    """Return the flat indices of every third row's every third pixel, as far as it is kept."""
+    v, u = np.nonzero(keep[::3, ::3])
+    return np.asarray(3 * (v * keep.shape[1] + u))
+
+
+def _strong_response(
+    dx: Int16[np.ndarray, "h w"], dy: Int16[np.ndarray, "h w"], sample: Int[np.ndarray, " n"]
+) -> float:
+    """99th percentile of the Sobel magnitude over a sample of the pixels."""
+    if sample.size == 0:
+        return 0.0
+    wide_x = dx.reshape(-1).take(sample).astype(np.int32)
+    wide_y = dy.reshape(-1).take(sample).astype(np.int32)
+    squared = wide_x * wide_x + wide_y * wide_y
+    rank = int(0.99 * (squared.size - 1))
+    squared.partition(rank)
+    return math.sqrt(squared[rank])
+
+
+def to_gray(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+    """Return the frame as gray uint8.
+
+    Raises:
+        DriveFormatError: If the array is not an image of one or three uint8 channels.
+    """
+    frame = check_frame(frame_bgr)
+    return frame if frame.ndim == 2 else np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+
+
+def check_frame(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
+    """Return the frame if it is an image.
+
+    Raises:
+        DriveFormatError: If the array is not an image of one or three uint8 channels.
+    """
+    # A camera that has stopped gives None, and a list of lists is no image yet.
+    if not isinstance(frame_bgr, np.ndarray):
+        raise DriveFormatError(
+            f"frame: expected a uint8 image (h, w) or (h, w, 3), found {type(frame_bgr).__name__}"
+        )
+    if frame_bgr.dtype != np.uint8 or frame_bgr.ndim not in (2, 3) or frame_bgr.size == 0:
+        raise DriveFormatError(
+            f"frame: expected a uint8 image (h, w) or (h, w, 3), found {frame_bgr.dtype} {frame_bgr.shape}"
+        )
+    if frame_bgr.ndim == 3 and frame_bgr.shape[2] != 3:
+        raise DriveFormatError(f"frame: expected 3 channels (BGR), found {frame_bgr.shape[2]}")
+    return frame_bgr

@@ -1,0 +1,238 @@
+"""Edge pixels moved to the road through a precomputed table: no image is warped."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from pydantic import Field
+
+from lanenet.config import Settings, flat_settings
+from lanenet.errors import CalibrationError
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, check_frame, find_edges, sample_pixels
+from lanenet.perception.edges.markings_only import PixelScale
+
+#: What colours count beside brightness in what networks see. Maps, which see each line in many frames, gain
+#: nothing by colours but the edges of coloured things beside the road.
+COLOUR_WEIGHT = 0.75
+
+
+class RangeSettings(Settings):
+    """Which part of the image counts as road.
+
+    Attributes:
+        far_cm: Points further ahead than this are dropped.
+        side_cm: Points further to the side than this are dropped.
+        max_cm_per_px: Points where one pixel spans more road than this are dropped.
+        top_row: Rows above this are dropped whatever the camera says (0 keeps all below the horizon).
+        bottom_rows: Rows at the bottom that show the car itself.
+    """
+
+    far_cm: float = Field(default=120.0, gt=0.0)
+    side_cm: float = Field(default=100.0, gt=0.0)
+    max_cm_per_px: float = Field(default=6.0, gt=0.0)
+    top_row: int = Field(default=0, ge=0)
+    bottom_rows: int = Field(default=0, ge=0)
+
+
+class PerceptionSettings(Settings):
+    """Everything that decides which edge points a frame gives; stored with labels and models."""
+
+    edges: EdgeSettings = EdgeSettings()
+    range: RangeSettings = RangeSettings()
+
+    def with_colours(self, weight: float = COLOUR_WEIGHT) -> PerceptionSettings:
+        """Return the same with edges by colour as well: what networks see, where maps go by gray alone."""
+        return self.model_copy(update={"edges": self.edges.model_copy(update={"colour_weight": weight})})
+
+    def of_all_rows(self) -> PerceptionSettings:
+        """Return the same without the rows that one car has to leave out: what two cars have in common."""
+        rows = {"top_row": 0, "bottom_rows": 0}
+        return self.model_copy(update={"range": self.range.model_copy(update=rows)})
+
+    def unlike(self, other: PerceptionSettings) -> str:
+        """Say which settings find other edges than ``other``'s; rows that one car leaves out do not count."""
+        own, others = (flat_settings(each.of_all_rows()) for each in (self, other))
+        return ", ".join(f"{key} {own[key]}, not {others[key]}" for key in own if own[key] != others[key])
+
+
+@dataclass(frozen=True)
+class RoadEdges:
+    """Edge points on the road.
+
+    Attributes:
+        points_cm: Positions, frame car.
+        normals: Unit vectors across the edge, towards the brighter side, frame car.
+    """
+
+    points_cm: Float[np.ndarray, "n 2"]
+    normals: Float[np.ndarray, "n 2"]
+
+
+class RoadTable:
+    """For each pixel its point of the road and how that point moves with the pixel.
+
+    This is the interpolation of Kozlowski et al. 2024 (section 2.1, the 131 x 4 matrix), with one node per
+    pixel: a lookup is exact at pixel centres and linear between them.
+
+    Attributes:
+        keep: uint8 mask of the pixels that see the useful part of the road.
+        useful_pixels: Number of them.
+        sample: Those of them that tell the contrast, for :func:`lanenet.perception.edges.canny.find_edges`.
+        scale: Road that a pixel spans sideways.
+        points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
+        jacobian: d(point)/d(pixel), [cm/px], height x width x 2 x 2 (row x, y; column u, v).
+    """
+
+    def __init__(
+        self, camera: Camera, range_settings: RangeSettings, mask: UInt8[np.ndarray, "h w"] | None = None
+    ) -> None:
+        if range_settings.top_row + range_settings.bottom_rows >= camera.height:
+            raise CalibrationError(
+                f"range: top_row {range_settings.top_row} and bottom_rows {range_settings.bottom_rows} leave "
+                f"nothing of an image of {camera.height} rows"
+            )
+        self.height, self.width = camera.height, camera.width
+        v, u = np.mgrid[-1 : self.height + 1, -1 : self.width + 1].astype(np.float64)
+        grid = camera.intersect_ground(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 2)
+        du = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
+        dv = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
+        self._last_px = np.array([self.width - 1.0, self.height - 1.0])
+        # A pixel's six numbers side by side, so that a lookup touches the memory once.
+        self._rows = np.concatenate([grid[1:-1, 1:-1], du, dv], axis=-1).reshape(-1, 6)
+        table = self._rows.reshape(self.height, self.width, 6)
+        self.points_cm: Float[np.ndarray, "h w 2"] = table[..., :2]
+        self.jacobian: Float[np.ndarray, "h w 2 2"] = (
+            table[..., 2:].reshape(self.height, self.width, 2, 2).swapaxes(-1, -2)
+        )
+        x, y = self.points_cm[..., 0], self.points_cm[..., 1]
+        with np.errstate(invalid="ignore"):
+            coarse = np.maximum(np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1))
+            useful = (
+                (y <= range_settings.far_cm)
+                & (np.abs(x) <= range_settings.side_cm)
+                & (coarse <= range_settings.max_cm_per_px)
+            )
+        useful[: range_settings.top_row] = False
+        useful[self.height - range_settings.bottom_rows :] = False
+        if mask is not None:
+            if mask.shape != useful.shape:
+                raise CalibrationError(
+                    f"mask of {mask.shape[1]}x{mask.shape[0]} px, but the camera is calibrated for "
+                    f"{camera.width}x{camera.height}"
+                )
+            useful &= mask == 0
+        self.keep: UInt8[np.ndarray, "h w"] = np.where(useful, 255, 0).astype(np.uint8)
+        self.useful_pixels = int(np.count_nonzero(useful))
+        self.sample = sample_pixels(self.keep)
+        if not useful.any():
+            raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
+        across = np.linalg.norm(du, axis=-1)
+        with warnings.catch_warnings():
+            # Rows without a useful pixel have no median, which is what NaN says.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            per_row = np.nanmedian(np.where(useful, across, np.nan), axis=1)
+        self.scale = PixelScale(across, per_row)
+
+    def lift(self, edges: EdgePixels) -> RoadEdges:
+        """Move edge pixels to the road.
+
+        Args:
+            edges: Edge points of a frame; those outside :attr:`keep` must have been dropped before.
+
+        Returns:
+            Their points and directions on the road, [cm], frame car.
+        """
+        points, rows = self._look_up(edges)
+        _, _, x_u, y_u, x_v, y_v = rows
+        normal_u, normal_v = edges.normals.T
+        # A direction along the edge maps by the Jacobian; the normal is perpendicular to it, on the side to
+        # which the image gradient leads. Together: the cofactors, with the sign of the determinant.
+        across = np.empty_like(points)
+        np.subtract(y_v * normal_u, y_u * normal_v, out=across[0])
+        np.subtract(x_u * normal_v, x_v * normal_u, out=across[1])
+        across *= np.sign(x_u * y_v - x_v * y_u)
+        across *= 1.0 / np.maximum(np.sqrt(across[0] * across[0] + across[1] * across[1]), 1e-12)
+        return RoadEdges(np.ascontiguousarray(points.T), np.ascontiguousarray(across.T))
+
+    def lift_points(self, edges: EdgePixels) -> Float[np.ndarray, "n 2"]:
+        """Return the points of :meth:`lift` alone."""
+        return np.ascontiguousarray(self._look_up(edges)[0].T)
+
+    def _look_up(self, edges: EdgePixels) -> tuple[Float[np.ndarray, "2 n"], Float[np.ndarray, "6 n"]]:
+        """Return x and y of each edge point, and the six numbers of the pixel that it lies in."""
+        nearest = np.rint(edges.uv_px)
+        np.maximum(nearest, 0.0, out=nearest)
+        np.minimum(nearest, self._last_px, out=nearest)
+        at = (nearest[:, 1] * self.width + nearest[:, 0]).astype(np.intp)
+        rows = np.ascontiguousarray(self._rows.take(at, axis=0).T)
+        off_u, off_v = (edges.uv_px - nearest).T
+        return rows[:2] + (rows[2:4] * off_u + rows[4:] * off_v), rows
+
+
+class RoadEdgeExtractor:
+    """Frame in, edge points on the road out; the one path for training and for driving.
+
+    Attributes:
+        camera: Camera of the frames.
+        settings: Detector and range.
+        table: Its road table; a mask given to the extractor (nonzero on the car itself, as from
+            :func:`lanenet.perception.edges.static.static_mask`) is taken out of the table's ``keep``.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        settings: PerceptionSettings,
+        mask: UInt8[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        self.camera = camera
+        self.settings = settings
+        self.table = RoadTable(camera, settings.range, mask)
+
+    def is_crowded(self, n_edges: int, max_share: float) -> bool:
+        """Tell whether so many edges are more than this share of the pixels that see the road.
+
+        A frame of noise has an edge everywhere, and any lane can be found in it.
+        """
+        return n_edges > max_share * self.table.useful_pixels
+
+    def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> RoadEdges:
+        """Find a frame's edges and move them to the road.
+
+        Raises:
+            CalibrationError: If the frame's size is not the camera's.
+            DriveFormatError: If the array is no image.
+        """
+        edges = self.table.lift(self._find(frame_bgr))
+        # The precision of the label files, so that a raster made from a file and one made on the car agree.
+        points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
+        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
+        return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])
+
+    def extract_points(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> Float[np.ndarray, "n 2"]:
+        """Return the points of :meth:`extract` alone, which is all that a raster takes.
+
+        Raises:
+            CalibrationError: If the frame's size is not the camera's.
+            DriveFormatError: If the array is no image.
+        """
+        points = self.table.lift_points(self._find(frame_bgr)).astype(np.float32)
+        # A normal is missing only where its point is: both follow from the same numbers of the table.
+        # One sum tells that nothing is missing, as in nearly every frame.
+        return points if math.isfinite(points.sum()) else points[np.isfinite(points).all(axis=1)]
+
+    def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
+        height, width = check_frame(frame_bgr).shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise CalibrationError(
+                f"frame of {width}x{height} px, but the camera is calibrated for "
+                f"{self.camera.width}x{self.camera.height}"
+            )
+        return find_edges(
+            frame_bgr, self.settings.edges, self.table.keep, self.table.scale, self.table.sample
+        )

@@ -1,0 +1,259 @@
+"""Suto's lane line tracker as a detector."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.config import Settings
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import N_POINTS
+from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.hough import lines, steering
+from lanenet.perception.hough.edges import HoughEdgeSettings, find_contours
+from lanenet.perception.hough.lines import HoughLineSettings, Line, Segment, choose_lines
+from lanenet.perception.hough.marking import centre_on_marking
+from lanenet.perception.hough.steering import HoughSteeringSettings
+from lanenet.perception.image_lane import (
+    ImageLane,
+    Polyline,
+    check_size,
+    rows_on_road,
+    sample_segment,
+    to_bgr,
+)
+
+#: A tracker that finds a line in fewer frames than this share has the wrong settings for them.
+_FEW = 0.05
+
+
+class HoughSettings(Settings):
+    """Suto's tracker; the defaults are the paper's where it gives one."""
+
+    edges: HoughEdgeSettings = HoughEdgeSettings()
+    lines: HoughLineSettings = HoughLineSettings()
+    steering: HoughSteeringSettings = HoughSteeringSettings()
+
+
+@dataclass(frozen=True)
+class SideMemory:
+    """What the tracker remembers of one side.
+
+    Attributes:
+        line: Averaged line, eq. 16.
+        distance_px: dnx or dpx of the last frame that showed the side, d of t-1 in eq. 13 and 14.
+        missed: Frames since then.
+    """
+
+    line: Line
+    distance_px: float
+    missed: int = 0
+
+
+@dataclass(frozen=True)
+class HoughState:
+    """What the tracker remembers: a memory per side and the smoothed angle (eq. 15).
+
+    Attributes:
+        left: The left side; None before the first left line and when it is forgotten.
+        right: The right side.
+        steering_deg: Smoothed angle, positive left; None until a pair of lines was seen.
+    """
+
+    left: SideMemory | None = None
+    right: SideMemory | None = None
+    steering_deg: float | None = None
+
+    @property
+    def lines(self) -> tuple[Line | None, Line | None]:
+        """The averaged lines."""
+        return (
+            None if self.left is None else self.left.line,
+            None if self.right is None else self.right.line,
+        )
+
+
+class HoughTracker:
+    """Frame in, lane out, by the lines of the Hough transform; frames are scaled to the paper's size.
+
+    A frame of less than half that size gives an empty estimate.
+
+    With a camera the stretches of the lines that the frame shows are moved to the road. Without one the
+    points are NaN. The confidence is the share of the two lines that this frame shows: 1, 0.5 or 0. A frame
+    without lines keeps the steering of the frames before (the paper's third case) with confidence 0, until
+    both sides are forgotten. A single line changes a steering that is known; before the first pair there is
+    none.
+
+    Attributes:
+        last: Lines of the last frame in the image; the remembered ones beside them.
+        state: What is carried to the next frame.
+    """
+
+    def __init__(self, camera: Camera | None = None, settings: HoughSettings | None = None) -> None:
+        """Build the tracker; without a camera it answers with steering and lines of the image only."""
+        self.camera = camera
+        self.settings = HoughSettings() if settings is None else settings
+        self.last = ImageLane()
+        self.state = HoughState()
+        self._frames = self._frames_steered = 0
+
+    def reset(self) -> None:
+        """Forget lines and steering of earlier frames."""
+        self.state = HoughState()
+        self.last = ImageLane()
+
+    @property
+    def hint(self) -> str:
+        """What to try where the frames so far, across resets, gave nearly no steering; else empty."""
+        if self.settings.edges.channel != "hue" or self._frames_steered >= _FEW * self._frames:
+            return ""
+        return (
+            f"hough steers in {self._frames_steered} of {self._frames} frames; the hue says little "
+            "about white lines and gray floors: --config configs/detectors/hough_value.yaml looks at the "
+            "brightness"
+        )
+
+    def detect(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> LaneEstimate:
+        """Find the lane in one frame.
+
+        Raises:
+            DriveFormatError: If the array is not an image of one or three uint8 channels.
+            CalibrationError: If the frame's size is not the camera's.
+        """
+        frame = to_bgr(frame_bgr)
+        check_size(frame, self.camera)
+        left, right = self.find_lines(frame)
+        steered = self.track(left, right)
+        self._frames += 1
+        self._frames_steered += steered is not None
+        self.last = self._image_lane(left, right, frame.shape[1], frame.shape[0])
+        points = np.full((2, N_POINTS // 2), np.nan)
+        if self.camera is not None:
+            for side, seen in enumerate((left, right)):
+                if seen is not None:
+                    seen_px = self._to_frame(seen, frame.shape[1], frame.shape[0])
+                    points[side] = rows_on_road(seen_px, self.camera)
+        return LaneEstimate(
+            points_cm=points.reshape(N_POINTS),
+            steering_rad=float("nan") if steered is None else math.radians(steered),
+            confidence=0.5 * (left is not None) + 0.5 * (right is not None),
+        )
+
+    def find_lines(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> tuple[Segment | None, Segment | None]:
+        """Choose the left and the right line of a frame (sections 4.1 to 4.3); the state stays as it is."""
+        settings = self.settings.lines
+        edges = self.settings.edges
+        if 2 * frame_bgr.shape[1] < edges.width_px or 2 * frame_bgr.shape[0] < edges.height_px:
+            # Enlarged so much, single pixels would turn into lines.
+            return None, None
+        contours = find_contours(frame_bgr, edges)
+        segments = lines.find_lane_segments(contours, settings)
+        width, height = self._size
+        left, right = lines.split_sides(segments, width, height, settings)
+        chosen = choose_lines(left, right, self.state.lines, width, height, settings)
+        if not settings.middle:
+            return chosen
+        left_line, right_line = (
+            None if line is None else centre_on_marking(line, contours, edges.threshold, settings)
+            for line in chosen
+        )
+        return left_line, right_line
+
+    def track(self, left: Segment | None, right: Segment | None) -> float | None:
+        """Turn a frame's lines into the smoothed angle and update the state (section 4.4).
+
+        Returns:
+            The steering angle, [deg], positive left; None where no pair was seen so far.
+        """
+        settings, state = self.settings.steering, self.state
+        angle = state.steering_deg
+        current = self._current_deg(left, right)
+        if current is not None:
+            # The relative changes of eq. 13 and 14 know no bound where a line passes near c1.
+            bounded = min(max(current, -settings.max_angle_deg), settings.max_angle_deg)
+            angle = steering.smooth_angle_deg(bounded, angle, settings.angle_smoothing)
+        sides = self._remember(left, state.left), self._remember(right, state.right)
+        self.state = HoughState(*sides, angle) if any(sides) else HoughState()
+        return self.state.steering_deg
+
+    def _remember(self, seen: Segment | None, earlier: SideMemory | None) -> SideMemory | None:
+        """Update the memory of one side (eq. 16), or let it age."""
+        settings = self.settings.steering
+        if seen is not None:
+            average = None if earlier is None else earlier.line
+            line = steering.smooth_line(seen.line, average, settings.line_smoothing)
+            return SideMemory(line, self._distance_px(seen))
+        if earlier is None or (settings.hold_frames is not None and earlier.missed >= settings.hold_frames):
+            return None
+        return replace(earlier, missed=earlier.missed + 1)
+
+    def _current_deg(self, left: Segment | None, right: Segment | None) -> float | None:
+        """Angle of this frame by eq. 8, or by eq. 12 where it shows one line; None where neither is known."""
+        settings, state = self.settings.steering, self.state
+        if left is not None and right is not None:
+            width, height = self._size
+            c1, c2 = (0.5 * width, height), (0.5 * width, 0.0)
+            vp = lines.vanishing_point(left.line, right.line)
+            distances = self._distance_px(left), self._distance_px(right)
+            return steering.combine_angles(
+                steering.vanishing_angle_deg(vp, c1, c2),
+                steering.distance_angle_deg(*distances, settings.gain_deg),
+                settings,
+            )
+        if state.steering_deg is None or (left is None and right is None):
+            return None
+        change = 0.0
+        segment, earlier = (left, state.left) if left is not None else (right, state.right)
+        if segment is not None and earlier is not None:
+            distance, before = self._distance_px(segment), earlier.distance_px
+            rule = steering.change_by_right_line_deg if left is None else steering.change_by_left_line_deg
+            if settings.max_jump_px is None or abs(distance - before) <= settings.max_jump_px:
+                change = rule(distance, before, settings.gain_deg)
+        return steering.angle_of_one_line_deg(state.steering_deg, change)
+
+    def _distance_px(self, segment: Segment) -> float:
+        """Return dnx or dpx of a line, measured on the row of the settings."""
+        width, height = self._size
+        row = 0.0 if self.settings.steering.distance_row == "top" else height
+        return steering.horizontal_distance(segment.line, (0.5 * width, height), row)
+
+    @property
+    def _size(self) -> tuple[float, float]:
+        """Width and height of the region of interest, [px]."""
+        return float(self.settings.edges.width_px), float(self.settings.edges.roi_height_px)
+
+    def _image_lane(
+        self, left: Segment | None, right: Segment | None, frame_width: int, frame_height: int
+    ) -> ImageLane:
+        """Carry lines of the region of interest back to the frame that they were found in."""
+        edges = self.settings.edges
+
+        def polyline(line: Line) -> Polyline | None:
+            # Straight through the whole region, as the paper takes it, or up to where the line leaves it.
+            ends = []
+            for y in (edges.roi_height_px - 1.0, 0.0):
+                x = min(max(lines.x_at(line, y), 0.0), edges.width_px - 1.0)
+                ends.append((x, line.m * x + line.b))
+            whole = Segment(*ends[0], *ends[1])
+            inside = all(-1.0 <= y <= edges.roi_height_px for _, y in ends)
+            return self._to_frame(whole, frame_width, frame_height) if inside and ends[0] != ends[1] else None
+
+        memory = (polyline(line) for line in self.state.lines if line is not None)
+        return ImageLane(
+            None if left is None else polyline(left.line),
+            None if right is None else polyline(right.line),
+            tuple(line for line in memory if line is not None),
+        )
+
+    def _to_frame(self, segment: Segment, frame_width: int, frame_height: int) -> Polyline:
+        """Carry a segment of the region of interest back to the frame that it was found in, near to far."""
+        edges = self.settings.edges
+        sx, sy = frame_width / edges.width_px, frame_height / edges.height_px
+        ends = [
+            ((x + 0.5) * sx - 0.5, (y + edges.roi_top_px + 0.5) * sy - 0.5)
+            for x, y in ((segment.x1, segment.y1), (segment.x2, segment.y2))
+        ]
+        return sample_segment(ends[0], ends[1])

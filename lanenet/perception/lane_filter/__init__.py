@@ -1,0 +1,1 @@
+"""Kozlowski's lane filter: pairs of points with the spacing of a marking, pairs of markings a lane apart."""

@@ -1,0 +1,177 @@
+"""The network as a detector: an ONNX file and one frame after the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.errors import ModelMismatchError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.perception.edges.road import RoadEdgeExtractor
+from lanenet.perception.estimate import LaneEstimate, confidence
+from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.network.model_file import (
+    ANY_CAMERA,
+    INPUT_NAME,
+    OUTPUT_NAMES,
+    WIDTH_NAME,
+    ModelMeta,
+    open_model,
+    read_model_meta,
+)
+
+__all__ = [
+    "ANY_CAMERA",
+    "INPUT_NAME",
+    "OUTPUT_NAMES",
+    "ModelMeta",
+    "NetworkDetector",
+    "open_model",
+    "read_model_meta",
+]
+
+#: A frame with more edges than this share of its road pixels is noise.
+_MAX_EDGE_SHARE = 0.15
+#: With a model that does not tell the presence of lines: marked cells from which on they count as seen.
+_ENOUGH_CELLS = 120
+#: A camera fits a model for any camera if it sees at least this share of the far half of the window.
+_LEAST_SHARE_SEEN = 1.0 / 3.0
+
+
+class NetworkDetector:
+    """Frame in, lane out, by the network; from earlier frames it keeps the lane's width alone.
+
+    Attributes:
+        meta: What the model says about itself.
+        memory: Rebuilds the missing line of a frame with one; None if that is switched off.
+        problems: What is known to be wrong with what it was given, a line each.
+    """
+
+    def __init__(
+        self,
+        model_path: Path,
+        camera: Camera,
+        *,
+        any_camera: bool = False,
+        window: BirdseyeWindow | None = None,
+        threads: int = 1,
+        mask: UInt8[np.ndarray, "h w"] | None = None,
+        memory: bool = True,
+        lane_width_cm: float | None = None,
+    ) -> None:
+        """Open a model for a camera.
+
+        Args:
+            model_path: ONNX file or checkpoint folder.
+            camera: The car's camera. Edges are found as the model's training images had them.
+            any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
+                calibrated cameras look alike, but not where one of them sees more.
+            window: The bird's-eye window that the caller counts on; None takes the model's.
+            threads: Threads of the computation.
+            mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
+                leave out.
+            memory: Rebuild the line that a frame lacks from the other one and the lane's width.
+            lane_width_cm: That width, if it is known, which a network that can be told it is told; None takes
+                it from the frames that show both lines.
+
+        Raises:
+            CalibrationError: If the mask's size is not the camera's.
+            ModelMismatchError: If the file is not a model of this format, or was made for another window or
+                camera; the message says which.
+        """
+        self._session, self.meta = open_model(model_path, threads, frames=1)
+        if window is not None and window != self.meta.window:
+            raise ModelMismatchError(
+                f"{model_path}: made for the window {self.meta.window}, but {window} is in use"
+            )
+        if not any_camera:
+            _check_camera(self.meta, camera, model_path)
+        widths_cm = [] if lane_width_cm is None else [lane_width_cm]
+        self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
+        self.memory = LaneMemory(lane_width_cm) if memory else None
+        self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
+        shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
+        self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
+        self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster}
+        if self.meta.takes_width and lane_width_cm is not None:
+            self._feed[WIDTH_NAME] = np.array([lane_width_cm], np.float32)
+
+    def detect(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
+        """Find the lane in one frame.
+
+        Returns:
+            All six points with their standard deviations; an empty estimate of confidence 0 if no edge lies
+            in the window, or if the frame is all edges.
+
+        Raises:
+            CalibrationError: If the frame's size is not the camera's.
+        """
+        points_cm = self._extractor.extract_points(frame_bgr)
+        if self._extractor.is_crowded(len(points_cm), _MAX_EDGE_SHARE):
+            return LaneEstimate()
+        return self.detect_raster(self.meta.window.rasterise(points_cm, out=self._raster[0, 0]))
+
+    def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
+        """Find the lane in a bird's-eye raster of 0 and 255."""
+        n_cells = int(np.count_nonzero(raster))
+        if n_cells == 0:
+            return LaneEstimate()
+        if raster.base is not self._raster and raster is not self._raster:
+            self._raster[0, 0] = raster
+        if self.meta.tells_sigma:
+            found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
+            points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
+        else:
+            (points,) = self._session.run(("points_cm",), self._feed)
+            points_cm, sigma_cm = np.asarray(points[0], np.float64), np.array(self.meta.rmse_cm)
+            presence = np.full(len(SIDES), min(1.0, n_cells / _ENOUGH_CELLS))
+        if self.memory is not None:
+            points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        row = 1
+        centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))
+        return LaneEstimate(
+            points_cm=points_cm,
+            sigma_cm=sigma_cm,
+            steering_rad=proportional_angle_rad(centre_cm, ROWS_CM[row]),
+            confidence=confidence(points_cm, sigma_cm, presence, self.meta.widths_cm),
+            presence=presence,
+        )
+
+    def reset(self) -> None:
+        """Forget the lane's width that earlier frames showed."""
+        if self.memory is not None:
+            self.memory.reset()
+
+
+def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
+    """Refuse a camera that a model was not trained for.
+
+    Raises:
+        ModelMismatchError: Naming both cameras, or how much of the window this one sees.
+    """
+    if meta.any_camera:
+        share = _share_seen(meta.window, camera)
+        if share < _LEAST_SHARE_SEEN:
+            raise ModelMismatchError(
+                f"{model_path}: made for any camera that sees its window, {meta.window}; this one sees "
+                f"{share:.0%} of the window's far half, expected at least {_LEAST_SHARE_SEEN:.0%}"
+            )
+        return
+    this = f"this camera, {camera.model} {camera.width}x{camera.height},"
+    meta.check_trained_with(camera.hash, this, str(model_path))
+
+
+def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
+    """Return the share of the far half of a window that lies in a camera's picture."""
+    row, column = np.mgrid[0 : window.rows / 2 : 16j, 0 : window.columns - 1 : 32j]
+    pixels = camera.project_ground(window.points(np.stack([row.ravel(), column.ravel()], axis=1)))
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(
+            axis=1
+        )
+    return float(inside.mean())

@@ -1,0 +1,294 @@
+"""Model files: an ONNX file that says what it is, and the check that it is that.
+
+Where the model of a checkpoint folder lies: whoever takes a model takes the folder as well.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+
+from lanenet.config import check_settings
+from lanenet.errors import ConfigError, ModelMismatchError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM
+from lanenet.perception.edges.road import PerceptionSettings
+
+#: The network as the car runs it.
+MODEL_NAME = "model.onnx"
+#: Says that a folder is a checkpoint.
+MARKER_NAME = "checkpoint.yaml"
+#: More folders than these are not listed in an error.
+_MOST_NAMED = 8
+
+
+def is_model(path: Path) -> bool:
+    """Tell whether a path stands for a model: an ONNX file by its name, or a checkpoint folder."""
+    return _is_checkpoint(path) or path.suffix.lower() == ".onnx"
+
+
+def find_model(path: Path) -> Path:
+    """Return the model file that a path stands for: the path itself, or the model of a checkpoint folder.
+
+    Raises:
+        ModelMismatchError: If there is no such file, or none in the folder; names the folders in it that have
+            one.
+    """
+    found = path / MODEL_NAME if path.is_dir() else path
+    if found.is_file():
+        return found
+    if _is_checkpoint(path):
+        raise ModelMismatchError(f"{path}: no {MODEL_NAME} in it; make one with: lanenet export {path}")
+    if path.is_dir():
+        raise ModelMismatchError(f"{path}: expected a model: {without_model(path)}")
+    raise ModelMismatchError(f"{path}: no such file, expected an ONNX model or a checkpoint folder")
+
+
+def without_model(folder: Path) -> str:
+    """Say that a folder is no checkpoint, and which of its own folders are."""
+    there = sorted(child.name for child in folder.iterdir() if _is_checkpoint(child))
+    more = f" and {len(there) - _MOST_NAMED} more" if len(there) > _MOST_NAMED else ""
+    hint = f"; of its folders these do: {', '.join(there[:_MOST_NAMED])}{more}" if there else ""
+    return f"the folder holds neither {MODEL_NAME} nor {MARKER_NAME}{hint}"
+
+
+def _is_checkpoint(path: Path) -> bool:
+    return any((path / name).is_file() for name in (MODEL_NAME, MARKER_NAME))
+
+
+FORMAT = "lanenet-model/2"
+#: Of models from before the network told its uncertainty; they are still read.
+FORMAT_WITHOUT_SIGMA = "lanenet-model/1"
+INPUT_NAME = "raster"
+#: Input of a network that can be told the lane's width, [cm]; it may be left out, and 0 is unknown.
+WIDTH_NAME = "lane_width_cm"
+#: The dimension of inputs and outputs that counts the rasters.
+BATCH_NAME = "n"
+OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
+#: Stands for the cameras of a model that was trained with many.
+ANY_CAMERA = "any"
+#: So exactly is a lane's width known that was measured on the floor.
+_WIDTH_SLACK_CM = 0.5
+
+_UNITS = {
+    "points_cm": "cm",
+    "sigma_cm": "cm",
+    "presence": "probability",
+    "parabolas": "1/cm, 1, cm",
+    "centre_cm": "cm",
+    "steering_rad": "rad",
+}
+_SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positive left"}
+_NEW_OUTPUTS = ("sigma_cm", "presence")
+
+
+@dataclass(frozen=True)
+class ModelMeta:
+    """What a model file says about itself.
+
+    Attributes:
+        window: Bird's-eye window of its rasters.
+        camera_hashes: Of the cameras whose frames it was trained on; ``any`` if it was trained for every
+            calibrated camera.
+        wheelbase_cm: Of the car that it was trained on.
+        lane_width_cm: Mean lane width of its training data, between the middles of the markings.
+        training_hash: Hash of the contents of its training files.
+        rmse_cm: Error of each point on validation frames; NaN where it was not measured.
+        reference: What the errors were measured against: ``truth``, ``map`` or ``map and truth``.
+        perception: How the edge points of its rasters were found.
+        lane_width_range_cm: The narrowest and the widest lane of its training data; None if all had the mean
+            width.
+        tells_sigma: False for a model of the older format, which has no outputs for spread and presence.
+        takes_width: It can be told the lane's width beside the raster.
+    """
+
+    window: BirdseyeWindow
+    camera_hashes: tuple[str, ...]
+    wheelbase_cm: float
+    lane_width_cm: float
+    training_hash: str
+    rmse_cm: tuple[float, ...]
+    reference: str
+    perception: PerceptionSettings = field(default_factory=PerceptionSettings)
+    lane_width_range_cm: tuple[float, float] | None = None
+    tells_sigma: bool = True
+    takes_width: bool = False
+
+    @property
+    def any_camera(self) -> bool:
+        """True if the model was trained for every calibrated camera."""
+        return ANY_CAMERA in self.camera_hashes
+
+    @property
+    def widths_cm(self) -> tuple[float, float]:
+        """The narrowest and the widest lane of the training data."""
+        return self.lane_width_range_cm or (self.lane_width_cm, self.lane_width_cm)
+
+    def check_trained_with(self, camera_hash: str, camera: str, where: str) -> None:
+        """Refuse a camera that the model was not trained with.
+
+        Args:
+            camera_hash: Of the camera.
+            camera: What the error calls it.
+            where: Names the model's file in the error.
+
+        Raises:
+            ModelMismatchError: Naming both cameras, and the way out.
+        """
+        if not self.any_camera and camera_hash not in self.camera_hashes:
+            raise ModelMismatchError(
+                f"{where}: trained with camera {', '.join(self.camera_hashes) or 'unknown'}, but {camera} is "
+                f"{camera_hash}; train with this camera, or allow any camera (--any-camera, "
+                "detector.any_camera) if both are calibrated and see about the same road"
+            )
+
+    def untrained_widths(self, lane_widths_cm: Iterable[float], where: str) -> list[str]:
+        """Warn of lanes that are narrower or wider than those of the training data.
+
+        Args:
+            lane_widths_cm: What the model will be told, or will see.
+            where: Names the model's file in the warning.
+
+        Returns:
+            One line; none where the model knows all the widths.
+        """
+        low, high = self.widths_cm
+        least, most = low - _WIDTH_SLACK_CM, high + _WIDTH_SLACK_CM
+        others = sorted({width for width in lane_widths_cm if not least <= width <= most})
+        if not others:
+            return []
+        told = " and ".join(f"{width:g}" for width in others)
+        known = f"{low:.0f} cm" if high - low < 1.0 else f"{low:.0f} to {high:.0f} cm"
+        return [
+            f"lane width {told} cm: {where} was trained on lanes of {known}, and how wrong it is on others "
+            "is not known"
+        ]
+
+    def to_properties(self) -> dict[str, str]:
+        """Return the description as the text properties of an ONNX file."""
+        errors = [None if math.isnan(v) else v for v in self.rmse_cm]
+        return {
+            "format": FORMAT,
+            "rows_cm": json.dumps(ROWS_CM),
+            "points": json.dumps(POINT_NAMES),
+            "units": json.dumps(_UNITS),
+            "signs": json.dumps(_SIGNS),
+            "window": json.dumps(asdict(self.window)),
+            "camera_hashes": json.dumps(self.camera_hashes),
+            "wheelbase_cm": json.dumps(self.wheelbase_cm),
+            "lane_width_cm": json.dumps(self.lane_width_cm),
+            "lane_width_range_cm": json.dumps(self.widths_cm),
+            "training_hash": self.training_hash,
+            "rmse_cm": json.dumps(errors),
+            "reference": self.reference,
+            "perception": self.perception.model_dump_json(),
+            "takes_width": json.dumps(self.takes_width),
+        }
+
+    @staticmethod
+    def from_properties(properties: Mapping[str, str], where: str) -> ModelMeta:
+        """Read the description back.
+
+        Args:
+            properties: Text properties of an ONNX file.
+            where: Names the file in the error.
+
+        Raises:
+            ModelMismatchError: If the format is unknown, a property is missing or unreadable, or the six
+                outputs mean something else.
+        """
+        found = properties.get("format")
+        if found not in (FORMAT, FORMAT_WITHOUT_SIGMA):
+            what = f"format {found!r}" if found else "no format"
+            raise ModelMismatchError(f"{where}: {what}, expected {FORMAT!r}; export the model again")
+
+        def value(key: str) -> Any:
+            try:
+                return json.loads(properties[key])
+            except KeyError:
+                raise ModelMismatchError(f"{where}: property {key!r} is missing") from None
+            except ValueError:
+                raise ModelMismatchError(f"{where}: property {key!r} is not JSON") from None
+
+        for key, expected in (("rows_cm", list(ROWS_CM)), ("points", list(POINT_NAMES)), ("signs", _SIGNS)):
+            if value(key) != expected:
+                raise ModelMismatchError(f"{where}: {key} {value(key)}, expected {expected}")
+        widths = value("lane_width_range_cm") if found == FORMAT else None
+        try:
+            meta = ModelMeta(
+                window=BirdseyeWindow(**value("window")),
+                camera_hashes=tuple(str(v) for v in value("camera_hashes")),
+                wheelbase_cm=float(value("wheelbase_cm")),
+                lane_width_cm=float(value("lane_width_cm")),
+                training_hash=str(properties.get("training_hash", "")),
+                rmse_cm=tuple(math.nan if v is None else float(v) for v in value("rmse_cm")),
+                reference=str(properties.get("reference", "")),
+                perception=check_settings(PerceptionSettings, value("perception"), "perception"),
+                lane_width_range_cm=None if widths is None else (float(widths[0]), float(widths[1])),
+                tells_sigma=found == FORMAT,
+                takes_width="takes_width" in properties and value("takes_width") is True,
+            )
+        except (TypeError, ValueError, IndexError, ConfigError) as error:
+            raise ModelMismatchError(f"{where}: unreadable description ({error})") from None
+        if len(meta.rmse_cm) != N_POINTS:
+            raise ModelMismatchError(f"{where}: rmse_cm has {len(meta.rmse_cm)} values, expected {N_POINTS}")
+        return meta
+
+
+def open_model(
+    path: Path, threads: int = 1, frames: int | None = None
+) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
+    """Open a model file and check that it is what its description says.
+
+    Args:
+        path: ONNX file that :mod:`lanenet.learn` exported, or its checkpoint folder.
+        threads: Threads of the computation.
+        frames: Rasters of every run, which is faster for being known; None takes any number.
+
+    Raises:
+        ModelMismatchError: If the file is missing, is not an ONNX file, or its description is of another
+            format or does not fit its own inputs and outputs.
+    """
+    path = find_model(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    if frames is not None:
+        options.add_free_dimension_override_by_name(BATCH_NAME, frames)
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has no common base class of its own
+        reason = str(error).splitlines()[0][:200]
+        raise ModelMismatchError(f"{path}: cannot be opened as an ONNX model ({reason})") from None
+    meta = ModelMeta.from_properties(session.get_modelmeta().custom_metadata_map, str(path))
+    inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
+    expected = {INPUT_NAME: ("tensor(uint8)", [1, meta.window.rows, meta.window.columns])}
+    if inputs != expected:
+        raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
+    may_be_told = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
+    if may_be_told != meta.takes_width:
+        has = "has an" if may_be_told else "has no"
+        raise ModelMismatchError(
+            f"{path}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
+        )
+    outputs = [o.name for o in session.get_outputs()]
+    wanted = [name for name in OUTPUT_NAMES if meta.tells_sigma or name not in _NEW_OUTPUTS]
+    if not set(wanted) <= set(outputs):
+        raise ModelMismatchError(f"{path}: outputs {outputs}, expected {wanted}")
+    return session, meta
+
+
+def read_model_meta(path: Path) -> ModelMeta:
+    """Return what a model file says about itself.
+
+    Raises:
+        ModelMismatchError: As :func:`open_model`.
+    """
+    return open_model(path)[1]

@@ -1,0 +1,333 @@
+"""Pentek's lane painter as a detector.
+
+Radius of curvature, offset and aim of a lane on the road, from its two lines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from pydantic import Field
+
+from lanenet.config import Settings
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import N_POINTS, ROWS_CM
+from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.image_lane import ImageLane, check_size, rows_of_points, to_bgr
+from lanenet.perception.painter.curves import (
+    CurveSettings,
+    Plane,
+    RoadPlane,
+    SquarePlane,
+    curvature_radius,
+    finite_rows,
+    mean_curve,
+)
+from lanenet.perception.painter.edges import PainterEdgeSettings, find_painter_edges, find_trapezoid
+from lanenet.perception.painter.lines import (
+    EvidenceSettings,
+    PainterLineSettings,
+    SolidLine,
+    agree_px,
+    are_close,
+    blend,
+    find_edge_field,
+    find_painter_segments,
+    find_side_lines,
+    find_two_lines,
+)
+from lanenet.perception.painter.markings import (
+    Marking,
+    Pair,
+    can_bound_the_lane,
+    choose_lane,
+    follow_lines,
+    straight_px,
+    weigh,
+)
+
+
+@dataclass(frozen=True)
+class PaintedLane:
+    """What the road of a calibrated camera tells about the last frame.
+
+    Attributes:
+        radius_cm: Radius of curvature of the lane's middle at its near end; infinite where both lines are
+            straight, NaN where a line is unknown.
+        offset_cm: The car's place right of the lane's middle, at the nearest row that both lines reach; NaN
+            where there is none.
+    """
+
+    radius_cm: float = float("nan")
+    offset_cm: float = float("nan")
+
+    @property
+    def text(self) -> str:
+        """Both figures for people; empty where neither is known."""
+        parts = []
+        if math.isfinite(self.radius_cm):
+            parts.append(f"R {self.radius_cm:.0f} cm" if self.radius_cm < 1e4 else "straight")
+        elif math.isinf(self.radius_cm):
+            parts.append("straight")
+        if math.isfinite(self.offset_cm):
+            side = "right" if self.offset_cm > 0.0 else "left"
+            parts.append(f"{abs(self.offset_cm):.1f} cm {side} of the middle")
+        return "  ".join(parts)
+
+
+def measure_lane(found: Pair, rows_cm: Float[np.ndarray, "2 3"]) -> PaintedLane:
+    """Measure radius and offset of a lane on the road.
+
+    The radius is that of the mean of both parabolas. Where only one of the lines is curved, the other one was
+    seen over too short a stretch to bend, and the curved one tells the radius.
+
+    Args:
+        found: The two lines; both are needed.
+        rows_cm: x of both at the label rows, [cm], frame car; NaN where unknown.
+    """
+    left, right = found
+    if left is None or right is None:
+        return PaintedLane()
+    curves = [marking.curve for marking in (left, right) if marking.curve is not None]
+    radius_cm = math.inf
+    if curves:
+        middle = curves[0] if len(curves) == 1 else mean_curve(curves[0], curves[1])
+        radius_cm = curvature_radius(middle, middle.near)
+    middle_cm = rows_cm.mean(axis=0)
+    known = np.flatnonzero(np.isfinite(middle_cm))
+    offset_cm = -float(middle_cm[known[0]]) if len(known) else float("nan")
+    return PaintedLane(radius_cm, offset_cm)
+
+
+def find_aim_cm(found: Pair, look_ahead_cm: float) -> tuple[float, float] | None:
+    """Return the lane's middle at the look-ahead distance, (x, y) in cm, frame car.
+
+    The aim comes nearer or moves away to where both lines are seen; None if there is no such place.
+    """
+    left, right = found
+    if left is None or right is None or len(left.points) == 0 or len(right.points) == 0:
+        return None
+    near = max(float(left.points[0, 1]), float(right.points[0, 1]))
+    far = min(float(left.points[-1, 1]), float(right.points[-1, 1]))
+    y = min(max(look_ahead_cm, near), far)
+    # Behind or beside the axle nothing can be aimed at.
+    if far < near or y < ROWS_CM[1]:
+        return None
+    lines = (left.points, right.points)
+    return 0.5 * sum(float(np.interp(y, line[:, 1], line[:, 0])) for line in lines), y
+
+
+#: Smaller frames hold no line that could be told from chance.
+_MIN_SIDE_PX = 48
+#: Default look-ahead in camera heights; see :class:`PainterSettings`.
+_LOOK_AHEAD_HEIGHTS = 3.5
+
+
+class PainterSettings(Settings):
+    """Pentek's painter; the defaults are the paper's where it gives one.
+
+    Attributes:
+        mode: ``photo`` takes each frame by itself, ``video`` averages the lines over frames.
+        video_weight: ``video``: weight of the current frame in the average.
+        hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
+        curves: Follow curves by sliding windows; False leaves the paper's straight lines.
+        look_ahead_cm: With a camera: distance of the point that is steered at. None takes 3.5 camera heights:
+            nearer to the car the lane's middle tells where the car stands in the lane, not where it leads.
+        edges: From frame to edges.
+        lines: From edges to straight lines.
+        curve: From straight lines to curves.
+        evidence: What a line has to show before it is answered.
+    """
+
+    mode: Literal["photo", "video"] = "video"
+    video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
+    hold_frames: int = Field(default=5, ge=0)
+    curves: bool = True
+    look_ahead_cm: float | None = Field(default=None, gt=0.0)
+    edges: PainterEdgeSettings = PainterEdgeSettings()
+    lines: PainterLineSettings = PainterLineSettings()
+    curve: CurveSettings = CurveSettings()
+    evidence: EvidenceSettings = EvidenceSettings()
+
+
+class LanePainter:
+    """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
+
+    With a camera the lines are moved to the road and answered up to where they are seen, and the steering
+    aims at the lane's middle some camera heights ahead. Without one the points are NaN, and the steering is
+    the angle in the image between straight up and the lane's middle, halfway up the region, seen from the
+    middle of its bottom. The confidence is the share of the two lines that this frame shows; a line that is
+    only remembered is drawn as a memory, not answered.
+
+    Attributes:
+        last: Lines of the last frame in the image, for drawing.
+        lane: Radius and offset of the last frame; unknown without a camera.
+    """
+
+    def __init__(self, camera: Camera | None = None, settings: PainterSettings | None = None) -> None:
+        """Build the painter.
+
+        Raises:
+            CalibrationError: If the camera sees no road.
+        """
+        self.camera = camera
+        self.settings = PainterSettings() if settings is None else settings
+        self.last = ImageLane()
+        self.lane = PaintedLane()
+        self._road = None if camera is None else RoadPlane(camera)
+        self._earlier: list[SolidLine | None] = [None, None]
+        self._missed = [0, 0]
+        self._shape: tuple[int, int] | None = None
+
+    def reset(self) -> None:
+        """Forget what earlier frames showed."""
+        self.last, self.lane = ImageLane(), PaintedLane()
+        self._earlier, self._missed = [None, None], [0, 0]
+
+    def detect(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> LaneEstimate:
+        """Find the lane in one frame.
+
+        Raises:
+            DriveFormatError: If the array is not an image of one or three uint8 channels.
+            CalibrationError: If the frame's size is not the camera's.
+        """
+        frame = to_bgr(frame_bgr)
+        check_size(frame, self.camera)
+        height, width = frame.shape[:2]
+        if self.settings.mode == "photo" or self._shape != (height, width):
+            self.reset()
+        self._shape = (height, width)
+        if min(height, width) < _MIN_SIDE_PX:
+            return LaneEstimate()
+        trapezoid = find_trapezoid(width, height, self.camera, self.settings.edges)
+        found = self._smooth(self._find(frame, trapezoid), trapezoid)
+        rows = np.full((2, len(ROWS_CM)), np.nan)
+        if self.camera is not None:
+            for side, marking in enumerate(found):
+                if marking is not None:
+                    rows[side] = rows_of_points(self._seen(marking))
+        self.lane = PaintedLane() if self.camera is None else measure_lane(found, rows)
+        self.last = self._image_lane(found, trapezoid)
+        return LaneEstimate(
+            points_cm=rows.reshape(N_POINTS),
+            steering_rad=self._steering_rad(found, trapezoid),
+            confidence=0.5 * sum(marking is not None for marking in found),
+            radius_cm=self.lane.radius_cm,
+            offset_cm=self.lane.offset_cm,
+        )
+
+    def _find(self, frame_bgr: UInt8[np.ndarray, "h w 3"], trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
+        """The lines that this frame shows."""
+        chosen = self.settings
+        edges = find_painter_edges(frame_bgr, trapezoid_px, chosen.edges)
+        segments = find_painter_segments(edges, float(trapezoid_px[2, 1] - trapezoid_px[0, 1]), chosen.lines)
+        earlier = (self._earlier[0], self._earlier[1])
+        plane: Plane = self._road if self._road is not None else SquarePlane(trapezoid_px)
+        points = plane.edge_points(edges)
+        height_cm = None if self.camera is None else self.camera.mounting.height_cm
+        half_width = chosen.curve.half_width_share
+        if height_cm is not None:
+            half_width = chosen.curve.half_width_heights * height_cm
+        curve = chosen.curve if chosen.curves else None
+
+        def follow(lines: Sequence[SolidLine]) -> dict[SolidLine, tuple[Marking, Marking | None]]:
+            ways = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
+            return dict(zip(lines, ways, strict=True))
+
+        if not chosen.evidence.required:
+            pair = find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
+            ways = follow([line for line in pair if line is not None])
+            left, right = (None if line is None else ways[line][1] or ways[line][0] for line in pair)
+            return left, right
+        field = find_edge_field(frame_bgr, edges, trapezoid_px, chosen.edges)
+        tolerance = agree_px(trapezoid_px, chosen.lines)
+        both_sides = find_side_lines(
+            segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates
+        )
+        ways = follow([*both_sides[0], *both_sides[1]])
+        sides = []
+        for lines, before in zip(both_sides, earlier, strict=True):
+            known = [before is not None and are_close(line, before, tolerance) for line in lines]
+            sides.append(
+                [
+                    weigh(*ways[line], field, again, chosen.evidence)
+                    for line, again in zip(lines, known, strict=True)
+                ]
+            )
+        if height_cm is not None:
+            width = frame_bgr.shape[1]
+            sides = [can_bound_the_lane(side, plane, width, height_cm, chosen.evidence) for side in sides]
+        return choose_lane(sides[0], sides[1], trapezoid_px, height_cm, chosen.lines, chosen.evidence)
+
+    def _smooth(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
+        """Average straight lines over frames, and keep what is expected in the next one."""
+        smooth: list[Marking | None] = []
+        for k, marking in enumerate(found):
+            if marking is None:
+                self._missed[k] += 1
+                if self._missed[k] > self.settings.hold_frames:
+                    self._earlier[k] = None
+                smooth.append(None)
+                continue
+            before = self._earlier[k]
+            # Another line than before; their mean would lie on neither.
+            if before is not None and not are_close(
+                marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)
+            ):
+                before = None
+            line = blend(marking.line, before, self.settings.video_weight)
+            self._earlier[k], self._missed[k] = line, 0
+            if marking.curve is None:
+                line_px = straight_px(line, trapezoid_px)
+                points = marking.points
+                if self._road is not None:
+                    points = finite_rows(self._road.from_image(line_px))
+                    points = points[np.argsort(points[:, 1], kind="stable")]
+                marking = replace(marking, line=line, line_px=line_px, points=points)
+            smooth.append(marking)
+        return smooth[0], smooth[1]
+
+    def _seen(self, marking: Marking) -> Float[np.ndarray, "n 2"]:
+        """The points of a line in the image, up to where an edge lies along it: further on it may bend."""
+        far_px = marking.evidence.far_px
+        if self._road is None or self._shape is None or not math.isfinite(far_px):
+            return marking.points
+        u, v = marking.line_px.T
+        seen = (v >= far_px - 1.0) & (u >= 0.0) & (u <= self._shape[1] - 1.0)
+        ahead = finite_rows(self._road.from_image(marking.line_px[seen]))[:, 1]
+        if len(ahead) == 0:
+            return ahead.reshape(0, 2)
+        y = marking.points[:, 1]
+        return marking.points[(y >= ahead.min()) & (y <= ahead.max())]
+
+    def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> ImageLane:
+        left, right = (None if marking is None else marking.line_px for marking in found)
+        memory = tuple(
+            straight_px(line, trapezoid_px)
+            for line, marking in zip(self._earlier, found, strict=True)
+            if line is not None and marking is None
+        )
+        return ImageLane(left, right, memory, filled=True, text=self.lane.text)
+
+    def _steering_rad(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> float:
+        left, right = found
+        if left is None or right is None:
+            return float("nan")
+        if self.camera is not None:
+            look_ahead_cm = self.settings.look_ahead_cm
+            if look_ahead_cm is None:
+                look_ahead_cm = _LOOK_AHEAD_HEIGHTS * self.camera.mounting.height_cm
+            aim = find_aim_cm(found, look_ahead_cm)
+            return float("nan") if aim is None else proportional_angle_rad(*aim)
+        bottom = float(trapezoid_px[2, 1])
+        row = 0.5 * (float(trapezoid_px[0, 1]) + bottom)
+        lines = (left.line_px, right.line_px)
+        middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in lines)
+        start = 0.5 * float(trapezoid_px[2, 0] + trapezoid_px[3, 0])
+        return math.atan2(start - middle, bottom - row)

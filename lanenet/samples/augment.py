@@ -1,0 +1,233 @@
+"""Seeded changes of samples on their edge points, in cm, with labels that stay exact.
+
+The points are moved, dropped and joined by clutter before they become a raster, so that a turned road has
+edges as sharp as a straight one, and the labels of the moved car follow from the lane lines themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.samples.kernels import (
+    Amounts,
+    Frames,
+    augment_frames,
+    misplace_points,
+    rasterise_frames,
+)
+from lanenet.samples.raster import Grid, near_lines
+from lanenet.samples.settings import AugmentSettings
+
+Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
+
+#: Where a camera is taken to be whose label set does not say so: right of, ahead of and above the front axle.
+TYPICAL_CAMERA_CM = (0.0, 0.0, 18.0)
+
+
+class Batch(NamedTuple):
+    """Samples as a network takes them.
+
+    Attributes:
+        rasters: Of 0 and 255.
+        points_cm: Labels, [cm]; NaN where masked.
+        present: Whether each line is seen: 1, 0 or NaN for unknown.
+        lane_cm: The lane's width as the network is told it, [cm]; 0 where it is not told.
+    """
+
+    rasters: UInt8[np.ndarray, "b 1 r c"]
+    points_cm: Float[np.ndarray, "b 6"]
+    present: Float[np.ndarray, "b 2"]
+    lane_cm: Float[np.ndarray, "b"]
+
+
+@dataclass(frozen=True)
+class _View:
+    """Where the car of a changed sample stands: new point = point @ matrix + offset."""
+
+    mirror: bool
+    matrix: Float[np.ndarray, "2 2"]
+    offset_cm: Float[np.ndarray, "2"]
+
+    def move(self, points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Express points of the recorded car frame in the frame of the moved car, [cm]."""
+        return points_cm @ self.matrix + self.offset_cm
+
+
+def make_view(mirror: bool, shift_cm: float, turn_rad: float, scale: float = 1.0) -> _View:
+    """Place the car anew: the road is scaled and mirrored, then the car moved to the right and turned left.
+
+    Args:
+        mirror: Swap left and right.
+        shift_cm: Way of the front axle to the right, [cm].
+        turn_rad: Turn about the front axle, [rad], positive left.
+        scale: Every length of road and camera is multiplied by this.
+    """
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    sign = -1.0 if mirror else 1.0
+    matrix = scale * np.array([[sign * c, -sign * s], [s, c]])
+    return _View(mirror, matrix, np.array([-shift_cm * c, shift_cm * s]))
+
+
+def join_frames(
+    edges: Sequence[Float[np.ndarray, "_ 4"]],
+    lines_cm: Sequence[Lines],
+    points_cm: Float[np.ndarray, "n 6"],
+    camera_cm: Float[np.ndarray, "n 3"] | None = None,
+    lane_cm: Float[np.ndarray, "n"] | None = None,
+    divides: Bool[np.ndarray, "n 2"] | None = None,
+) -> Frames:
+    """Lay frames one after the other, as the compiled loops take them.
+
+    Args:
+        edges: Edge points of each frame, as label sets hold them: x, y, [cm], normal x, normal y, frame car.
+        lines_cm: Left and right lane line of each frame, in the direction of travel, frame car.
+        points_cm: Labels of each frame; a point that is masked here stays masked.
+        camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
+            one for all.
+        lane_cm: Width of the lane of each frame; None where it is not known.
+        divides: Whether there is another lane beyond its left, its right line; None for none anywhere.
+    """
+    size = len(edges)
+    polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
+    lines_of_edges = []
+    for k in range(size):
+        near = np.empty(len(edges[k]), np.uint8)
+        near_lines(np.asarray(edges[k], np.float32), polylines[2 * k], polylines[2 * k + 1], near)
+        lines_of_edges.append(near)
+    typical = np.tile(np.array(TYPICAL_CAMERA_CM), (size, 1))
+    return Frames(
+        edges_cm=np.concatenate([np.empty((0, 2), np.float32), *(e[:, :2] for e in edges)]).astype(
+            np.float32
+        ),
+        edge_lines=np.concatenate([np.empty(0, np.uint8), *lines_of_edges]),
+        edge_start=_starts(edges),
+        lines_cm=np.concatenate([np.empty((0, 2)), *polylines]),
+        line_start=_starts(polylines),
+        points_cm=np.ascontiguousarray(points_cm, np.float64),
+        camera_cm=typical if camera_cm is None else np.ascontiguousarray(camera_cm, np.float64),
+        lane_cm=np.zeros(size) if lane_cm is None else np.ascontiguousarray(lane_cm, np.float64),
+        divides=np.zeros((size, 2), np.bool_) if divides is None else np.ascontiguousarray(divides, np.bool_),
+    )
+
+
+def plain_batch(frames: Frames, indices: Int[np.ndarray, "b"], window: BirdseyeWindow) -> Batch:
+    """Return frames as they are, with the lane's width told."""
+    rasters, present = _empty(len(indices), window)
+    rasterise_frames(rasters, np.asarray(indices, np.int64), frames, _grid(window), present)
+    labels, lane_cm = (part[indices].astype(np.float32) for part in (frames.points_cm, frames.lane_cm))
+    return Batch(rasters, labels, present, lane_cm)
+
+
+def augment_batch(
+    frames: Frames,
+    indices: Int[np.ndarray, "b"],
+    window: BirdseyeWindow,
+    settings: AugmentSettings,
+    seed: int,
+    epoch: int,
+    streams: Int[np.ndarray, "b"] | None = None,
+) -> Batch:
+    """Change each sample of a batch by its own draw.
+
+    Args:
+        frames: What :func:`join_frames` answers.
+        indices: Frames of the batch.
+        window: Grid of the rasters.
+        settings: What is changed, and how much.
+        seed: Of the run.
+        epoch: Counted from 0.
+        streams: Number of each sample's draw; None takes its index. A frame that comes twice in an epoch
+            needs two.
+
+    Returns:
+        The changed samples; each follows from seed, epoch, stream and frame alone.
+    """
+    rasters, present = _empty(len(indices), window)
+    labels, told = np.empty((len(indices), 6), np.float32), np.empty(len(indices), np.float32)
+    chosen = np.asarray(indices, np.int64)
+    augment_frames(
+        rasters,
+        labels,
+        present,
+        told,
+        chosen,
+        chosen if streams is None else np.asarray(streams, np.int64),
+        seed,
+        epoch,
+        frames,
+        _grid(window),
+        _amounts(settings),
+    )
+    return Batch(rasters, labels, present, told)
+
+
+def misplaced(
+    points_cm: Float[np.ndarray, "n 2"],
+    camera_cm: Float[np.ndarray, "3"],
+    *,
+    height: float = 0.0,
+    pitch_rad: float = 0.0,
+    roll_rad: float = 0.0,
+) -> Float[np.ndarray, "n 2"]:
+    """Return where points of the road seem to lie when the camera's mounting is known wrongly.
+
+    The rays of the camera are turned by the error of its mounting and met with the road again, below a camera
+    of the wrong height. The camera is taken to look straight ahead. A wrong pitch then moves the points alike
+    whatever the pitch is; a wrong roll is one about the level line ahead.
+
+    Args:
+        points_cm: True points, frame car.
+        camera_cm: Optical centre: right of, ahead of and above the front axle.
+        height: The height is taken too large by this share.
+        pitch_rad: The camera is taken to look down by so much more than it does.
+        roll_rad: It is taken to lean to the right by so much more.
+
+    Returns:
+        Seeming points, [cm], frame car; NaN where the turned ray misses the road.
+
+    Source:
+        Own derivation; ``tests/unit/learn/test_augment.py`` compares it with two cameras.
+    """
+    moved = np.empty(points_cm.shape)
+    misplace_points(
+        np.asarray(points_cm, np.float64),
+        np.asarray(camera_cm, np.float64),
+        1.0 + height,
+        pitch_rad,
+        roll_rad,
+        moved,
+    )
+    return moved
+
+
+def _starts(parts: Sequence[np.ndarray]) -> Int[np.ndarray, "_"]:
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def _empty(size: int, window: BirdseyeWindow) -> tuple[np.ndarray, np.ndarray]:
+    return np.empty((size, 1, window.rows, window.columns), np.uint8), np.empty((size, 2), np.float32)
+
+
+def _grid(window: BirdseyeWindow) -> Grid:
+    return Grid(
+        np.float32(window.left_cm),
+        np.float32(window.far_cm),
+        np.float32(window.cell_cm),
+        window.rows,
+        window.columns,
+        float(window.left_cm),
+        float(window.right_cm),
+    )
+
+
+def _amounts(settings: AugmentSettings) -> Amounts:
+    values = settings.model_dump()
+    values["limit"] = int(values.pop("draw") == "limit")
+    return Amounts(**values)
