@@ -15,13 +15,15 @@ TEST_PROCESSES ?= auto
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4
 
-.PHONY: help train env test test-slow test-base-install arm check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install golden golden-renew arm check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take longer than about ten seconds each"
 	@echo "make test-base-install  detection in an environment with the base installation only"
+	@echo "make golden       two drives from recording to detections, against what they gave before"
+	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
@@ -43,6 +45,12 @@ test-slow: $(VENV)/.stamp-dev
 # What the car installs, in an empty environment; fetches packages.
 test-base-install: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow tests/contracts/test_base_install.py
+
+golden: $(VENV)/.stamp-dev
+	$(PYTEST) tests/golden
+
+golden-renew: $(VENV)/.stamp-dev
+	$(BIN)/python tests/golden/renew.py
 
 # Needs debootstrap and qemu-user-static, and root.
 arm: $(VENV)/.stamp-train
