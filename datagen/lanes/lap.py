@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.path import Path, left_of
-from datagen.slam.loops.places import path_lengths
 from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import path_lengths
 
 #: Frames whose heading is further than this from the road's, either way round, have no place on it: cosine.
 _ALONG = 0.5

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.slam.loops.places import path_lengths
 from datagen.slam.odometry.scans import Scans
 from lanenet.errors import TrackingLostError
+from lanenet.geometry.poses import path_lengths
 
 _SHORTEST_CM = 20.0
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 
 from datagen.quality.residuals import REFERENCE_WIDTH, BorderSamples, ResidualSettings, border_samples
 from datagen.slam.camera.coarse import mapping_range
-from datagen.slam.loops.places import path_lengths
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
+from lanenet.geometry.poses import path_lengths
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 

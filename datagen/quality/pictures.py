@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import REFERENCE_WIDTH
-from datagen.slam.loops.places import path_lengths
 from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.frame_lines import FrameLines
@@ -24,6 +23,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.geometry.poses import path_lengths
 
 _LEFT, _RIGHT, _POINT = (80, 220, 80), (220, 80, 220), (60, 60, 255)
 _BESIDE = (200, 200, 80)

@@ -14,20 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.settings import MapSettings
-from datagen.slam.adjustment.adjust import adjust
+from datagen.slam.adjustment.adjust import BundleEstimate, Observations, adjust
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, compose, separate_places
-from datagen.slam.loops.places import (
-    Revisit,
-    alike,
-    diagonal_mean,
-    match_places,
-    path_lengths,
-    relative_pose,
-    thumbnails,
-)
+from datagen.slam.loops.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, separate_places
+from datagen.slam.loops.places import Revisit, alike, diagonal_mean, match_places, thumbnails
 from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
 from datagen.slam.odometry.scans import Scans, scans_of
 from datagen.slam.seen import road_edges
@@ -36,6 +28,7 @@ from datagen.slam.track import commands_of
 from lanenet.data.drives import Drive
 from lanenet.data.segments import equal_runs
 from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import compose, moved_rigidly, path_lengths, relative_pose
 
 #: Frames beside a break whose surroundings belong to both stretches.
 _EDGE = 21
@@ -118,8 +111,8 @@ def _join(
     # Of both maps what they know of themselves already, beside what they share.
     later = [replace(r, earlier=r.earlier + first, later=r.later + first) for r in other.solved.revisits]
     revisits = [*base.solved.revisits, *later, *cross]
-    start = np.concatenate([base.solved.poses, moved])
-    poses, missed = close_loops(start, revisits, height, breaks)
+    laid = np.concatenate([base.solved.poses, moved])
+    poses, missed = close_loops(laid, revisits, height, breaks)
     along, across = np.median(np.abs(missed[-len(cross) :, :2]), axis=0) / height
     if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
         return None
@@ -133,15 +126,14 @@ def _join(
     # In one unit: the usual way of one stretch need not be that of the other one.
     ways_cm = np.concatenate([part.distance_cm for part in commands])
     expected = replace(commands[0], distance_cm=ways_cm, turn=None).relative_ways
+    observed = Observations(edges, roads[0].keep, expected, commands[0].speed_known, breaks)
     tilt = np.concatenate([base.solved.bundle.tilt, other.solved.bundle.tilt])
     keys = _keys_of_both(base.solved, other.solved)
     held = [] if keys is None else key_pairs(keys, settings.bundle.lags, breaks)
     loops = loop_pairs(revisits, len(poses), breaks)
     for _ in range(2):
-        bundle = adjust(
-            edges, poses, camera, settings.bundle, rng, (), held + loops, tilt, breaks,
-            expected=expected, keep=roads[0].keep, recorded=commands[0].speed_known,
-        )  # fmt: skip
+        start = BundleEstimate(poses, tilt, camera)
+        bundle = adjust(observed, start, settings.bundle, rng, (), held + loops)
         poses, tilt = bundle.poses, bundle.tilt
         true = borne_out(poses, revisits, height)
         loops = loop_pairs(true, len(poses), breaks) + side_by_side(poses, height, s)
@@ -149,7 +141,7 @@ def _join(
     before = np.average([b.misfit for b in alone], weights=[b.pairs for b in alone])
     if bundle.misfit > MAX_MISFIT * before:
         return None
-    opened = _carried(other.solved.open_poses, other.solved.poses[0], bundle.poses[first])
+    opened = moved_rigidly(other.solved.open_poses, other.solved.poses[0], bundle.poses[first])
     # From here on in the order of the drive: the base may be the later one, or lie on both sides.
     rows = np.concatenate([base.rows, other.rows])
     order = np.argsort(rows)
@@ -223,7 +215,7 @@ def _agreeing(
     moved = other
     for one in found:
         # Where the frame would be in the base's map.
-        carried = _carried(other, other[one.later - first], compose(poses[one.earlier], one.relative))
+        carried = moved_rigidly(other, other[one.later - first], compose(poses[one.earlier], one.relative))
         kept = []
         for r in found:
             seen = relative_pose(poses[r.earlier], carried[r.later - first]) - r.relative
@@ -235,16 +227,6 @@ def _agreeing(
         if len(kept) > len(best):
             best, moved = kept, carried
     return best, moved
-
-
-def _carried(
-    poses: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"], to: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Move poses rigidly so that ``place`` comes to lie at ``to``."""
-    turn = to[2] - place[2]
-    c, s = np.cos(turn), np.sin(turn)
-    xy = (poses[:, :2] - place[:2]) @ np.array([[c, s], [-s, c]]) + to[:2]
-    return np.column_stack([xy, poses[:, 2] + turn])
 
 
 def _together(a: Scans, b: Scans) -> Scans:

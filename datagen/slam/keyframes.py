@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.slam.track import CommandedMotion
 from lanenet.data.segments import equal_runs, true_runs
+from lanenet.geometry.poses import between_on_arc
 
 #: Way per frame below which a car crawls, and from one key frame to the next, in camera heights.
 _CRAWL_HEIGHTS, _KEY_HEIGHTS = 0.075, 0.15
@@ -107,16 +108,7 @@ def poses_between(
         Poses of all frames; those of the key frames as they were.
     """
     before, share = _places(keys, ways)
-    start, step = poses[before], np.diff(poses, axis=0)[before]
-    turn = step[:, 2]
-    # The chord of a part of an arc is turned by half of the rest of it, and as much shorter as the sines.
-    sine = np.sin(0.5 * turn)
-    straight = np.abs(sine) < 1e-9
-    length = np.where(straight, share, np.sin(0.5 * share * turn) / np.where(straight, 1.0, sine))
-    back = 0.5 * (share - 1.0) * turn
-    c, s = length * np.cos(back), length * np.sin(back)
-    xy = start[:, :2] + np.column_stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]])
-    between = np.column_stack([xy, start[:, 2] + share * turn])
+    between = between_on_arc(poses[before], poses[before + 1], share)
     between[keys] = poses
     return between
 

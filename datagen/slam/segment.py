@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.settings import MapSettings
-from datagen.slam.adjustment.adjust import BundleResult, adjust
+from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, Observations, adjust
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import commands_between, key_frames, key_pairs, poses_between, values_between
@@ -21,17 +21,17 @@ from datagen.slam.loops.places import (
     Revisit,
     consistent_revisits,
     match_places,
-    path_lengths,
     propose_revisits,
     thumbnails,
 )
 from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
 from datagen.slam.odometry.far_view import far_turns
 from datagen.slam.odometry.scans import Progress, Scans, scans_of
-from datagen.slam.seen import SeenDrive, SeenRoad, road_edges, see_drive
+from datagen.slam.seen import SeenDrive, road_edges, see_drive
 from datagen.slam.track import CommandedMotion, SteeringFit, commands_of, fit_steering, track
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import path_lengths
 
 #: What the open loop can tell of the camera; the focal length runs away before the loop is closed.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
@@ -121,10 +121,9 @@ def solve_frames(
         progress, far_turns(drive, camera),
     )  # fmt: skip
     free = _OPEN_LOOP if find_camera else ()
-    opened = adjust(
-        road.edges, trajectory.poses, camera, settings.bundle, rng, free,
-        expected=commands.relative_ways, believed=believed, keep=road.keep, recorded=commands.speed_known,
-    )  # fmt: skip
+    observed = Observations(road.edges, road.keep, commands.relative_ways, commands.speed_known)
+    start = BundleEstimate.level(trajectory.poses, camera)
+    opened = adjust(observed, start, settings.bundle, rng, free, prior_camera=believed)
     scans = scans_of(road.edges, opened.camera, limits, opened.tilt)
     pairs = propose_revisits(thumbnails(drive), opened.poses, height, settings.revisits)
     found = [
@@ -132,28 +131,24 @@ def solve_frames(
         for pair in pairs
     ]
     matched = [revisit for revisit in found if revisit is not None]
-    closure = _close(road, opened, matched, settings, rng, free, commands, believed)
+    closure = _close(observed, opened, matched, settings, rng, free, believed)
     if closure is not None and not find_camera:
         # Pictures that outvote a revisit are still pulled by it.
         true = borne_out(closure.bundle.poses, closure.revisits, height)
         if settings.revisits.min_revisits <= len(true) < len(closure.revisits):
-            again = _closed_by(
-                true, closure.drift_rad_per_cm, road, opened, settings, rng, free, commands, believed
-            )
+            drift = closure.drift_rad_per_cm
+            again = _closed_by(true, drift, observed, opened, settings, rng, free, believed)
             closure = again or closure
     bundle = opened if closure is None else closure.bundle
     if closure is not None and find_camera:
         for _ in range(_MAX_CAMERA_ROUNDS):
             # A camera that has changed sees other edges on the road.
             road = road_edges(drive, bundle.camera, limits, settings)
+            observed = replace(observed, edges=road.edges, keep=road.keep)
             before = bundle.camera.K[0, 0]
             true = borne_out(bundle.poses, closure.revisits, height)
             loops = loop_pairs(true, len(drive)) + side_by_side(bundle.poses, height, settings.revisits)
-            bundle = adjust(
-                road.edges, bundle.poses, bundle.camera, settings.bundle, rng,
-                loops=loops, tilt=bundle.tilt, expected=commands.relative_ways, believed=believed,
-                keep=road.keep, recorded=commands.speed_known,
-            )  # fmt: skip
+            bundle = adjust(observed, bundle, settings.bundle, rng, loops=loops, prior_camera=believed)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
     if closure is not None:
@@ -181,13 +176,12 @@ class _Closure:
 
 
 def _close(
-    road: SeenRoad,
+    observed: Observations,
     opened: BundleResult,
     matched: list[Revisit],
     settings: MapSettings,
     rng: np.random.Generator,
     free: Sequence[str],
-    commands: CommandedMotion,
     believed: Camera,
 ) -> _Closure | None:
     """Close the loops in every way that explains the revisits; the map in which frames agree best wins."""
@@ -199,7 +193,7 @@ def _close(
         for group in [supported, explained][: 1 + (len(supported) > len(explained))]:
             left = without_contradicted(opened.poses, group, height)
             revisits = left if len(left) >= settings.revisits.min_revisits else group
-            closure = _closed_by(revisits, drift, road, opened, settings, rng, free, commands, believed)
+            closure = _closed_by(revisits, drift, observed, opened, settings, rng, free, believed)
             if closure is not None:
                 if best is None or closure.bundle.misfit < best.bundle.misfit:
                     best = closure
@@ -210,12 +204,11 @@ def _close(
 def _closed_by(
     revisits: list[Revisit],
     drift: float,
-    road: SeenRoad,
+    observed: Observations,
     opened: BundleResult,
     settings: MapSettings,
     rng: np.random.Generator,
     free: Sequence[str],
-    commands: CommandedMotion,
     believed: Camera,
 ) -> _Closure | None:
     """Close the loops with these revisits; None where they do not meet, or frames agree less with them."""
@@ -225,10 +218,7 @@ def _closed_by(
     if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
         return None
     loops = loop_pairs(revisits, len(poses))
-    closed = adjust(
-        road.edges, poses, opened.camera, settings.bundle, rng, free, loops, opened.tilt,
-        expected=commands.relative_ways, believed=believed, keep=road.keep, recorded=commands.speed_known,
-    )  # fmt: skip
+    closed = adjust(observed, replace(opened, poses=poses), settings.bundle, rng, free, loops, believed)
     return _Closure(revisits, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
 
@@ -323,11 +313,9 @@ def _with_frames_between(
         # Those that the key frames' map contradicts would pull again.
         true = borne_out(poses, revisits, height)
         pairs += loop_pairs(true, len(drive)) + side_by_side(poses, height, settings.revisits)
-    bundle = adjust(
-        road.edges, poses, camera, settings.bundle, rng, (), pairs,
-        values_between(solved.bundle.tilt, keys, ways), expected=commands.relative_ways, keep=road.keep,
-        recorded=commands.speed_known,
-    )  # fmt: skip
+    observed = Observations(road.edges, road.keep, commands.relative_ways, commands.speed_known)
+    start = BundleEstimate(poses, values_between(solved.bundle.tilt, keys, ways), camera)
+    bundle = adjust(observed, start, settings.bundle, rng, (), pairs)
     opened, t = poses_between(solved.open_poses, keys, ways), solved.trajectory
     # How well a key frame matched goes for those before it.
     after = np.searchsorted(keys, np.arange(len(drive)))

@@ -24,7 +24,6 @@ from datagen.pipeline import map_drive
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory, run_filter
-from datagen.slam.loops.places import path_lengths
 from datagen.slam.odometry.image_pairs import Pictures
 from datagen.slam.odometry.odometry import Evidence
 from datagen.slam.odometry.scans import scans_of
@@ -36,6 +35,7 @@ from lanenet.data.maps.folder import SETTINGS_NAME
 from lanenet.data.maps.mapped_drive import MappedDrive, open_mapped_drive
 from lanenet.errors import LanenetError
 from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import path_lengths
 
 LIKELIHOODS = ("direction", "count")
 #: What counts as the same place: least way between the visits, most distance [camera heights], heading [rad].

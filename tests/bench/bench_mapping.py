@@ -24,7 +24,6 @@ import numpy as np
 from datagen.labels.truth import true_lines
 from datagen.pipeline import map_drive
 from datagen.settings import MapSettings
-from datagen.slam.loops.places import path_lengths
 from datagen.slam.odometry.stillness import following_frames
 from datagen.world.road.track_settings import preset_names
 from datagen.world.simulate import simulate_drive
@@ -36,6 +35,7 @@ from lanenet.data.trajectory import read_tum
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
+from lanenet.geometry.poses import path_lengths
 
 CAMERAS: tuple[dict[str, Any], ...] = (
     {},

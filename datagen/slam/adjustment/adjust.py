@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
-from datagen.slam.adjustment.problem import BundleProblem
-from datagen.slam.adjustment.state import CAMERA_NAMES, BundleSettings, start_state
+from datagen.slam.adjustment.problem import BundleProblem, Observations
+from datagen.slam.adjustment.state import CAMERA_NAMES, BundleEstimate, BundleSettings, start_state
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
 
-__all__ = ["CAMERA_NAMES", "BundleResult", "BundleSettings", "adjust"]
+__all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "Observations", "adjust"]
 
 #: Share added to the diagonal. A drive bends as a whole by next to nothing in any one frame: with 1e-4 an
 #: error of every turn alike is still there after all rounds.
@@ -25,13 +24,10 @@ _DAMPING = 1e-8
 
 
 @dataclass(frozen=True)
-class BundleResult:
+class BundleResult(BundleEstimate):
     """What the adjustment found.
 
     Attributes:
-        poses: Rear-axle poses, frame map, in the camera's unit of length.
-        tilt: Pitch and roll of each frame beyond the camera's, [rad].
-        camera: The adjusted camera.
         sigma: Standard deviation of each of the camera's numbers (see ``CAMERA_NAMES``; focal relative); 0
             of those that stayed.
         residual_px: Residuals of the last round.
@@ -40,9 +36,6 @@ class BundleResult:
         pairs: Number of pairs of frames.
     """
 
-    poses: Float[np.ndarray, "n 3"]
-    tilt: Float[np.ndarray, "n 2"]
-    camera: Camera
     sigma: dict[str, float]
     residual_px: Float[np.ndarray, "r"]
     misfit: float
@@ -55,46 +48,34 @@ class BundleResult:
 
 
 def adjust(
-    edges: Sequence[EdgePixels],
-    poses: Float[np.ndarray, "n 3"],
-    camera: Camera,
+    observed: Observations,
+    start: BundleEstimate,
     settings: BundleSettings,
     rng: np.random.Generator,
     free: Sequence[str] = CAMERA_NAMES,
     loops: Sequence[tuple[int, int]] = (),
-    tilt: Float[np.ndarray, "n 2"] | None = None,
-    breaks: Bool[np.ndarray, "n"] | None = None,
-    expected: Float[np.ndarray, "n"] | None = None,
-    believed: Camera | None = None,
-    keep: UInt8[np.ndarray, "h w"] | None = None,
-    recorded: bool = False,
+    prior_camera: Camera | None = None,
 ) -> BundleResult:
     """Adjust poses, tilts and the camera.
 
     Args:
-        edges: Edge pixels per frame, only such that see the road.
-        poses: Start, rear axle, [cm], frame map.
-        camera: Start; its height sets the scale and stays.
-        settings: Priors.
-        rng: Draws the points that are moved.
+        observed: What the frames show, and what was commanded.
+        start: Estimate to start from, such as an earlier result; the height of its camera sets the scale and
+            stays.
+        settings: Priors and robustness.
+        rng: Draws the edge points that are compared.
         free: Names of the camera's numbers that may change.
         loops: More pairs of frames that show the same place.
-        tilt: Start of the frames' tilts; None for level.
-        breaks: Frames that do not follow the one before them.
-        expected: Commanded way from the frame before, 1 where it is usual; None for the same all along.
-        believed: Camera about which the priors lie; None for the start. Rounds that each begin where the one
-            before ended would walk away from it otherwise.
-        keep: Pixels in which edges were looked for; None for all.
-        recorded: Whether the commanded ways come from a recorded speed.
+        prior_camera: Centre of the camera's priors; None for the camera of the start. Where each round starts
+            from the result of the last one, the camera would otherwise drift away from what is known of it.
 
     Returns:
         The adjusted drive.
     """
-    problem = BundleProblem(
-        edges, camera, settings, rng, free, loops, breaks, expected, believed, keep, recorded
-    )
+    camera = start.camera
+    problem = BundleProblem(observed, camera, settings, rng, free, loops, prior_camera)
     height = camera.mounting.height_cm
-    state = start_state(poses, tilt, camera)
+    state = start_state(start)
     for gate_px in settings.gates_px:
         links = problem.associate(state, gate_px)
         damping = _DAMPING

@@ -228,25 +228,42 @@ class Links:
     pair_starts: Int[np.ndarray, "p1"]
 
 
+@dataclass(frozen=True)
+class Observations:
+    """What the frames of a drive show, and what was commanded: the same for every adjustment of them.
+
+    Attributes:
+        edges: Edge pixels per frame, only such that see the road.
+        keep: Pixels in which edges were looked for; None for all.
+        relative_steps: Commanded step length to each frame, 1 where it is typical; None for
+            steps of equal length.
+        speed_recorded: Whether these come from a recorded speed.
+        breaks: Frames that do not follow the one before them; None for one segment.
+    """
+
+    edges: Sequence[EdgePixels]
+    keep: UInt8[np.ndarray, "h w"] | None = None
+    relative_steps: Float[np.ndarray, "n"] | None = None
+    speed_recorded: bool = False
+    breaks: Bool[np.ndarray, "n"] | None = None
+
+
 class BundleProblem:
     """Points, edges and pairs of frames, which stay; see :func:`datagen.slam.adjustment.adjust.adjust`."""
 
     def __init__(
         self,
-        edges: Sequence[EdgePixels],
+        observed: Observations,
         camera: Camera,
         settings: BundleSettings,
         rng: np.random.Generator,
         free: Sequence[str] = CAMERA_NAMES,
         loops: Sequence[tuple[int, int]] = (),
-        breaks: Bool[np.ndarray, "n"] | None = None,
-        expected: Float[np.ndarray, "n"] | None = None,
-        believed: Camera | None = None,
-        keep: UInt8[np.ndarray, "h w"] | None = None,
-        recorded: bool = False,
+        prior_camera: Camera | None = None,
     ) -> None:
+        edges, breaks = observed.edges, observed.breaks
         self.settings, self.camera, self.n = settings, camera, len(edges)
-        self.believed = camera if believed is None else believed
+        self.prior_camera = camera if prior_camera is None else prior_camera
         self.fisheye = camera.model == "fisheye"
         self.free = np.array([name in free for name in CAMERA_NAMES])
         counts = np.array([len(e.uv_px) for e in edges])
@@ -265,12 +282,13 @@ class BundleProblem:
         self.edge_uv, self.edge_normals = edge_uv[by_row], edge_normals[by_row]
         segment = np.zeros(self.n, int) if breaks is None else np.cumsum(breaks)
         self.pairs = _pairs(settings.lags, segment, loops, rng)
-        self.inner = inner_pixels(camera, keep)
+        self.inner = inner_pixels(camera, observed.keep)
         self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         self.weight = np.full(len(self.uv), 1.0 / settings.pixel_sigma**2)
-        self.recorded = recorded
-        self.expected = np.ones(self.n) if expected is None else expected
+        self.recorded = observed.speed_recorded
+        steps = observed.relative_steps
+        self.expected = np.ones(self.n) if steps is None else steps
         self._lifted: tuple[BundleState, _Lifted] | None = None
         self.pattern = FramePattern(self.pairs, self.n)
         scale = camera.width / 160.0
@@ -370,7 +388,7 @@ class BundleProblem:
         prior_cost, prior, downhill = frame_priors(
             state, self.settings, self.joined, self.expected, self.recorded
         )
-        off = (state.camera_off(self.believed) / self.camera_sigmas)[self.free]
+        off = (state.camera_off(self.prior_camera) / self.camera_sigmas)[self.free]
         camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(self.free, self.free)]
         camera_rhs = rhs[:, both:].sum(axis=0)[self.free] - off / self.camera_sigmas[self.free]
         return Equations(

@@ -20,6 +20,26 @@ CAMERA_NAMES = ("focal", "cx", "cy", "k1", "pitch", "roll", "yaw", "lever")
 
 
 @dataclass(frozen=True)
+class BundleEstimate:
+    """Poses, tilts and camera of a drive: where an adjustment starts, and what it ends with.
+
+    Attributes:
+        poses: Rear-axle poses, [cm], [cm], [rad], frame map, in the scale of the camera's height.
+        tilt: Pitch and roll of each frame beyond the camera's, [rad].
+        camera: The camera.
+    """
+
+    poses: Float[np.ndarray, "n 3"]
+    tilt: Float[np.ndarray, "n 2"]
+    camera: Camera
+
+    @staticmethod
+    def level(poses: Float[np.ndarray, "n 3"], camera: Camera) -> BundleEstimate:
+        """Return an estimate in which no frame is tilted."""
+        return BundleEstimate(poses, np.zeros((len(poses), 2)), camera)
+
+
+@dataclass(frozen=True)
 class BundleState:
     """Lengths in camera heights.
 
@@ -79,13 +99,10 @@ def numbers_of(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray
     return lens, mount
 
 
-def start_state(
-    poses_cm: Float[np.ndarray, "n 3"], tilt: Float[np.ndarray, "n 2"] | None, camera: Camera
-) -> BundleState:
-    """Begin at these poses, [cm], and tilts; None for level."""
-    height = camera.mounting.height_cm
-    tilt = np.zeros((len(poses_cm), 2)) if tilt is None else tilt
-    return BundleState(poses_cm / [height, height, 1.0], tilt, *numbers_of(camera))
+def start_state(start: BundleEstimate) -> BundleState:
+    """Return the state at an estimate."""
+    height = start.camera.mounting.height_cm
+    return BundleState(start.poses / [height, height, 1.0], start.tilt, *numbers_of(start.camera))
 
 
 class BundleSettings(Settings):

@@ -16,8 +16,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from datagen.slam.loops.places import Revisit, RevisitSettings, path_lengths, relative_pose
+from datagen.slam.loops.places import Revisit, RevisitSettings
 from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import compose, path_lengths, relative_pose
 
 #: What two revisits may miss of each other: in camera heights, as a share of the way between them, which the
 #: open loop drifts over, and in heading.
@@ -151,10 +152,3 @@ def _off(poses: Float[np.ndarray, "n 3"], a: Revisit, b: Revisit) -> tuple[float
     second = compose(a.relative, relative_pose(poses[a.later], poses[b.later]))
     x, y, turn = first - second
     return float(np.hypot(x, y)), abs(float(wrap_angle(np.array([turn]))[0]))
-
-
-def compose(pose: Float[np.ndarray, "3"], relative: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Pose that is seen at ``relative`` from ``pose``."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y, turn = relative
-    return np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + turn])

@@ -15,6 +15,7 @@ from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pic
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
+from lanenet.geometry.poses import path_lengths, relative_pose
 
 #: Heading per lap that an open loop misses which is good.
 _SMALL_DRIFT_RAD = 0.6
@@ -149,11 +150,6 @@ def diagonal_mean(similarity: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n 
     return np.asarray(cv2.filter2D(similarity, -1, kernel / len(kernel), borderType=cv2.BORDER_REPLICATE))
 
 
-def path_lengths(poses: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n"]:
-    """Length of the path up to each pose or point, [cm]."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-
-
 def consistent_revisits(
     poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], settings: RevisitSettings
 ) -> list[tuple[list[Revisit], float]]:
@@ -269,13 +265,6 @@ def match_places(
         grid[0] = best
         spread = spread * 0.35
     return Revisit(earlier, later, best, share) if share >= settings.min_match else None
-
-
-def relative_pose(origin: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return ``pose`` as seen from ``origin``: x ahead, y left, heading difference in (-pi, pi]."""
-    c, s = np.cos(origin[2]), np.sin(origin[2])
-    dx, dy = pose[0] - origin[0], pose[1] - origin[1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy, wrap_angle(pose[2:] - origin[2:])[0]])
 
 
 def _submap(

@@ -5,15 +5,14 @@ Pairs of frames that show the same place, for the adjustment of all frames toget
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
-from datagen.slam.loops.places import Revisit, RevisitSettings, path_lengths, relative_pose
+from datagen.slam.loops.places import Revisit, RevisitSettings
 from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import path_lengths, relative_pose
 
 _ITERATIONS = 12
 #: Weight of the motion across a break, which is known from nothing; not zero, so that all stays determined.
@@ -46,7 +45,7 @@ def close_loops(
     """
     if not revisits:
         return poses, np.empty((0, 3))
-    odometry = np.array([relative_pose(a, b) for a, b in pairwise(poses)])
+    odometry = relative_pose(poses[:-1], poses[1:])
     # How far the motion to each frame can be trusted, 1 for what the drive has seen.
     trust = np.ones(len(odometry)) if breaks is None else np.where(breaks[1:], _ACROSS_BREAK, 1.0)
     closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits, trust))
@@ -112,7 +111,7 @@ def missed_by(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float
     """What each revisit misses with these poses: ahead and to the left, [cm], and in heading, [rad]."""
     if not revisits:
         return np.empty((0, 3))
-    seen = np.array([relative_pose(poses[r.earlier], poses[r.later]) for r in revisits])
+    seen = relative_pose(poses[[r.earlier for r in revisits]], poses[[r.later for r in revisits]])
     residual = seen - np.array([r.relative for r in revisits])
     residual[:, 2] = wrap_angle(residual[:, 2])
     return residual

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32
 
 from datagen.world.compiled import compiled_bare
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import arc_chord
 
 NEAR_CM = 250.0  # markings and things on the floor are painted up to here
 WALL_CM = 450.0  # the floor ends here
@@ -256,11 +257,9 @@ def row_poses(
     """
     at_s = readout_s * (np.arange(height) / max(height - 1, 1) - 0.5)
     turn = yaw_rate_rad_s * at_s
-    chord_cm = speed_cm_s * at_s * np.sinc(0.5 * turn / np.pi)
-    direction, heading = heading_rad + 0.5 * turn, heading_rad + turn
-    return np.stack(
-        [chord_cm * np.cos(direction), chord_cm * np.sin(direction), np.cos(heading), np.sin(heading)], axis=1
-    )
+    heading = heading_rad + turn
+    chord_cm = arc_chord(heading_rad, speed_cm_s * at_s, turn)
+    return np.column_stack([chord_cm, np.cos(heading), np.sin(heading)])
 
 
 def shake_rotation(pitch_down_rad: float, roll_rad: float) -> Float[np.ndarray, "3 3"]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import rows_of_polyline
+from lanenet.geometry.poses import arc_chord
 
 _MIN_INTERRUPTION_CM = 10.0
 _FLAKE_CM = 1.5  # mean length of what flakes off a worn line
@@ -235,10 +236,8 @@ class Track:
         lap, i = self._nearest_sample(s_cm)
         along_cm = s_cm - lap * self.length_cm - float(self.s_cm[i])
         turn = float(self.curvature_per_cm[i]) * along_cm
-        direction = float(self.heading_rad[i]) + 0.5 * turn
         heading = float(self.heading_rad[i]) + turn
-        chord_cm = along_cm * float(np.sinc(0.5 * turn / np.pi))
-        xy_cm = self.xy_cm[i] + chord_cm * np.array([np.cos(direction), np.sin(direction)])
+        xy_cm = self.xy_cm[i] + arc_chord(float(self.heading_rad[i]), along_cm, turn)
         return xy_cm + offset_cm * np.array([-np.sin(heading), np.cos(heading)]), heading
 
     def points(
@@ -250,11 +249,7 @@ class Track:
         along_cm = s_cm - (i if self.closed else index) * self.step_cm
         turn = self.curvature_per_cm[index] * along_cm
         heading = self.heading_rad[index] + turn
-        direction = heading - 0.5 * turn
-        chord_cm = along_cm * np.sinc(0.5 * turn / np.pi)
-        xy_cm = self.xy_cm[index] + chord_cm[:, None] * np.stack(
-            [np.cos(direction), np.sin(direction)], axis=1
-        )
+        xy_cm = self.xy_cm[index] + arc_chord(self.heading_rad[index], along_cm, turn)
         return xy_cm + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1), heading
 
     def nearest(

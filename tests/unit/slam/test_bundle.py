@@ -8,10 +8,10 @@ from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixe
 from tape_road import tape_road
 
 from datagen.slam.adjustment import problem as bundle_problem
-from datagen.slam.adjustment.adjust import BundleSettings, adjust
+from datagen.slam.adjustment.adjust import BundleEstimate, BundleSettings, Observations, adjust
 from datagen.slam.adjustment.problem import BundleProblem, frame_priors, inner_pixels, point_trust
 from datagen.slam.adjustment.state import start_state
-from datagen.slam.loops.places import path_lengths
+from lanenet.geometry.poses import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
 SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))
@@ -33,7 +33,9 @@ def test_drifted_poses_come_back(model, seed, way, turn_rad):
     road = tape_road(70)
     start = drifted(road.poses, way, turn_rad)
     assert _error(start, road.poses) > 0.03
-    found = adjust(pixels(road, camera), start, camera, SMALL, _rng(seed), free=())
+    found = adjust(
+        Observations(pixels(road, camera)), BundleEstimate.level(start, camera), SMALL, _rng(seed), free=()
+    )
     assert _error(found.poses, road.poses) < 1e-3
     assert np.abs(found.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(0.1)
     np.testing.assert_allclose(found.poses[0], road.poses[0], atol=1e-3)
@@ -46,15 +48,16 @@ def test_drifted_poses_come_back(model, seed, way, turn_rad):
 def test_nods_of_each_frame_come_back(seed):
     camera, road, rng = fisheye(), tape_road(70), _rng(seed)
     tilt = rng.normal(size=(70, 2)) * [0.012, 0.005]
-    edges = pixels(road, camera, tilt)
-    found = adjust(edges, drifted(road.poses, 0.02, 0.001), camera, SMALL, rng, free=())
+    observed = Observations(pixels(road, camera, tilt))
+    start = BundleEstimate.level(drifted(road.poses, 0.02, 0.001), camera)
+    found = adjust(observed, start, SMALL, rng, free=())
     for k in (0, 1):
         assert np.corrcoef(found.tilt[5:, k], tilt[5:, k])[0, 1] > 0.98
         assert np.std(found.tilt[5:, k] - tilt[5:, k]) < 1e-3
     assert _error(found.poses, road.poses) < 2e-3
     # Without the frames' own tilt the same edges do not agree.
     stiff = SMALL.model_copy(update={"frame_pitch": 1e-6, "frame_roll": 1e-6})
-    worse = adjust(edges, drifted(road.poses, 0.02, 0.001), camera, stiff, _rng(seed), free=())
+    worse = adjust(observed, start, stiff, _rng(seed), free=())
     assert worse.misfit > 1.5 * found.misfit and worse.robust_sd_px > 2.0 * found.robust_sd_px
 
 
@@ -64,14 +67,15 @@ def test_a_break_is_not_bridged(seed):
     edges = pixels(road, camera)
     breaks = np.zeros(80, dtype=bool)
     breaks[40] = True
-    problem = BundleProblem(edges, camera, SMALL, _rng(seed), breaks=breaks)
+    observed = Observations(edges, breaks=breaks)
+    problem = BundleProblem(observed, camera, SMALL, _rng(seed))
     first = problem.pairs.min(axis=1)
     assert not ((first < 40) & (problem.pairs.max(axis=1) >= 40)).any()
     assert len(problem.pairs) == 2 * sum(40 - lag for lag in SMALL.lags)
     # Put down a metre away: both pieces come back, each as it lies.
     start = drifted(road.poses, 0.02, 0.001)
     start[40:] = drifted(road.poses[40:], 0.02, 0.001) + [100.0, 60.0, 0.0]
-    found = adjust(edges, start, camera, SMALL, _rng(seed), free=(), breaks=breaks)
+    found = adjust(observed, BundleEstimate.level(start, camera), SMALL, _rng(seed), free=())
     lay = found.poses[40] - road.poses[40]
     assert np.linalg.norm(lay[:2] - [100.0, 60.0]) < 2.0
     assert _error(found.poses[:40], road.poses[:40]) < 1e-3
@@ -105,8 +109,9 @@ def test_noise_that_stays_in_the_picture_does_not_hold_the_car_back(monkeypatch,
     ]
 
     def error() -> float:
-        start, settings = drifted(road.poses, 0.02, 0.001), BundleSettings(points=80)
-        return _error(adjust(noisy, start, camera, settings, _rng(seed), free=()).poses, road.poses)
+        start = BundleEstimate.level(drifted(road.poses, 0.02, 0.001), camera)
+        found = adjust(Observations(noisy), start, BundleSettings(points=80), _rng(seed), free=())
+        return _error(found.poses, road.poses)
 
     trusting_some = error()
     assert trusting_some < 3e-3
@@ -123,8 +128,8 @@ def test_what_falls_on_the_rim_of_what_is_seen_looks_for_no_edge():
     edges = pixels(road, camera)[:1] * 2
     where = []
     for known in (keep, None):
-        problem = BundleProblem(edges, camera, SMALL, _rng(), keep=known)
-        state = start_state(road.poses[[0, 0]], None, camera)
+        problem = BundleProblem(Observations(edges, known), camera, SMALL, _rng())
+        state = start_state(BundleEstimate.level(road.poses[[0, 0]], camera))
         where.append(problem.uv[problem.associate(state, 5.0).point, 1])
     assert len(where[0]) > 10 and where[0].min() > 55.5 and where[0].max() < 93.5
     assert len(where[1]) > len(where[0])
@@ -144,8 +149,9 @@ def test_pixels_at_the_rim_are_no_inner_ones():
 
 def test_the_same_seed_gives_the_same_and_another_nearly():
     camera, road = fisheye(), tape_road(30)
-    edges, start = pixels(road, camera), drifted(road.poses, 0.02, 0.001)
-    one, same, other = (adjust(edges, start, camera, SMALL, _rng(seed)) for seed in (3, 3, 4))
+    observed = Observations(pixels(road, camera))
+    start = BundleEstimate.level(drifted(road.poses, 0.02, 0.001), camera)
+    one, same, other = (adjust(observed, start, SMALL, _rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.poses, same.poses)
     np.testing.assert_array_equal(one.residual_px, same.residual_px)
     assert one.camera.hash == same.camera.hash
@@ -161,7 +167,8 @@ def test_a_mirrored_world_gives_the_mirrored_result():
     seen = pixels(road.mirrored(), other)
     np.testing.assert_allclose(seen[0].uv_px, edges[0].uv_px * [-1.0, 1.0] + [159.0, 0.0], atol=1e-9)
     here, there = (
-        adjust(e, p, c, SMALL, _rng(1)) for e, p, c in ((edges, start, camera), (seen, start * flip, other))
+        adjust(Observations(e), BundleEstimate.level(p, c), SMALL, _rng(1))
+        for e, p, c in ((edges, start, camera), (seen, start * flip, other))
     )
     np.testing.assert_allclose(there.poses * flip, here.poses, atol=0.01)
     np.testing.assert_allclose(there.tilt * [1.0, -1.0], here.tilt, atol=1e-4)
@@ -180,14 +187,15 @@ def test_ways_follow_the_commands_where_the_pictures_are_silent(command):
     expected = np.ones(30)
     expected[15:18] = command
     settings = SMALL.model_copy(update={"lags": (1,), "speed_change": 1e-4})
-    found = adjust(edges, road.poses, camera, settings, _rng(), free=(), expected=expected)
+    observed = Observations(edges, relative_steps=expected)
+    found = adjust(observed, BundleEstimate.level(road.poses, camera), settings, _rng(), free=())
     way = np.diff(path_lengths(found.poses))
     np.testing.assert_allclose(way[14:17] / np.median(way[:12]), command, rtol=0.02)
 
 
 def _prior(poses: np.ndarray, expected: np.ndarray, recorded: bool) -> tuple[float, np.ndarray]:
     """Cost of what is believed of the frames, and its downhill slope by their numbers."""
-    state = start_state(poses, None, fisheye())
+    state = start_state(BundleEstimate.level(poses, fisheye()))
     cost, _, downhill = frame_priors(state, BundleSettings(), np.arange(len(poses) - 1), expected, recorded)
     return cost, downhill
 
@@ -230,6 +238,7 @@ def test_the_slope_of_the_prior_of_a_recorded_speed():
 
 def test_the_gain_of_a_recorded_speed_is_left_to_the_pictures():
     camera, road = fisheye(), tape_road(60)
-    start = drifted(road.poses, 0.03, 0.0)
-    found = adjust(pixels(road, camera), start, camera, SMALL, _rng(), free=(), recorded=True)
+    observed = Observations(pixels(road, camera), speed_recorded=True)
+    start = BundleEstimate.level(drifted(road.poses, 0.03, 0.0), camera)
+    found = adjust(observed, start, SMALL, _rng(), free=())
     assert _error(found.poses, road.poses) < 1e-3

@@ -7,7 +7,7 @@ import pytest
 from pixel_road import camera_numbers, fisheye, pixels, tape_loop
 from tape_road import TapeRoad, tape_road
 
-from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings, adjust
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleEstimate, BundleSettings, Observations, adjust
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
 SMALL = BundleSettings(points=40, pixel_sigma=0.3, gates_px=(5.0, 4.0, 3.0, 2.0, 1.0, 1.0))
@@ -33,7 +33,13 @@ def test_a_wrong_camera_comes_back_when_the_loop_is_closed(seed):
         ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + 1.5,
     )
     wrong.K[:2, :2] *= 1.05
-    found = adjust(pixels(road, camera), road.poses, wrong, SMALL, _rng(seed), loops=loops)
+    found = adjust(
+        Observations(pixels(road, camera)),
+        BundleEstimate.level(road.poses, wrong),
+        SMALL,
+        _rng(seed),
+        loops=loops,
+    )
     f = found.camera
     assert f.K[0, 0] == pytest.approx(camera.K[0, 0], rel=0.005)
     assert f.K[1, 1] / f.K[0, 0] == pytest.approx(camera.K[1, 1] / camera.K[0, 0])
@@ -51,7 +57,13 @@ def test_a_wrong_camera_comes_back_when_the_loop_is_closed(seed):
 @pytest.mark.parametrize("free", [(), ("pitch", "yaw"), ("focal", "k1")])
 def test_what_is_not_free_stays(free):
     camera, road = fisheye(pitch_down_rad=0.29, yaw_rad=-0.03), tape_road(30)
-    found = adjust(pixels(road, fisheye()), road.poses, camera, SMALL, _rng(), free=free)
+    found = adjust(
+        Observations(pixels(road, fisheye())),
+        BundleEstimate.level(road.poses, camera),
+        SMALL,
+        _rng(),
+        free=free,
+    )
     moved = np.abs(camera_numbers(found.camera) - camera_numbers(camera))
     for k, name in enumerate(CAMERA_NAMES):
         if name in free:

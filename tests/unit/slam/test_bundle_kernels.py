@@ -11,8 +11,8 @@ from tape_road import HEIGHT_CM, tape_road
 
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
 from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_slopes, set_view
-from datagen.slam.adjustment.problem import BundleProblem
-from datagen.slam.adjustment.state import start_state
+from datagen.slam.adjustment.problem import BundleProblem, Observations
+from datagen.slam.adjustment.state import BundleEstimate, start_state
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgePixels
 
@@ -25,12 +25,13 @@ STEPS = np.array([1e-4, 1e-2, 1e-2, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4])
 
 
 def _problem(camera: Camera, frames: int = 2) -> BundleProblem:
-    return BundleProblem(pixels(tape_road(frames), camera), camera, SMALL, np.random.default_rng(0))
+    observed = Observations(pixels(tape_road(frames), camera))
+    return BundleProblem(observed, camera, SMALL, np.random.default_rng(0))
 
 
 def _vectors(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Lens and view."""
-    state, view = start_state(np.zeros((1, 3)), None, camera), np.empty(N_VIEW)
+    state, view = start_state(BundleEstimate.level(np.zeros((1, 3)), camera)), np.empty(N_VIEW)
     set_view(state.mount, 0.0, 0.0, view)
     return state.lens, view
 
@@ -115,7 +116,7 @@ def test_slopes_of_projecting_by_the_point_and_by_the_camera(model, seed):
 def test_derivatives_of_lifting_by_the_camera(model):
     camera = CAMERAS[model]
     problem = _problem(camera)
-    lifted, by, half = problem.lift(start_state(np.zeros((2, 3)), None, camera))
+    lifted, by, half = problem.lift(start_state(BundleEstimate.level(np.zeros((2, 3)), camera)))
     np.testing.assert_allclose(lifted, _ground(camera, problem.uv), atol=1e-6)
     np.testing.assert_allclose(half, _ground(camera, problem.uv + 0.5 * problem.normals), atol=1e-5)
     near = lifted[:, 0] < 6.0
@@ -131,7 +132,7 @@ def test_a_frame_that_nods_is_a_camera_that_is_mounted_so():
     camera = fisheye()
     problem = _problem(camera)
     tilt = np.array([[0.0, 0.0], [0.02, -0.015]])
-    lifted, _, _ = problem.lift(start_state(np.zeros((2, 3)), tilt, camera))
+    lifted, _, _ = problem.lift(start_state(BundleEstimate(np.zeros((2, 3)), tilt, camera)))
     m = camera.mounting
     nodded = camera.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.02, roll_rad=m.roll_rad - 0.015)
     for frame, seen in enumerate((camera, nodded)):
@@ -148,7 +149,7 @@ def test_the_normal_equations_hold_the_slope_of_the_cost(model, seed):
     road = tape_road(frames)
     problem = _problem(camera, frames)
     poses_cm = road.poses + rng.normal(size=(frames, 3)) * [0.01 * HEIGHT_CM, 0.01 * HEIGHT_CM, 0.004]
-    state = start_state(poses_cm, 0.003 * rng.normal(size=(frames, 2)), camera)
+    state = start_state(BundleEstimate(poses_cm, 0.003 * rng.normal(size=(frames, 2)), camera))
     away = np.concatenate([np.zeros(5 * frames), [0.02, 0.3, -0.4, 0.004, 0.003, 0.002, -0.004, 0.05]])
     state = state.moved(away, problem.free)
     links = problem.associate(state, 4.0)
@@ -175,7 +176,7 @@ def test_uncertainty_of_a_link_grows_with_the_stretch(model):
     camera, frames = CAMERAS[model], 6
     road = tape_road(frames)
     problem = _problem(camera, frames)
-    state = start_state(road.poses, None, camera)
+    state = start_state(BundleEstimate.level(road.poses, camera))
     links = problem.associate(state, 2.0)
     pair = np.searchsorted(links.pair_starts, np.arange(len(links.point)), side="right") - 1
     i, j = problem.pairs[pair].T
@@ -200,9 +201,9 @@ def test_an_edge_that_brightens_the_other_way_is_not_met():
     camera = fisheye()
     edges = pixels(tape_road(2), camera)
     turned = EdgePixels(edges[1].uv_px, -edges[1].normals)
-    state = start_state(tape_road(2).poses, None, camera)
+    state = start_state(BundleEstimate.level(tape_road(2).poses, camera))
     met = []
     for second in (edges[1], turned):
-        problem = BundleProblem([edges[0], second], camera, SMALL, np.random.default_rng(0))
+        problem = BundleProblem(Observations([edges[0], second]), camera, SMALL, np.random.default_rng(0))
         met.append(len(problem.associate(state, 0.3).point))
     assert met[0] > 20 and met[1] == 0

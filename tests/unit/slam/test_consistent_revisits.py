@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits, path_lengths
+from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits
+from lanenet.geometry.poses import path_lengths
 
 LAP = 80
 STEP_CM = 5.0

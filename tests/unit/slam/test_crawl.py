@@ -13,12 +13,13 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings, Trajectory
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.places import Revisit, path_lengths
+from datagen.slam.loops.places import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment, _with_frames_between, solve_segment
 from datagen.slam.track import commands_of
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import path_lengths
 
 SMALL = MapSettings(filter=FilterSettings(particles=80, max_points=80), bundle=BundleSettings(points=40))
 STEP_CM, CRAWLED = 0.6, 180

@@ -12,14 +12,15 @@ from pixel_road import fisheye
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.join import Stretch, _agreeing, _carried, frames_text, join_stretches
+from datagen.slam.join import Stretch, _agreeing, frames_text, join_stretches
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.places import Revisit, RevisitSettings, relative_pose
+from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs
 from datagen.slam.seen import SeenRoad, road_edges
 from datagen.slam.segment import solve_segment
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import moved_rigidly, relative_pose
 
 SMALL = MapSettings(
     filter=FilterSettings(particles=80, max_points=80),
@@ -190,7 +191,7 @@ def test_alignments_that_contradict_each_other_do_not_join():
     poses = np.column_stack([np.arange(60.0) * 4.0, np.zeros(60), np.zeros(60)])
     poses[30:, 0] -= 120.0
     # The second stretch lies 80 cm further along the road of the first one, turned by half a radian.
-    true = _carried(poses[30:], poses[30], np.array([80.0, 10.0, 0.5]))
+    true = moved_rigidly(poses[30:], poses[30], np.array([80.0, 10.0, 0.5]))
     right = [Revisit(k, 30 + k, relative_pose(poses[k], true[k]), 0.8) for k in range(0, 30, 4)]
     wrong = [replace(r, relative=r.relative + rng.normal(size=3) * [60.0, 60.0, 1.0]) for r in right[::2]]
     kept, moved = _agreeing(poses, 30, wrong + right, 15.0)

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.mutual import compose, separate_places, with_supported, without_contradicted
-from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits, relative_pose
+from datagen.slam.loops.mutual import separate_places, with_supported, without_contradicted
+from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits
+from lanenet.geometry.poses import compose, relative_pose
 
 HEIGHT_CM, LAP = 15.0, 90
 SETTINGS = RevisitSettings()
@@ -87,12 +88,6 @@ def test_neighbouring_frames_are_one_place():
     assert separate_places(np.array([100.0, 96.0, 104.0, 130.0]), 15.0) == 1
     assert separate_places(np.array([100.0, 96.0, 104.0, 145.0, 400.0]), 15.0) == 3
     assert separate_places(np.empty(0), 15.0) == 0
-
-
-def test_composing_undoes_seeing_from():
-    rng = np.random.default_rng(1)
-    a, b = rng.normal(size=(2, 3))
-    np.testing.assert_allclose(compose(a, relative_pose(a, b)), b, atol=1e-12)
 
 
 def _along(pose: np.ndarray, ahead_cm: float) -> np.ndarray:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from picture_road import made_up_drive
 from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
@@ -15,47 +13,14 @@ from datagen.slam.loops.places import (
     alike,
     diagonal_mean,
     match_places,
-    path_lengths,
     propose_revisits,
-    relative_pose,
     thumbnails,
 )
 from datagen.slam.odometry.scans import Scans, pack_scans
+from lanenet.geometry.poses import compose, path_lengths
 from lanenet.perception.edges.road import RoadEdges
 
 LAP = 100
-POSE = st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-20.0, 20.0)).map(np.array)
-
-
-def _placed(origin: np.ndarray, relative: np.ndarray) -> np.ndarray:
-    c, s = np.cos(origin[2]), np.sin(origin[2])
-    x, y, turn = relative
-    return np.array([origin[0] + c * x - s * y, origin[1] + s * x + c * y, origin[2] + turn])
-
-
-@settings(max_examples=80, deadline=None)
-@given(POSE, POSE)
-def test_relative_pose_round_trip(origin, pose):
-    relative = relative_pose(origin, pose)
-    assert -np.pi < relative[2] <= np.pi
-    back = _placed(origin, relative)
-    np.testing.assert_allclose(back[:2], pose[:2], atol=1e-9)
-    assert np.cos(back[2] - pose[2]) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_relative_pose_is_ahead_then_left():
-    origin = np.array([10.0, 20.0, np.pi / 2.0])
-    for pose, expected in (
-        ([10.0, 25.0, np.pi], [5.0, 0.0, np.pi / 2.0]),
-        ([7.0, 20.0, np.pi / 2.0], [0.0, 3.0, 0.0]),
-        ([10.0, 20.0, 0.0], [0.0, 0.0, -np.pi / 2.0]),
-    ):
-        np.testing.assert_allclose(relative_pose(origin, np.array(pose)), expected, atol=1e-12)
-
-
-def test_path_lengths_add_up():
-    poses = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [3.0, 4.0, 2.0], [3.0, 10.0, 2.0]])
-    np.testing.assert_allclose(path_lengths(poses), [0.0, 5.0, 5.0, 11.0])
 
 
 def _pictures(rng: np.random.Generator, frames: int, shift: int = 0) -> np.ndarray:
@@ -175,7 +140,7 @@ def _two_visits(
 ) -> tuple[Scans, np.ndarray]:
     """Forty frames of a road, then nine on it again, displaced; with poses that drifted in between."""
     earlier = road.poses[20:61]
-    later = np.array([_placed(pose, relative) for pose in road.poses[36:45]])
+    later = np.array([compose(pose, relative) for pose in road.poses[36:45]])
     clean = road.scans(np.concatenate([earlier, later]))
     frames = []
     for k in range(len(clean)):
@@ -188,7 +153,7 @@ def _two_visits(
             RoadEdges(np.concatenate([noisy, clutter]), np.concatenate([clean.normals[rows], normals]))
         )
     # Open loop, the later visit is somewhere else; only poses within a visit relate to each other.
-    moved = np.array([_placed(drift, pose) for pose in later])
+    moved = np.array([compose(drift, pose) for pose in later])
     return pack_scans(frames, HEIGHT_CM), np.concatenate([earlier, moved])
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.places import Revisit, relative_pose
+from datagen.slam.loops.places import Revisit
 from datagen.slam.loops.pose_graph import borne_out, close_loops, missed_by
+from lanenet.geometry.poses import relative_pose
 
 HEIGHT_CM = 15.0
 LAP = 100

@@ -14,7 +14,7 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.self_calibration import SIGMA_FACTOR
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.places import Revisit, RevisitSettings, path_lengths
+from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
 from datagen.slam.segment import SolvedSegment, solve_segment
 from datagen.slam.track import CommandedMotion
@@ -23,6 +23,7 @@ from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import path_lengths
 
 SMALL = MapSettings(
     filter=FilterSettings(particles=80, max_points=80),
