@@ -12,10 +12,10 @@ from jaxtyping import Int
 
 from datagen.labels.label_map import label_map
 from datagen.lanes.find import map_stretches
+from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
 from datagen.quality.agreement import contradicted_lines
 from datagen.quality.figures import (
-    MappedSegment,
     Report,
     free_lane_cm,
     map_edges,
@@ -25,7 +25,7 @@ from datagen.quality.figures import (
 )
 from datagen.quality.mappable import check_edges, check_lines_seen, check_moving
 from datagen.quality.measure import held_out_frames, measure_map, quality_figures
-from datagen.quality.page import PAGE_NAME, kept_map, report_page
+from datagen.quality.page import PAGE_NAME, report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.quality.residuals import ResidualSettings
 from datagen.quality.verdict import judge
@@ -40,7 +40,7 @@ from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.data.files import atomic_folder, check_replaceable, clear_unfinished, write_text
-from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, write_map
+from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, kept_map, write_map
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text
 from lanenet.data.trajectory import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError

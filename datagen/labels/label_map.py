@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 
 from datagen.labels.quality import frame_residual_cm, label_report
 from datagen.quality.figures import Report
-from datagen.quality.page import refuse_rejected
+from datagen.quality.page import PAGE_NAME
 from datagen.quality.pictures import draw_contact_sheet
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
@@ -131,3 +133,29 @@ def label_map(
         f"{report['residual_cm']['p95']:.2f} cm (p95) from the projected lines",
     ]
     return Report(tuple(lines_out), report)
+
+
+def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
+    """Raise if the map was rejected.
+
+    Args:
+        map_folder: Where it lies, with its report.
+        drive_map: The map.
+
+    Raises:
+        TrackingLostError: With the first reason, and where the others stand.
+    """
+    if drive_map.meta.verdict != "reject":
+        return
+    try:
+        reasons = json.loads((map_folder / "report.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
+        reason = str(reasons[0])
+    except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
+        reason = "its report cannot be read"
+    page = map_folder / PAGE_NAME
+    # Maps of which nobody wants pictures have no page.
+    told_by = page if page.is_file() else map_folder / "report.json"
+    raise TrackingLostError(
+        f"{map_folder}: the map was rejected: {reason}; see {told_by}, and label it with --force if it is to "
+        "be used all the same"
+    )

@@ -8,12 +8,11 @@ from jaxtyping import Bool
 from datagen.lanes.beside import trace_beside
 from datagen.lanes.fit import fit_lines
 from datagen.lanes.lap import lap_path
+from datagen.lanes.mapped import MappedSegment, check_lane
+from datagen.lanes.path import without_frames
 from datagen.lanes.profile import without_crossings
 from datagen.lanes.scale import STEP_HEIGHTS, edges_beside
-from datagen.lanes.trace import trace_lane
-from datagen.quality.figures import MappedSegment
-from datagen.quality.mappable import check_lane, trace_known_lane
-from datagen.quality.measure import without_frames
+from datagen.lanes.trace import trace_known_lane, trace_lane
 from datagen.settings import MapSettings
 from datagen.slam.join import Stretch, frames_text, join_stretches
 from datagen.slam.odometry.scans import Progress

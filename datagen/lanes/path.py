@@ -185,6 +185,14 @@ def edges_along_path(
     )
 
 
+def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
+    """Return the scans with some frames emptied; the others stay at their index."""
+    kept = ~left_out[scans.frame_of_point]
+    counts = np.where(left_out, 0, np.diff(scans.starts))
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Scans(scans.points_cm[kept], scans.normals[kept], scans.weights[kept], starts)
+
+
 @njit(cache=True)
 @no_type_check
 def _project(xy, left, step, closed, s_frame, forward, pose, points, normals, wheelbase, span):

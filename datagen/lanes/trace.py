@@ -19,14 +19,22 @@ from datagen.lanes.profile import EdgeProfile, edge_profile
 from datagen.lanes.width import find_lane_width, find_tape_width
 from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
-from lanenet.errors import TrackingLostError
+from lanenet.errors import CalibrationError, TrackingLostError
 
-__all__ = ["TraceSettings", "TracedLane", "trace_lane"]
+__all__ = ["TraceSettings", "TracedLane", "trace_known_lane", "trace_lane"]
 
 
 #: How far a line may lie beside its usual offset, as a share of the lane's width: beyond the first, what is
 #: off by the second goes as well; and how far around the usual offset is looked for, in lane widths.
 _STRAY, _BESIDE, _STRAY_REACH_LANES = 0.08, 0.04, 1.5
+
+#: A line that is there along less of the way than this does not bound a lane.
+LEAST_SEEN = 0.2
+#: Less than this of a line is clutter that happens to lie along the way.
+MAYBE_LINE = 0.5
+#: A line of the given lane that is seen along less than this share of the way along which one of another
+#: width is: gaps between dashes leave more.
+_HARDLY = 0.4
 
 
 @dataclass(frozen=True)
@@ -137,3 +145,65 @@ def _without_strays(
         if off[piece].max() > _STRAY:
             kept[piece] = np.nan
     return kept
+
+
+def trace_known_lane(
+    path: Path, edges: PathEdges, height_cm: float, lane_width_cm: float, settings: TraceSettings
+) -> tuple[TracedLane, float | None]:
+    """Trace the lane of the given width, and look for the lane's width without that number too.
+
+    Returns:
+        The lane, and the width of the lane that is found freely; None where none is, or where the lane of the
+        given width fits the road as well.
+
+    Raises:
+        CalibrationError: If there is no lane of this width but one of another; names both.
+        TrackingLostError: If there is no lane.
+    """
+    try:
+        free: TracedLane | None = trace_lane(path, edges, height_cm, None, settings)
+    except TrackingLostError:
+        free = None
+    lane: TracedLane | None
+    try:
+        lane = trace_lane(path, edges, height_cm, lane_width_cm, settings)
+    except TrackingLostError:
+        if free is None:
+            raise
+        lane = None
+    if (
+        free is not None
+        # Clutter that lies along the way makes pairs of any width.
+        and min(_seen(free)) >= MAYBE_LINE
+        and (lane is None or min(_seen(lane)) < LEAST_SEEN)
+    ):
+        raise other_lane(lane_width_cm, free.lane_cm)
+    if lane is None:
+        raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
+    return lane, free.lane_cm if free is not None and _fits_better(free, lane) else None
+
+
+def other_lane(given_cm: float, found_cm: float) -> CalibrationError:
+    return CalibrationError(
+        f"no two lines {given_cm:g} cm apart run along the drive, but two that are {found_cm:.0f} cm apart "
+        "with this camera: check the lane width and the camera's height"
+    )
+
+
+def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
+    """Whether the lane that was found freely is more likely the driven one than that of the given width.
+
+    The free search alone is no proof: clutter beside a line makes a narrower lane, and the far line of a road
+    of two lanes, where the one in its middle is dashed, a wider one. It counts where the weaker line of the
+    given lane is hardly seen beside its own, or where the car keeps to its middle and not to that of the
+    given lane, as on a road of two lanes whose whole width was given.
+    """
+    if min(_seen(lane)) < _HARDLY * min(_seen(free)):
+        return True
+    aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
+    return min(_seen(free)) >= LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
+
+
+def _seen(lane: TracedLane) -> tuple[float, float]:
+    """Share of the way along which the left and the right line were seen."""
+    return float(np.isfinite(lane.left_cm).mean()), float(np.isfinite(lane.right_cm).mean())

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
-from datagen.lanes.trace import TracedLane
+from datagen.lanes.mapped import MappedSegment
 from datagen.quality.verdict import LineEvidence, MapEvidence
 from datagen.slam.loops.pose_graph import missed_by
-from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.folder import DriveMap
-from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import known_lines
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -25,28 +23,6 @@ class Report:
 
     lines: tuple[str, ...]
     figures: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class MappedSegment:
-    """A segment with its lane, in the scale of its camera.
-
-    Attributes:
-        rows: Frames of the drive that it covers, as positions among those that count.
-        solved: Poses and scans.
-        s_frames_cm: Position of each frame along the driven path.
-        lane: The traced lane.
-        lines: Its two lines, then those of the lanes beside it.
-        free_lane_cm: Width of the lane as found without the user's number; None where that fails, or where
-            the user's number was not used in the first place.
-    """
-
-    rows: Int[np.ndarray, "n"]
-    solved: SolvedSegment
-    s_frames_cm: Float[np.ndarray, "n"]
-    lane: TracedLane
-    lines: list[LaneLine]
-    free_lane_cm: float | None = None
 
 
 def map_edges(

@@ -19,7 +19,6 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.quality.residuals import BorderSamples, ResidualSettings, border_samples, join_samples, summarise
 from datagen.slam.camera.coarse import mapping_range
-from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.mapped_drive import (
     DELETED,
     NOT_TO_LABEL,
@@ -187,11 +186,3 @@ def held_out_frames(count: int, every: int, seed: int) -> Bool[np.ndarray, "n"]:
         first = int(np.random.default_rng((seed, _STREAM)).integers(every))
         chosen[first::every] = True
     return chosen
-
-
-def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
-    """Return the scans with some frames emptied; the others stay at their index."""
-    kept = ~left_out[scans.frame_of_point]
-    counts = np.where(left_out, 0, np.diff(scans.starts))
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Scans(scans.points_cm[kept], scans.normals[kept], scans.weights[kept], starts)

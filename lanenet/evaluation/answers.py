@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lanenet.data.label_set import LabelSet
-from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.data.maps.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.perception.edges.road import RoadEdgeExtractor

@@ -16,7 +16,7 @@ from lanenet.evaluation.sources import Opened
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
-    from lanenet.data.labelled_frames import LabelledFrames
+    from lanenet.data.maps.labelled_frames import LabelledFrames
     from lanenet.evaluation.answers import ComparedName, FrameAnswers
     from lanenet.evaluation.comparison import Comparison, SourceAnswers
     from lanenet.perception.estimate import Detector

@@ -238,6 +238,24 @@ def read_map(folder: Path) -> DriveMap:
     )
 
 
+def kept_map(out: Path) -> str:
+    """Say, after a refusal, that the map which lies where the new one was to be written is an older one.
+
+    Args:
+        out: Where the new one was to be written.
+
+    Returns:
+        The end of a sentence; empty where no map lies there.
+    """
+    if not (out / "map.yaml").is_file():
+        return ""
+    try:
+        verdict = read_yaml(out / "map.yaml").get("verdict")
+    except ConfigError:  # it was kept, whatever it is
+        verdict = None
+    return f"; the map at {out} is an older one, which was kept (verdict: {verdict or 'none'})"
+
+
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))

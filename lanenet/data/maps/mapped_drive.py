@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from lanenet.config import check_settings, read_yaml
 from lanenet.data.drives import Drive, open_drive
-from lanenet.data.labelled_frames import LabelledFrames
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
 from lanenet.data.maps.frame_lines import FrameLines, beside_line, label_rows, lines_of_frame
 from lanenet.errors import CalibrationError, DriveFormatError
@@ -196,45 +194,3 @@ def points_text(shares: dict[str, float]) -> str:
     """Say what :func:`labelled_points` found."""
     said = " and ".join(f"{100.0 * share:.0f} % of the {side} line's" for side, share in shares.items())
     return f"{said} points in the window have labels"
-
-
-def read_map_frames(
-    map_folder: Path, window: BirdseyeWindow | None = None, drive_path: Path | None = None
-) -> LabelledFrames:
-    """Read the frames of a mapped drive with the labels that the map gives them.
-
-    The labels are those of :func:`datagen.labels.label_map.label_map`; frames that get none are kept.
-
-    Args:
-        map_folder: Folder of the map.
-        window: Points beside this bird's-eye window have no label; None takes the default.
-        drive_path: Where the drive is now, if it has moved since it was mapped.
-
-    Raises:
-        LanenetError: As :func:`open_mapped_drive`.
-    """
-    mapped = open_mapped_drive(map_folder, drive_path)
-    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
-    window = BirdseyeWindow() if window is None else window
-    points = np.full((len(rows), N_POINTS), np.nan)
-    for k in range(len(rows)):
-        labelled = label_frame(mapped, k, window)
-        if not isinstance(labelled, str):
-            points[k] = labelled[1]
-    return LabelledFrames(
-        name=str(map_folder),
-        reference="map",
-        camera=drive_map.camera,
-        lane_width_cm=drive_map.meta.lane_cm,
-        marking_cm=drive_map.meta.tape_cm,
-        perception=mapped.perception,
-        frames=drive_map.frames,
-        starts=mapped.starts,
-        points_cm=points,
-        image=partial(_image_of_row, drive, rows),
-    )
-
-
-def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Frame i of a map; other processes can be given a module's function only."""
-    return drive.image(int(rows[i]))

@@ -5,7 +5,7 @@ import pytest
 
 from lanenet.data.drives.folder import TRUTH_NAMES
 from lanenet.data.drives.writer import DriveWriter
-from lanenet.data.labelled_frames import read_truth_frames
+from lanenet.data.maps.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.trace import TracedLane
-from datagen.quality.figures import MappedSegment, map_edges
+from datagen.quality.figures import map_edges
 from datagen.slam.adjustment.adjust import BundleResult
 from datagen.slam.camera.coarse import GuessSettings, guessed_camera
 from datagen.slam.filter.dp_slam import Trajectory

@@ -10,8 +10,8 @@ import pytest
 
 from datagen import pipeline
 from datagen.lanes import find as stretches
+from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.trace import TracedLane
-from datagen.quality.figures import MappedSegment
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult
 from datagen.slam.camera.coarse import GuessSettings, guessed_camera

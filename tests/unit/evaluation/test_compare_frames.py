@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lanenet.data.labelled_frames import LabelledFrames
+from lanenet.data.maps.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import COMPARED, answer_frames, build_compared, choose_names
 from lanenet.evaluation.breakdown import GROUPS

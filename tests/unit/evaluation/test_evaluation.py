@@ -6,7 +6,7 @@ import pytest
 from datagen.world.car.rig import CameraSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.files import json_text
-from lanenet.data.labelled_frames import read_truth_frames
+from lanenet.data.maps.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError
 from lanenet.evaluation import report as evaluation
 from lanenet.evaluation.sources import Opened

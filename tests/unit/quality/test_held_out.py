@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.quality.measure import held_out_frames, without_frames
+from datagen.lanes.path import without_frames
+from datagen.quality.measure import held_out_frames
 from datagen.settings import MapSettings
 from datagen.slam.odometry.scans import pack_scans
 from lanenet.config import check_settings

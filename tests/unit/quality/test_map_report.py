@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 import yaml
 
-from datagen.labels.label_map import label_map
+from datagen.labels.label_map import label_map, refuse_rejected
 from datagen.pipeline import map_drive
-from datagen.quality.page import refuse_rejected
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings

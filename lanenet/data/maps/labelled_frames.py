@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drives import open_drive
+from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
+from lanenet.data.maps.mapped_drive import label_frame, open_mapped_drive
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import POINT_NAMES
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES
 from lanenet.perception.edges.road import PerceptionSettings
 
 
@@ -117,3 +118,45 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
         points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
         image=drive.image,
     )
+
+
+def read_map_frames(
+    map_folder: Path, window: BirdseyeWindow | None = None, drive_path: Path | None = None
+) -> LabelledFrames:
+    """Read the frames of a mapped drive with the labels that the map gives them.
+
+    The labels are those of :func:`datagen.labels.label_map.label_map`; frames that get none are kept.
+
+    Args:
+        map_folder: Folder of the map.
+        window: Points beside this bird's-eye window have no label; None takes the default.
+        drive_path: Where the drive is now, if it has moved since it was mapped.
+
+    Raises:
+        LanenetError: As :func:`open_mapped_drive`.
+    """
+    mapped = open_mapped_drive(map_folder, drive_path)
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    window = BirdseyeWindow() if window is None else window
+    points = np.full((len(rows), N_POINTS), np.nan)
+    for k in range(len(rows)):
+        labelled = label_frame(mapped, k, window)
+        if not isinstance(labelled, str):
+            points[k] = labelled[1]
+    return LabelledFrames(
+        name=str(map_folder),
+        reference="map",
+        camera=drive_map.camera,
+        lane_width_cm=drive_map.meta.lane_cm,
+        marking_cm=drive_map.meta.tape_cm,
+        perception=mapped.perception,
+        frames=drive_map.frames,
+        starts=mapped.starts,
+        points_cm=points,
+        image=partial(_image_of_row, drive, rows),
+    )
+
+
+def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Frame i of a map; other processes can be given a module's function only."""
+    return drive.image(int(rows[i]))

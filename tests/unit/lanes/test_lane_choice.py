@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.lanes.path import PathEdges, path_of_poses
-from datagen.lanes.trace import TracedLane, TraceSettings
-from datagen.quality.mappable import _fits_better, trace_known_lane
+from datagen.lanes.trace import TracedLane, TraceSettings, _fits_better, trace_known_lane
 from lanenet.errors import CalibrationError, TrackingLostError
 
 
@@ -55,7 +54,7 @@ def test_another_width_is_named_where_two_lines_are_seen(monkeypatch, free, lane
             raise TrackingLostError("no lane")
         return found
 
-    monkeypatch.setattr("datagen.quality.mappable.trace_lane", trace)
+    monkeypatch.setattr("datagen.lanes.trace.trace_lane", trace)
     path = path_of_poses(np.column_stack([np.arange(0.0, 99.0, 3.0), np.zeros(33), np.zeros(33)]), 2.0, 9.0)
     none = np.zeros(0, dtype=np.int64)
     edges = PathEdges(*[np.zeros(0)] * 6, none)
