@@ -1,4 +1,4 @@
-"""Work on many drives at once, a process for each; what kills a process is told as what it is."""
+"""Run a list of jobs, each in its own process; a process that dies is reported with its job."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def run_jobs(
     workers: int,
     progress: Progress | None = None,
 ) -> list[ResultT]:
-    """Do each job, in processes of their own if there is more than one worker and more than one job.
+    """Run each job, in separate processes if there is more than one worker and more than one job.
 
     Args:
         work: What to do; a function of a module, since it is sent to other processes.
-        jobs: Name and input of each; the name is for people.
+        jobs: Name, for messages, and input of each.
         workers: Processes at a time.
         progress: Called with (jobs done, jobs).
 
@@ -33,10 +33,10 @@ def run_jobs(
         The results, in the order of the jobs.
 
     Raises:
-        LanenetError: If a process dies or the memory does not suffice; names the job, or those that were
-            being done. What ``work`` raises is passed on.
+        LanenetError: If a process dies or memory runs out; names the job, or those that were running. What
+            ``work`` raises is passed on.
     """
-    # A pool starts all of its processes at once, also those that will have nothing to do.
+    # A pool starts all its processes at once, even those that would have nothing to do.
     workers = min(workers, len(jobs))
     if workers <= 1:
         results = []
@@ -75,22 +75,20 @@ def _take_one_core() -> None:
 
 
 def _out_of_memory(name: str, workers: int) -> LanenetError:
-    fewer = f"; fewer at a time need less ({_at_a_time(workers)})" if workers > 1 else ""
-    return LanenetError(f"{name}: the memory does not suffice for this drive{fewer}")
+    return LanenetError(f"{name}: out of memory" + (f"; {_fewer(workers)}" if workers > 1 else ""))
 
 
-def _at_a_time(workers: int) -> str:
-    return f"now {workers}; training takes data.workers, or one per core"
+def _fewer(workers: int) -> str:
+    return f"run fewer processes at a time (now {workers}; training takes data.workers, or one per core)"
 
 
 def _died(names: dict[Future[ResultT], str], workers: int) -> LanenetError:
-    """All jobs that are not done fail at once; begun were the first of them."""
+    """All unfinished jobs fail at once; the first of them were running."""
     unfinished = [name for future, name in names.items() if _has_failed(future)]
-    begun = " or ".join(unfinished[:workers])
+    running = " or ".join(unfinished[:workers])
     return LanenetError(
-        f"{begun}: the process at work on this drive was killed, most often because the memory does not "
-        f"suffice; fewer at a time need less ({_at_a_time(workers)}). Drives that are done are kept: run the "
-        "command again"
+        f"{running}: its process was killed, most often because memory ran out; {_fewer(workers)}. Finished "
+        "drives are kept: run the command again"
     )
 
 

@@ -1,1 +1,1 @@
-"""The label sets of a training run: which drives, how they are split, and what is there already."""
+"""The label sets of a training run: which drives, how each is made and split, and what exists already."""

@@ -17,20 +17,20 @@ from lanenet.perception.edges.road import COLOUR_WEIGHT, PerceptionSettings
 
 
 class SyntheticSettings(Settings):
-    """Synthetic drives, each on a road, and with a look, of its own.
+    """Synthetic drives, each with its own road and its own look.
 
     Attributes:
         seed: Every drive's seed follows from this, its role and its number.
         train: Drives to learn from.
         validation: Drives to choose the epoch by.
         test: Drives whose truth scores the result.
-        variety: ``none``: all drives are those of ``simulation``; ``roads``: every drive has a kind of road
-            and a driver of its own; ``all``: a camera near one of ``cameras``, and a car of its own size.
-        cameras: Lenses and mountings that the drives' cameras are drawn near, by turns; none takes the
+        variety: What differs between drives. ``none``: only what their seeds draw; ``roads``: also the kind
+            of road and the driver; ``all``: also the size of the car, and the camera, drawn near ``cameras``.
+        cameras: Lenses and mountings that the drives' cameras are drawn near, in turn; empty takes the
             simulation's.
-        may_fail: Up to this share of the drives that are mapped may be left out because their map is rejected
-            or their road cannot be driven. Random roads do not all make good drives.
-        simulation: What all drives share; their ``seed`` is set here.
+        may_fail: Up to this share of the mapped drives may be left out because their map is rejected or their
+            road cannot be driven. Not every random road makes a good drive.
+        simulation: What all drives share; each gets its own ``seed``.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -45,7 +45,7 @@ class SyntheticSettings(Settings):
     @model_validator(mode="after")
     def _cameras_are_used(self) -> SyntheticSettings:
         if self.cameras and self.variety != "all":
-            raise ValueError(f"cameras are drawn with variety 'all' only, found {self.variety!r}")
+            raise ValueError(f"cameras need variety 'all', found {self.variety!r}")
         return self
 
 
@@ -53,16 +53,18 @@ class RecordedSettings(Settings):
     """A recorded drive, split along its time or by its laps.
 
     Attributes:
-        path: Drive folder, tub or video, from the folder in which the command runs.
+        path: Drive folder, tub or video, relative to the folder in which the command runs.
         lane_width_cm: Between the middles of the lines of the driven lane.
-        camera: Camera file; left out, the camera is found from the drive.
+        camera: Camera file; without it the camera is found from the drive.
         split: ``time`` cuts at the shares below; ``lap`` keeps the last lap for the test, the one before it
-            for the validation and all earlier ones to learn from.
-        train_share: Share of the labelled frames, from the start, to learn from.
-        validation_share: Share of the frames after them to choose the epoch by; the rest is for the test.
-        gap_frames: Frames left out between the parts, so that neighbours are never on both sides.
-        gap_cm: Way left out between the parts, likewise; of the two gaps the longer counts.
-        counts_as: As many drives to learn from, beside many synthetic ones: its frames come so often.
+            for the validation and all earlier ones for learning.
+        train_share: Share of the labelled frames, from the start, to learn from. Chosen, like the next.
+        validation_share: Share of the following frames to choose the epoch by; the rest is for the test.
+        gap_frames: Frames left out between the parts, so that neighbours are never on both sides. Chosen: 2 s
+            at 20 frames/s.
+        gap_cm: Distance left out between the parts, likewise; the longer of the two gaps counts.
+        counts_as: Number of drives that this one counts as beside synthetic ones: its frames are shown that
+            many times as often.
         map: Settings for mapping this drive.
     """
 
@@ -91,9 +93,9 @@ class DataSettings(Settings):
         synthetic: Synthetic drives.
         drives: Recorded drives.
         map: Settings for mapping the synthetic drives.
-        window: The patch of road that the network sees: wide enough for the lane's lines on either side.
-        colour_weight: What colours count beside brightness in the network's edges; maps go by gray.
-        workers: Processes that simulate, map and evaluate; 0 takes one per core.
+        window: The bird's-eye window of the network: wide enough for the lane's lines on either side.
+        colour_weight: Weight of colours beside brightness in the network's edges; maps use brightness alone.
+        workers: Processes that simulate, map and evaluate; 0 uses one per core.
     """
 
     synthetic: SyntheticSettings = SyntheticSettings()
@@ -110,7 +112,7 @@ class DataSettings(Settings):
 
     @property
     def perceptions(self) -> list[PerceptionSettings]:
-        """How edges are found for the network: in synthetic drives, and in each recorded one."""
+        """How the network's edges are found: in synthetic drives, and in each recorded one."""
         simulated = [self.map] if self.synthetic.train or self.synthetic.validation else []
         maps = [*simulated, *(drive.map for drive in self.drives)]
         return [settings.perception.with_colours(self.colour_weight) for settings in maps]
@@ -120,5 +122,5 @@ class DataSettings(Settings):
         paths = [drive.path.resolve() for drive in self.drives]
         twice = next((drive.path for drive in self.drives if paths.count(drive.path.resolve()) > 1), None)
         if twice is not None:
-            raise ValueError(f"drives: {twice} is listed twice; counts_as shows one drive more often")
+            raise ValueError(f"drives: {twice} is listed twice; use counts_as to show a drive more often")
         return self

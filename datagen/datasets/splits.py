@@ -1,7 +1,7 @@
-"""A recorded drive cut into parts to learn from, to choose by and to judge by, with gaps between them.
+"""Split the labels of a recorded drive into training, validation and test part, with gaps between them.
 
-The parts follow each other in time, so that a part is never between two of another. Frames close to a cut, by
-number or by way, belong to no part: neighbouring frames show the same road from almost the same place.
+The parts follow one another in time. Frames close to a cut, by number or by distance, belong to no part:
+neighbouring frames show the same road from almost the same place.
 """
 
 from __future__ import annotations
@@ -11,27 +11,40 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from datagen.datasets.settings import RecordedSettings
 from lanenet.data.label_set import LabelSet
 from lanenet.data.segments import equal_runs, map_pieces
 from lanenet.errors import ConfigError
 
-#: A lap with less than this share of the frames of the median lap was not driven to its end.
+#: A lap with less than this share of the median lap's frames was not completed. Chosen: half a lap.
 _WHOLE_LAP = 0.5
+
+
+def split_recording(labels: LabelSet, settings: RecordedSettings) -> list[LabelSet]:
+    """Return training, validation and test part of a recorded drive.
+
+    Raises:
+        ConfigError: As :func:`split_along_time` and :func:`split_by_lap`.
+    """
+    if settings.split == "lap":
+        return split_by_lap(labels, settings.gap_frames, settings.gap_cm)
+    shares = (settings.train_share, settings.validation_share)
+    return split_along_time(labels, shares, settings.gap_frames, settings.gap_cm)
 
 
 def split_along_time(
     labels: LabelSet, shares: tuple[float, ...], gap_frames: int, gap_cm: float = 0.0
 ) -> list[LabelSet]:
-    """Cut a drive's labels along its time.
+    """Split a drive's labels along its time.
 
     Args:
         labels: Labels of one drive, in the order of its frames.
         shares: Share of the frames of each part but the last, which gets the rest.
-        gap_frames: No two frames of different parts are this close or closer by their numbers.
-        gap_cm: Nor by the way driven between them, [cm].
+        gap_frames: The numbers of two frames of different parts differ by more than this.
+        gap_cm: At least this distance was driven between them, [cm].
 
     Returns:
-        One more part than there are shares.
+        One part more than there are shares.
 
     Raises:
         ConfigError: If a part would be empty.
@@ -41,10 +54,9 @@ def split_along_time(
 
 
 def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list[LabelSet]:
-    """Cut a drive's labels where laps begin: all early laps, the last but one, the last.
+    """Split a drive's labels by lap: all early laps, the last but one, the last.
 
-    A lap that was not driven to its end belongs to the one before it. Where the map is in several pieces,
-    each piece counts its own laps.
+    An incomplete lap belongs to the one before it. Each segment of a map counts its own laps.
 
     Args:
         labels: Labels of one drive, in the order of its frames.
@@ -55,43 +67,44 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
         The three parts.
 
     Raises:
-        ConfigError: If there are fewer than three laps, or a part would be empty.
+        ConfigError: If there are fewer than three complete laps, or a part would be empty.
     """
     laps = equal_runs(labels.lap)
-    usual = np.median([len(lap) for lap in laps]) if laps else 0.0
-    starts = [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * usual]
+    typical = np.median([len(lap) for lap in laps]) if laps else 0.0
+    starts = [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * typical]
     if len(starts) < 3:
         raise ConfigError(
-            f"split by lap: found {len(starts)} laps driven to their end, expected at least 3; split along "
-            "the time"
+            f"split by lap: found {len(starts)} complete laps, expected at least 3; use split: time"
         )
     return _cut(labels, np.array([0, *starts[-2:]]), gap_frames, gap_cm, "the laps")
 
 
-def way_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:
-    """Return the way driven up to each labelled frame, [cm]; it stays where the map is interrupted."""
+def driven_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:
+    """Return the distance driven up to each labelled frame, [cm]; jumps between segments add nothing."""
     steps = np.linalg.norm(np.diff(labels.poses[:, :2], axis=0), axis=1)
     steps[np.diff(map_pieces(labels.frame, labels.poses)) != 0] = 0.0
     return np.concatenate([np.zeros(min(1, len(labels))), np.cumsum(steps)])
 
 
 def _cut(
-    labels: LabelSet, cuts: Int[np.ndarray, "k"], gap_frames: int, gap_cm: float, how: str
+    labels: LabelSet, cuts: Int[np.ndarray, "k"], gap_frames: int, gap_cm: float, what: str
 ) -> list[LabelSet]:
-    """Cut at rows, and leave out what lies within the gaps after the part before."""
-    way = way_cm(labels)
+    """Cut before the given rows, and leave out what lies within the gap after each part."""
+    distance_cm = driven_cm(labels)
     parts: list[LabelSet] = []
     last = -1
     for start, end in pairwise([*cuts.tolist(), len(labels)]):
         rows = np.arange(start, end)
         if last >= 0:
-            rows = rows[
-                (labels.frame[rows] - labels.frame[last] > gap_frames) & (way[rows] - way[last] >= gap_cm)
-            ]
+            numbers, distances_cm = (
+                labels.frame[rows] - labels.frame[last],
+                distance_cm[rows] - distance_cm[last],
+            )
+            rows = rows[(numbers > gap_frames) & (distances_cm >= gap_cm)]
         if not rows.size:
             raise ConfigError(
-                f"{how} with a gap of {gap_frames} frames and {gap_cm:g} cm leave a part of {len(labels)} "
-                "empty"
+                f"{what} with a gap of {gap_frames} frames and {gap_cm:g} cm leave a part empty; the drive "
+                f"has {len(labels)} labelled frames"
             )
         parts.append(labels.subset(rows))
         last = int(rows[-1])

@@ -97,9 +97,11 @@ def train(
     run_folder = settings.work_folder / f"train-{run_hash}"
     with console.training_bar() as progress:
         model = train_network(settings.learn, data.train, data.validation, run_folder, progress).model_path
-    if not data.test:
-        console.show_problems(["the data has no test part: the table is over the validation labels"])
-    sources = open_tests(data.test or data.validation, data.test_frames or data.validation_frames)
+    judged = data.of("test")
+    if not judged:
+        console.show_problems(["the data has no test part: the tables use the validation labels"])
+        judged = data.of("validation")
+    sources = open_tests([part.labels for part in judged], [part.frames for part in judged])
     training = [read_labels(path) for path in dict.fromkeys(data.train)]
     with console.progress_bar("test") as progress:
         evaluation = evaluate(

@@ -131,7 +131,7 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
 
     So the window, the split, the network, the augmentation and what it starts from are those of the file.
     """
-    from datagen.datasets import build as datasets
+    from datagen.datasets import build, jobs
     from lanenet.learn.checkpoint import publish
     from lanenet.learn.train import train
 
@@ -154,18 +154,18 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
         write_quick_labels(tmp_path / "truth.parquet", window, "truth", drive.name)
         return tmp_path / "truth.parquet"
 
-    monkeypatch.setattr(datasets, "simulate_drive", lambda simulation, out: out)
-    monkeypatch.setattr(datasets, "map_drive", map_drive)
-    monkeypatch.setattr(datasets, "label_map", label_map)
-    monkeypatch.setattr(datasets, "truth_labels", truth_labels)
-    monkeypatch.setattr(datasets, "write_labels", write_or_move)
-    monkeypatch.setattr(datasets, "fingerprint", str)
+    monkeypatch.setattr(jobs, "simulate_drive", lambda simulation, out: out)
+    monkeypatch.setattr(jobs, "map_drive", map_drive)
+    monkeypatch.setattr(jobs, "label_map", label_map)
+    monkeypatch.setattr(jobs, "truth_labels", truth_labels)
+    monkeypatch.setattr(jobs, "write_labels", write_or_move)
+    monkeypatch.setattr(jobs, "fingerprint", str)
     settings = read_training_run(path)
     few = {"train": 2, "validation": 1, "test": 1} if settings.data.synthetic.train else {}
     data = settings.data.model_copy(
         update={"synthetic": settings.data.synthetic.model_copy(update=few), "workers": 1}
     )
-    prepared = datasets.prepare(data, tmp_path / "work")
+    prepared = build.prepare(data, tmp_path / "work")
     drives = sum(drive.counts_as for drive in data.drives)
     assert len(prepared.train) == few.get("train", 0) + drives
     n = sum(len(read_labels_of(p)) for p in prepared.train)
@@ -178,8 +178,9 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
         learn = learn.model_copy(update={"start_from": tmp_path / "start"})
     result = train(learn, prepared.train, prepared.validation, tmp_path / "run")
     assert result.model_path.is_file() and result.val_rmse_cm < 100.0
-    for part in (prepared.validation, prepared.test):
-        assert part and all(p.is_file() for p in part)
+    for role in ("validation", "test"):
+        parts = prepared.of(role)
+        assert parts and all(part.labels.is_file() for part in parts)
 
 
 def write_or_move(path: Path, labels: Any) -> None:

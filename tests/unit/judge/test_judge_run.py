@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.datasets.build import _synthetic_job
+from datagen.datasets.jobs import SyntheticJob
 from datagen.datasets.settings import DataSettings, SyntheticSettings
 from datagen.judge.run import (
     TRUE_POINTS,
@@ -180,7 +180,7 @@ def test_roads_differ_and_do_not_depend_on_the_rest_of_the_contest():
 def test_no_road_is_one_of_a_training_run_with_the_same_seed(seed, tmp_path):
     data = DataSettings(synthetic=SyntheticSettings(seed=seed, train=20, validation=4, test=20))
     trained = {
-        _synthetic_job(data, role, number, tmp_path)["simulation"].seed
+        SyntheticJob.draw(data, role, number, tmp_path).simulation.seed
         for role in ("train", "validation", "test")
         for number in range(getattr(data.synthetic, role))
     }

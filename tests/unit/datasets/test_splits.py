@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.datasets.build import _split
 from datagen.datasets.settings import RecordedSettings
-from datagen.datasets.splits import split_along_time, split_by_lap, way_cm
+from datagen.datasets.splits import driven_cm, split_along_time, split_by_lap, split_recording
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -62,7 +61,7 @@ def test_no_frame_to_learn_from_lies_within_the_gap_of_another_part(counts, gap_
             "gap_cm": gap_cm,
         }
     )
-    parts = _split(labels, recorded)
+    parts = split_recording(labels, recorded)
     true_way = dict(zip(frames.tolist(), np.cumsum(step_cm), strict=True))
     for before, after in combinations(parts, 2):
         numbers = np.abs(before.frame[:, None] - after.frame[None, :])
@@ -96,7 +95,7 @@ def test_a_map_in_two_pieces_starts_its_laps_again():
 
 
 def test_too_few_laps_are_refused():
-    with pytest.raises(ConfigError, match="found 2 laps driven to their end, expected at least 3"):
+    with pytest.raises(ConfigError, match="found 2 complete laps, expected at least 3"):
         split_by_lap(drive(np.repeat([0, 1, 2], [200, 200, 30])), 10)
     with pytest.raises(ConfigError, match="400 frames and 0 cm leave a part of 600 empty"):
         split_by_lap(drive(np.repeat([0, 1, 2], 200)), 400)
@@ -104,12 +103,12 @@ def test_too_few_laps_are_refused():
 
 def test_the_way_does_not_grow_where_the_map_is_interrupted():
     labels = drive(np.zeros(100, int), 3.0)
-    assert way_cm(labels)[-1] == pytest.approx(99 * 3.0, rel=1e-3)
+    assert driven_cm(labels)[-1] == pytest.approx(99 * 3.0, rel=1e-3)
     labels.poses[50:, :2] += 5000.0
-    assert way_cm(labels)[-1] == pytest.approx(98 * 3.0, rel=1e-3)
+    assert driven_cm(labels)[-1] == pytest.approx(98 * 3.0, rel=1e-3)
     # A longer step where frames have no labels is way all the same.
     gaps = drive(
         np.zeros(60, int), np.where(np.arange(60) == 30, 30.0, 3.0), np.arange(60) + 9 * (np.arange(60) >= 30)
     )
-    assert way_cm(gaps)[-1] == pytest.approx(58 * 3.0 + 30.0, rel=1e-2)
-    assert len(way_cm(labels.subset(slice(0, 1)))) == 1 and len(way_cm(labels.subset(slice(0, 0)))) == 0
+    assert driven_cm(gaps)[-1] == pytest.approx(58 * 3.0 + 30.0, rel=1e-2)
+    assert len(driven_cm(labels.subset(slice(0, 1)))) == 1 and len(driven_cm(labels.subset(slice(0, 0)))) == 0

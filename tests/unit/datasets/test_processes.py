@@ -30,7 +30,7 @@ def test_errors_of_the_work_are_passed_on(workers):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_lack_of_memory_names_the_drive(workers):
-    with pytest.raises(LanenetError, match=r"^train_01 \(seed 5\): the memory does not suffice"):
+    with pytest.raises(LanenetError, match=r"^train_01 \(seed 5\): out of memory"):
         run_jobs(bytearray, [("train_00 (seed 4)", 8), ("train_01 (seed 5)", HUGE)], workers)
 
 

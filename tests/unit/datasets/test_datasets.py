@@ -12,16 +12,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from datagen.datasets.build import (
-    _frames_of,
-    _job_name,
-    _recorded_labels,
-    _shared_camera,
-    _synthetic_job,
-    prepare,
-    split_along_time,
-)
+from datagen.datasets.build import prepare, shared_camera
+from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
 from datagen.datasets.settings import DataSettings, RecordedSettings, SyntheticSettings
+from datagen.datasets.splits import split_along_time
 from datagen.world.simulate import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.errors import ConfigError, TrackingLostError
@@ -112,11 +106,11 @@ def test_every_synthetic_drive_has_a_seed_of_its_own_that_stays(tmp_path):
     def seeds(**counts: int) -> dict[str, int]:
         data = DataSettings(synthetic=SyntheticSettings(seed=5, **counts))
         jobs = [
-            _synthetic_job(data, role, k, tmp_path)
+            SyntheticJob.draw(data, role, k, tmp_path)
             for role in ("train", "validation", "test")
             for k in range(getattr(data.synthetic, role))
         ]
-        return {job["name"]: job["simulation"].seed for job in jobs}
+        return {job.name: job.simulation.seed for job in jobs}
 
     few, many = seeds(train=3, validation=1, test=2), seeds(train=12, validation=4, test=2)
     assert len(set(many.values())) == 18
@@ -131,7 +125,7 @@ def varied(**changes: object) -> DataSettings:
 
 def test_varied_drives_have_roads_and_cameras_of_their_own(tmp_path):
     def simulations(data: DataSettings) -> list[SimulationSettings]:
-        return [_synthetic_job(data, "train", k, tmp_path)["simulation"] for k in range(4)]
+        return [SyntheticJob.draw(data, "train", k, tmp_path).simulation for k in range(4)]
 
     none, roads = simulations(varied()), simulations(varied(variety="roads"))
     cameras = simulations(varied(variety="all", cameras=[{}, {"width": 160, "height": 120}]))
@@ -145,7 +139,7 @@ def test_varied_drives_have_roads_and_cameras_of_their_own(tmp_path):
     assert len({s.car.wheelbase_cm for s in cameras}) == 4 and len({s.car for s in roads}) == 1
     assert [s.camera.width for s in cameras] == [320, 160, 320, 160]
     assert len({s.camera.height_cm for s in cameras}) == 4 and {s.frames for s in cameras} == {60}
-    with pytest.raises(ValidationError, match="variety 'all' only"):
+    with pytest.raises(ValidationError, match="variety 'all'"):
         varied(variety="roads", cameras=[{}])
 
 
@@ -163,10 +157,10 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
     def label_map(drive_map: Path, out: Path, **_: object) -> None:
         write_labels(out, _labels(np.arange(30)))
 
-    monkeypatch.setattr("datagen.datasets.build.simulate_drive", lambda simulation, out: out)
-    monkeypatch.setattr("datagen.datasets.build.map_drive", map_drive)
-    monkeypatch.setattr("datagen.datasets.build.label_map", label_map)
-    monkeypatch.setattr("datagen.datasets.build.truth_labels", lambda *_: _labels(np.arange(30)))
+    monkeypatch.setattr("datagen.datasets.jobs.simulate_drive", lambda simulation, out: out)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.jobs.label_map", label_map)
+    monkeypatch.setattr("datagen.datasets.jobs.truth_labels", lambda *_: _labels(np.arange(30)))
     with pytest.raises(TrackingLostError, match="train_01: no lane"):
         prepare(varied(), tmp_path / "strict")
     mapped.clear()
@@ -190,24 +184,34 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
 
 
 def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
-    def recorded_labels(settings: RecordedSettings, *_: object) -> dict[str, Path]:
-        return {role: tmp_path / f"{role}.parquet" for role in ("train", "validation", "test")}
-
-    monkeypatch.setattr("datagen.datasets.build._recorded_labels", recorded_labels)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
+    monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
+    whole = _labels(np.arange(400))
+    (tmp_path / "tub").mkdir()
     drives = (RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0, counts_as=3),)
     # A recording alone needs no other process, nor does it leave one idle that could compile.
     given: list[Path] = []
     found = prepare(DataSettings(drives=drives, workers=2), tmp_path / "work", last=given.append)
     assert not given
-    assert found.train == [tmp_path / "train.parquet"] * 3
-    assert found.validation == [tmp_path / "validation.parquet"] and len(found.test) == 1
+    assert len(found.train) == 3 and len(set(found.train)) == 1
+    assert len(found.validation) == len(found.of("test")) == 1
 
 
 def test_the_camera_is_that_of_all_drives_or_of_the_example(tmp_path):
-    drives = tmp_path / "synthetic" / "drives"
-    assert _shared_camera(varied(), tmp_path) == drives / "train_00" / "camera.yaml"
-    assert _shared_camera(varied(variety="all"), tmp_path) == drives / "test_00" / "camera.yaml"
-    assert _shared_camera(varied(variety="all", test=0), tmp_path) is None
+    def owner(data: DataSettings) -> str | None:
+        roles = [role for role in ("train", "test") if getattr(data.synthetic, role)]
+        jobs = [SyntheticJob.draw(data, role, 0, tmp_path) for role in roles]
+        jobs += [RecordedJob(drive, data, tmp_path) for drive in data.drives]
+        path = shared_camera(data, jobs)
+        assert path is None or path.name == "camera.yaml"
+        return None if path is None else path.parent.name.partition("-")[0]
+
+    tubs = tuple(RecordedSettings(path=tmp_path / name, lane_width_cm=40.0) for name in ("tub", "other"))
+    assert owner(varied()) == "train_00"
+    assert owner(varied(variety="all")) == "test_00"
+    assert owner(varied(variety="all", test=0)) is None
+    assert owner(varied().model_copy(update={"drives": tubs[:1]})) is None
+    assert owner(DataSettings(drives=tubs[:1])) == "tub" and owner(DataSettings(drives=tubs)) is None
 
 
 def test_a_run_without_drives_is_refused(tmp_path):
@@ -218,20 +222,20 @@ def test_a_run_without_drives_is_refused(tmp_path):
 
 def test_test_drives_lead_to_their_frames(tmp_path):
     data = DataSettings(synthetic=SyntheticSettings(train=1, test=1))
-    folders = [_frames_of(_synthetic_job(data, role, 0, tmp_path)) for role in ("test", "validation")]
+    folders = [SyntheticJob.draw(data, role, 0, tmp_path).frames for role in ("test", "validation")]
     # The truth of a test drive lies with the drive; the labels of the others come from its map.
     assert folders == [tmp_path / "synthetic/drives/test_00", tmp_path / "synthetic/maps/validation_00"]
     recorded = RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0)
-    job = {"kind": "recorded", "settings": recorded, "folder": tmp_path / "drives"}
-    assert _frames_of(job).parent == tmp_path / "drives/maps" and _frames_of(job).name.startswith("tub-")
+    frames = RecordedJob(recorded, data, tmp_path / "drives").frames
+    assert frames.parent == tmp_path / "drives/maps" and frames.name.startswith("tub-")
 
 
 def test_drives_have_names_for_people(tmp_path):
     data = DataSettings(synthetic=SyntheticSettings(train=2))
-    job = _synthetic_job(data, "train", 1, tmp_path)
-    assert _job_name(job) == f"train_01 (seed {job['simulation'].seed})"
+    job = SyntheticJob.draw(data, "train", 1, tmp_path)
+    assert job.title == f"train_01 (seed {job.simulation.seed})"
     recorded = RecordedSettings(path=Path("drives/tub"), lane_width_cm=40.0)
-    assert _job_name({"kind": "recorded", "settings": recorded}) == "drives/tub"
+    assert RecordedJob(recorded, data, tmp_path).title == "drives/tub"
 
 
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):
@@ -249,8 +253,8 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
         made.append("label")
         write_labels(out, _labels(np.arange(400)))
 
-    monkeypatch.setattr("datagen.datasets.build.map_drive", map_drive)
-    monkeypatch.setattr("datagen.datasets.build.label_map", label_map)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", map_drive)
+    monkeypatch.setattr("datagen.datasets.jobs.label_map", label_map)
     drive, camera = tmp_path / "drive", tmp_path / "camera.yaml"
     drive.mkdir()
     (drive / "frames.csv").write_text("frame\n1\n")
@@ -262,8 +266,10 @@ def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, 
         recorded: RecordedSettings, window: BirdseyeWindow = window, colour_weight: float = 0.75
     ) -> tuple[int, int]:
         """How often the drive was mapped and labelled so far, after asking for its labels once more."""
-        parts = _recorded_labels(recorded, window, colour_weight, folder)
-        assert [len(read_labels(parts[role])) for role in ("train", "validation", "test")] == [240, 20, 60]
+        data = DataSettings(window=window, colour_weight=colour_weight)
+        parts: tuple[Part, ...] = RecordedJob(recorded, data, folder).run()
+        assert [len(read_labels(part.labels)) for part in parts] == [240, 20, 60]
+        assert [part.role for part in parts] == ["train", "validation", "test"]
         return made.count("map"), made.count("label")
 
     assert times(recorded) == (1, 1)

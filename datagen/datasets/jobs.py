@@ -1,0 +1,264 @@
+"""The jobs that make label sets, one per drive: simulate or read it, map it, label it.
+
+A job carries everything that it needs to another process. What it finished stays on disk and is not repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from datagen.datasets.done import Output, fingerprint, key_of
+from datagen.datasets.settings import DataSettings, RecordedSettings
+from datagen.datasets.splits import split_recording
+from datagen.labels.truth import truth_labels
+from datagen.pipeline import MapSettings, label_map, map_drive
+from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.variety import first_world, vary_simulation
+from lanenet.data.files import write_text
+from lanenet.data.label_set import read_labels, write_labels
+from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
+
+Role = Literal["train", "validation", "test"]
+ROLES: tuple[Role, ...] = ("train", "validation", "test")
+
+#: Synthetic drives of each role whose map and labels get pictures. Chosen: nobody looks at those of hundreds.
+_PICTURED = 2
+
+
+@dataclass(frozen=True)
+class Part:
+    """A label set and its role.
+
+    Attributes:
+        role: What it is for.
+        labels: Its file.
+        frames: The simulated drive whose truth it holds, or the map that it was made from.
+        counts_as: As many drives to learn from.
+    """
+
+    role: Role
+    labels: Path
+    frames: Path
+    counts_as: int = 1
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Why a drive has no label set, for people."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class SyntheticJob:
+    """Simulate a drive and label it: from a map, or for the test from the truth.
+
+    Attributes:
+        role: What its labels are for.
+        number: Counted from 0, within the role.
+        simulation: The drive.
+        data: Settings of the run.
+        folder: Folder of all synthetic drives, maps and labels.
+    """
+
+    role: Role
+    number: int
+    simulation: SimulationSettings
+    data: DataSettings
+    folder: Path
+
+    @classmethod
+    def draw(cls, data: DataSettings, role: Role, number: int, work_dir: Path) -> SyntheticJob:
+        """Draw a drive; it follows from the seed, the role and the number alone."""
+        # Each role has its own stream, so that more training drives leave the test drives as they are.
+        synthetic, seed = data.synthetic, [data.synthetic.seed, ROLES.index(role), number]
+        varied = synthetic.variety != "none"
+        cameras = synthetic.cameras or (synthetic.simulation.camera,)
+        simulation = vary_simulation(
+            synthetic.simulation,
+            np.random.SeedSequence(seed),
+            number,
+            cameras=cameras if synthetic.variety == "all" else (),
+            road=varied,
+            driver=varied,
+        )
+        return cls(role, number, simulation, data, work_dir / "synthetic")
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return f"{self.role}_{self.number:02d}"
+
+    @property
+    def title(self) -> str:
+        """Its name in messages."""
+        return f"{self.name} (seed {self.simulation.seed})"
+
+    @property
+    def drive(self) -> Path:
+        """The simulated drive."""
+        return self.folder / "drives" / self.name
+
+    @property
+    def labels(self) -> Path:
+        """The label set."""
+        return self.folder / "labels" / f"{self.name}.parquet"
+
+    @property
+    def frames(self) -> Path:
+        """The drive for the test, otherwise the map."""
+        return self.drive if self.role == "test" else self.folder / "maps" / self.name
+
+    @property
+    def _map_settings(self) -> MapSettings:
+        # The simulated camera does not see its car.
+        return self.data.map.model_copy(update={"find_bumper": False})
+
+    def run(self) -> tuple[Part, ...] | LeftOut:
+        """Make the label set, or say why there is none.
+
+        Raises:
+            LanenetError: If it fails and no drive may.
+        """
+        # The truth needs no map, but its edges are found in the same way.
+        mapped = self._map_settings.perception if self.role == "test" else self._map_settings
+        key = key_of(self.simulation, self.role, self.data.window, self.data.colour_weight, mapped)
+        labels, failure = Output(self.labels, key), Output(self.labels.with_suffix(".failed.txt"), key)
+        if not labels.done and failure.done:
+            return LeftOut(failure.path.read_text(encoding="utf-8"))
+        try:
+            labels.make(self._make_labels)
+        except (TrackingLostError, CalibrationError, ConfigError) as error:
+            if self.role == "test" or not self.data.synthetic.may_fail:
+                raise
+            write_text(failure.path, str(error))
+            failure.mark()
+            return LeftOut(str(error))
+        return (Part(self.role, self.labels, self.frames),)
+
+    def _make_labels(self) -> None:
+        data, mapping, track = self.data, self._map_settings, self.simulation.track
+        Output(self.drive / "drive.yaml", key_of(self.simulation)).make(self._simulate)
+        if self.role == "test":
+            perception = mapping.perception.with_colours(data.colour_weight)
+            write_labels(self.labels, truth_labels(self.drive, perception, data.window, track.line_width_cm))
+            return
+        pictures, lane_cm = self.number < _PICTURED, track.lane_width_cm
+        Output(self.frames / "map.yaml", key_of(self.simulation, mapping)).make(
+            lambda: map_drive(self.drive, lane_cm, None, mapping, self.frames, pictures=pictures)
+        )
+        label_map(
+            self.frames, self.labels, window=data.window, colour_weight=data.colour_weight, pictures=pictures
+        )
+
+    def _simulate(self) -> None:
+        # A random road takes the first seed that leaves room for one.
+        seed = first_world(self.simulation).settings.seed
+        simulate_drive(self.simulation.model_copy(update={"seed": seed}), self.drive)
+
+
+@dataclass(frozen=True)
+class RecordedJob:
+    """Map and label a recorded drive, and split it into the three roles.
+
+    Attributes:
+        recording: The drive.
+        data: Settings of the run.
+        folder: Folder of the maps and labels of all recorded drives.
+    """
+
+    recording: RecordedSettings
+    data: DataSettings
+    folder: Path
+
+    @property
+    def title(self) -> str:
+        """Its name in messages."""
+        return str(self.recording.path)
+
+    @property
+    def name(self) -> str:
+        """Name of its files; two drives may have folders of the same name."""
+        path = self.recording.path.resolve()
+        return f"{path.name}-{key_of(str(path))[:6]}"
+
+    @property
+    def frames(self) -> Path:
+        """The map."""
+        return self.folder / "maps" / self.name
+
+    def run(self) -> tuple[Part, ...]:
+        """Make the three label sets.
+
+        Raises:
+            LanenetError: If the drive cannot be read, mapped or split.
+        """
+        settings, data = self.recording, self.data
+        files = [settings.path]
+        if settings.camera is not None and settings.camera.is_file():
+            files.append(settings.camera)
+        recording = [fingerprint(path) for path in files]
+        # A map takes minutes, and does not depend on the window, the colours or the split.
+        mapped = settings.model_dump(mode="json", include={"path", "lane_width_cm", "camera", "map"})
+        folder = self.folder / "labels"
+        whole = Output(
+            folder / f"{self.name}.parquet", key_of(settings, data.window, data.colour_weight, *recording)
+        )
+        parts = tuple(
+            Part(
+                role,
+                folder / f"{self.name}.{role}.parquet",
+                self.frames,
+                settings.counts_as if role == "train" else 1,
+            )
+            for role in ROLES
+        )
+
+        def make() -> None:
+            Output(self.frames / "map.yaml", key_of(mapped, *recording)).make(
+                lambda: map_drive(
+                    settings.path, settings.lane_width_cm, settings.camera, settings.map, self.frames
+                )
+            )
+            label_map(self.frames, whole.path, window=data.window, colour_weight=data.colour_weight)
+            for part, labels in zip(parts, split_recording(read_labels(whole.path), settings), strict=True):
+                write_labels(part.labels, labels)
+
+        if not all(part.labels.is_file() for part in parts):
+            whole.forget()
+        whole.make(make)
+        return parts
+
+
+@dataclass(frozen=True)
+class CompileJob:
+    """Call a function with the first label set that exists, to compile what the training needs.
+
+    Attributes:
+        call: A function of a module.
+        label_sets: Label sets that may exist by then.
+    """
+
+    call: Callable[[Path], object]
+    label_sets: tuple[Path, ...]
+    title: str = "compiling"
+
+    def run(self) -> tuple[Part, ...]:
+        """Do it; makes no label set."""
+        path = next((path for path in self.label_sets if path.is_file()), None)
+        if path is not None:
+            self.call(path)
+        return ()
+
+
+Job = SyntheticJob | RecordedJob | CompileJob
+
+
+def run_job(job: Job) -> tuple[Part, ...] | LeftOut:
+    """Run a job; a function of a module, since it is called in other processes."""
+    return job.run()
