@@ -1,5 +1,5 @@
 """The command line: one file per verb, each a thin shell over a Python function.
 
-The only place that imports ``datagen``. The verbs for one's own drive are here, those of the car in
-:mod:`lanenet.cli.car`, those for experiments in :mod:`lanenet.cli.research`.
+The only room that imports ``datagen``. Verbs for the car are in ``car``, those for experiments in
+``research``.
 """

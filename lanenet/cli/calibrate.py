@@ -1,4 +1,4 @@
-"""The verbs below ``lanenet calibrate``: thin shells over :mod:`lanenet.calibration` and ``datagen``."""
+"""``lanenet calibrate``: the camera, from a chessboard, from points on the ground, or from a drive."""
 
 from __future__ import annotations
 
@@ -10,21 +10,32 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from lanenet.cli import console
-from lanenet.cli.calibrate_show import ground_pictures, lens_pictures, show_lens, show_mounting
-from lanenet.cli.outputs import check_not_source
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import DriveArgument, MappingOption, WheelbaseOption
+from lanenet.cli.shared.outputs import check_ending, check_not_source
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
+    from datagen.calibrate_drive import CalibratedDrive
+    from lanenet.calibration.chessboard_camera import ChessboardCalibration
+    from lanenet.calibration.ground import GroundCalibration
     from lanenet.geometry.camera import Camera
 
-app = typer.Typer(no_args_is_help=True, help="Find the camera: its lens, and where it sits on the car.")
+app = typer.Typer(
+    name="calibrate",
+    no_args_is_help=True,
+    help="Find the camera: its lens, and where it sits on the car.",
+)
 
 _Board = Annotated[
     str | None, typer.Option(help="Inner corners of the board, for example 9x6.", show_default=False)
 ]
 _Square = Annotated[float, typer.Option(min=0.01, help="Side of a square, cm.")]
+#: Left, near, right and far edge of the bird's-eye pictures, [cm]; chosen: two lanes wide, three car lengths.
+_AREA_CM = (-60.0, 0.0, 60.0, 120.0)
+#: Scale of bird's-eye pictures that stand side by side.
+_SMALL_PX_PER_CM = 4.0
 _Out = Annotated[Path, typer.Option(help="Camera file to write (.yaml).", show_default=False)]
 
 
@@ -45,13 +56,13 @@ def chessboard(
     out: _Out,
     square: _Square = 2.5,
     model: Annotated[
-        LensModel, typer.Option(help="Lens; auto takes the one with more evidence.")
+        LensModel, typer.Option(help="Lens model; auto takes the one that fits better.")
     ] = LensModel.AUTO,
     height: Annotated[
         float | None, typer.Option(min=0.1, help="Height of the lens above the ground, cm.")
     ] = None,
     pitch: Annotated[float | None, typer.Option(help="Downward tilt of the camera, degrees.")] = None,
-    wheelbase: Annotated[float | None, typer.Option(min=0.1, help="Distance of the car's axles, cm.")] = None,
+    wheelbase: WheelbaseOption = None,
     ros: Annotated[Path | None, typer.Option(help="Also write a ROS camera_info file (.yaml).")] = None,
 ) -> None:
     """Find a camera's lens from photos of a chessboard held in different tilts and places."""
@@ -61,7 +72,9 @@ def chessboard(
     from lanenet.data.camera_file import write_camera, write_ros_camera_info
     from lanenet.geometry.camera import Mounting
 
-    _check_yaml(out, ros)
+    for path in (out, ros):
+        if path is not None:
+            check_ending(path, ".yaml", ".yml")
     wanted = parse_board(board, square)
     paths = list_pictures(images)
     with console.progress_bar("calibrate") as progress:
@@ -79,7 +92,7 @@ def chessboard(
             NOMINAL_WHEELBASE_CM if wheelbase is None else wheelbase,
             lambda done, total: progress("fit the lens", done, total),
         )
-    # Written by hand or not at all: only `calibrate ground` measures the mounting.
+    # A board in the hand says nothing about the mounting: only `calibrate ground` measures it.
     given = [name for name, value in (("height", height), ("pitch", pitch)) if value is not None]
     origin = "given " + " and ".join(given) if given else "nominal values"
     notes = [*result.notes, f"the mounting is not measured ({origin}); run `lanenet calibrate ground`"]
@@ -94,9 +107,9 @@ def chessboard(
     )
     if ros is not None:
         write_ros_camera_info(ros, result.camera, out.stem)
-    pictures = lens_pictures(out, result)
+    pictures = _lens_pictures(out, result)
     left_out = {**left_out, **result.dropped}
-    show_lens(result, len(paths))
+    _show_lens(result, len(paths))
     console.show_problems([f"left out {name}: {reason}" for name, reason in left_out.items()], limit=100)
     console.show_problems(notes)
     console.wrote(out, ros, *pictures)
@@ -118,15 +131,17 @@ def ground(
         ),
     ] = None,
     image: Annotated[
-        Path | None, typer.Option(help="Photo of the ground: for the pictures, and of the board.")
+        Path | None, typer.Option(help="Photo of the ground, with the board if there is one.")
     ] = None,
     board: _Board = None,
     square: _Square = 2.5,
     near_left: Annotated[
         str | None,
-        typer.Option(help="Board's inner corner near the car on the left, as X,Y in cm.", show_default=False),
+        typer.Option(
+            help="The board's inner corner nearest to the car and leftmost, as X,Y in cm.", show_default=False
+        ),
     ] = None,
-    wheelbase: Annotated[float | None, typer.Option(min=0.1, help="Distance of the car's axles, cm.")] = None,
+    wheelbase: WheelbaseOption = None,
 ) -> None:
     """Find where the camera sits, from points on the ground or from a board that lies there (--board)."""
     from dataclasses import replace
@@ -135,7 +150,7 @@ def ground(
     from lanenet.calibration.ground import calibrate_ground
     from lanenet.data.camera_file import write_camera
 
-    _check_yaml(out)
+    check_ending(out, ".yaml", ".yml")
     lens = _read_lens(camera)
     if wheelbase is not None:
         lens = replace(lens, wheelbase_cm=wheelbase)
@@ -161,9 +176,9 @@ def ground(
         {**_figures(camera), **result.residuals},
         datetime.date.today().isoformat(),
     )
-    pictures = [] if frame is None else ground_pictures(out, frame, result, pixels_px)
-    show_mounting(result, points_cm, pixels_px)
-    console.show_problems([] if image else ["no pictures without a photo; give --image"])
+    pictures = [] if frame is None else _ground_pictures(out, frame, result, pixels_px)
+    _show_mounting(result, points_cm, pixels_px)
+    console.show_problems([] if image else ["without a photo there are no pictures; give --image"])
     console.wrote(out, *pictures)
     console.next_command("doctor", "--camera", out)
 
@@ -173,7 +188,7 @@ def ground(
     epilog="Example: lanenet calibrate drive data/tub --lane-width 40 --wheelbase 26 --out runs/camera.yaml",
 )
 def drive_(
-    drive: Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)],
+    drive: DriveArgument,
     out: _Out,
     lane_width: Annotated[
         float | None,
@@ -185,25 +200,28 @@ def drive_(
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help="Camera YAML to begin with (--refine).", show_default=False),
+        typer.Option("--camera", help="Camera YAML to start from (--refine).", show_default=False),
     ] = None,
     refine: Annotated[
-        bool, typer.Option("--refine", help="Refine --camera, or the drive's own, instead of a search.")
+        bool,
+        typer.Option(
+            "--refine", help="Refine --camera, or the drive's own camera, instead of searching for one."
+        ),
     ] = False,
     accept_open_loop: Annotated[
-        bool, typer.Option("--accept-open-loop", help="Take a guessed focal length where no place recurs.")
+        bool,
+        typer.Option("--accept-open-loop", help="Accept a guessed focal length if no place is seen twice."),
     ] = False,
-    wheelbase: Annotated[float | None, typer.Option(min=0.1, help="Distance of the car's axles, cm.")] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML with the mapping's settings.")] = None,
+    wheelbase: WheelbaseOption = None,
+    config: MappingOption = None,
 ) -> None:
     """Find lens and mounting from two laps alone: no board, no measured points."""
     from datagen.calibrate_drive import calibrate_drive, starting_camera
     from datagen.settings import MapSettings, with_wheelbase
-    from lanenet.cli.calibrate_show import drive_pictures, show_drive
     from lanenet.config import load_settings
     from lanenet.data.camera_file import write_camera
 
-    _check_yaml(out)
+    check_ending(out, ".yaml", ".yml")
     check_not_source(drive, out)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start, notes = starting_camera(drive, camera, refine)
@@ -214,18 +232,12 @@ def drive_(
         )
     today = datetime.date.today().isoformat()
     write_camera(out, result.camera, result.method, result.residuals, today)
-    pictures = drive_pictures(out, result)
-    show_drive(result)
+    pictures = _drive_pictures(out, result)
+    _show_drive(result)
     console.show_problems([*notes, *result.notes, *note])
     console.wrote(out, *pictures)
     width = "LANE_WIDTH" if lane_width is None else f"{lane_width:g}"
     console.next_command("map", drive, "--lane-width", width, "--camera", out, "--out", "MAP")
-
-
-def _check_yaml(*paths: Path | None) -> None:
-    for path in paths:
-        if path is not None and path.suffix.lower() not in (".yaml", ".yml"):
-            raise ConfigError(f"{path}: expected a name that ends in .yaml")
 
 
 def _read_lens(path: Path) -> Camera:
@@ -239,7 +251,7 @@ def _read_lens(path: Path) -> Camera:
 
 
 def _figures(path: Path) -> dict[str, float]:
-    """Figures of the lens, kept when only the mounting changes."""
+    """Return the lens's residuals, which stay valid when only the mounting changes."""
     found = read_yaml(path).get("residuals") or {}
     lens = ("rms_px", "worst_view_rms_px", "views_count", "seen_angle_rad")
     return {name: float(found[name]) for name in found if name in lens or name.endswith("_sigma_px")}
@@ -271,3 +283,135 @@ def _board_points(
     if isinstance(view, str):
         raise CalibrationError(f"{image}: {view}")
     return points_of_floor_board(view, wanted, (x_cm, y_cm))
+
+
+def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
+    """Write the largest view undistorted, and its board from above; returns the paths."""
+    from lanenet.calibration.chessboard import read_picture
+    from lanenet.calibration.chessboard_camera import reprojected
+    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+
+    sizes = [float(np.prod(np.ptp(view.corners_px, axis=0))) for view in result.views]
+    index = int(np.argmax(sizes))
+    view = result.views[index]
+    frame = read_picture(Path(view.name))
+    marked = points_picture(frame, view.corners_px, reprojected(result, index))
+    (x0, y0), (x1, y1) = view.points_cm.min(axis=0), view.points_cm.max(axis=0)
+    margin = 0.4 * max(x1 - x0, y1 - y0)
+    area = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
+    return [
+        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "board", plane_picture(frame, result.camera, result.fit.poses[index], area)),
+    ]
+
+
+def _ground_pictures(
+    out: Path, frame: np.ndarray, result: GroundCalibration, pixels_px: np.ndarray
+) -> list[Path]:
+    """Write the photo of the ground undistorted, and from above; returns the paths."""
+    from lanenet.calibration.lens import pose_from_mounting
+    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+
+    marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
+    pose = pose_from_mounting(result.camera.mounting)
+    return [
+        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
+    ]
+
+
+def _drive_pictures(out: Path, result: CalibratedDrive) -> list[Path]:
+    """Write frames of a straight section undistorted, and from above; returns the paths."""
+    from lanenet.calibration.lens import pose_from_mounting
+    from lanenet.calibration.pictures import plane_picture, undistorted_picture
+
+    pose = pose_from_mounting(result.camera.mounting)
+    frames = [result.drive.image(k) for k in result.shown]
+    flat = [undistorted_picture(frame, result.camera) for frame in frames]
+    above = [plane_picture(frame, result.camera, pose, _AREA_CM, _SMALL_PX_PER_CM) for frame in frames]
+    return [
+        _write_picture(out, "undistorted", np.concatenate(flat, axis=1)),
+        _write_picture(out, "birdseye", np.concatenate(above, axis=1)),
+    ]
+
+
+def _write_picture(out: Path, what: str, picture: np.ndarray) -> Path:
+    from lanenet.data.files import write_bytes
+    from lanenet.data.parquet import png_bytes
+
+    path = out.with_name(f"{out.stem}-{what}.png")
+    write_bytes(path, png_bytes(picture))
+    return path
+
+
+def _show_lens(result: ChessboardCalibration, pictures: int) -> None:
+    """Print a lens with its sigmas, and the RMS residual of each photo."""
+    from lanenet.calibration.chessboard_camera import view_errors_px
+
+    rows = [[Path(name).name, f"{rms:.3f}"] for name, rms in view_errors_px(result).items()]
+    console.show_table("corners, measured minus projected", ("photo", "RMS px"), rows)
+    K, s, D = result.camera.K, result.fit.lens_sigma, result.camera.D
+    console.show_lines(
+        [
+            f"{result.camera.model} lens, {len(result.views)} of {pictures} photos used, "
+            f"RMS {result.fit.rms_px:.3f} px",
+            f"focal lengths   {K[0, 0]:.2f} +- {s[0]:.2f}   {K[1, 1]:.2f} +- {s[1]:.2f} px",
+            f"principal point {K[0, 2]:.2f} +- {s[2]:.2f}   {K[1, 2]:.2f} +- {s[3]:.2f} px",
+            "distortion      " + "  ".join(f"{d:.4f} +- {e:.4f}" for d, e in zip(D, s[4:], strict=True)),
+        ]
+    )
+
+
+def _show_mounting(result: GroundCalibration, points_cm: np.ndarray, pixels_px: np.ndarray) -> None:
+    """Print a mounting with its sigmas, and the points that were left out as outliers."""
+    mounting, sigma = result.camera.mounting, result.sigma
+    lines = [f"{int(result.used.sum())} of {len(result.used)} points used, RMS {result.rms_px:.2f} px"]
+    for name in sigma:
+        value, spread = getattr(mounting, name), sigma[name]
+        label, _, unit = name.rpartition("_")
+        if unit == "rad":
+            value, spread, unit = np.rad2deg(value), np.rad2deg(spread), "degrees"
+        lines.append(f"{label.replace('_', ' '):20s}{value:8.2f} +- {spread:.2f} {unit}")
+    road_cm = result.camera.intersect_ground(pixels_px[result.used])
+    worst = float(np.nanmax(np.linalg.norm(road_cm - points_cm[result.used], axis=1)))
+    console.show_lines([*lines, f"{'worst point':20s}{worst:8.2f} cm off on the ground"])
+    console.show_problems(
+        [
+            f"left out point {k + 1}: "
+            + (
+                "behind the camera or outside its field of view"
+                if result.behind[k]
+                else f"{np.linalg.norm(result.residuals_px[k]):.1f} px off"
+            )
+            for k in np.flatnonzero(~result.used)
+        ]
+    )
+
+
+def _show_drive(result: CalibratedDrive) -> None:
+    """Print a camera found from a drive with its sigmas; angles in degrees."""
+    camera, m, sigma = result.camera, result.camera.mounting, result.sigma
+    K, turn = camera.K, float(np.rad2deg(1.0))
+    numbers = (
+        ("focal length", K[0, 0], sigma["focal_px"], "px", 1),
+        ("principal point, u", K[0, 2], sigma["cx_px"], "px", 1),
+        ("principal point, v", K[1, 2], sigma["cy_px"], "px", 1),
+        ("distortion k1", camera.D[0], sigma["k1"], "", 4),
+        ("pitch, down", turn * m.pitch_down_rad, turn * sigma["pitch_down_rad"], "degrees", 2),
+        ("roll", turn * m.roll_rad, turn * sigma["roll_rad"], "degrees", 2),
+        ("yaw, to the left", turn * m.yaw_rad, turn * sigma["yaw_rad"], "degrees", 2),
+        ("height", m.height_cm, sigma.get("height_cm"), "cm", 1),
+        ("ahead of front axle", m.ahead_of_front_axle_cm, sigma["ahead_of_front_axle_cm"], "cm", 1),
+    )
+    rows = [
+        [name, f"{value:.{digits}f}", "given" if spread is None else f"{spread:.{digits}f}", unit]
+        for name, value, spread, unit, digits in numbers
+    ]
+    console.show_table(f"{camera.model} camera from {result.drive.name}", ("number", "found", "+-", ""), rows)
+    lane = "no lane found" if result.lane_cm is None else f"lane {result.lane_cm:.1f} cm"
+    console.show_lines(
+        [
+            f"{result.frames} frames, {result.revisits} places seen twice, edges agree to "
+            f"{result.robust_sd_px:.2f} px (robust sd), {lane}"
+        ]
+    )

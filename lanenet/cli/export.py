@@ -1,4 +1,4 @@
-"""The verb that makes the files which the car runs: export."""
+"""``lanenet export``: the files that the car runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lanenet.cli import console
-from lanenet.cli.outputs import check_ending
+from lanenet.cli.shared import console
+from lanenet.cli.shared.outputs import check_ending
 from lanenet.errors import ConfigError
 
 app = typer.Typer()
@@ -25,12 +25,13 @@ def export(
     ] = None,
     check: Annotated[
         list[Path] | None,
-        typer.Option(help="Labels on whose frames the file is checked as well.", metavar="LABELS.parquet"),
+        typer.Option(help="Also check the file on the frames of these labels.", metavar="LABELS.parquet"),
     ] = None,
     int8: Annotated[
         bool,
         typer.Option(
-            "--int8", help="Quantise CHECKPOINT/model.onnx, and say what that costs and brings here."
+            "--int8",
+            help="Quantise CHECKPOINT/model.onnx to INT8, and show what it costs in cm and saves in time.",
         ),
     ] = False,
 ) -> None:
@@ -38,7 +39,7 @@ def export(
     if out is not None:
         check_ending(out, ".onnx")
     if int8 and check:
-        raise ConfigError("--check: compares with PyTorch, expected it without --int8")
+        raise ConfigError("--check: compares with PyTorch; it cannot be combined with --int8")
     if int8:
         from lanenet.learn.quantise import export_int8
         from lanenet.perception.network.model_file import MODEL_NAME

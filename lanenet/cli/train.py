@@ -1,4 +1,4 @@
-"""``lanenet train`` and ``lanenet sweep``: from a config to a checkpoint with its tables and its model card.
+"""``lanenet train``: from a config to a checkpoint with its tables and its model card.
 
 Imports ``datagen`` and ``lanenet.learn`` inside the commands, since the car has neither torch nor numba.
 """
@@ -8,14 +8,14 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from pydantic import Field
 
-from lanenet.cli import console
 from lanenet.cli import val as val_cli
-from lanenet.cli.car.verbs import MarkingOption
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import ConfigArgument, MarkingOption, OverridesArgument
 from lanenet.config import Settings, dump_settings, load_settings
 
 if TYPE_CHECKING:
@@ -25,13 +25,6 @@ if TYPE_CHECKING:
     from lanenet.evaluation.sources import Opened
 
 app = typer.Typer()
-
-_Config = Annotated[
-    Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
-]
-_Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
-]
 
 
 @functools.cache
@@ -67,8 +60,8 @@ def run_settings_schema() -> type[Settings]:
 
 @app.command(epilog="Example: lanenet train configs/small.yaml learn.epochs=5")
 def train(
-    config: _Config,
-    overrides: _Overrides = None,
+    config: ConfigArgument,
+    overrides: OverridesArgument = None,
     marking: MarkingOption = None,
 ) -> None:
     """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
@@ -156,30 +149,3 @@ def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:
         return []
     label_sets, names = zip(*known, strict=True)
     return measure_robustness({"network": RasterModel(model)}, label_sets, names)
-
-
-@app.command(epilog="Example: lanenet sweep configs/small.yaml learn.epochs=10 --minutes 60")
-def sweep(
-    config: _Config,
-    overrides: _Overrides = None,
-    minutes: Annotated[
-        float, typer.Option(min=0.0, help="No longer than this; goes on when called again.")
-    ] = 60.0,
-    trials: Annotated[int, typer.Option(min=1, help="No more finished trials than this, in all.")] = 100,
-) -> None:
-    """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
-    from datagen.datasets.build import prepare
-    from lanenet.learn.run_state import check_start
-    from lanenet.learn.sweep import sweep as sweep_networks
-
-    settings: Any = load_settings(run_settings_schema(), config, overrides)
-    check_start(settings.learn, settings.data.window, settings.data.perceptions)
-    with console.progress_bar("data") as progress:
-        data = prepare(settings.data, settings.work_folder, progress)
-    out = settings.work_folder / "sweep"
-    with console.progress_bar("trials") as progress:
-        table = sweep_networks(
-            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
-        )
-    console.show_lines(table.splitlines()[:14])
-    console.wrote(out / "sweep.md", out / "trials.csv")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lanenet.cli import console
-from lanenet.cli.car.verbs import MarkingOption
-from lanenet.cli.outputs import check_not_source
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import AnyCameraOption, MarkingOption
+from lanenet.cli.shared.outputs import check_not_source
 from lanenet.errors import ConfigError
 from lanenet.evaluation.report import default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
@@ -50,9 +50,7 @@ def val(
     ] = None,
     no_baselines: Annotated[bool, typer.Option("--no-baselines", help="The network only.")] = False,
     marking: MarkingOption = None,
-    any_camera: Annotated[
-        bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
-    ] = False,
+    any_camera: AnyCameraOption = False,
     also: Annotated[
         list[Path] | None,
         typer.Option(help="Another model or checkpoint for the same tables; may be given again."),
@@ -79,7 +77,7 @@ def val(
     needed.
     """
     from datagen.labels.truth import truth_labels
-    from lanenet.data.files import atomic_file, write_json, write_text
+    from lanenet.data.files import write_bytes, write_json, write_text
     from lanenet.data.label_set import read_labels
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network.detector import read_model_meta
@@ -123,8 +121,7 @@ def val(
             if isinstance(content, str):
                 write_text(path, content)
             else:
-                with atomic_file(path) as temporary:
-                    temporary.write_bytes(content)
+                write_bytes(path, content)
             console.wrote(path)
         if robustness is not None:
             table, figures = robustness

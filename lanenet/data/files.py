@@ -169,6 +169,12 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a binary file atomically."""
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def json_text(obj: Any) -> str:
     """Return indented JSON.
 

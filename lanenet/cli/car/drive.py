@@ -1,4 +1,4 @@
-"""``lanenet drive``: the car."""
+"""``lanenet drive``: the onboard loop, from camera to actuator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lanenet.cli import console
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import OverridesArgument
 from lanenet.errors import LanenetError
 
 app = typer.Typer()
@@ -16,15 +17,13 @@ app = typer.Typer()
 @app.command(epilog="Example: lanenet drive configs/car/replay.yaml --dry-run")
 def drive(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML of the car.", show_default=False)],
-    overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
-    ] = None,
+    overrides: OverridesArgument = None,
     arm: Annotated[bool, typer.Option("--arm", help="Let the motor turn, after a countdown.")] = False,
     steering_only: Annotated[
         bool, typer.Option("--steering-only", help="Move the wheels, never the motor.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Touch no actuator; show what would be sent.")
+        bool, typer.Option("--dry-run", help="Use no actuator; show what would be sent.")
     ] = False,
     frames: Annotated[
         int | None, typer.Option(min=1, help="End after this many frames.", show_default=False)

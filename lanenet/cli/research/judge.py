@@ -1,69 +1,25 @@
-"""The verb judge, and who may be at the wheel of a simulated car."""
+"""``lanenet judge``: detectors drive synthetic roads in closed loop."""
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lanenet.cli import console
+from lanenet.cli.research.entrants import SHIPPED_MODEL, named_entrant, warn_of_widths
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import AnyCameraOption
 from lanenet.config import apply_overrides, check_settings, read_yaml
-from lanenet.errors import ConfigError
-from lanenet.perception.network.model_file import find_model
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
     from datagen.judge.settings import JudgeSettings
-    from datagen.world.simulate import BuildPilot
-    from lanenet.geometry.camera import Camera
-    from lanenet.perception.estimate import Detector
-    from lanenet.perception.registry import DetectorName
 
 app = typer.Typer()
 
-_MODEL = Path("checkpoints/small")
-_BESIDE = 5  # detectors in a table on the screen
 _DETECTORS = "truth,network,lane-filter,hough,painter"
-
-
-@dataclass(frozen=True)
-class NamedDetector:
-    """Builds a detector by its name, in any process.
-
-    Attributes:
-        name: Of :data:`lanenet.perception.registry.DetectorName`.
-        model: ONNX file, for the network.
-        config: YAML with the settings of hough or painter.
-        any_camera: Accept a model that was trained with another camera.
-    """
-
-    name: DetectorName
-    model: Path | None = None
-    config: Path | None = None
-    any_camera: bool = False
-
-    def __call__(self, camera: Camera, lane_width_cm: float, marking_cm: float | None) -> Detector:
-        """Build it for a camera and a lane."""
-        from lanenet.perception.registry import build_detector
-
-        return build_detector(
-            self.name,
-            camera,
-            model=self.model if self.name == "network" else None,
-            lane_width_cm=lane_width_cm,
-            marking_cm=marking_cm,
-            any_camera=self.any_camera,
-            config=self.config,
-        )
-
-    @property
-    def identity(self) -> str:
-        """Hash of the files that it depends on."""
-        files = [path for path in (self.model, self.config) if path is not None]
-        return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+_BESIDE = 5  # detectors in one table on the screen: a terminal is narrow
 
 
 @app.command(
@@ -73,15 +29,16 @@ def judge(
     detectors: Annotated[
         str | None,
         typer.Option(
-            help="Who drives, separated by commas; hough and painter as NAME=SETTINGS.yaml too; truth is the "
-            f"scripted driver, true-points the steering law with perfect sight. Default: {_DETECTORS}.",
+            help="Entrants, separated by commas; hough and painter also as NAME=SETTINGS.yaml; truth is the "
+            f"scripted driver, true-points the steering law on the true lane. Default: {_DETECTORS}.",
             show_default=False,
         ),
     ] = None,
     model: Annotated[
         Path | None,
         typer.Option(
-            help=f"Model (.onnx) or checkpoint folder of the network; default {_MODEL}.", show_default=False
+            help=f"Model (.onnx) or checkpoint folder of the network; default {SHIPPED_MODEL}.",
+            show_default=False,
         ),
     ] = None,
     tracks: Annotated[
@@ -97,14 +54,14 @@ def judge(
     ] = None,
     put_back: Annotated[
         bool | None,
-        typer.Option("--put-back/--no-put-back", help="Put a lost car back (default), or end its run."),
+        typer.Option(
+            "--put-back/--no-put-back", help="Put a car that left the road back (default), or end its run."
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Decides roads, looks and cars.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of roads, looks and cars.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path("runs/judge"),
-    any_camera: Annotated[
-        bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
-    ] = False,
+    any_camera: AnyCameraOption = False,
     config: Annotated[
         Path | None, typer.Option(help="YAML with the contest's settings; options replace its values.")
     ] = None,
@@ -128,17 +85,17 @@ def judge(
     settings = check_settings(JudgeSettings, data, "judge" if config is None else str(config))
     if detectors is None:
         detectors = _DETECTORS
-        if model is None and not _MODEL.exists():
+        if model is None and not SHIPPED_MODEL.exists():
             detectors = ",".join(name for name in _DETECTORS.split(",") if name != "network")
-            console.show_problems([f"{_MODEL} is not there: without the network; --model names one"])
+            console.show_problems([f"{SHIPPED_MODEL} is not there: without the network; --model names one"])
     names = [text.strip() for text in detectors.split(",")]
-    entrants = [_entrant(name, model, "--detectors", any_camera) for name in names]
+    entrants = [named_entrant(name, model, "--detectors", any_camera) for name in names]
     _try_out(settings, entrants)
-    _warn_of_widths(entrants, _lane_widths_cm(settings))
+    warn_of_widths(entrants, _lane_widths_cm(settings))
     with console.progress_bar("judge") as progress:
         results = run_contest(settings, entrants, out, workers, progress)
     for kind, (measures, *table) in tables(results).items():
-        # Turned round, a few detectors at a time: there are more measures, and a terminal is narrow.
+        # Transposed, a few detectors at a time: there are more measures than detectors.
         for first in range(0, len(table), _BESIDE):
             headers, *rows = zip(measures, *table[first : first + _BESIDE], strict=True)
             console.show_table(table_title(settings, kind), headers, rows)
@@ -162,75 +119,16 @@ def judge(
     console.next_command("judge", *console.given(again))
 
 
-def pilot_builder(text: str, model: Path | None, lane_width_cm: float) -> BuildPilot:
-    """Return who steers a simulated drive in closed loop, for its world.
-
-    Args:
-        text: As one of judge's ``--detectors``.
-        model: Model or checkpoint folder, for the network; None takes the one that ships, and says so.
-        lane_width_cm: Of the road; a network that was trained on other ones is warned of.
-
-    Raises:
-        LanenetError: If there is no such detector or file.
-    """
-    from datagen.judge.run import build_pilot
-    from datagen.world.car.pilot import PilotSettings
-
-    entrant = _entrant(text, model, "--detector", any_camera=False)
-    _warn_of_widths([entrant], [lane_width_cm])
-    return lambda world: build_pilot(world, entrant, PilotSettings())
-
-
-def _entrant(text: str, model: Path | None, option: str, any_camera: bool) -> Entrant:
-    """Who a text stands for; ``option`` is where it comes from."""
-    from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant
-    from lanenet.perception.registry import DetectorName
-
-    name, equals, file = text.partition("=")
-    if name in (TRUTH, TRUE_POINTS) and not equals:
-        return Entrant(name)
-    known = get_args(DetectorName)
-    if name not in known:
-        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *known))}")
-    if equals and not Path(file).is_file():
-        raise ConfigError(f"{option} {text!r}: {file}: no such file")
-    detector = NamedDetector(
-        cast("Literal['network', 'lane-filter', 'hough', 'painter']", name),
-        _network_model(model) if name == "network" else None,
-        Path(file).resolve() if equals else None,
-        any_camera,
-    )
-    return Entrant(f"{name}-{Path(file).stem}" if equals else name, detector, detector.identity)
-
-
-def _network_model(given: Path | None) -> Path:
-    """The network's file; where none is named, the one that ships."""
-    if given is None:
-        if not _MODEL.exists():
-            raise ConfigError(f"detector network: expected a model (--model), {_MODEL} is not there")
-        typer.echo(f"network: {_MODEL}; --model names another one")
-    return find_model(_MODEL if given is None else given).resolve()
-
-
 def _lane_widths_cm(settings: JudgeSettings) -> list[float]:
-    """Widths of the lanes, a road of each kind after the other."""
+    """Return the lane width of one road of each kind."""
     from datagen.judge.settings import road_simulation
 
     kinds = range(len(settings.tracks))
     return [road_simulation(settings, kind * settings.count).track.lane_width_cm for kind in kinds]
 
 
-def _warn_of_widths(entrants: list[Entrant], lane_widths_cm: list[float]) -> None:
-    from lanenet.perception.network.model_file import read_model_meta
-
-    for entrant in entrants:
-        if isinstance(entrant.build, NamedDetector) and entrant.build.model is not None:
-            model = entrant.build.model
-            console.show_problems(read_model_meta(model).untrained_widths(lane_widths_cm, str(model)))
-
-
 def _try_out(settings: JudgeSettings, entrants: list[Entrant]) -> None:
-    """Refuse a detector that cannot be built for this camera before anything is driven."""
+    """Build each detector once, so that one that cannot be built is refused before the first run."""
     simulation = settings.simulation
     camera = simulation.camera.build(simulation.car.wheelbase_cm)
     for entrant in entrants:
@@ -244,7 +142,7 @@ def _draw_pictures(
     from datagen.judge.contest import contest_jobs, read_trajectory
     from datagen.judge.pictures import draw_top_view
     from datagen.world.world import draw_track
-    from lanenet.data.files import atomic_file
+    from lanenet.data.files import write_bytes
     from lanenet.data.parquet import png_bytes
 
     jobs = contest_jobs(settings, entrants, out)
@@ -257,7 +155,6 @@ def _draw_pictures(
         ]
         road = runs[0][0].road
         title = f"{road}, seed {runs[0][0].seed}, {settings.laps} laps, {settings.speed_cm_s:g} cm/s"
-        with atomic_file(folder / f"{road}.png") as temporary:
-            picture = draw_top_view(draw_track(jobs[first].simulation), runs, title)
-            temporary.write_bytes(png_bytes(picture))
+        picture = draw_top_view(draw_track(jobs[first].simulation), runs, title)
+        write_bytes(folder / f"{road}.png", png_bytes(picture))
     return folder

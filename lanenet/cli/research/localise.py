@@ -1,4 +1,4 @@
-"""The verb for localising a car as it drives."""
+"""``lanenet localise``: the particle filter alone, on a recording or on a running camera."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from lanenet.cli import console
-from lanenet.cli.outputs import check_ending, check_not_source
+from lanenet.cli.shared import console
+from lanenet.cli.shared.outputs import check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError, HardwareError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 log = logging.getLogger(__name__)
 
-#: The longest wait for a frame; a signal is answered at least this often.
+#: Longest wait for a frame, and so the longest until a signal is answered; chosen: three frames at 30/s.
 _WAIT_S = 0.1
 
 
@@ -46,7 +46,9 @@ def localise(
     live: Annotated[
         Path | None,
         typer.Option(
-            metavar="CONFIG", help="YAML of the car, as for drive: its camera as it runs.", show_default=False
+            metavar="CONFIG",
+            help="YAML of the car, as for drive: use its running camera.",
+            show_default=False,
         ),
     ] = None,
     camera: Annotated[
@@ -60,12 +62,12 @@ def localise(
         float | None,
         typer.Option(
             min=1e-3,
-            help="Usual way per frame, cm; with a recorded speed its gain. Default: found at the start.",
+            help="Typical step length, cm per frame; with a recorded speed, its gain. Default: estimated.",
             show_default=False,
         ),
     ] = None,
     start_frames: Annotated[
-        int, typer.Option(min=60, help="Frames in which speed and steering are found.")
+        int, typer.Option(min=60, help="Frames from which speed and steering are found.")
     ] = 300,
     speed: Annotated[
         float | None,
@@ -79,7 +81,7 @@ def localise(
         int | None, typer.Option(min=1, help="With --live: end after this many frames.", show_default=False)
     ] = None,
 ) -> None:
-    """Run the particle filter alone, as on the car: a pose per frame as it comes, memory bounded."""
+    """Run the particle filter alone, as on the car: one pose per frame, in bounded memory."""
     from datagen.localise.live_filter import StartSettings, moments_of
     from datagen.localise.localise import localise as run
     from datagen.settings import MapSettings
@@ -101,8 +103,8 @@ def localise(
         known = read_camera(camera) if camera is not None else drive.camera
         if known is None:
             raise CalibrationError(
-                f"{source}: comes without a camera, expected --camera camera.yaml; "
-                "the folder of its map has one (lanenet map)"
+                f"{source}: has no camera, expected --camera camera.yaml; "
+                "lanenet map writes one into the map's folder"
             )
         with console.progress_bar("localise") as progress:
             moments = moments_of(drive)
@@ -135,24 +137,24 @@ def localise(
 
 
 class LiveMoments:
-    """Frames of a running camera, as the filter takes them, with the speed that the car is meant to hold.
+    """Frames of a running camera for the filter, each with the speed that the car is meant to hold.
 
-    The filter is given the newest frame each time it asks: those that it was too slow for are left out, and
-    the car has come further by so much time. Ctrl-C and the other signals that end a drive end the frames,
-    and so does a camera that is gone for good: what was localised by then is kept.
+    The filter always gets the newest frame. Frames that it was too slow for are left out; the step to the
+    next one is longer by that time. Ctrl-C, the other signals that end a drive, and a camera that is gone for
+    good end the iteration; the poses found until then are kept.
 
     Attributes:
-        failure: Why the camera gave no more frames; None where it did not fail.
+        failure: Why the camera gave no more frames; None if it did not fail.
         skipped: Frames of the camera that were left out.
     """
 
     def __init__(self, source: FrameSource, speed_cm_s: float, most: int | None = None) -> None:
-        """Take the frames of a source, which is opened when the first is asked for.
+        """Take the source of the frames; it is opened when the first frame is requested.
 
         Args:
             source: Camera, or a recording that plays one.
-            speed_cm_s: Speed that whoever drives the car holds, about; what it really is the filter finds.
-            most: Ends after so many frames; None goes on.
+            speed_cm_s: Approximate speed of the car; the filter finds the true one.
+            most: Number of frames after which to end; None for no limit.
         """
         self._source, self._speed_cm_s = source, speed_cm_s
         self._most = math.inf if most is None else most
@@ -164,7 +166,7 @@ class LiveMoments:
         """Yield frames until a signal, an end or a failure.
 
         Raises:
-            HardwareError: If the camera is not there to begin with.
+            HardwareError: If the camera cannot be opened.
             MissingExtraError: If its driver is not installed.
         """
         from lanenet.onboard.loop import ending_signals
@@ -195,7 +197,7 @@ class LiveMoments:
                 log.error("the camera is gone: %s", error)
                 self.failure = error
                 return
-            # A driver that corrects its clock may stamp a frame before the last one.
+            # A driver that corrects its clock may give a frame an earlier time than the last one.
             if frame is None or frame.t_s <= t_s:
                 continue
             self.skipped += max(0, frame.number - number - 1) if taken else 0
@@ -213,7 +215,7 @@ def _show(report: LiveReport) -> None:
         + ("" if report.process_mb is None else f", process {report.process_mb:.0f} MB at most"),
         f"gain of the speed {report.factor:.3f}"
         if report.speed_known
-        else f"usual way per frame {report.factor:.2f} cm",
+        else f"typical step length {report.factor:.2f} cm per frame",
         f"median match {report.match:.2f}",
     ]
     if report.steering is not None:

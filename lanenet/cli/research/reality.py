@@ -1,4 +1,4 @@
-"""The verb reality: synthetic drives beside real ones."""
+"""``lanenet reality``: synthetic drives compared with real ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lanenet.cli import console
+from lanenet.cli.shared import console
 from lanenet.config import check_settings, load_settings
 from lanenet.errors import CalibrationError, ConfigError
 
@@ -35,7 +35,7 @@ def reality(
         list[str] | None,
         typer.Option(
             metavar="[DRIVE=]FILE",
-            help="Camera YAML of a drive, by its folder's name; without a name: of all others.",
+            help="Camera YAML of the drive with this folder name; without a name, of all others.",
             show_default=False,
         ),
     ] = None,
@@ -43,22 +43,22 @@ def reality(
         list[Path] | None,
         typer.Option(
             metavar="CONFIG|DRIVE",
-            help="YAML with the settings of the synthetic drives, or simulated drives (once for each).",
+            help="YAML with the settings of the synthetic drives, or a simulated drive; may be given again.",
             show_default=False,
         ),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Synthetic drives; default 60.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames of each of them; default 40.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Decides all synthetic drives.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all synthetic drives.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
-    """Compare what a network is given of synthetic and of real drives: statistics, histograms, sheets."""
+    """Compare the network's input on synthetic and on real drives: statistics, histograms, sheets."""
     from datagen.reality.drives import measure_all_synthetic
     from datagen.reality.measure import measure_drive
     from datagen.reality.pictures import histograms, sheet
     from datagen.reality.report import compare, summary, table, write_report
     from lanenet.data.drives import open_drive
-    from lanenet.data.files import atomic_file
+    from lanenet.data.files import write_bytes
     from lanenet.data.parquet import png_bytes
 
     settings, given = _synthetic(synthetic or [], {"count": count, "frames": frames, "seed": seed})
@@ -99,15 +99,14 @@ def reality(
     }
     for name, data in pictures.items():
         if data is not None:
-            with atomic_file(out / name) as temporary:
-                temporary.write_bytes(data)
+            write_bytes(out / name, data)
             paths.append(out / name)
     console.wrote(*paths)
     console.next_command("simulate", "CONFIG", "--out", "DRIVE")
 
 
 def _synthetic(given: list[Path], options: dict[str, int | None]) -> tuple[RealitySettings, list[Path]]:
-    """Return settings and simulated drives, from what ``--synthetic`` names."""
+    """Return the settings and simulated drives that ``--synthetic`` names."""
     from datagen.reality.drives import RealitySettings
 
     overrides = {key: value for key, value in options.items() if value is not None}
@@ -124,12 +123,12 @@ def _synthetic(given: list[Path], options: dict[str, int | None]) -> tuple[Reali
 
 
 def _cameras(drives: list[Drive], options: list[str]) -> list[Camera]:
-    """Return the camera of each drive: the one given for it, for all, or its own."""
+    """Return each drive's camera: the one given for it, else the one given for all, else its own."""
     from lanenet.data.camera_file import read_camera
 
     files: dict[str, Path] = {}
     for text in options:
-        # From the right: a path may hold an equals sign, a camera file hardly does.
+        # Split at the last equals sign: a drive's path may hold one, a camera file hardly does.
         name, _, file = text.rpartition("=")
         name = Path(name).name
         if name in files:
@@ -145,8 +144,8 @@ def _cameras(drives: list[Drive], options: list[str]) -> list[Camera]:
         lens = read_camera(given) if given is not None else drive.camera
         if lens is None:
             raise CalibrationError(
-                f"{drive.path}: the drive names no camera; pass --camera {drive.name}=camera.yaml (a rough "
-                "one will do: the height does not matter, focal length and pitch do)"
+                f"{drive.path}: the drive has no camera; give --camera {drive.name}=camera.yaml (a rough "
+                "one will do: focal length and pitch matter, the height does not)"
             )
         if (lens.width, lens.height) != (drive.width, drive.height):
             raise CalibrationError(
@@ -158,11 +157,11 @@ def _cameras(drives: list[Drive], options: list[str]) -> list[Camera]:
 
 
 def _warn_of_sizes(real: list[MeasuredDrive], synthetic: list[MeasuredDrive]) -> None:
-    """Numbers of points depend on the size of the images: say so where they differ."""
+    """Warn where image sizes differ, since the number of edge points depends on them."""
     sizes = {(drive.camera.width, drive.camera.height) for drive in real}
     other = {(drive.camera.width, drive.camera.height) for drive in synthetic} - sizes
     if other:
         shown = ", ".join(f"{w}x{h}" for w, h in sorted(other))
         console.show_problems(
-            [f"synthetic images of {shown} px beside real ones of other sizes: counts do not compare"]
+            [f"synthetic images of {shown} px and real ones of other sizes: counts cannot be compared"]
         )

@@ -1,11 +1,11 @@
 """Progress where nobody looks at a terminal: in log files and pipes."""
 
-from lanenet.cli import console
+from lanenet.cli.shared import console
 
 
 def test_a_log_gets_a_line_at_once_now_and_then_and_at_the_end(capsys, monkeypatch):
     now_s = [100.0]
-    monkeypatch.setattr("lanenet.cli.console.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("lanenet.cli.shared.console.time.monotonic", lambda: now_s[0])
     with console.progress_bar("map") as progress:
         for done in range(1, 61):
             now_s[0] += 1.0

@@ -9,7 +9,7 @@ import pytest
 
 from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.camera.coarse import guessed_camera
-from lanenet.cli.app import map_
+from lanenet.cli.map import map_drive
 from lanenet.config import dump_settings, load_settings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, MapSettings().guess)
@@ -54,4 +54,4 @@ def test_a_given_wheelbase_goes_before_all_others(wheelbase_cm):
 
 
 def test_map_can_be_told_the_wheelbase():
-    assert "wheelbase" in inspect.signature(map_).parameters
+    assert "wheelbase" in inspect.signature(map_drive).parameters

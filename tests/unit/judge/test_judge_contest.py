@@ -20,7 +20,7 @@ from datagen.world.car.rig import CameraSettings
 from datagen.world.road.track import TrackSettings, random_track
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli.app import app
-from lanenet.cli.research.judge import NamedDetector
+from lanenet.cli.research.entrants import NamedDetector
 from lanenet.errors import ConfigError, LanenetError
 
 # Short open roads: a run is a few dozen frames.

@@ -1,4 +1,4 @@
-"""The verbs for looking at synthetic worlds: track, sheets."""
+"""``lanenet track``: a road, checked and drawn from above."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lanenet.cli import console
+from lanenet.cli.shared import console
+from lanenet.cli.shared.outputs import check_ending
 from lanenet.errors import ConfigError
 
 app = typer.Typer()
@@ -20,7 +21,7 @@ def track(
         typer.Argument(metavar="FILE|PRESET", help="YAML file, or name of a preset.", show_default=False),
     ],
     out: Annotated[Path, typer.Option(help="Picture to write (.png).", show_default=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Decides what the road leaves open.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for what the road file leaves open.")] = 0,
     size: Annotated[int, typer.Option(min=100, max=20_000, help="Longer side of the picture, px.")] = 1600,
 ) -> None:
     """Check a road and draw it from above."""
@@ -28,11 +29,10 @@ def track(
 
     from datagen.world.road.track import load_track_settings, preset, preset_names, random_track
     from datagen.world.road.track_picture import draw_track, picture_scale
-    from lanenet.data.files import atomic_file
+    from lanenet.data.files import write_bytes
     from lanenet.data.parquet import png_bytes
 
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"{out}: expected a name that ends in .png")
+    check_ending(out, ".png")
     path = Path(road)
     if path.suffix.lower() in (".yaml", ".yml") or path.exists():
         settings = load_track_settings(path)
@@ -51,39 +51,8 @@ def track(
         f"{drawn.lane_width_cm:g} cm, tightest bend {radius}, {len(drawn.markings)} lines, "
         f"{len(drawn.boxes)} painted rectangles"
     )
-    with atomic_file(out) as temporary:
-        temporary.write_bytes(png_bytes(picture))
+    write_bytes(out, png_bytes(picture))
     console.wrote(out)
     console.next_command(
         "simulate", "CONFIG", f"track.{'file' if path.exists() else 'preset'}={road}", "--out", "DRIVE"
     )
-
-
-@app.command(epilog="Example: lanenet sheets bfmc light --out runs/sheets")
-def sheets(
-    out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).", show_default=False)],
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME", help="Presets and groups of effects; default all.")
-    ] = None,
-    max_kb: Annotated[
-        int | None, typer.Option(min=5, help="Shrink each picture to so many kB.", show_default=False)
-    ] = None,
-) -> None:
-    """Draw sheets of frames to look at: presets in random looks, and effects switched on one by one."""
-    from datagen.world.sheets import draw_sheet, encode_sheet, sheet_names
-    from lanenet.data.files import atomic_file
-
-    chosen = sheet_names() if not names else list(dict.fromkeys(names))
-    for name in chosen:
-        if name not in sheet_names():
-            raise ConfigError(f"no sheet {name!r}, expected some of {', '.join(sheet_names())}")
-    paths = [out / f"{name}.jpg" for name in chosen]
-    with console.progress_bar("sheets") as progress:
-        for done, (name, path) in enumerate(zip(chosen, paths, strict=True)):
-            progress(done, len(chosen))
-            data = encode_sheet(draw_sheet(name), None if max_kb is None else 1000 * max_kb)
-            with atomic_file(path) as temporary:
-                temporary.write_bytes(data)
-        progress(len(chosen), len(chosen))
-    console.wrote(*paths)
-    console.next_command("track", "PRESET", "--out", "PICTURE.png")

@@ -1,4 +1,4 @@
-"""What the command line shows: progress, tables, and where to go next."""
+"""What the command line shows: progress, tables, warnings, and the next command."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from rich.table import Table
 ProgressCall = Callable[..., None]
 
 
-#: A log file gets a line about a stage this often at most, and one at its end.
+#: A log file gets one line per stage this often, and one at the stage's end; chosen: three a minute.
 _LOG_EVERY_S = 20.0
 
 
 @contextmanager
 def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
-    """Show stages on stderr: bars in a terminal, lines now and then where it is a file or a pipe.
+    """Show stages on stderr: bars in a terminal, lines now and then in a file or a pipe.
 
     Yields:
-        Function of a stage's key, its text, the number done and the number in all.
+        A function of the stage's key, its text, the number done and the total.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -57,10 +57,10 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCall]:
-    """Show on stderr how far the body is; a new stage starts a new bar.
+    """Show the progress of the body on stderr; a new stage starts a new bar.
 
     Args:
-        title: What is being done; followed by the stage, if there is one.
+        title: What is being done; the stage's name follows it, if there is one.
     """
     with _bars() as show:
 
@@ -73,7 +73,7 @@ def progress_bar(title: str) -> Iterator[ProgressCall]:
 
 @contextmanager
 def training_bar() -> Iterator[ProgressCall]:
-    """Show epochs with the errors reached and the speed."""
+    """Show epochs with their errors and the training speed."""
     with _bars() as show:
 
         def report(*args: Any) -> None:
@@ -85,7 +85,7 @@ def training_bar() -> Iterator[ProgressCall]:
 
 
 class _LiveLog(logging.Handler):
-    """Log lines above the line that is written over."""
+    """Prints log lines above the live line."""
 
     def __init__(self, clear: str) -> None:
         super().__init__()
@@ -98,11 +98,11 @@ class _LiveLog(logging.Handler):
 
 @contextmanager
 def live_line() -> Iterator[Callable[[Callable[[], str]], None]]:
-    """Show one line on stderr that is written over, and log lines above it, while the body runs.
+    """Show one line on stderr that is overwritten, with log lines above it, while the body runs.
 
     Yields:
-        A function that takes a function of no arguments; it is asked for its text only when the line is due,
-        five times a second on a terminal, else every five seconds. A terminal that is gone does not matter.
+        A function that takes a function of no arguments which returns the text. It is called only when the
+        line is due: five times a second on a terminal, else every five seconds. A closed terminal is ignored.
     """
     terminal = sys.stderr.isatty()
     clear, end, every_s = ("\r\033[K", "", 0.2) if terminal else ("", "\n", 5.0)
@@ -144,7 +144,7 @@ def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
 
 
 def show_lines(lines: Sequence[str]) -> None:
-    """Print what a stage found, indented below its progress bar."""
+    """Print the results of a stage, indented below its progress bar."""
     for line in lines:
         typer.echo(f"  {line}")
 
@@ -165,7 +165,7 @@ def wrote(*paths: Path | None) -> None:
 
 
 def given(options: Mapping[str, Path | float | str | None]) -> list[str]:
-    """Return the options that were given, as words of a command; None and False stand for not given."""
+    """Return options as words of a command, without those that are None or False."""
     words: list[str] = []
     for name, value in options.items():
         if value is not None and value is not False:

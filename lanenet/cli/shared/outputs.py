@@ -1,4 +1,4 @@
-"""Where commands may write: refused before the work starts, not after it."""
+"""Checks of output paths, before the work starts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BESIDE_FRAMES = ("track.json", "simulation.yaml")
 
 
 def check_ending(path: Path, *endings: str) -> None:
-    """Refuse an output whose name does not end as its format does.
+    """Refuse an output whose ending is not one of its format.
 
     Raises:
         ConfigError: Names the endings.
@@ -21,7 +21,7 @@ def check_ending(path: Path, *endings: str) -> None:
 
 
 def check_not_source(source: Path, *outs: Path | None) -> None:
-    """Refuse an output that would replace a file of its own source, or be read as one the next time.
+    """Refuse an output that would replace a file of the source, or be read as part of it next time.
 
     Args:
         source: Photo, video, folder of photos, drive, tub, map or label set.
@@ -33,13 +33,13 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
     for out in outs:
         if out is not None and _belongs_to(source, source.resolve(), out.resolve()):
             raise ConfigError(
-                f"{out}: is, or would be read as, a file of {source}, which this command reads; choose "
+                f"{out}: is a file of {source}, which this command reads, or would be taken for one; choose "
                 "another name"
             )
 
 
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
-    # Here, because commands that read nothing need not wait for OpenCV.
+    # Imported here: commands that read no drive need not wait for OpenCV.
     from lanenet.data.drives.folder import DRIVE_FILE, FRAMES_FILE, TRUTH_FILE
     from lanenet.data.drives.sources import PHOTO_ENDINGS
     from lanenet.data.drives.tub import MANIFEST_FILE

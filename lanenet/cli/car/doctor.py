@@ -1,0 +1,85 @@
+"""``lanenet doctor``: checks of the installation, the camera and the car."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import CameraOption
+from lanenet.errors import ConfigError, LanenetError
+
+if TYPE_CHECKING:
+    from lanenet.onboard.drive_settings import DriveSettings
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet doctor --config configs/car/picamera_pca9685.yaml")
+def doctor(
+    camera: CameraOption = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML of a car, to check its devices.", show_default=False)
+    ] = None,
+    wheels_off_ground: Annotated[
+        bool,
+        typer.Option(
+            "--wheels-off-ground",
+            help="Turn wheels and motor, ask what they did, and write the answers into --config.",
+        ),
+    ] = False,
+) -> None:
+    """Check the installation, a camera file if one is given, and a whole car with --config."""
+    from lanenet.onboard.doctor.installation import run_checks
+    from lanenet.onboard.drive_settings import load_drive_settings
+
+    settings = None if config is None else load_drive_settings(config)
+    if wheels_off_ground:
+        if config is None or settings is None:
+            raise ConfigError("--wheels-off-ground: needs the car's file as well (--config car.yaml)")
+        _try_wheels(config, settings)
+        return
+    checks = run_checks(camera)
+    if settings is not None:
+        from lanenet.onboard.doctor.car import check_car
+
+        checks += check_car(settings)
+    for check in checks:
+        typer.echo(f"{check.state:8s}{check.name}: {check.text}")
+    problems = sum(check.state == "problem" for check in checks)
+    if problems:
+        raise LanenetError(f"{problems} problem(s) found, see above")
+    if settings is None or config is None:
+        # Without the training packages this is a car.
+        trains = any(check.name == "extra train" and check.state == "ok" for check in checks)
+        words = ("train", "configs/small.yaml") if trains else ("doctor", "--config", "CAR.yaml")
+        console.next_command(*words)
+    elif settings.actuator is None:
+        console.next_command("drive", config, "--dry-run")
+    else:
+        console.next_command("doctor", "--config", config, "--wheels-off-ground")
+
+
+def _try_wheels(config: Path, settings: DriveSettings) -> None:
+    """Ask about the wheels on the terminal, and write the result into the car's file."""
+    from lanenet.data.files import write_text
+    from lanenet.onboard.doctor.wheel_trial import pulses_of, try_wheels
+    from lanenet.onboard.doctor.yaml_edit import set_values
+    from lanenet.onboard.drive import build_sink
+
+    def ask(question: str, letters: str) -> str:
+        while True:
+            answer = typer.prompt(f"{question} [{'/'.join(letters)}]", type=str).strip().lower()[:1]
+            if answer and answer in letters:
+                return str(answer)
+
+    pulses_of(settings)
+    result = try_wheels(settings, build_sink(settings), ask)
+    console.show_lines(result.lines)
+    if result.changes:
+        text = config.read_text(encoding="utf-8")
+        write_text(config, set_values(text, result.changes, str(config)))
+        console.wrote(config)
+    console.next_command("drive", config, "--steering-only")

@@ -1,0 +1,165 @@
+"""``lanenet detect``: any detector over a photo, a video, a drive or a tub."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import AnyCameraOption, CameraOption, MarkingOption, ModelOption
+from lanenet.cli.shared.outputs import check_ending, check_not_source
+from lanenet.errors import CalibrationError, ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import UInt8
+
+    from lanenet.data.drives.sources import Source
+
+app = typer.Typer()
+
+
+class DetectorName(StrEnum):
+    """Detectors of ``lanenet detect``."""
+
+    NETWORK = "network"
+    LANE_FILTER = "lane-filter"
+    HOUGH = "hough"
+    PAINTER = "painter"
+
+
+@app.command(
+    epilog="Example: lanenet detect tub --detector lane-filter --camera runs/camera.yaml --out runs/l.csv"
+)
+def detect(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE", help="Photo, folder of photos, video, drive or tub.", show_default=False
+        ),
+    ],
+    detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
+    model: ModelOption = None,
+    camera: CameraOption = None,
+    video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
+    lane_width: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0,
+            help="Lane width for lane-filter and network, cm; default: from the settings file or the drive.",
+        ),
+    ] = None,
+    marking: MarkingOption = None,
+    any_camera: AnyCameraOption = False,
+    frames: Annotated[
+        str | None, typer.Option(help="Only these frame numbers, FIRST:LAST.", metavar="FIRST:LAST")
+    ] = None,
+    skip_unreadable: Annotated[
+        bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and continue.")
+    ] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="YAML with the settings of lane-filter (filter, perception), hough or painter.",
+            show_default=False,
+        ),
+    ] = None,
+    mask: Annotated[
+        str | None,
+        typer.Option(
+            help="Ignore the car itself, for lane-filter and network: 'auto' finds what never moves; "
+            "or a PNG that is black except on the car.",
+            metavar="auto|FILE.png",
+        ),
+    ] = None,
+) -> None:
+    """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
+    from lanenet.data.camera_file import read_camera
+    from lanenet.data.detections import check_table_path
+    from lanenet.data.drives.sources import open_source
+    from lanenet.evaluation.detect import run_detector
+    from lanenet.perception.registry import WITHOUT_CAMERA, build_detector
+
+    check_ending(out, ".parquet", ".csv")
+    check_not_source(source, out, video)
+    check_table_path(out)
+    whole = open_source(source)
+    opened = whole if frames is None else whole.numbered(*_frame_range(frames))
+    used_camera = read_camera(camera) if camera is not None else opened.camera
+    if used_camera is None and detector.value not in WITHOUT_CAMERA:
+        raise CalibrationError(
+            f"{source}: has no camera, expected --camera camera.yaml; "
+            "lanenet map writes one into the map's folder"
+        )
+    chosen = build_detector(
+        detector.value,
+        used_camera,
+        model=model,
+        lane_width_cm=lane_width,
+        drive_lane_width_cm=opened.lane_width_cm,
+        marking_cm=marking,
+        any_camera=any_camera,
+        config=config,
+        mask=_mask_of(mask, whole, detector),
+    )
+    console.show_problems(getattr(chosen, "problems", ()))
+    with console.progress_bar(f"detect ({detector.value})") as progress:
+        report = run_detector(
+            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
+        )
+    console.show_problems(report.problems)
+    typer.echo(
+        f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
+        f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
+    )
+    if hint := getattr(chosen, "hint", ""):
+        typer.echo(f"hint: {hint}")
+    console.wrote(report.out, report.video)
+    if report.video is None:
+        again = {
+            "--detector": detector.value,
+            "--model": model,
+            "--camera": camera,
+            "--lane-width": lane_width,
+            "--marking": marking,
+            "--any-camera": any_camera,
+            "--frames": frames,
+            "--skip-unreadable": skip_unreadable,
+            "--config": config,
+            "--mask": mask,
+            "--out": out,
+            "--video": out.with_suffix(".mp4"),
+        }
+        console.next_command("detect", source, *console.given(again))
+    else:
+        console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
+
+
+def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:
+    """Find or read the mask, and print what was found."""
+    from lanenet.onboard.masks import find_mask, read_mask
+    from lanenet.perception.registry import refuse_mask
+
+    if mask is None:
+        return None
+    refuse_mask(detector.value)
+    if mask != "auto":
+        return read_mask(Path(mask))
+    found, message = find_mask(source)
+    typer.echo(message)
+    return found
+
+
+def _frame_range(text: str) -> tuple[int, int]:
+    first, colon, last = text.partition(":")
+    if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
+        raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
+    if int(last) < int(first):
+        raise ConfigError(
+            f"--frames {text!r}: the last frame is before the first, expected FIRST:LAST, as in 700:999"
+        )
+    return int(first), int(last)

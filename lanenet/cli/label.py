@@ -1,0 +1,39 @@
+"""``lanenet label``: a map becomes a label set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet.cli.shared import console
+from lanenet.cli.shared.outputs import check_ending, check_not_source
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet label runs/tub --out runs/tub.parquet")
+def label(
+    map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Label set to write (.parquet).", show_default=False)],
+    force: Annotated[bool, typer.Option("--force", help="Label a rejected map, too.")] = False,
+    colour_weight: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, max=1.0, help="Weight of colour beside brightness when edges are found; default 0.75."
+        ),
+    ] = None,
+) -> None:
+    """Project a map's lane lines into each frame: six labels per frame, and a report of their quality."""
+    from datagen.pipeline import label_map
+    from lanenet.perception.edges.road import COLOUR_WEIGHT
+
+    check_ending(out, ".parquet")
+    check_not_source(map_folder, out, out.with_suffix(".json"), out.with_suffix(".png"))
+    with console.progress_bar("label") as progress:
+        weight = COLOUR_WEIGHT if colour_weight is None else colour_weight
+        report = label_map(map_folder, out, progress, force=force, colour_weight=weight)
+    console.show_lines(report.lines)
+    console.wrote(out)
+    console.next_command("val", "MODEL", out)

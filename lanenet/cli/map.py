@@ -1,0 +1,44 @@
+"""``lanenet map``: a drive becomes poses and a map of its lane lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import CameraOption, DriveArgument, MappingOption, WheelbaseOption
+from lanenet.config import load_settings
+from lanenet.errors import LanenetError
+
+app = typer.Typer()
+
+
+@app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out runs/tub")
+def map_drive(
+    drive: DriveArgument,
+    lane_width: Annotated[
+        float,
+        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm.", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the map.", show_default=False)],
+    camera: CameraOption = None,
+    config: MappingOption = None,
+    refine_camera: Annotated[
+        bool, typer.Option("--refine-camera", help="Adjust a known camera to this drive.")
+    ] = False,
+    wheelbase: WheelbaseOption = None,
+) -> None:
+    """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
+    from datagen.pipeline import MapSettings
+    from datagen.pipeline import map_drive as run
+
+    settings = MapSettings() if config is None else load_settings(MapSettings, config)
+    with console.progress_bar("map") as progress:
+        report = run(drive, lane_width, camera, settings, out, progress, refine_camera, wheelbase)
+    console.show_lines(report.lines)
+    console.wrote(out, out / "report.html")
+    if report.figures["verdict"]["grade"] == "reject":
+        raise LanenetError(f"{out}: the map was rejected: it is kept for inspection, but gives no labels")
+    console.next_command("label", out, "--out", out.with_suffix(".parquet"))

@@ -1,0 +1,42 @@
+"""``lanenet simulate``: a synthetic drive with ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lanenet.cli.research.entrants import pilot_builder
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import ConfigArgument, ModelOption, OverridesArgument
+from lanenet.config import load_settings
+from lanenet.errors import ConfigError
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out runs/three")
+def simulate(
+    config: ConfigArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],
+    overrides: OverridesArgument = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that draw the frames.")] = 1,
+    detector: Annotated[
+        str | None,
+        typer.Option(help="Detector that steers instead of the scripted driver.", show_default=False),
+    ] = None,
+    model: ModelOption = None,
+) -> None:
+    """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
+    from datagen.world.simulate import SimulationSettings, simulate_drive
+
+    settings = load_settings(SimulationSettings, config, overrides)
+    if model is not None and detector is None:
+        raise ConfigError("--model: is the network's, expected --detector network as well")
+    width_cm = settings.track.lane_width_cm
+    pilot = None if detector is None else pilot_builder(detector, model, width_cm)
+    with console.progress_bar("simulate") as progress:
+        drive = simulate_drive(settings, out, progress, workers=workers, pilot=pilot)
+    console.wrote(drive)
+    console.next_command("map", drive, "--lane-width", f"{width_cm:g}", "--out", "MAP")
