@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import UInt8
 
-    from lanenet.data.drives.sources import Source
+    from lanenet.data.sources import Source
 
 app = typer.Typer()
 
@@ -80,7 +80,7 @@ def detect(
     """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.detections import check_table_path
-    from lanenet.data.drives.sources import open_source
+    from lanenet.data.sources import open_source
     from lanenet.evaluation.detect import run_detector
     from lanenet.perception.registry import WITHOUT_CAMERA, build_detector
 
@@ -141,7 +141,7 @@ def detect(
 
 def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:
     """Find or read the mask, and print what was found."""
-    from lanenet.onboard.masks import find_mask, read_mask
+    from lanenet.data.sources import find_mask, read_mask
     from lanenet.perception.registry import refuse_mask
 
     if mask is None:

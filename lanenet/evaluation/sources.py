@@ -99,13 +99,11 @@ def open_source(
 
 def _check_folder(path: Path) -> None:
     """Refuse a folder that holds neither a drive nor a map."""
-    from lanenet.data.drives.folder import FRAMES_FILE
-    from lanenet.data.drives.tub import MANIFEST_FILE
+    from lanenet.data.drives import find_format, formats_text
 
-    known = (FRAMES_FILE, MANIFEST_FILE, "map.yaml")
-    if not any((path / name).is_file() for name in known):
+    if find_format(path) is None and not (path / "map.yaml").is_file():
         raise DriveFormatError(
-            f"{path}: not a drive, map or model: no {', '.join(known[:-1])} or {known[-1]} is in it, and "
+            f"{path}: not a drive, map or model: expected {formats_text()}, or a map (map.yaml), and "
             f"{without_model(path)}"
         )
 

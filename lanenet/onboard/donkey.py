@@ -39,11 +39,11 @@ from pydantic import Field
 from lanenet.config import Settings, check_settings, load_settings
 from lanenet.control.controller import ControlSettings, LaneController, throttle_of
 from lanenet.data.camera_file import read_camera
+from lanenet.data.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive_settings import DriveDetectorSettings
-from lanenet.onboard.masks import read_mask
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.edges.views import birdseye_view, undistorting_view

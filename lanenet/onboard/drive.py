@@ -10,6 +10,7 @@ import cv2
 from lanenet.control.controller import LaneController
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.recorder import DriveRecorder, new_drive_folder
+from lanenet.data.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
@@ -20,7 +21,6 @@ from lanenet.onboard.drive_report import Step
 from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.masks import read_mask
 from lanenet.onboard.safety import CommandLimiter
 from lanenet.perception.estimate import Detector
 from lanenet.perception.registry import build_detector

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.sources import open_source
+from lanenet.data.sources import find_mask, open_source
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.onboard.masks import find_mask
 from lanenet.perception.estimate import Detector
 from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.painter.detector import LanePainter, PainterSettings

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 from pathlib import Path
 
 from lanenet.errors import ConfigError
-
-#: What the simulator puts into a drive's folder.
-_BESIDE_FRAMES = ("track.json", "simulation.yaml")
 
 
 def check_ending(path: Path, *endings: str) -> None:
@@ -40,23 +38,23 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
 
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
     # Imported here: commands that read no drive need not wait for OpenCV.
-    from lanenet.data.drives.folder import DRIVE_FILE, FRAMES_FILE, TRUTH_FILE
-    from lanenet.data.drives.sources import PHOTO_ENDINGS
-    from lanenet.data.drives.tub import MANIFEST_FILE
+    from lanenet.data.drives import FORMATS, find_format
+    from lanenet.data.sources import PHOTO_ENDINGS
 
     if not resolved.is_dir():
-        # Beside a video lie its times and commands, beside a label set its report, wherever a link leads.
+        # A link may lead elsewhere, but the files beside a source are found by the name that was given.
+        files = [pattern for known in FORMATS for pattern in known.files if "{stem}" in pattern]
         ending = source.suffix.lower()
-        kinds = (".json", ".png") if ending == ".parquet" else () if ending in PHOTO_ENDINGS else (".csv",)
+        files = ["{stem}.json", "{stem}.png"] if ending == ".parquet" else files
+        files = [] if ending in PHOTO_ENDINGS else files
         folder = source.parent.resolve()
-        return out == resolved or out in {folder / f"{source.stem}{kind}" for kind in kinds}
+        return out == resolved or out in {folder / name.format(stem=source.stem) for name in files}
     if resolved not in out.parents:
         return False
     if (resolved / "map.yaml").is_file():
         return out.exists()
-    # Not the camera: a calibration gives the drive one.
-    read = (FRAMES_FILE, MANIFEST_FILE, DRIVE_FILE, TRUTH_FILE, *_BESIDE_FRAMES)
-    is_drive = any((resolved / name).is_file() for name in (FRAMES_FILE, MANIFEST_FILE))
-    if is_drive and out.parent == resolved and out.name.lower() in read:
+    files = [pattern for known in FORMATS for pattern in known.files]
+    is_drive_file = any(fnmatch.fnmatch(out.name.lower(), pattern) for pattern in files)
+    if is_drive_file and out.parent == resolved and find_format(resolved) is not None:
         return True
-    return out.exists() and out.suffix.lower() in (".catalog", ".catalog_manifest", *PHOTO_ENDINGS)
+    return out.exists() and out.suffix.lower() in PHOTO_ENDINGS

@@ -1,13 +1,13 @@
-"""Records a drive on the car: a folder that can be read at any moment, power cut included.
+"""Records a drive on the car: a folder that is readable at any moment, even after a power cut.
 
-A thread writes, so that a slow card holds the drive loop no longer than it takes to put a frame into a queue.
-Every :attr:`RecordingSettings.sync_s` the images are forced onto the card, then their rows are added to
-``frames.csv`` and forced as well: a row whose image is not there does not exist. The row's last field is the
-file name, so that a line that was cut off shows (:func:`lanenet.data.tables.is_torn`).
+A thread writes, so that a slow card does not hold up the drive loop. Every :attr:`RecordingSettings.sync_s`
+the images are synced to the card, then their rows are appended to ``frames.csv`` and synced: no row exists
+without its image. The file name is the last field of a row, so that a row that was cut off is recognised
+(:func:`lanenet.data.tables.is_torn`).
 
     card too slow    the queue is full: frames are left out and counted; their numbers are missing
     card full        recording stops with a line in the log, and the car drives on
-    power cut        what came in the last second is lost, the drive opens
+    power cut        the last second is lost; the drive can be opened
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from jaxtyping import UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.folder import DRIVE_FILE, DRIVE_FORMAT, FRAMES_FILE
+from lanenet.data.drives.folder import FRAMES_FILE
+from lanenet.data.drives.reading import DRIVE_FORMAT, DriveFile, write_drive_file
 from lanenet.data.drives.writer import image_name
 from lanenet.data.files import sync_path, write_text
 from lanenet.errors import DriveFormatError, LanenetError
@@ -38,22 +38,22 @@ from lanenet.geometry.camera import Camera
 
 log = logging.getLogger(__name__)
 
-#: How often left-out frames are mentioned in the log.
+#: The log mentions one in so many left-out frames; chosen: about every five seconds.
 _MENTION_EVERY = 100
-#: Closing waits this long for a card.
+#: Closing waits this long for the card; chosen: SD cards may stall for seconds.
 _CLOSE_S = 10.0
 
 
 class RecordingSettings(Settings):
-    """What is recorded, and when recording gives way.
+    """What is recorded, and when recording yields to driving.
 
     Attributes:
-        folder: Parent of the drives; each gets a folder of its own, named after the time.
+        folder: Parent of the drives; each gets its own folder, named after the time.
         jpeg_quality: 1 to 100.
-        queue_frames: Frames that may wait for the card; more are left out. Half a second's worth, since what
-            waits is lost in a power cut.
-        sync_s: How often frames are forced onto the card.
-        min_free_mb: Recording stops when less than this is free.
+        queue_frames: Frames that may wait for the card; more are left out. The default is half a second at
+            30 frames/s, since waiting frames are lost in a power cut.
+        sync_s: How often frames are synced to the card. With the queue, a power cut costs about a second.
+        min_free_mb: Recording stops when less than this is free; the default leaves room for logs.
     """
 
     folder: Path = Path("drives")
@@ -72,9 +72,9 @@ class _Item:
 
 
 def new_drive_folder(parent: Path, now: datetime) -> Path:
-    """Return a name for a drive that begins now and that no drive has yet.
+    """Return a folder that does not exist yet, named after the time.
 
-    A Raspberry Pi without a network does not know the time and may begin twice at the same one.
+    A Raspberry Pi without a network does not know the time, so two drives may start at the same one.
     """
     name = now.strftime("drive-%Y%m%d-%H%M%S")
     path, again = parent / name, 1
@@ -89,9 +89,9 @@ class DriveRecorder:
 
     Attributes:
         path: The drive's folder.
-        recorded: Frames that are safe on the card.
-        dropped: Frames left out because the card was slow, or after recording had stopped.
-        problem: Why recording stopped; empty while it goes on.
+        recorded: Frames that are synced to the card.
+        dropped: Frames left out because the card was slow or recording had stopped.
+        problem: Why recording stopped; empty while it runs.
     """
 
     def __init__(
@@ -103,15 +103,15 @@ class DriveRecorder:
         max_steering_rad: float | None = None,
         notes: str = "",
     ) -> None:
-        """Make the drive's folder and start the thread that writes.
+        """Make the drive's folder and start the writing thread.
 
         Args:
-            path: Folder of the drive, which must not exist.
+            path: Folder of the drive; must not exist.
             settings: Quality, queue and limits.
             camera: Stored beside the images.
             lane_width_cm: Distance between the middles of the driven lane's lines.
-            max_steering_rad: The car's lock.
-            notes: Anything worth knowing.
+            max_steering_rad: Largest steering angle of the car.
+            notes: Free text.
 
         Raises:
             LanenetError: If the folder exists or cannot be written.
@@ -119,21 +119,20 @@ class DriveRecorder:
         self.path, self._settings = path, settings
         self.recorded = self.dropped = 0
         self.problem = ""
-        data = {
-            "format": DRIVE_FORMAT,
-            "camera": None if camera is None else "camera.yaml",
-            "lane_width_cm": lane_width_cm,
-            "max_steering_rad": max_steering_rad,
-            "notes": notes,
-        }
         try:
             (path / "images").mkdir(parents=True)
         except OSError as error:
             raise LanenetError(f"{path}: the drive cannot be recorded there ({error})") from None
         if camera is not None:
             write_camera(path / "camera.yaml", camera, "copied from the car")
-        kept = {key: value for key, value in data.items() if value not in (None, "")}
-        write_text(path / DRIVE_FILE, yaml.safe_dump(kept, sort_keys=False, allow_unicode=True))
+        file = DriveFile.model_construct(
+            format=DRIVE_FORMAT,
+            camera=None if camera is None else "camera.yaml",
+            lane_width_cm=lane_width_cm,
+            max_steering_rad=max_steering_rad,
+            notes=notes,
+        )
+        write_drive_file(path, file)
         self._queue: queue.Queue[_Item] = queue.Queue(settings.queue_frames)
         self._ending = threading.Event()
         self._number = 0
@@ -147,12 +146,12 @@ class DriveRecorder:
         self._thread.start()
 
     def add(self, frame_bgr: UInt8[np.ndarray, "h w 3"], t_s: float, **commands: float) -> None:
-        """Hand over a frame, which nobody may write to any more.
+        """Queue a frame; the image must not be changed afterwards.
 
         Args:
             frame_bgr: The image.
-            t_s: Its time; the recording begins at 0.
-            **commands: What the car was told, by the names of :class:`.recording.Commands`.
+            t_s: Its time; the first frame of the recording gets 0.
+            **commands: Commanded values by the names of :class:`.recording.Commands`.
         """
         item = _Item(self._number, frame_bgr, t_s, commands)
         self._number += 1
@@ -167,7 +166,7 @@ class DriveRecorder:
             self.dropped += 1
 
     def close(self) -> None:
-        """Force what waits onto the card; gives up on a card that hangs. A drive without a frame goes."""
+        """Sync the waiting frames; gives up on a card that hangs, and removes a drive without frames."""
         self._ending.set()
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
@@ -187,28 +186,28 @@ class DriveRecorder:
                 if item is not None:
                     self._store(item)
                     item = None
-                # The first frame is forced at once: from then on the folder is a drive.
+                # The first frame is synced at once: from then on the folder is a drive.
                 if self._rows and (ended or self.recorded == 0 or time.monotonic() >= due_s):
                     self._commit()
                     due_s = time.monotonic() + self._settings.sync_s
             except Exception as error:
-                # Whatever it is, a thread that dies in silence would look like a slow card.
+                # Any error: a thread that dies silently would look like a slow card.
                 self._stop(str(error) or type(error).__name__)
                 self._discard()
-                # The one in hand has no row yet.
+                # The frame in hand has no row yet.
                 self.dropped += item is not None
                 return
             if ended:
                 return
 
     def _store(self, item: _Item) -> None:
-        """Write one image; its row waits until the image is safe."""
+        """Write one image; its row waits until the image is synced."""
         first = not self._size
         if first:
             self._names = list(item.commands)
             self._size, self._first_s = item.image_bgr.shape, item.t_s
         t_s = item.t_s - self._first_s
-        # A clock that stands, or an image of another size, would make the whole drive unreadable.
+        # A time that does not increase, or another image size, would make the whole drive unreadable.
         if not first and (not t_s > self._last_s or item.image_bgr.shape != self._size):
             self.dropped += 1
             return
@@ -238,7 +237,7 @@ class DriveRecorder:
         if not table.exists():
             header = ",".join(["frame", "t_s", *self._names, "file"])
             write_text(table, f"{header}\n{''.join(self._rows)}")
-            # The folder's own name is as safe as what is in it; its parent may be as new.
+            # Sync the names of the drive's folder and of its parent too: both may be new.
             sync_path(self.path.parent)
             sync_path(self.path.parent.parent)
         else:
@@ -266,7 +265,7 @@ class DriveRecorder:
         log.warning("recording stopped after %d frames: %s; driving goes on", self.recorded, why)
 
     def _discard(self) -> None:
-        """Remove images that have no row, and count what waits."""
+        """Remove images without a row, and count the frames that wait."""
         for image in self._images:
             try:
                 image.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A recorded drive in memory: times, commands and images that are read when asked for."""
+"""A recorded drive in memory: times, commands, and images that are read on demand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Integer, UInt8
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.camera import Camera
 
-#: A longer pause is a break in the drive: a car at 1 m/s would be out of sight of its last frame.
+#: A longer pause is a break: a car at 1 m/s would have lost its last frame from sight.
 MAX_PAUSE_S = 1.0
 
 COMMAND_NAMES: tuple[str, ...] = ("speed_cm_s", "throttle", "steering_rad", "angle", "yaw_rate_rad_s")
@@ -21,7 +21,7 @@ COMMAND_NAMES: tuple[str, ...] = ("speed_cm_s", "throttle", "steering_rad", "ang
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """Where a drive's images come from."""
+    """Source of a drive's images."""
 
     def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
         """Return image ``row``, BGR.
@@ -34,7 +34,7 @@ class ImageSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What the car was told to do; None where the drive does not hold a command.
+    """The commands that the car got; None for a command that the drive does not hold.
 
     Attributes:
         speed_cm_s: Commanded speed.
@@ -62,23 +62,23 @@ class Drive:
 
     Attributes:
         name: Name of the folder or video.
-        path: Where it lies.
+        path: Its place on disk.
         frames: Frame numbers, strictly increasing.
         t_s: Time of each frame, strictly increasing.
-        times_trusted: False where ``t_s`` is frame number times a guessed period.
-        commands: What the car was told; NaN in rows that lack one.
-        deleted: True where the driver flagged the frame as not to be learned from.
-        breaks: True where a frame does not follow the one before it: numbers were skipped, another session
-            began, or time jumped. False for the first.
-        camera: The camera, if the drive knows it.
-        lane_width_cm: Distance between the middles of the lane's lines, if the drive knows it.
-        problems: What was wrong with the recording and left out or replaced, a sentence each.
+        times_trusted: False if ``t_s`` is the frame number times a guessed period.
+        commands: Commanded values; NaN in rows that lack one.
+        deleted: True where the driver flagged the frame as unfit for learning.
+        breaks: True where a frame does not continue the one before it: frame numbers were skipped, another
+            session began, or time jumped. False for the first.
+        camera: The camera; None if the drive does not name one.
+        lane_width_cm: Distance between the middles of the lane's lines; None if unknown.
+        problems: What was wrong with the recording, a sentence each.
         width: Image width, [px].
         height: Image height, [px].
-        images: Where the images come from.
+        images: Source of the images.
         rows: Row of each frame in ``images``.
-        max_steering_rad: Steering angle at Donkeycar's angle -1, if the drive knows it.
-        notes: What the driver wrote down.
+        max_steering_rad: Steering angle at Donkeycar's angle -1; None if unknown.
+        notes: Free text of the driver.
     """
 
     name: str
@@ -122,19 +122,19 @@ class Drive:
         return image
 
     def subset(self, keep: slice | Bool[np.ndarray, "_"] | Int[np.ndarray, "_"]) -> Drive:
-        """Return a part of the drive.
+        """Return some frames of the drive.
 
-        Frames that a mask leaves out make a break. A slice with a step, or rows in ascending order, thin the
-        drive out, which makes none.
+        Frames left out by a mask make a break. A slice with a step, or ascending row numbers, thin the drive
+        out, which makes none.
 
         Raises:
             DriveFormatError: If nothing is left.
         """
         rows = np.arange(len(self))[keep]
         if len(rows) == 0:
-            raise DriveFormatError(f"{self.path}: the chosen part of the drive has no frames")
-        piece = np.cumsum(self.breaks)[rows]
-        breaks = np.diff(piece, prepend=piece[0]) > 0
+            raise DriveFormatError(f"{self.path}: the selection has no frames")
+        segment = np.cumsum(self.breaks)[rows]
+        breaks = np.diff(segment, prepend=segment[0]) > 0
         if not isinstance(keep, slice) and keep.dtype == bool:
             breaks |= np.diff(rows, prepend=rows[0] - 1) > 1
             breaks[0] = False
@@ -150,7 +150,7 @@ class Drive:
 
 
 class ImageFiles:
-    """Images that lie in files."""
+    """Images in files."""
 
     def __init__(self, paths: list[Path]) -> None:
         self.paths = paths
@@ -164,8 +164,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file, BGR.
 
     Raises:
-        DriveFormatError: If the file is missing, is not an image, or ends too early. OpenCV would fill the
-            rest of a truncated JPEG with gray and say nothing.
+        DriveFormatError: If the file is missing, is not an image, or ends too early: OpenCV fills the rest
+            of a truncated JPEG with gray without an error.
     """
     try:
         data = path.read_bytes()
@@ -186,48 +186,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 def _truncated(data: bytes) -> bool:
     if data.startswith(b"\xff\xd8"):
-        # The end marker has to come after the last scan; a thumbnail in the header has an end of its own.
+        # The end marker must follow the last scan: a thumbnail in the header has an end marker, too.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:]
     return False
-
-
-def first_size(images: ImageSource, rows: Int[np.ndarray, "n"], where: Path) -> tuple[int, int]:
-    """Width and height of the first image that can be read.
-
-    Raises:
-        DriveFormatError: If there is none; tells what is wrong with the first.
-    """
-    reason = "no frames"
-    for k, row in enumerate(rows):
-        try:
-            height, width = images.read(int(row)).shape[:2]
-        except DriveFormatError as error:
-            reason = str(error) if k == 0 else reason
-            continue
-        return int(width), int(height)
-    raise DriveFormatError(f"{where}: none of the {len(rows)} frames has a readable image ({reason})")
-
-
-def find_breaks(
-    frames: Int[np.ndarray, "n"], t_s: Float[np.ndarray, "n"], times_trusted: bool
-) -> Bool[np.ndarray, "n"]:
-    """Find the frames that do not follow the one before them.
-
-    Args:
-        frames: Frame numbers, increasing. A drive that numbers every second frame has no gaps: a gap is more
-            than the usual step.
-        t_s: Times.
-        times_trusted: Whether a jump of more than :data:`MAX_PAUSE_S` counts.
-
-    Returns:
-        True at the first frame after a gap or a pause.
-    """
-    breaks = np.zeros(len(frames), dtype=bool)
-    if len(frames) > 1:
-        steps = np.diff(frames)
-        breaks[1:] = steps > max(1.0, float(np.median(steps)))
-        if times_trusted:
-            breaks[1:] |= np.diff(t_s) > MAX_PAUSE_S
-    return breaks

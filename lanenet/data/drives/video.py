@@ -9,20 +9,23 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.drives.folder import drive_of, read_times
-from lanenet.data.drives.recording import Commands, Drive
+from lanenet.data.drives.reading import DriveFormat, RecordedFrames, read_times
+from lanenet.data.drives.recording import Commands
 from lanenet.errors import DriveFormatError
 
 VIDEO_ENDINGS: tuple[str, ...] = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
-#: Up to this many frames ahead, decoding on is faster than a jump to the next key frame before them.
+#: Up to this many frames ahead, decoding is taken to be faster than a seek, which decodes from the keyframe
+#: before the target. Chosen: a common keyframe interval is 12 to 250 frames.
 _MAX_FORWARD = 60
+#: Where the header has no rate: that of a Donkeycar.
 _DEFAULT_FPS = 20.0
+#: A higher rate in a header is a time base, not a rate.
 _MAX_FPS = 1000.0
 
 
 class VideoImages:
-    """Frames of a video file: in order at full speed, out of order by seeking."""
+    """Frames of a video file: fast in order, by seeking out of order."""
 
     def __init__(self, path: Path) -> None:
         """Open a video.
@@ -32,22 +35,22 @@ class VideoImages:
         """
         self.path = path
         self._capture = self._opened()
-        #: Frame that the decoder answers next.
+        #: Frame that the decoder gives next.
         self._next = 0
         self._last: tuple[int, np.ndarray] | None = None
 
     def __reduce__(self) -> tuple[type[VideoImages], tuple[Path]]:
-        """Another process opens the file again."""
+        """Pickle the path only: another process opens the file again."""
         return VideoImages, (self.path,)
 
     @property
     def listed_frames(self) -> int:
-        """Number of frames as the header says; 0 if it does not."""
+        """Number of frames according to the header; 0 if it has none."""
         return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
 
     @property
     def fps(self) -> float:
-        """Frames per second as the header says; 0 if it does not."""
+        """Frames per second according to the header; 0 if it has none."""
         fps = float(self._capture.get(cv2.CAP_PROP_FPS))
         return fps if 0.0 < fps <= _MAX_FPS else 0.0
 
@@ -61,7 +64,7 @@ class VideoImages:
             self._next += 1
         ok, image = self._capture.read() if self._next == row else (False, None)
         if not ok or image is None:
-            # Where the decoder stands after a failure is not defined.
+            # The decoder's position after a failure is undefined.
             self._rewind()
             raise DriveFormatError(
                 f"{self.path}: video frame {row} cannot be decoded (is the video cut off?)"
@@ -73,7 +76,7 @@ class VideoImages:
     def count(self) -> int:
         """Count the frames that can be decoded.
 
-        The last one listed is tried first; only if it fails is the whole video walked through.
+        Tries the last frame of the header first; decodes the whole video only if that fails.
         """
         listed = self.listed_frames
         if listed and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1) and self._capture.grab():
@@ -100,13 +103,13 @@ class VideoImages:
     def _seek(self, row: int) -> None:
         if self._capture.set(cv2.CAP_PROP_POS_FRAMES, row):
             self._next = int(self._capture.get(cv2.CAP_PROP_POS_FRAMES))
-        # A jump that does not land there is replaced by decoding from the start.
+        # A seek that lands elsewhere is replaced by decoding from the start.
         if self._next != row:
             self._rewind()
 
 
-def open_video(path: Path) -> Drive:
-    """Open a video; ``<name>.csv`` beside it may give times and commands of its frames, counted from 0.
+def read_video(path: Path) -> RecordedFrames:
+    """Read a video; ``<name>.csv`` beside it may give times and commands of its frames, counted from 0.
 
     Raises:
         DriveFormatError: If the video or its CSV cannot be read, or it has no frame.
@@ -120,7 +123,7 @@ def open_video(path: Path) -> Drive:
         problems.append(f"{path}: the video is cut off: {n} of {images.listed_frames} frames can be decoded")
     table = path.with_suffix(".csv")
     if table.is_file():
-        columns, commands = read_times(table, with_files=False)
+        columns, commands = read_times(table)
         frames, t_s, trusted = columns["frame"], columns["t_s"], True
         inside = np.flatnonzero(frames < n)
         if len(inside) == 0:
@@ -134,8 +137,16 @@ def open_video(path: Path) -> Drive:
     else:
         fps, trusted = images.fps, images.fps > 0.0
         if not trusted:
-            problems.append(f"{path}: the video does not tell its rate; taking {_DEFAULT_FPS:.0f} frames/s")
+            problems.append(f"{path}: the video has no frame rate; taking {_DEFAULT_FPS:.0f} frames/s")
         frames = np.arange(n)
         t_s = frames / (fps or _DEFAULT_FPS)
         commands = Commands()
-    return drive_of(path, frames, t_s, commands, images, problems, rows=frames, times_trusted=trusted)
+    return RecordedFrames(frames, t_s, commands, images, tuple(problems), rows=frames, times_trusted=trusted)
+
+
+FORMAT = DriveFormat(
+    described=f"a video ({', '.join(VIDEO_ENDINGS)})",
+    recognises=lambda path: path.is_file() and path.suffix.lower() in VIDEO_ENDINGS,
+    read=read_video,
+    files=("{stem}.csv",),
+)

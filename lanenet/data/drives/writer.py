@@ -1,4 +1,4 @@
-"""Writes drive folders: images, frames.csv, drive.yaml, and the truth where a simulator knows it."""
+"""Writes drive folders: images, frames.csv, drive.yaml, and the ground truth of a simulator."""
 
 from __future__ import annotations
 
@@ -9,21 +9,14 @@ from types import TracebackType
 
 import cv2
 import numpy as np
-import yaml
 from jaxtyping import UInt8
 
 from lanenet.config import check_settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.folder import (
-    DRIVE_FILE,
-    DRIVE_FORMAT,
-    FRAMES_FILE,
-    TRUTH_FILE,
-    TRUTH_NAMES,
-    DriveFile,
-)
+from lanenet.data.drives.folder import FRAMES_FILE, TRUTH_FILE, TRUTH_NAMES
+from lanenet.data.drives.reading import DRIVE_FORMAT, DriveFile, write_drive_file
 from lanenet.data.drives.recording import COMMAND_NAMES
-from lanenet.data.files import atomic_folder, write_text
+from lanenet.data.files import atomic_folder
 from lanenet.data.tables import write_csv
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.camera import Camera
@@ -31,9 +24,9 @@ from lanenet.geometry.lane import POINT_NAMES
 
 
 class DriveWriter:
-    """Writes a drive; the folder appears, complete, when the ``with`` block ends well, else not at all.
+    """Writes a drive; the folder appears when the ``with`` block ends without an error, else not at all.
 
-    A caller that wants to keep what was recorded before an error has to catch it inside the block.
+    To keep what was written before an error, catch the error inside the block.
     """
 
     def __init__(
@@ -52,7 +45,7 @@ class DriveWriter:
             path: Folder to write; an earlier drive there is replaced at the end.
             camera: Stored beside the images as ``camera.yaml``.
             lane_width_cm: Distance between the middles of the driven lane's lines.
-            notes: Anything worth knowing.
+            notes: Free text.
             jpeg_quality: 1 to 100.
             max_steering_rad: Steering angle at Donkeycar's angle -1.
             camera_method: How the camera was found, for its file.
@@ -77,7 +70,7 @@ class DriveWriter:
 
     @property
     def folder(self) -> Path:
-        """Where the drive grows until it is moved into place, for files that belong beside the images."""
+        """Temporary folder of the drive until it is complete; further files may be written into it."""
         if self._folder is None:
             raise DriveFormatError(f"{self.path}: the drive is not open for writing (use a with block)")
         return self._folder
@@ -104,8 +97,8 @@ class DriveWriter:
             t_s: Its time, later than the one before.
             truth: Rear-axle pose in the map and the six labels (:data:`TRUTH_NAMES`; labels may be NaN), for
                 every frame or for none.
-            **commands: What the car was told, by the names of :class:`.recording.Commands`; the
-                same ones for every frame.
+            **commands: Commanded values by the names of :class:`.recording.Commands`; the same names for
+                every frame.
 
         Raises:
             DriveFormatError: If a value is missing, unknown or not finite, time does not increase, or the
@@ -175,8 +168,7 @@ class DriveWriter:
             write_csv(self.folder / TRUTH_FILE, {"frame": frame, **truth}, allow_empty=POINT_NAMES)
         if self._camera is not None:
             write_camera(self.folder / "camera.yaml", self._camera, self._camera_method)
-        data = {key: value for key, value in self._file.model_dump().items() if value not in (None, "")}
-        write_text(self.folder / DRIVE_FILE, yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
+        write_drive_file(self.folder, self._file)
 
 
 def image_name(number: int) -> str:

@@ -14,12 +14,11 @@ from lanenet.cli import app as cli
 from lanenet.config import check_settings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.detections import read_detections
-from lanenet.data.drives.sources import Source
+from lanenet.data.sources import Source, find_mask, read_mask
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.drive import build_drive_detector
 from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.masks import find_mask, read_mask
 from lanenet.perception.lane_filter.detector import LaneFilter
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.registry import build_detector, lane_filter_settings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lanenet.data.detections import read_detections
-from lanenet.data.drives.sources import Source
+from lanenet.data.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import lane_filter_points_cm
 from lanenet.evaluation.detect import run_detector
