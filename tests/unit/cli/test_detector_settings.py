@@ -137,7 +137,7 @@ def test_no_mask_says_why() -> None:
     for frame in high:
         frame[180:, 60:260] = 10
     mask, told = find_mask(source_of(high))
-    assert mask is None and "too much to be taken for the car" in told
+    assert mask is None and "too high for the car" in told
 
 
 def test_unreadable_frames_do_not_hide_the_car() -> None:
@@ -166,7 +166,7 @@ def test_mask_files(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.dstack([np.zeros((9, 9, 3), np.uint8), np.full((9, 9), 255, np.uint8)]))
     assert not read_mask(path).any()
     cv2.imwrite(str(path), np.full((9, 9), 256, np.uint16))
-    with pytest.raises(ConfigError, match="hides the whole picture"):
+    with pytest.raises(ConfigError, match="masks the whole image"):
         read_mask(path)
     path.write_bytes(b"no picture")
     with pytest.raises(ConfigError, match="not a picture"):

@@ -233,12 +233,12 @@ def test_a_drive_that_numbers_every_third_frame_has_no_gaps(tmp_path: Path) -> N
 
 
 def test_what_is_not_a_drive(tmp_path: Path) -> None:
-    with pytest.raises(DriveFormatError, match=r"neither frames\.csv nor a Donkeycar tub's manifest\.json"):
+    with pytest.raises(DriveFormatError, match=r"frames\.csv.*manifest\.json"):
         open_drive(tmp_path)
     with pytest.raises(DriveFormatError, match="no such drive"):
         open_drive(tmp_path / "nowhere")
     (tmp_path / "a.txt").write_text("x")
-    with pytest.raises(DriveFormatError, match=r"expected a folder or a video .*found \.txt"):
+    with pytest.raises(DriveFormatError, match=r"a\.txt: .*video .*\.mp4"):
         open_drive(tmp_path / "a.txt")
     (tmp_path / "record_0.json").write_text("{}")
     with pytest.raises(DriveFormatError, match="version 1 tub"):
