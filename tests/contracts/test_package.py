@@ -42,9 +42,17 @@ def commands(group: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[s
 COMMANDS = dict(commands(typer.main.get_command(app)))
 
 
+#: Documents whose command lines are checked.
+DOCUMENTS = (REPO / "README.md", REPO / "docs" / "commands.md")
+
+
+def documents_text() -> str:
+    return "\n".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+
+
 def readme_lines() -> list[str]:
-    """The command lines ``lanenet ...`` in the code blocks of the README."""
-    blocks = re.findall(r"```(?:bash|sh|console)?\n(.*?)```", (REPO / "README.md").read_text(), re.DOTALL)
+    """The command lines ``lanenet ...`` in the code blocks of the README and of the page of commands."""
+    blocks = re.findall(r"```(?:bash|sh|console)?\n(.*?)```", documents_text(), re.DOTALL)
     lines = (line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines())
     return [line for line in lines if line.startswith("lanenet ")]
 
@@ -83,9 +91,13 @@ def test_every_verb_has_help_with_an_example(names: tuple[str, ...]) -> None:
             assert parameter.help, f"{parameter.opts[0]} is not explained"
 
 
-def test_the_readme_shows_the_main_verbs() -> None:
+def test_the_documents_show_every_verb() -> None:
     shown = {line.split()[1] for line in readme_lines()}
-    assert {"train", "simulate", "map", "label", "val", "detect"} <= shown
+    assert {names[0] for names in COMMANDS} <= shown
+
+
+def test_the_readme_fits_on_a_few_screens() -> None:
+    assert len((REPO / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
 
 @pytest.mark.parametrize("line", readme_lines(), ids=lambda line: line.split()[1])
@@ -106,9 +118,8 @@ def outputs(line: str) -> list[str]:
 
 
 def examples() -> list[str]:
-    """The command lines of the README and of the help texts, those that do not run from the clone too."""
-    readme = (REPO / "README.md").read_text()
-    shown = [line for line in readme.splitlines() if re.match(r"(lanenet-env/bin/)?lanenet ", line)]
+    """The command lines of the documents and of the help texts, those that do not run from the clone too."""
+    shown = [line for line in documents_text().splitlines() if re.match(r"(lanenet-env/bin/)?lanenet ", line)]
     return [*shown, *(str(command.epilog) for command in COMMANDS.values())]
 
 
