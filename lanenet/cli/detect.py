@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption, CameraOption, MarkingOption, ModelOption
+from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, ModelOption
 from lanenet.cli.shared.outputs import check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.perception.detector_kind import DetectorInputs
+from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed, refuse_mask
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,16 +21,16 @@ if TYPE_CHECKING:
 
     from lanenet.data.sources import Source
 
+    DetectorName = str
+else:
+    DetectorName = StrEnum("DetectorName", {name: name for name in KINDS})
+
 app = typer.Typer()
 
-
-class DetectorName(StrEnum):
-    """Detectors of ``lanenet detect``."""
-
-    NETWORK = "network"
-    LANE_FILTER = "lane-filter"
-    HOUGH = "hough"
-    PAINTER = "painter"
+_WITHOUT_CAMERA = listed(detector_names(lambda kind: not kind.needs_camera))
+_WITH_LANE_WIDTH = listed(detector_names(lambda kind: kind.takes_lane_width))
+_WITH_SETTINGS = listed(detector_names(lambda kind: kind.settings is not None), "or")
+_WITH_MASK = listed(detector_names(lambda kind: kind.takes_mask))
 
 
 @app.command(
@@ -44,13 +46,16 @@ def detect(
     detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
     model: ModelOption = None,
-    camera: CameraOption = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", help=f"Camera YAML; {_WITHOUT_CAMERA} need none.", show_default=False),
+    ] = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
         float | None,
         typer.Option(
             min=1.0,
-            help="Lane width for lane-filter and network, cm; default: from the settings file or the drive.",
+            help=f"Lane width for {_WITH_LANE_WIDTH}, cm; default: from the settings file or the drive.",
         ),
     ] = None,
     marking: MarkingOption = None,
@@ -63,26 +68,22 @@ def detect(
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(
-            help="YAML with the settings of lane-filter (filter, perception), hough or painter.",
-            show_default=False,
-        ),
+        typer.Option(help=f"YAML with the settings of {_WITH_SETTINGS}.", show_default=False),
     ] = None,
     mask: Annotated[
         str | None,
         typer.Option(
-            help="Ignore the car itself, for lane-filter and network: 'auto' finds what never moves; "
+            help=f"Ignore the car itself, for {_WITH_MASK}: 'auto' finds what never moves; "
             "or a PNG that is black except on the car.",
             metavar="auto|FILE.png",
         ),
     ] = None,
 ) -> None:
-    """Run a detector over a photo, a video, a drive or a tub; hough and painter need no camera."""
+    """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.detections import check_table_path
     from lanenet.data.sources import open_source
     from lanenet.evaluation.detect import run_detector
-    from lanenet.perception.registry import WITHOUT_CAMERA, build_detector
 
     check_ending(out, ".parquet", ".csv")
     check_not_source(source, out, video)
@@ -90,24 +91,24 @@ def detect(
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
-    if used_camera is None and detector.value not in WITHOUT_CAMERA:
+    if used_camera is None and kind_of(detector).needs_camera:
         raise CalibrationError(
             f"{source}: has no camera, expected --camera camera.yaml; "
             "lanenet map writes one into the map's folder"
         )
-    chosen = build_detector(
-        detector.value,
-        used_camera,
+    inputs = DetectorInputs(
+        camera=used_camera,
         model=model,
+        any_camera=any_camera,
         lane_width_cm=lane_width,
         drive_lane_width_cm=opened.lane_width_cm,
         marking_cm=marking,
-        any_camera=any_camera,
-        config=config,
         mask=_mask_of(mask, whole, detector),
+        config=config,
     )
+    chosen = build_detector(detector, inputs)
     console.show_problems(getattr(chosen, "problems", ()))
-    with console.progress_bar(f"detect ({detector.value})") as progress:
+    with console.progress_bar(f"detect ({detector})") as progress:
         report = run_detector(
             opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
         )
@@ -121,7 +122,7 @@ def detect(
     console.wrote(report.out, report.video)
     if report.video is None:
         again = {
-            "--detector": detector.value,
+            "--detector": detector,
             "--model": model,
             "--camera": camera,
             "--lane-width": lane_width,
@@ -139,14 +140,13 @@ def detect(
         console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
 
 
-def _mask_of(mask: str | None, source: Source, detector: DetectorName) -> UInt8[np.ndarray, "h w"] | None:
+def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarray, "h w"] | None:
     """Find or read the mask, and print what was found."""
     from lanenet.data.sources import find_mask, read_mask
-    from lanenet.perception.registry import refuse_mask
 
     if mask is None:
         return None
-    refuse_mask(detector.value)
+    refuse_mask(detector)
     if mask != "auto":
         return read_mask(Path(mask))
     found, message = find_mask(source)

@@ -16,9 +16,9 @@ from lanenet.errors import ConfigError
 from lanenet.evaluation.report import default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
 from lanenet.perception.network.model_file import find_model, is_model
+from lanenet.perception.registry import compared_names, kind_of, listed
 
 if TYPE_CHECKING:
-    from lanenet.evaluation.answers import ComparedName
     from lanenet.evaluation.comparison import Comparison
 
 app = typer.Typer()
@@ -43,8 +43,8 @@ def val(
     detectors: Annotated[
         str | None,
         typer.Option(
-            help="Which to compare, as in network,painter; all: network, lane-filter, hough, "
-            "hough-value, painter. Default: all that the sources allow.",
+            help=f"Which to compare, as in network,painter; all: {', '.join(compared_names())}. "
+            "Default: all that the sources allow.",
             show_default=False,
         ),
     ] = None,
@@ -73,8 +73,8 @@ def val(
     """Show errors in cm of a model and of the other detectors on the same frames.
 
     Simulated drives are compared with their truth, maps and the label sets made of them with the map. Label
-    sets hold no frames, so that hough and painter cannot be run on them. Without the network no MODEL is
-    needed.
+    sets hold no frames, so that only detectors that work on edge points can be run on them. Without the
+    network no MODEL is needed.
     """
     from datagen.labels.truth import truth_labels
     from lanenet.data.files import write_bytes, write_json, write_text
@@ -92,7 +92,8 @@ def val(
     sources = [open_source(path, window, perception, truth_labels) for path in source_paths]
     names = _chosen(detectors, no_baselines, model, sources)
     if detectors is None and not no_baselines and any(source.frames is None for source in sources):
-        console.show_problems(["label sets hold no frames: hough, hough-value and painter are left out"])
+        left_out = listed(compared_names(lambda kind: not kind.on_label_sets))
+        console.show_problems([f"label sets hold no frames: {left_out} are left out"])
     if robust:
         _check_robust(model, sources)
     networks = more if model is None or "network" not in names else {"network": model, **more}
@@ -152,14 +153,14 @@ def _next_words(
     with_frames = [source for source in sources if source.frames is not None]
     if not with_frames:
         return ["bench", *console.given({"--model": model})]
-    source, detector = with_frames[0], "network" if model is not None else shown.removesuffix("-value")
-    is_map, needs_width = source.drive != source.path, detector in ("network", "lane-filter")
+    source, detector = with_frames[0], kind_of("network" if model is not None else shown)
+    is_map = source.drive != source.path
     options = {
-        "--detector": detector,
+        "--detector": detector.name,
         "--model": model,
         "--camera": source.path / "camera.yaml" if is_map else None,
-        "--lane-width": round(source.lane_width_cm, 2) if is_map and needs_width else None,
-        "--marking": marking if detector == "lane-filter" else None,
+        "--lane-width": round(source.lane_width_cm, 2) if is_map and detector.takes_lane_width else None,
+        "--marking": marking if detector.takes_marking else None,
         "--any-camera": any_camera and model is not None,
         "--out": "runs/lanes.csv",
     }
@@ -168,8 +169,6 @@ def _next_words(
 
 def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
     """Models by the names that they get in the tables: those of their folders or files."""
-    from lanenet.evaluation.answers import COMPARED
-
     models: dict[str, Path] = {}
     for path in paths:
         if path.is_file() and not is_model(path):
@@ -179,7 +178,7 @@ def _more_models(paths: Sequence[Path]) -> dict[str, Path]:
         if path.is_dir() or name == "model":
             # A checkpoint's file is called as every other one's.
             name = model.resolve().parent.name
-        if name in models or name in COMPARED:
+        if name in models or name in compared_names():
             raise ConfigError(f"--also {path}: the name {name!r} is taken, expected another one")
         models[name] = model
     return models
@@ -229,8 +228,8 @@ def _split_paths(paths: list[Path]) -> tuple[Path | None, list[Path]]:
 
 def _chosen(
     text: str | None, no_baselines: bool, model: Path | None, sources: Sequence[Opened]
-) -> tuple[ComparedName, ...]:
-    from lanenet.evaluation.answers import ON_LABEL_SETS, choose_names
+) -> tuple[str, ...]:
+    from lanenet.evaluation.answers import choose_names
 
     if no_baselines and text is not None:
         raise ConfigError("--no-baselines: is the same as --detectors network, expected one of the two")
@@ -239,7 +238,7 @@ def _chosen(
     if "network" in names and model is None:
         raise ConfigError("detector network: expected a model before the sources (lanenet val MODEL SOURCE)")
     without_frames = [source.path for source in sources if source.frames is None]
-    refused = [name for name in names if without_frames and name not in ON_LABEL_SETS]
+    refused = [name for name in names if without_frames and not kind_of(name).on_label_sets]
     if refused:
         raise ConfigError(
             f"detector {refused[0]}: needs frames, but {without_frames[0]} is a label set; give the "

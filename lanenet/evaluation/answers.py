@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,17 +13,9 @@ from lanenet.data.label_set import LabelSet
 from lanenet.data.maps.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.lane import N_POINTS, SIDES
-from lanenet.perception.edges.road import RoadEdgeExtractor
+from lanenet.perception.detector_kind import DetectorInputs, EdgeDetector
 from lanenet.perception.estimate import Detector
-from lanenet.perception.hough.detector import HoughSettings, HoughTracker
-from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings
-from lanenet.perception.registry import build_detector, filter_settings
-
-ComparedName = Literal["network", "lane-filter", "hough", "hough-value", "painter"]
-#: All that can be compared, in the order of the tables; what the others are held against comes first.
-COMPARED: tuple[ComparedName, ...] = ("network", "lane-filter", "hough", "hough-value", "painter")
-#: These look at edge points only, so that a label set, which has no frames, will do.
-ON_LABEL_SETS: tuple[ComparedName, ...] = ("network", "lane-filter")
+from lanenet.perception.registry import build_detector, compared_names, kind_of
 
 Progress = Callable[[int, int], None]
 
@@ -48,22 +39,23 @@ class FrameAnswers:
     brightness: Float[np.ndarray, "n"]
 
 
-def choose_names(text: str) -> tuple[ComparedName, ...]:
+def choose_names(text: str) -> tuple[str, ...]:
     """Read a list of detectors, as in ``network,painter``; they come back in the order of the tables.
 
     Raises:
         ConfigError: If a name is unknown, or there is none.
     """
+    known = compared_names()
     wanted = [part.strip() for part in text.split(",") if part.strip()]
-    unknown = [name for name in wanted if name not in COMPARED]
+    unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
         found = repr(unknown[0]) if unknown else "no detector"
-        raise ConfigError(f"--detectors {text!r}: found {found}, known: {', '.join(COMPARED)}")
-    return tuple(name for name in COMPARED if name in wanted)
+        raise ConfigError(f"--detectors {text!r}: found {found}, known: {', '.join(known)}")
+    return tuple(name for name in known if name in wanted)
 
 
 def build_compared(
-    names: Sequence[ComparedName],
+    names: Sequence[str],
     frames: LabelledFrames,
     *,
     model: Path | None = None,
@@ -84,31 +76,21 @@ def build_compared(
         ModelMismatchError: If the model cannot be used with this camera.
         CalibrationError: If the camera sees no road.
     """
-    detectors: dict[str, Detector] = {}
-    for name in names:
-        if name == "hough-value":
-            # On most floors the paper's hue is noise, while the brightness shows the lines.
-            brightness = HoughSettings.model_validate({"edges": {"channel": "value"}})
-            detectors[name] = HoughTracker(frames.camera, brightness)
-        elif name == "lane-filter":
-            # The perception is the source's: it leaves out the rows in which a car sees itself.
-            settings = filter_settings(frames.lane_width_cm, frames.marking_cm, marking_cm)
-            detectors[name] = LaneFilter(RoadEdgeExtractor(frames.camera, frames.perception), settings)
-        elif name == "network":
-            # Beside the rows that the model leaves out, those in which this car sees itself.
-            mask = hidden_rows(frames) if frames.perception.range.bottom_rows else None
-            # It is told what the lane filter is told; so is the car.
-            detectors[name] = build_detector(
-                name,
-                frames.camera,
-                model=model,
-                lane_width_cm=frames.lane_width_cm,
-                any_camera=any_camera,
-                mask=mask,
-            )
-        else:
-            detectors[name] = build_detector(name, frames.camera)
-    return detectors
+    inputs = DetectorInputs(
+        camera=frames.camera,
+        model=model,
+        any_camera=any_camera,
+        # The network gets the same lane width as the lane filter, as on the car.
+        lane_width_cm=frames.lane_width_cm,
+        marking_cm=frames.marking_cm if marking_cm is None else marking_cm,
+        perception=frames.perception,
+    )
+    # Beside the rows that a model leaves out, those in which this car sees itself.
+    hidden = hidden_rows(frames) if frames.perception.range.bottom_rows else None
+    return {
+        name: build_detector(name, replace(inputs, mask=hidden if kind_of(name).takes_mask else None))
+        for name in names
+    }
 
 
 def hidden_rows(frames: LabelledFrames) -> UInt8[np.ndarray, "h w"]:
@@ -163,23 +145,18 @@ def answer_frames(
     return answers
 
 
-def lane_filter_points_cm(
-    label_set: LabelSet, settings: LaneFilterSettings | None = None
-) -> Float[np.ndarray, "n 6"]:
-    """Run the lane filter over a label set.
+def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarray, "n 6"]:
+    """Run a detector over the edge points of a label set.
 
-    The filter starts again wherever a frame does not follow the one before it.
+    The detector is reset wherever a frame does not follow the one before it.
 
     Args:
         label_set: Frames with their edge points and the directions of these.
-        settings: Of the filter; None takes its defaults with the label set's lane width.
+        detector: Built for the label set's lane.
 
     Returns:
-        Six points per frame, [cm], frame car; NaN where the filter has no answer.
+        Six points per frame, [cm], frame car; NaN where the detector has no answer.
     """
-    if settings is None:
-        settings = LaneFilterSettings(lane_width_cm=label_set.meta.lane_width_cm)
-    lane_filter = LaneFilter(None, settings)
     points = np.full(label_set.points_cm.shape, np.nan)
     for i, edges in enumerate(label_set.edges):
         follows = (
@@ -188,7 +165,7 @@ def lane_filter_points_cm(
             and label_set.frame[i] == label_set.frame[i - 1] + 1
         )
         if not follows:
-            lane_filter.reset()
+            detector.reset()
         edges = np.asarray(edges, np.float64)
-        points[i] = lane_filter.estimate(edges[:, :2], edges[:, 2:]).points_cm
+        points[i] = detector.estimate(edges[:, :2], edges[:, 2:]).points_cm
     return points

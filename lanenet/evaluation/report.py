@@ -17,7 +17,7 @@ from lanenet.evaluation.sources import Opened
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
     from lanenet.data.maps.labelled_frames import LabelledFrames
-    from lanenet.evaluation.answers import ComparedName, FrameAnswers
+    from lanenet.evaluation.answers import FrameAnswers
     from lanenet.evaluation.comparison import Comparison, SourceAnswers
     from lanenet.perception.estimate import Detector
 
@@ -31,7 +31,7 @@ _WORTH_PROCESSES = 600
 class _Entrants:
     """Who answers, in the order of the tables, and how they are built for a source."""
 
-    names: Sequence[ComparedName]
+    names: Sequence[str]
     models: Mapping[str, Path]
     marking_cm: float | None
     any_camera: bool
@@ -59,17 +59,21 @@ class Evaluation:
     files: dict[str, str | bytes]
 
 
-def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[ComparedName, ...]:
+def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[str, ...]:
     """Return the detectors that all sources allow, in the order of the tables."""
-    from lanenet.evaluation.answers import COMPARED, ON_LABEL_SETS
+    from lanenet.perception.registry import compared_names
 
-    possible = COMPARED if all(source.frames is not None for source in sources) else ON_LABEL_SETS
-    return tuple(name for name in possible if with_model or name != "network")
+    with_frames = all(source.frames is not None for source in sources)
+    return tuple(
+        compared_names(
+            lambda kind: (with_frames or kind.on_label_sets) and (with_model or not kind.needs_model)
+        )
+    )
 
 
 def evaluate(
     sources: Sequence[Opened],
-    names: Sequence[ComparedName],
+    names: Sequence[str],
     model: Path | None,
     *,
     also: Mapping[str, Path] | None = None,
@@ -150,7 +154,7 @@ def _answer(frames: LabelledFrames, entrants: _Entrants, progress: Progress | No
 
     detectors: dict[str, Detector] = {}
     for key in entrants.in_order:
-        detector: Any = "network" if key in entrants.models else key
+        detector = "network" if key in entrants.models else key
         built = build_compared(
             [detector],
             frames,
@@ -192,11 +196,12 @@ def _describe(source: Opened, answers: FrameAnswers, training: Sequence[LabelSet
 
 
 def _answer_labels(source: Opened, entrants: _Entrants, training: Sequence[LabelSet]) -> SourceAnswers:
-    from lanenet.evaluation.answers import lane_filter_points_cm
+    from lanenet.evaluation.answers import answer_edges
     from lanenet.evaluation.comparison import SourceAnswers
     from lanenet.evaluation.conditions import lines_seen, way_to_training_cm
     from lanenet.evaluation.errors import RasterModel
-    from lanenet.perception.registry import filter_settings
+    from lanenet.perception.detector_kind import DetectorInputs
+    from lanenet.perception.registry import build_on_edges
 
     labels = source.labels
     assert labels is not None
@@ -213,8 +218,9 @@ def _answer_labels(source: Opened, entrants: _Entrants, training: Sequence[Label
             found = model.answer_labels(labels)
             points[key], sigma[key], presence[key] = found.points_cm, found.sigma_cm, found.presence
         else:
-            settings = filter_settings(meta.lane_width_cm, meta.marking_cm, entrants.marking_cm)
-            points[key] = lane_filter_points_cm(labels, settings)
+            marking_cm = meta.marking_cm if entrants.marking_cm is None else entrants.marking_cm
+            inputs = DetectorInputs(lane_width_cm=meta.lane_width_cm, marking_cm=marking_cm)
+            points[key] = answer_edges(labels, build_on_edges(key, inputs))
     return SourceAnswers(
         name=str(source.path),
         kind="label set",

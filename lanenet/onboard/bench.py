@@ -24,12 +24,13 @@ from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector
 from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings
 from lanenet.perception.network.detector import NetworkDetector
-from lanenet.perception.registry import build_detector
+from lanenet.perception.registry import build_detector, detector_names
 
 LANE_WIDTH_CM = 40.0
 _LINE_CM = 2.0
@@ -257,7 +258,7 @@ def time_paths(
     cv2.setNumThreads(threads)
     sizes = [camera, smaller_camera(camera, 2)]
     result: dict[str, dict[str, dict[str, float]]] = {}
-    total = len(sizes) * (3 + len(models)) * rounds
+    total = len(sizes) * (len(_without_model()) + len(models)) * rounds
     done = 0
     try:
         for used in sizes:
@@ -284,9 +285,12 @@ def _detectors(camera: Camera, models: Sequence[Path], threads: int) -> dict[str
         f"network {model}": NetworkDetector(model, camera, any_camera=True, threads=threads)
         for model in models
     }
-    lane_filter = build_detector("lane-filter", camera, lane_width_cm=LANE_WIDTH_CM)
-    others = {name: build_detector(name, camera) for name in ("hough", "painter")}
-    return {**networks, "lane-filter": lane_filter, **others}
+    inputs = DetectorInputs(camera=camera, lane_width_cm=LANE_WIDTH_CM)
+    return networks | {name: build_detector(name, inputs) for name in _without_model()}
+
+
+def _without_model() -> list[str]:
+    return detector_names(lambda kind: not kind.needs_model)
 
 
 class _Path:

@@ -45,6 +45,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive_settings import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.edges.views import birdseye_view, undistorting_view
 from lanenet.perception.estimate import Detector, LaneEstimate
@@ -108,15 +109,15 @@ class LanePilot:
         self.camera = None if camera is None else read_camera(camera)
         self.estimate = LaneEstimate()
         self._settings = settings
-        self._detector: Detector = build_detector(
-            settings.detector.kind,
-            self.camera,
+        inputs = DetectorInputs(
+            camera=self.camera,
             model=found(settings.detector.model),
-            lane_width_cm=settings.detector.lane_width_cm,
             any_camera=settings.detector.any_camera,
-            config=found(settings.detector.config),
+            lane_width_cm=settings.detector.lane_width_cm,
             mask=None if mask is None else read_mask(mask),
+            config=found(settings.detector.config),
         )
+        self._detector: Detector = build_detector(settings.detector.kind, inputs)
         self._controller = LaneController(settings.control)
         self._limiter = CommandLimiter(settings.limits)
         self._clock = clock

@@ -22,6 +22,7 @@ from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import DriveLoop
 from lanenet.onboard.safety import CommandLimiter
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.estimate import Detector
 from lanenet.perception.registry import build_detector
 
@@ -82,17 +83,17 @@ def build_loop(
 def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Detector:
     """Build the detector that the settings name; see :func:`lanenet.perception.registry.build_detector`."""
     chosen = settings.detector
-    return build_detector(
-        chosen.kind,
-        camera,
+    inputs = DetectorInputs(
+        camera=camera,
         model=chosen.model,
-        lane_width_cm=chosen.lane_width_cm,
-        # What the car's file tells the controller counts for the detector as well.
-        drive_lane_width_cm=settings.control.steering.lane_width_cm,
         any_camera=chosen.any_camera,
-        config=chosen.config,
+        lane_width_cm=chosen.lane_width_cm,
+        # The controller's lane width counts for the detector as well.
+        drive_lane_width_cm=settings.control.steering.lane_width_cm,
         mask=None if chosen.mask is None else read_mask(chosen.mask),
+        config=chosen.config,
     )
+    return build_detector(chosen.kind, inputs)
 
 
 def build_sink(settings: DriveSettings) -> CommandSink:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
 from lanenet.control.controller import ControlSettings
@@ -14,7 +15,13 @@ from lanenet.data.drives.recorder import RecordingSettings
 from lanenet.onboard.actuators import ActuatorSettings
 from lanenet.onboard.cameras import SourceSettings
 from lanenet.onboard.safety import LimitSettings, SafetySettings
-from lanenet.perception.registry import DetectorName
+from lanenet.perception.registry import KINDS
+
+
+def _known_detector(name: str) -> str:
+    if name not in KINDS:
+        raise PydanticCustomError("detector", f"expected one of {', '.join(KINDS)}")
+    return name
 
 
 class DriveDetectorSettings(Settings):
@@ -29,7 +36,7 @@ class DriveDetectorSettings(Settings):
         lane_width_cm: Between the middles of the two lines, for the lane filter.
     """
 
-    kind: DetectorName = "network"
+    kind: Annotated[str, AfterValidator(_known_detector)] = "network"
     model: Path | None = None
     config: Path | None = None
     mask: Path | None = None

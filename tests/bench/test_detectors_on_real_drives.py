@@ -11,6 +11,7 @@ import pytest
 from lanenet.data.drives import open_drive
 from lanenet.data.sources import find_mask, open_source
 from lanenet.geometry.camera import Camera, Mounting
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.estimate import Detector
 from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.painter.detector import LanePainter, PainterSettings
@@ -66,20 +67,20 @@ def test_steering_beside_the_drivers(shared_data: Path, tub: str) -> None:
     compared: dict[str, Detector] = {
         "hough": HoughTracker(camera),
         "hough, V channel": HoughTracker(camera, value),
-        "hough, hough_value.yaml": build_detector("hough", camera, config=HOUGH_VALUE),
+        "hough, hough_value.yaml": build_detector("hough", DetectorInputs(camera=camera, config=HOUGH_VALUE)),
         "painter": LanePainter(camera),
     }
     mask, told = find_mask(open_source(shared_data / tub))
     LOG.warning("%s: %s", tub, told)
     for name, config in {"lane filter": None, "lane filter, plain Canny of the paper": PAPER}.items():
         for tape, marking_cm in {"": None, ", 5 cm tape": 5.08}.items():
-            compared[name + tape] = build_detector(
-                "lane-filter", camera, lane_width_cm=TUBS[tub][3], marking_cm=marking_cm, config=config
+            inputs = DetectorInputs(
+                camera=camera, lane_width_cm=TUBS[tub][3], marking_cm=marking_cm, config=config
             )
+            compared[name + tape] = build_detector("lane-filter", inputs)
     if mask is not None:
-        compared["lane filter, bumper masked"] = build_detector(
-            "lane-filter", camera, lane_width_cm=TUBS[tub][3], mask=mask
-        )
+        inputs = DetectorInputs(camera=camera, lane_width_cm=TUBS[tub][3], mask=mask)
+        compared["lane filter, bumper masked"] = build_detector("lane-filter", inputs)
     for name, detector in compared.items():
         steering, confidence = np.full(len(drive), np.nan), np.zeros(len(drive))
         for i in range(len(drive)):

@@ -36,12 +36,14 @@ def read_camera_file(path: Path) -> Any:
 
 
 def read_detector_settings(path: Path) -> Any:
-    from lanenet.perception.registry import build_detector, lane_filter_settings
+    from lanenet.perception.detector_kind import DetectorInputs
+    from lanenet.perception.lane_filter.detector import lane_filter_settings
+    from lanenet.perception.registry import build_detector
 
     # The detector's name comes first in the file's.
     if path.stem.startswith("lane_filter"):
-        return lane_filter_settings(path, drive_lane_width_cm=40.0)
-    return build_detector(path.stem.partition("_")[0], None, config=path)  # type: ignore[arg-type]
+        return lane_filter_settings(DetectorInputs(config=path, drive_lane_width_cm=40.0))
+    return build_detector(path.stem.partition("_")[0], DetectorInputs(config=path))
 
 
 def read_donkeycar_pilot(path: Path) -> Any:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING
 
 import typer
 
 from lanenet.cli.shared import console
 from lanenet.errors import ConfigError
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.network.model_file import find_model
+from lanenet.perception.registry import KINDS, build_detector, kind_of
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant
     from datagen.world.simulate import BuildPilot
     from lanenet.geometry.camera import Camera
     from lanenet.perception.estimate import Detector
-    from lanenet.perception.registry import DetectorName
 
 #: Drives as the network unless ``--model`` names another.
 SHIPPED_MODEL = Path("checkpoints/small")
@@ -29,30 +30,28 @@ class NamedDetector:
     """Builds a detector by its name, in any process.
 
     Attributes:
-        name: Of :data:`lanenet.perception.registry.DetectorName`.
+        name: One of :mod:`lanenet.perception.registry`.
         model: ONNX file, for the network.
-        config: YAML with the settings of hough or painter.
+        config: YAML with its settings.
         any_camera: Accept a model that was trained with another camera.
     """
 
-    name: DetectorName
+    name: str
     model: Path | None = None
     config: Path | None = None
     any_camera: bool = False
 
     def __call__(self, camera: Camera, lane_width_cm: float, marking_cm: float | None) -> Detector:
         """Build it for a camera and a lane."""
-        from lanenet.perception.registry import build_detector
-
-        return build_detector(
-            self.name,
-            camera,
-            model=self.model if self.name == "network" else None,
+        inputs = DetectorInputs(
+            camera=camera,
+            model=self.model,
+            any_camera=self.any_camera,
             lane_width_cm=lane_width_cm,
             marking_cm=marking_cm,
-            any_camera=self.any_camera,
             config=self.config,
         )
+        return build_detector(self.name, inputs)
 
     @property
     def identity(self) -> str:
@@ -84,7 +83,7 @@ def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) 
     """Return the entrant that a text names.
 
     Args:
-        text: ``truth``, ``true-points``, or a detector's name; ``NAME=SETTINGS.yaml`` for hough and painter.
+        text: ``truth``, ``true-points``, or a detector's name; ``NAME=SETTINGS.yaml`` if it takes settings.
         model: Model or checkpoint folder of the network; None takes the shipped one, and says so.
         option: The option that holds the text, for error messages.
         any_camera: Accept a model that was trained with another camera.
@@ -93,19 +92,17 @@ def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) 
         LanenetError: If there is no such detector or file.
     """
     from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant
-    from lanenet.perception.registry import DetectorName
 
     name, equals, file = text.partition("=")
     if name in (TRUTH, TRUE_POINTS) and not equals:
         return Entrant(name)
-    known = get_args(DetectorName)
-    if name not in known:
-        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *known))}")
+    if name not in KINDS:
+        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *KINDS))}")
     if equals and not Path(file).is_file():
         raise ConfigError(f"{option} {text!r}: {file}: no such file")
     detector = NamedDetector(
-        cast("Literal['network', 'lane-filter', 'hough', 'painter']", name),
-        _network_model(model) if name == "network" else None,
+        name,
+        _network_model(model) if kind_of(name).needs_model else None,
         Path(file).resolve() if equals else None,
         any_camera,
     )

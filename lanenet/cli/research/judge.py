@@ -11,6 +11,7 @@ from lanenet.cli.research.entrants import SHIPPED_MODEL, named_entrant, warn_of_
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption
 from lanenet.config import apply_overrides, check_settings, read_yaml
+from lanenet.perception.registry import KINDS, detector_names, listed
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_DETECTORS = "truth,network,lane-filter,hough,painter"
+_DETECTORS = ",".join(("truth", *KINDS))
+_WITH_SETTINGS = listed(detector_names(lambda kind: kind.settings is not None))
 _BESIDE = 5  # detectors in one table on the screen: a terminal is narrow
 
 
@@ -29,7 +31,7 @@ def judge(
     detectors: Annotated[
         str | None,
         typer.Option(
-            help="Entrants, separated by commas; hough and painter also as NAME=SETTINGS.yaml; truth is the "
+            help=f"Entrants, separated by commas; {_WITH_SETTINGS} also as NAME=SETTINGS.yaml; truth is the "
             f"scripted driver, true-points the steering law on the true lane. Default: {_DETECTORS}.",
             show_default=False,
         ),
@@ -86,7 +88,7 @@ def judge(
     if detectors is None:
         detectors = _DETECTORS
         if model is None and not SHIPPED_MODEL.exists():
-            detectors = ",".join(name for name in _DETECTORS.split(",") if name != "network")
+            detectors = ",".join(("truth", *detector_names(lambda kind: not kind.needs_model)))
             console.show_problems([f"{SHIPPED_MODEL} is not there: without the network; --model names one"])
     names = [text.strip() for text in detectors.split(",")]
     entrants = [named_entrant(name, model, "--detectors", any_camera) for name in names]

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from lanenet.perception.registry import detector_names, listed
+
 ConfigArgument = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
 ]
@@ -22,7 +24,11 @@ WheelbaseOption = Annotated[
 ]
 MappingOption = Annotated[Path | None, typer.Option("--config", help="YAML with the mapping's settings.")]
 MarkingOption = Annotated[
-    float | None, typer.Option("--marking", help="Width of the tape, for the lane filter, cm.")
+    float | None,
+    typer.Option(
+        "--marking",
+        help=f"Width of the tape for {listed(detector_names(lambda kind: kind.takes_marking))}, cm.",
+    ),
 ]
 ModelOption = Annotated[
     Path | None,

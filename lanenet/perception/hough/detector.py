@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS
+from lanenet.perception.detector_kind import DetectorKind
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.hough import lines, steering
 from lanenet.perception.hough.edges import HoughEdgeSettings, find_contours
@@ -257,3 +258,13 @@ class HoughTracker:
             for x, y in ((segment.x1, segment.y1), (segment.x2, segment.y2))
         ]
         return sample_segment(ends[0], ends[1])
+
+
+KIND = DetectorKind(
+    "hough",
+    lambda inputs: HoughTracker(inputs.camera, inputs.settings(HoughSettings)),
+    settings=HoughSettings,
+    needs_camera=False,
+    # On most floors the paper's hue is noise, while the brightness shows the lines.
+    variants={"hough-value": {"edges": {"channel": "value"}}},
+)

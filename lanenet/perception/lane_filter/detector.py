@@ -9,14 +9,18 @@ One row of the lane filter: markings paired to lanes, and what speaks against a 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from pydantic import Field
 
-from lanenet.errors import CalibrationError
+from lanenet.config import Settings, check_settings
+from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.lane import N_POINTS, ROWS_CM
 from lanenet.geometry.steering import proportional_angle_rad
-from lanenet.perception.edges.road import RoadEdgeExtractor
+from lanenet.perception.detector_kind import DetectorInputs, DetectorKind
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.lane_filter.markings import (
     MAX_OBLIQUE_RAD,
@@ -279,3 +283,59 @@ class LaneFilter:
 
 def _centre(pair: _Pair) -> float:
     return 0.5 * (pair[0] + pair[1])
+
+
+class LaneFilterFile(Settings):
+    """Settings file of ``lane-filter``: what differs from the defaults.
+
+    Attributes:
+        filter: Of :class:`LaneFilterSettings`; the lane width may be left out where the drive or the command
+            line gives it.
+        perception: How edge points are found in the frames.
+    """
+
+    filter: dict[str, Any] = Field(default_factory=dict)
+    perception: PerceptionSettings = PerceptionSettings()
+
+
+def lane_filter_settings(inputs: DetectorInputs) -> tuple[LaneFilterSettings, PerceptionSettings]:
+    """Put together what the settings file, the command line and the source say.
+
+    Raises:
+        ConfigError: If nothing gives the lane width, or a value is unknown or out of range.
+    """
+    file = inputs.settings(LaneFilterFile)
+    drive = {"lane_width_cm": inputs.drive_lane_width_cm}
+    given = {"lane_width_cm": inputs.lane_width_cm, "marking_cm": inputs.marking_cm}
+    data = {
+        **{key: value for key, value in drive.items() if value is not None},
+        **file.filter,
+        **{key: value for key, value in given.items() if value is not None},
+    }
+    if "lane_width_cm" not in data:
+        nowhere = (
+            "neither the source nor a settings file has"
+            if inputs.config is None
+            else f"{inputs.config} lacks"
+        )
+        raise ConfigError(f"detector lane-filter: {nowhere} the lane width, expected one (--lane-width CM)")
+    where = "lane filter" if inputs.config is None else f"{inputs.config}: filter"
+    perception = file.perception if inputs.perception is None else inputs.perception
+    return check_settings(LaneFilterSettings, data, where), perception
+
+
+def _build(inputs: DetectorInputs) -> LaneFilter:
+    assert inputs.camera is not None
+    settings, perception = lane_filter_settings(inputs)
+    return LaneFilter(RoadEdgeExtractor(inputs.camera, perception, inputs.mask), settings)
+
+
+KIND = DetectorKind(
+    "lane-filter",
+    _build,
+    settings=LaneFilterFile,
+    takes_lane_width=True,
+    takes_marking=True,
+    takes_mask=True,
+    build_on_edges=lambda inputs: LaneFilter(None, lane_filter_settings(inputs)[0]),
+)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.geometry.lane import ROWS_CM, SIDES, lane_width_cm
 from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.perception.detector_kind import DetectorInputs, DetectorKind
 from lanenet.perception.edges.road import RoadEdgeExtractor
-from lanenet.perception.estimate import LaneEstimate, confidence
+from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.lane_memory import LaneMemory
 from lanenet.perception.network.model_file import (
     ANY_CAMERA,
@@ -42,13 +44,18 @@ _ENOUGH_CELLS = 120
 #: A camera fits a model for any camera if it sees at least this share of the far half of the window.
 _LEAST_SHARE_SEEN = 1.0 / 3.0
 
+#: Standard deviation of the lane width that is expected beyond the known widths, as a share of the width.
+_WIDTH_TOLERANCE = 0.15
+#: Uncertainty of the lane's centre that halves the confidence, as a share of the width.
+_CENTRE_TOLERANCE = 0.1
+
 
 class NetworkDetector:
     """Frame in, lane out, by the network; from earlier frames it keeps the lane's width alone.
 
     Attributes:
         meta: What the model says about itself.
-        memory: Rebuilds the missing line of a frame with one; None if that is switched off.
+        memory: Rebuilds the missing line of a frame with one.
         problems: What is known to be wrong with what it was given, a line each.
     """
 
@@ -58,10 +65,8 @@ class NetworkDetector:
         camera: Camera,
         *,
         any_camera: bool = False,
-        window: BirdseyeWindow | None = None,
         threads: int = 1,
         mask: UInt8[np.ndarray, "h w"] | None = None,
-        memory: bool = True,
         lane_width_cm: float | None = None,
     ) -> None:
         """Open a model for a camera.
@@ -71,29 +76,22 @@ class NetworkDetector:
             camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
-            window: The bird's-eye window that the caller counts on; None takes the model's.
             threads: Threads of the computation.
             mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
                 leave out.
-            memory: Rebuild the line that a frame lacks from the other one and the lane's width.
-            lane_width_cm: That width, if it is known, which a network that can be told it is told; None takes
-                it from the frames that show both lines.
+            lane_width_cm: The lane's width if it is known; a network with an input for it gets it. None takes
+                it from the frames that show both lines. A line that a frame lacks is rebuilt with it.
 
         Raises:
             CalibrationError: If the mask's size is not the camera's.
-            ModelMismatchError: If the file is not a model of this format, or was made for another window or
-                camera; the message says which.
+            ModelMismatchError: If the file is not a model of this format, or was made for another camera.
         """
         self._session, self.meta = open_model(model_path, threads, frames=1)
-        if window is not None and window != self.meta.window:
-            raise ModelMismatchError(
-                f"{model_path}: made for the window {self.meta.window}, but {window} is in use"
-            )
         if not any_camera:
             _check_camera(self.meta, camera, model_path)
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
-        self.memory = LaneMemory(lane_width_cm) if memory else None
+        self.memory = LaneMemory(lane_width_cm)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
@@ -130,8 +128,7 @@ class NetworkDetector:
             (points,) = self._session.run(("points_cm",), self._feed)
             points_cm, sigma_cm = np.asarray(points[0], np.float64), np.array(self.meta.rmse_cm)
             presence = np.full(len(SIDES), min(1.0, n_cells / _ENOUGH_CELLS))
-        if self.memory is not None:
-            points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
         row = 1
         centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))
         return LaneEstimate(
@@ -144,8 +141,7 @@ class NetworkDetector:
 
     def reset(self) -> None:
         """Forget the lane's width that earlier frames showed."""
-        if self.memory is not None:
-            self.memory.reset()
+        self.memory.reset()
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
@@ -175,3 +171,57 @@ def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
             axis=1
         )
     return float(inside.mean())
+
+
+def confidence(
+    points_cm: Float[np.ndarray, "6"],
+    sigma_cm: Float[np.ndarray, "6"],
+    presence: Float[np.ndarray, "2"],
+    width_range_cm: tuple[float, float],
+) -> float:
+    """Judge an answer by whether a line is seen, how sure its centre is, and whether it is a lane.
+
+    The product of three factors from 0 to 1:
+
+    - the probability that at least one line is seen, ``1 - (1 - p_left) (1 - p_right)``;
+    - ``1 / (1 + (s / (0.1 W))^2)`` with s the standard deviation of the lane's centre at y = 15 cm, half the
+      root of the sum of the squares of both lines', and W the middle of the known widths; 1 where no s is
+      known;
+    - ``exp(-0.5 (d / (0.15 W'))^2)`` with d how far the width of the answer, across the lane, lies outside
+      the known widths, and W' the width at the side that it passed; 1 within them.
+
+    Args:
+        points_cm: The six points, frame car.
+        sigma_cm: Their standard deviations; NaN where unknown.
+        presence: Probability that each line can be seen.
+        width_range_cm: The narrowest and the widest lane that the network was trained on.
+
+    Returns:
+        0 to 1; 0 if the right line does not lie to the right of the left one.
+
+    Source:
+        Own choice; values in ``tests/unit/perception/test_confidence.py``.
+    """
+    width_cm = lane_width_cm(points_cm)
+    if not width_cm > 0.0:
+        return 0.0
+    low, high = width_range_cm
+    seen = 1.0 - (1.0 - float(presence[0])) * (1.0 - float(presence[1]))
+    centre_cm = 0.5 * math.hypot(float(sigma_cm[1]), float(sigma_cm[4]))
+    sure = 1.0
+    if math.isfinite(centre_cm):
+        sure = 1.0 / (1.0 + (centre_cm / (_CENTRE_TOLERANCE * 0.5 * (low + high))) ** 2)
+    nearest_cm = min(max(width_cm, low), high)
+    off = (width_cm - nearest_cm) / (_WIDTH_TOLERANCE * nearest_cm)
+    return seen * sure * math.exp(-0.5 * off * off)
+
+
+def _build(inputs: DetectorInputs) -> NetworkDetector:
+    assert inputs.camera is not None and inputs.model is not None
+    width_cm = inputs.drive_lane_width_cm if inputs.lane_width_cm is None else inputs.lane_width_cm
+    return NetworkDetector(
+        inputs.model, inputs.camera, any_camera=inputs.any_camera, mask=inputs.mask, lane_width_cm=width_cm
+    )
+
+
+KIND = DetectorKind("network", _build, needs_model=True, takes_lane_width=True, takes_mask=True)

@@ -10,15 +10,16 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
-
-import onnxruntime
+from typing import TYPE_CHECKING, Any
 
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM
 from lanenet.perception.edges.road import PerceptionSettings
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 #: The network as the car runs it.
 MODEL_NAME = "model.onnx"
@@ -255,6 +256,9 @@ def open_model(
         ModelMismatchError: If the file is missing, is not an ONNX file, or its description is of another
             format or does not fit its own inputs and outputs.
     """
+    # A command that runs no network starts without it.
+    import onnxruntime
+
     path = find_model(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads

@@ -18,6 +18,7 @@ from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, ROWS_CM
 from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.perception.detector_kind import DetectorKind
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.image_lane import ImageLane, check_size, rows_of_points, to_bgr
 from lanenet.perception.painter.curves import (
@@ -331,3 +332,11 @@ class LanePainter:
         middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in lines)
         start = 0.5 * float(trapezoid_px[2, 0] + trapezoid_px[3, 0])
         return math.atan2(start - middle, bottom - row)
+
+
+KIND = DetectorKind(
+    "painter",
+    lambda inputs: LanePainter(inputs.camera, inputs.settings(PainterSettings)),
+    settings=PainterSettings,
+    needs_camera=False,
+)

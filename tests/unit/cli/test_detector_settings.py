@@ -19,9 +19,10 @@ from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.drive import build_drive_detector
 from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.perception.lane_filter.detector import LaneFilter
+from lanenet.perception.detector_kind import DetectorInputs
+from lanenet.perception.lane_filter.detector import LaneFilter, lane_filter_settings
 from lanenet.perception.network.detector import NetworkDetector
-from lanenet.perception.registry import build_detector, lane_filter_settings
+from lanenet.perception.registry import build_detector
 
 CAMERA = example_camera()
 MODEL = Path(__file__).resolve().parents[3] / "checkpoints" / "small" / "model.onnx"
@@ -70,16 +71,19 @@ def detect(tmp_path: Path, photos: Path, *more: str | Path, detector: str = "lan
 def test_options_go_before_the_file_and_the_file_before_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text("filter: {lane_width_cm: 35, marking_cm: 3, polarity: dark}\n")
-    settings, _ = lane_filter_settings(path, drive_lane_width_cm=50.0)
+    settings, _ = lane_filter_settings(DetectorInputs(config=path, drive_lane_width_cm=50.0))
     assert (settings.lane_width_cm, settings.marking_cm, settings.polarity) == (35.0, 3.0, "dark")
-    settings, _ = lane_filter_settings(path, 40.0, 50.0, 2.5)
+    given = DetectorInputs(config=path, lane_width_cm=40.0, drive_lane_width_cm=50.0, marking_cm=2.5)
+    settings, _ = lane_filter_settings(given)
     assert (settings.lane_width_cm, settings.marking_cm, settings.polarity) == (40.0, 2.5, "dark")
     path.write_text("filter: {marking_cm: 3}\n")
-    assert lane_filter_settings(path, drive_lane_width_cm=50.0)[0].lane_width_cm == 50.0
+    assert (
+        lane_filter_settings(DetectorInputs(config=path, drive_lane_width_cm=50.0))[0].lane_width_cm == 50.0
+    )
     with pytest.raises(ConfigError, match=r"s\.yaml lacks the lane width.*--lane-width"):
-        lane_filter_settings(path)
-    with pytest.raises(ConfigError, match="neither the source nor a settings file"):
-        lane_filter_settings(None)
+        lane_filter_settings(DetectorInputs(config=path))
+    with pytest.raises(ConfigError, match="--lane-width"):
+        lane_filter_settings(DetectorInputs())
 
 
 @pytest.mark.parametrize(
@@ -96,13 +100,13 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, said: str) ->
     path = tmp_path / "s.yaml"
     path.write_text(text + "\n")
     with pytest.raises(ConfigError, match=said):
-        lane_filter_settings(path, 40.0)
+        lane_filter_settings(DetectorInputs(config=path, lane_width_cm=40.0))
 
 
 def test_the_files_perception_is_what_the_filter_sees(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text("perception: {edges: {method: canny}, range: {bottom_rows: 30}}\n")
-    detector = build_detector("lane-filter", CAMERA, lane_width_cm=40.0, config=path)
+    detector = build_detector("lane-filter", DetectorInputs(camera=CAMERA, lane_width_cm=40.0, config=path))
     assert isinstance(detector, LaneFilter) and detector.extractor is not None
     assert detector.extractor.settings.edges.method == "canny"
     assert not detector.extractor.table.keep[-30:].any() and detector.extractor.table.keep[-31].any()
@@ -183,14 +187,17 @@ def test_mask_files(tmp_path: Path) -> None:
 def test_masked_pixels_give_no_edges() -> None:
     mask = np.zeros((240, 320), np.uint8)
     mask[BUMPER] = 255
-    detector = build_detector("lane-filter", CAMERA, lane_width_cm=40.0, mask=mask)
+    detector = build_detector("lane-filter", DetectorInputs(camera=CAMERA, lane_width_cm=40.0, mask=mask))
     assert isinstance(detector, LaneFilter) and detector.extractor is not None
     assert not detector.extractor.table.keep[BUMPER].any()
     with pytest.raises(CalibrationError, match=r"mask of 9x9 px.*320x240"):
-        build_detector("lane-filter", CAMERA, lane_width_cm=40.0, mask=np.zeros((9, 9), np.uint8))
+        build_detector(
+            "lane-filter",
+            DetectorInputs(camera=CAMERA, lane_width_cm=40.0, mask=np.zeros((9, 9), np.uint8)),
+        )
     for name in ("hough", "painter"):
         with pytest.raises(ConfigError, match=f"detector {name}: takes no mask"):
-            build_detector(name, CAMERA, mask=mask)  # type: ignore[arg-type]
+            build_detector(name, DetectorInputs(camera=CAMERA, mask=mask))
 
 
 def test_detect_with_a_mask(tmp_path: Path, photos: Path) -> None:
@@ -215,8 +222,9 @@ def test_detect_with_a_mask(tmp_path: Path, photos: Path) -> None:
 
 def test_a_network_hears_the_lanes_width_from_the_nearest_source() -> None:
     def width_cm(**told: float) -> float | None:
-        detector = build_detector("network", CAMERA, model=MODEL, any_camera=True, **told)
-        assert isinstance(detector, NetworkDetector) and detector.memory is not None
+        inputs = DetectorInputs(camera=CAMERA, model=MODEL, any_camera=True, **told)  # type: ignore[arg-type]
+        detector = build_detector("network", inputs)
+        assert isinstance(detector, NetworkDetector)
         return detector.memory.width_cm
 
     assert width_cm() is None
@@ -233,5 +241,4 @@ def test_a_network_hears_the_lanes_width_from_the_nearest_source() -> None:
         "test",
     )
     detector = build_drive_detector(settings, CAMERA)
-    assert isinstance(detector, NetworkDetector) and detector.memory is not None
-    assert detector.memory.width_cm == 33.0
+    assert isinstance(detector, NetworkDetector) and detector.memory.width_cm == 33.0

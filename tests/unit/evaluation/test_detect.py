@@ -10,7 +10,7 @@ import pytest
 from lanenet.data.detections import read_detections
 from lanenet.data.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
-from lanenet.evaluation.answers import lane_filter_points_cm
+from lanenet.evaluation.answers import answer_edges
 from lanenet.evaluation.detect import run_detector
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
@@ -181,8 +181,9 @@ def test_lane_filter_on_label_sets_starts_again_after_gaps() -> None:
         quality=np.ones(n),
         divides=np.zeros((n, 2), dtype=bool),
     )
-    centres = lane_filter_points_cm(labels)[:, [1, 4]].mean(axis=1)
+    lane_filter = LaneFilter(None, LaneFilterSettings(lane_width_cm=40.0))
+    centres = answer_edges(labels, lane_filter)[:, [1, 4]].mean(axis=1)
     assert centres == pytest.approx([0.0, -8.0, -16.0, -24.0, 16.0], abs=0.2)
     # The directions in the label set are used: there is no dark marking.
-    dark = lane_filter_points_cm(labels, LaneFilterSettings(lane_width_cm=40.0, polarity="dark"))
+    dark = answer_edges(labels, LaneFilter(None, LaneFilterSettings(lane_width_cm=40.0, polarity="dark")))
     assert np.isnan(dark).all()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanenet.geometry.lane import lane_width_cm, mirror_points
-from lanenet.perception.estimate import confidence
+from lanenet.perception.network.detector import confidence
 
 LANE = np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0])
 SURE, BOTH, WIDTHS = np.zeros(6), np.ones(2), (40.0, 40.0)

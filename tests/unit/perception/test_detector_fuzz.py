@@ -20,6 +20,7 @@ from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.registry import build_detector
@@ -29,7 +30,7 @@ NAMES = ("hough", "painter")
 
 def detectors() -> list[Detector]:
     value = HoughSettings.model_validate({"edges": {"channel": "value"}})
-    return [*(build_detector(name, None) for name in NAMES), HoughTracker(None, value)]
+    return [*(build_detector(name, DetectorInputs()) for name in NAMES), HoughTracker(None, value)]
 
 
 def assert_empty(estimate: LaneEstimate) -> None:
@@ -67,7 +68,7 @@ def test_plain_frames_are_no_lane(shape: tuple[int, ...], value: int) -> None:
 @pytest.mark.parametrize("name", [*NAMES, "lane-filter"])
 def test_plain_frames_and_noise_of_a_calibrated_camera(name: str) -> None:
     camera = example_camera()
-    detector = build_detector(name, camera, lane_width_cm=40.0)  # type: ignore[arg-type]
+    detector = build_detector(name, DetectorInputs(camera=camera, lane_width_cm=40.0))
     for value in (0, 255):
         assert_empty(detector.detect(np.full((camera.height, camera.width, 3), value, np.uint8)))
     rng = np.random.default_rng(0)
@@ -99,7 +100,8 @@ def without_type_checks() -> Iterator[None]:
 def test_what_is_no_image_is_named(without_type_checks: None, name: str, frame: object, found: str) -> None:
     folder = Path(__file__).resolve().parents[3] / "checkpoints" / "small"
     model = folder / "model.onnx" if name == "network" else None
-    detector = build_detector(name, read_camera(folder / "camera.yaml"), model=model, lane_width_cm=40.0)  # type: ignore[arg-type]
+    camera = read_camera(folder / "camera.yaml")
+    detector = build_detector(name, DetectorInputs(camera=camera, model=model, lane_width_cm=40.0))
     with pytest.raises(DriveFormatError, match=rf"expected a uint8 image .* found {found}"):
         detector.detect(frame)  # type: ignore[arg-type]
 
@@ -107,19 +109,19 @@ def test_what_is_no_image_is_named(without_type_checks: None, name: str, frame: 
 @pytest.mark.parametrize("name", ["network", "lane-filter"])
 def test_the_others_need_a_camera(name: str) -> None:
     with pytest.raises(CalibrationError, match="--camera"):
-        build_detector(name, None)  # type: ignore[arg-type]
+        build_detector(name, DetectorInputs())
 
 
 def test_settings_file_is_read_and_refused_where_there_is_none(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text("edges: {channel: value}\n")
-    tracker = build_detector("hough", None, config=path)
+    tracker = build_detector("hough", DetectorInputs(config=path))
     assert isinstance(tracker, HoughTracker) and tracker.settings.edges.channel == "value"
     with pytest.raises(ConfigError, match="takes no settings file"):
-        build_detector("network", example_camera(), config=path)
+        build_detector("network", DetectorInputs(camera=example_camera(), config=path))
     path.write_text("edges: {chanel: value}\n")
     with pytest.raises(ConfigError, match="did you mean 'channel'"):
-        build_detector("hough", None, config=path)
+        build_detector("hough", DetectorInputs(config=path))
 
 
 @pytest.fixture

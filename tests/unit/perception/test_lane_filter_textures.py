@@ -11,6 +11,7 @@ from textured_frames import GENERATORS
 
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
+from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.edges.canny import EdgeSettings
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector
@@ -31,7 +32,9 @@ def camera(scale: float) -> Camera:
 
 @functools.cache
 def detector(size: str, lane_width_cm: float) -> Detector:
-    return build_detector("lane-filter", camera(SIZES[size]), lane_width_cm=lane_width_cm)
+    return build_detector(
+        "lane-filter", DetectorInputs(camera=camera(SIZES[size]), lane_width_cm=lane_width_cm)
+    )
 
 
 # A narrow lane is found by chance more easily than a wide one; two parallel strokes that far apart are one.

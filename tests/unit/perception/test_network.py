@@ -14,6 +14,7 @@ from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
+from lanenet.perception.lane_memory import LaneMemory
 from lanenet.perception.network.detector import ModelMeta, NetworkDetector, read_model_meta
 
 torch.set_num_threads(1)
@@ -77,7 +78,7 @@ def change_properties(model_path, out, **changes):
 
 
 def test_a_frame_gives_points_errors_and_steering(model_path):
-    detector = NetworkDetector(model_path, CAMERA, window=WINDOW)
+    detector = NetworkDetector(model_path, CAMERA)
     estimate = detector.detect(striped_frame())
     assert estimate.mask.all()
     # Hardly any training is in these weights: the answer is the mean lane, more or less.
@@ -159,8 +160,6 @@ def test_the_same_camera_at_another_resolution_is_refused(model_path):
 
 
 def test_another_window_is_refused(model_path, tmp_path):
-    with pytest.raises(ModelMismatchError, match="window"):
-        NetworkDetector(model_path, CAMERA, window=BirdseyeWindow())
     properties = replace(META, window=BirdseyeWindow()).to_properties()
     path = change_properties(model_path, tmp_path / "m.onnx", window=properties["window"])
     with pytest.raises(ModelMismatchError, match="do not fit its window"):
@@ -232,7 +231,7 @@ def test_a_model_without_outputs_for_its_doubt_is_still_read(model_path, tmp_pat
     frame = striped_frame()
     estimate = detector.detect(frame)
     np.testing.assert_array_equal(estimate.sigma_cm, META.rmse_cm)
-    new = NetworkDetector(model_path, CAMERA, memory=False).detect(frame)
+    new = NetworkDetector(model_path, CAMERA).detect(frame)
     np.testing.assert_array_equal(estimate.points_cm, new.points_cm)
     one_cell = np.zeros((24, 32), np.uint8)
     one_cell[10, 10] = 255
@@ -270,7 +269,7 @@ def test_a_missing_line_is_rebuilt_from_the_width_of_earlier_frames(model_path, 
     detector.reset()
     monkeypatch.setattr(detector, "_session", _Session([left_only]))
     np.testing.assert_allclose(detector.detect_raster(raster).points_cm, doubtful, atol=1e-4)
-    forgetful, _ = estimates([both] * 12 + [left_only], memory=False)
+    forgetful, _ = estimates([left_only])
     np.testing.assert_allclose(forgetful[-1].points_cm, doubtful, atol=1e-4)
     assert forgetful[-1].confidence < frames[-1].confidence
     told, _ = estimates([left_only], lane_width_cm=30.0)
@@ -283,10 +282,12 @@ def test_a_frame_of_noise_gives_no_lane(model_path):
     assert not estimate.mask.any() and estimate.confidence == 0.0
 
 
-def test_a_network_that_can_be_told_the_width_is_told_it(width_model_path):
+def test_a_network_that_takes_the_width_gets_it(width_model_path, monkeypatch):
+    # What the network itself answers.
+    monkeypatch.setattr(LaneMemory, "complete", lambda self, points, sigma, presence: (points, sigma))
     frame = striped_frame()
     answers = [
-        NetworkDetector(width_model_path, CAMERA, memory=False, lane_width_cm=width).detect(frame).points_cm
+        NetworkDetector(width_model_path, CAMERA, lane_width_cm=width).detect(frame).points_cm
         for width in (None, 25.0, 60.0)
     ]
     session = onnxruntime.InferenceSession(width_model_path, providers=["CPUExecutionProvider"])
