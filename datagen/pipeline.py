@@ -272,6 +272,8 @@ def _assemble(
         match=_in_order(parts, [part.solved.trajectory.match for part in parts]),
         lines={i: [line.scaled(factor) for line in part.lines] for i, part in enumerate(parts)},
         tilt_rad=_in_order(parts, [part.solved.bundle.tilt for part in parts]),
+        held_out=np.zeros(len(rows), dtype=bool),
+        contradicted=np.zeros((len(rows), 2), dtype=bool),
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from datagen.datasets.settings import RecordedSettings
 from lanenet.data.label_set import LabelSet
-from lanenet.data.segments import equal_runs, map_pieces
+from lanenet.data.segments import equal_runs, map_segments
 from lanenet.errors import ConfigError
 
 #: A lap with less than this share of the median lap's frames was not completed. Chosen: half a lap.
@@ -82,7 +82,7 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
 def driven_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:
     """Return the distance driven up to each labelled frame, [cm]; jumps between segments add nothing."""
     steps = np.linalg.norm(np.diff(labels.poses[:, :2], axis=0), axis=1)
-    steps[np.diff(map_pieces(labels.frame, labels.poses)) != 0] = 0.0
+    steps[np.diff(map_segments(labels.frame, labels.poses)) != 0] = 0.0
     return np.concatenate([np.zeros(min(1, len(labels))), np.cumsum(steps)])
 
 

@@ -112,7 +112,7 @@ def free_lane_cm(parts: list[MappedSegment]) -> float | None:
 
 
 def contradicted_share(
-    contradicted: Bool[np.ndarray, "n 2"] | None,
+    contradicted: Bool[np.ndarray, "n 2"],
     known: Bool[np.ndarray, "n 2"],
     deleted: Bool[np.ndarray, "n"],
 ) -> float:
@@ -122,12 +122,12 @@ def contradicted_share(
     labels: where the car leaves the road, it says nothing of the map.
 
     Args:
-        contradicted: Left and right line of the map's frames; None where nobody has looked.
+        contradicted: Left and right line of the map's frames.
         known: Which of them the frames have, see :func:`lanenet.data.maps.mapped_drive.known_lines`.
         deleted: Which frames the driver deleted.
     """
     counted = known & ~deleted[:, None]
-    if contradicted is None or not counted.any():
+    if not counted.any():
         return 0.0
     return float(contradicted[counted].mean())
 

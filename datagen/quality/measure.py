@@ -100,8 +100,7 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
     camera = drive_map.camera
     limits = mapping_range(camera.mounting.height_cm, mapped.perception.range)
     table = RoadTable(camera, limits)
-    held = np.zeros(0, dtype=bool) if drive_map.held_out is None else drive_map.held_out
-    rows = np.flatnonzero(held)
+    rows = np.flatnonzero(drive_map.held_out)
     samples, chance = [], []
     tape_cm, lane_cm = drive_map.meta.tape_cm, drive_map.meta.mapped_lane_cm
     for k in rows.tolist():

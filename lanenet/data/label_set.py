@@ -1,16 +1,14 @@
 """Label sets: what the network learns from, a Parquet file with a row per frame.
 
-A row holds the six labels, and beside them the edge points and the lane lines in the car frame, from which
-shifted, rotated and thinned views get exact labels. The bird's-eye picture is there for people and for other
-tools; training makes it from the edge points again.
-
-What a label set's file says of all its rows: window, camera, lane, and how its edges were found.
+A row holds the six labels, the edge points and the lane lines in the car frame. From points and lines,
+augmented views get exact labels. The bird's-eye image is for people and other tools; training makes it from
+the edge points again. Metadata hold what all rows share.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,34 +24,10 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
 from lanenet.perception.edges.road import PerceptionSettings
 
+__all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
+
 FORMAT = "lanenet-labels/1"
 Source = Literal["map", "truth"]
-
-_UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 to 1"}
-
-
-class _WindowFile(Settings):
-    left_cm: float
-    near_cm: float
-    cell_cm: float = Field(gt=0.0)
-    rows: int = Field(gt=0)
-    columns: int = Field(gt=0)
-
-
-class _MetaFile(Settings):
-    format: Literal["lanenet-labels/1"]
-    rows_cm: tuple[float, ...]
-    order: tuple[str, ...]
-    units: dict[str, str]
-    window: _WindowFile
-    camera_hash: str
-    wheelbase_cm: float = Field(gt=0.0)
-    lane_width_cm: float = Field(gt=0.0)
-    source: Source
-    perception: PerceptionSettings
-    marking_cm: float | None = Field(default=None, gt=0.0)
-    config_hash: str = ""
-    camera_cm: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,11 +35,11 @@ class LabelMeta:
     """What all rows of a label set share.
 
     Attributes:
-        window: Patch of road that the bird's-eye pictures show.
-        camera_hash: Camera that the edge points came through.
-        wheelbase_cm: Distance between the car's axles; moves poses to the front axle.
+        window: Bird's-eye window.
+        camera_hash: Camera of the edge points.
+        wheelbase_cm: Distance between the axles; poses are of the rear axle, labels of the front.
         lane_width_cm: Distance between the middles of the two lines.
-        source: ``map`` for labels from a map made of the drive, ``truth`` for a simulator's.
+        source: ``map`` for labels from a map of the drive, ``truth`` for a simulator's.
         perception: How the edge points were found; the car has to find them the same way.
         marking_cm: Width of the markings; None if unknown.
         config_hash: Hash of the settings that made the labels; empty if unknown.
@@ -83,61 +57,8 @@ class LabelMeta:
     camera_cm: tuple[float, float, float] | None = None
 
 
-def meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
-    """Return what the file will say, as plain values.
-
-    Raises:
-        LabelFormatError: If :func:`meta_from_file` would refuse it; ``where`` names the file.
-    """
-    data = {
-        "format": FORMAT,
-        "rows_cm": list(ROWS_CM),
-        "order": list(POINT_NAMES),
-        "units": _UNITS,
-        **asdict(meta),
-        "perception": meta.perception.model_dump(mode="json"),
-    }
-    meta_from_file(data, where)
-    return data
-
-
-def meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
-    """Read what a file says of its rows.
-
-    Raises:
-        LabelFormatError: If it is of another kind or version, made for other label rows, or a key is wrong;
-            ``where`` names the file.
-    """
-    found = data.get("format")
-    if found != FORMAT:
-        raise LabelFormatError(f"{where}: expected format {FORMAT!r}, found {found!r}")
-    try:
-        file = check_settings(_MetaFile, data, f"{where}: metadata")
-    except ConfigError as error:
-        raise LabelFormatError(str(error)) from None
-    if file.rows_cm != ROWS_CM or file.order != POINT_NAMES:
-        raise LabelFormatError(
-            f"{where}: expected labels at rows {ROWS_CM} in the order {', '.join(POINT_NAMES)}; found rows "
-            f"{file.rows_cm} in the order {', '.join(file.order)}"
-        )
-    return LabelMeta(
-        window=BirdseyeWindow(**file.window.model_dump()),
-        camera_hash=file.camera_hash,
-        wheelbase_cm=file.wheelbase_cm,
-        lane_width_cm=file.lane_width_cm,
-        source=file.source,
-        perception=file.perception,
-        marking_cm=file.marking_cm,
-        config_hash=file.config_hash,
-        camera_cm=file.camera_cm,
-    )
-
-
-__all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
-
 _EDGE_COLUMNS = ("edges_x_cm", "edges_y_cm", "edges_normal_x", "edges_normal_y")
 _LINE_COLUMNS = (("left_line_x_cm", "left_line_y_cm"), ("right_line_x_cm", "right_line_y_cm"))
-#: Older files lack these.
 _DIVIDES_COLUMNS = ("left_divides", "right_divides")
 _POSE_COLUMNS = ("x_cm", "y_cm", "heading_rad")
 
@@ -153,13 +74,13 @@ class LabelSet:
         frame: Frame number in its drive.
         t_s: Time in its drive.
         lap: Lap in its drive, from 0.
-        poses: Rear-axle centre and heading, [cm], [cm], [rad], frame map.
+        poses: Rear-axle poses, [cm], [cm], [rad], frame map.
         points_cm: The six labels, frame car; NaN where masked.
         edges: Per frame x, y, normal x, normal y of the edge points, [cm], frame car.
         lines: Per frame the left and the right line as polylines in the direction of travel, [cm], frame
             car; NaN rows break them.
         quality: 0 (worthless) to 1.
-        divides: Whether there is another lane beyond the left, beyond the right line; none where nobody said.
+        divides: Whether there is another lane beyond the left, beyond the right line.
     """
 
     meta: LabelMeta
@@ -187,11 +108,11 @@ class LabelSet:
         return len(self.frame)
 
     def raster(self, i: int) -> UInt8[np.ndarray, "r c"]:
-        """Return the bird's-eye image of row ``i``, made from its edge points."""
+        """Return the bird's-eye raster of row ``i``."""
         return self.meta.window.rasterise(self.edges[i][:, :2])
 
     def subset(self, keep: slice | Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> LabelSet:
-        """Return some of the rows, in the order asked for."""
+        """Return the selected rows, in the given order."""
         rows = np.arange(len(self))[keep]
         return LabelSet(
             meta=self.meta,
@@ -219,7 +140,7 @@ def write_labels(path: Path, label_set: LabelSet) -> None:
         MissingExtraError: If pyarrow is not installed.
     """
     arrow = require("pyarrow", "data")
-    meta = meta_to_file(label_set.meta, str(path))
+    meta = _meta_to_file(label_set.meta, str(path))
     _check_values(label_set, str(path))
     edges = [edge.astype(np.float32) for edge in label_set.edges]
     arrays: dict[str, Any] = {
@@ -236,7 +157,7 @@ def write_labels(path: Path, label_set: LabelSet) -> None:
         arrays |= {n: list_array([line[side][:, k] for line in label_set.lines]) for k, n in enumerate(names)}
     arrays["quality"] = float_array(label_set.quality)
     arrays |= {name: arrow.array(label_set.divides[:, k]) for k, name in enumerate(_DIVIDES_COLUMNS)}
-    # The layout in which Hugging Face `datasets` stores pictures, and the note by which it shows them.
+    # Layout and metadata by which Hugging Face `datasets` shows the images.
     image_type = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
     window = label_set.meta.window
     images = [
@@ -252,20 +173,18 @@ def read_labels(path: Path) -> LabelSet:
     """Read a label set.
 
     Raises:
-        LabelFormatError: If the file is missing, of another kind or version, made for other label rows, lacks
-            a column, holds an infinite value, or its pictures do not fit the window; names file and column.
+        LabelFormatError: If the file is missing, has another format or other label rows, lacks a column,
+            holds an infinite value, or its images do not fit the window; names file and column.
         MissingExtraError: If pyarrow is not installed.
     """
     table = ParquetTable(path)
-    meta = meta_from_file(table.meta, str(path))
+    meta = _meta_from_file(table.meta, str(path))
     edge_columns = [table.lists(name) for name in _EDGE_COLUMNS]
     line_columns = [[table.lists(name, allow_nan=True) for name in names] for names in _LINE_COLUMNS]
     left, right = (
         _stacked(names, columns, path) for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
     )
     _check_images(table, meta.window)
-    nobody_said = np.zeros(len(table), dtype=bool)
-    divides = [table.flags(name) if name in table.column_names else nobody_said for name in _DIVIDES_COLUMNS]
     label_set = LabelSet(
         meta=meta,
         drive=table.texts("drive"),
@@ -278,14 +197,74 @@ def read_labels(path: Path) -> LabelSet:
         edges=_stacked(_EDGE_COLUMNS, edge_columns, path),
         lines=list(zip(left, right, strict=True)),
         quality=table.floats("quality"),
-        divides=np.stack(divides, axis=1),
+        divides=np.stack([table.flags(name) for name in _DIVIDES_COLUMNS], axis=1),
     )
     _check_values(label_set, str(path))
     return label_set
 
 
+_UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 to 1"}
+
+
+class _WindowFile(Settings):
+    left_cm: float
+    near_cm: float
+    cell_cm: float = Field(gt=0.0)
+    rows: int = Field(gt=0)
+    columns: int = Field(gt=0)
+
+
+class _MetaFile(Settings):
+    """The metadata in the file, see :class:`LabelMeta`."""
+
+    format: Literal["lanenet-labels/1"]
+    rows_cm: tuple[float, ...]
+    order: tuple[str, ...]
+    units: dict[str, str]
+    window: _WindowFile
+    camera_hash: str
+    wheelbase_cm: float = Field(gt=0.0)
+    lane_width_cm: float = Field(gt=0.0)
+    source: Source
+    perception: PerceptionSettings
+    marking_cm: float | None = Field(gt=0.0)
+    config_hash: str
+    camera_cm: tuple[float, float, float] | None
+
+
+def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
+    """Return the metadata as plain values; refuse what :func:`_meta_from_file` would refuse."""
+    data = {
+        "format": FORMAT,
+        "rows_cm": list(ROWS_CM),
+        "order": list(POINT_NAMES),
+        "units": _UNITS,
+        **asdict(meta),
+        "perception": meta.perception.model_dump(mode="json"),
+    }
+    _meta_from_file(data, where)
+    return data
+
+
+def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
+    found = data.get("format")
+    if found != FORMAT:
+        raise LabelFormatError(f"{where}: expected format {FORMAT!r}, found {found!r}")
+    try:
+        file = check_settings(_MetaFile, data, f"{where}: metadata")
+    except ConfigError as error:
+        raise LabelFormatError(str(error)) from None
+    if file.rows_cm != ROWS_CM or file.order != POINT_NAMES:
+        raise LabelFormatError(
+            f"{where}: expected labels at rows {ROWS_CM} in the order {', '.join(POINT_NAMES)}; found rows "
+            f"{file.rows_cm} in the order {', '.join(file.order)}"
+        )
+    shared = {item.name: getattr(file, item.name) for item in fields(LabelMeta)}
+    return LabelMeta(**{**shared, "window": BirdseyeWindow(**file.window.model_dump())})
+
+
 def _check_values(label_set: LabelSet, where: str) -> None:
-    """Refuse numbers that are not there; on reading, most were refused before with their column's name."""
+    """Refuse missing and infinite numbers; :class:`ParquetTable` has refused most by their column's name."""
     finite = {"t_s": label_set.t_s, "pose": label_set.poses, "quality": label_set.quality}
     for name, values in finite.items():
         if not np.isfinite(values).all():
@@ -330,5 +309,5 @@ def _check_images(table: ParquetTable, window: BirdseyeWindow) -> None:
             shown = "no PNG" if found is None else f"{found[0]}x{found[1]} px"
             raise LabelFormatError(
                 f"{table.path}: column 'image', row {row}: found {shown}, expected "
-                f"{expected[0]}x{expected[1]} px as the window says"
+                f"{expected[0]}x{expected[1]} px for the window"
             )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lanenet.data.label_set import LabelSet
-from lanenet.data.segments import map_pieces
+from lanenet.data.segments import map_segments
 from lanenet.samples.augment import join_frames, plain_batch
 
 
@@ -37,7 +37,7 @@ def way_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[
     learned = np.arange(len(frames)) < len(frames) - len(labels)
     order = np.argsort(frames, kind="stable")
     pieces = np.empty(len(frames), np.int64)
-    pieces[order] = map_pieces(frames[order], poses[order])
+    pieces[order] = map_segments(frames[order], poses[order])
     result = np.full(len(labels), np.nan)
     for piece in np.unique(pieces[~learned]):
         mine = pieces[~learned] == piece

@@ -1,1 +1,1 @@
-"""Maps on disk: their folder, the lane lines in it, and the lane of each frame that follows from them."""
+"""Maps on disk: the folder, its lane lines, the lane of each frame, and the labels that follow."""

@@ -1,4 +1,4 @@
-"""The map on disk: a folder with poses, edges, lane lines, the camera, pictures and the report's figures."""
+"""The map on disk: a folder with poses, edge points, lane lines, camera, pictures and report."""
 
 from __future__ import annotations
 
@@ -25,13 +25,12 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 
 FORMAT = "lanenet-map/1"
-#: The first version has a left and a right line per segment, without period and uncertainty.
-LANES_FORMATS = ("lanenet-lanes/1", "lanenet-lanes/2")
+_LANES_FORMAT = "lanenet-lanes/2"
+_EDGES_FORMAT = "lanenet-edges/2"
+_REPORT_FORMAT = "lanenet-map-report/1"
 #: The resolved settings of the mapping, in the map's folder.
 SETTINGS_NAME = "settings.yaml"
-REPORT_FORMAT = "lanenet-map-report/1"
-EDGES_FORMAT = "lanenet-edges/2"
-#: Columns of ``poses.csv`` that say with which line of a frame the pictures around it disagree.
+#: Columns of ``poses.csv``: the images around a frame contradict its left, its right line.
 _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
 
 
@@ -40,14 +39,13 @@ class MapMeta(Settings):
 
     Attributes:
         format: Kind and version of the folder.
-        drive: The drive that was mapped. On disk its full path; older maps hold it as it was typed, from
-            the folder in which the command ran.
+        drive: The drive that was mapped; on disk its full path.
         lane_width_cm: Lane width that the user gave.
         mapped_lane_cm: Distance between the lines on this map.
         tape_cm: Width of the markings on this map.
         scale_from: What sets the scale: the camera's height or the lane width.
-        laps: Whole laps between revisits, 0 where no place was seen twice.
-        verdict: How far the map can be trusted, see :mod:`datagen.quality.verdict`; older maps have none.
+        laps: Whole laps between revisits; 0 without a revisit.
+        verdict: How far the map can be trusted; None until it has been judged.
     """
 
     format: str
@@ -61,7 +59,7 @@ class MapMeta(Settings):
 
     @property
     def lane_cm(self) -> float:
-        """Width of the lane: as measured where the camera sets the scale, else what sets it."""
+        """Lane width: the measured one if the camera sets the scale, else the given one."""
         return self.mapped_lane_cm if self.scale_from == "camera" else self.lane_width_cm
 
 
@@ -76,14 +74,14 @@ class DriveMap:
         t_s: Time of each frame.
         poses: Rear-axle x, y, heading (unwrapped) per frame, frame map.
         lap: Lap of each frame, from 0.
-        segment: Uninterrupted stretch of the drive that each frame belongs to.
-        s_cm: Position along the segment's path; on a closed lap below its length.
+        segment: Segment of each frame.
+        s_cm: Position along the segment's path; on a closed lap less than its length.
         match: Matched share of each frame's edges, 0..1.
-        lines: Left and right line of the driven lane of each segment, then those of the lanes beside it.
-        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for level.
-        held_out: Frames whose edge points had no say in the lines; None where there were none.
-        contradicted: Frames around which the pictures disagree with the left, with the right line, see
-            :mod:`datagen.quality.agreement`; None where nobody looked.
+        lines: Lines of each segment: left and right of the driven lane, then those of adjacent lanes.
+        tilt_rad: Pitch and roll of each frame, added to the camera's mounting.
+        held_out: Frames whose edge points were not used for the lines.
+        contradicted: Whether the images around a frame contradict its left, its right line, see
+            :mod:`datagen.quality.agreement`.
     """
 
     meta: MapMeta
@@ -96,21 +94,19 @@ class DriveMap:
     s_cm: Float[np.ndarray, "n"]
     match: Float[np.ndarray, "n"]
     lines: dict[int, list[LaneLine]]
-    tilt_rad: Float[np.ndarray, "n 2"] | None = None
-    held_out: Bool[np.ndarray, "n"] | None = None
-    contradicted: Bool[np.ndarray, "n 2"] | None = None
+    tilt_rad: Float[np.ndarray, "n 2"]
+    held_out: Bool[np.ndarray, "n"]
+    contradicted: Bool[np.ndarray, "n 2"]
 
     def camera_at(self, k: int) -> Camera:
-        """Return the camera as it nodded in the k-th frame."""
-        if self.tilt_rad is None:
-            return self.camera
+        """Return the camera with the tilt of the k-th frame."""
         m = self.camera.mounting
         pitch, roll = (float(angle) for angle in self.tilt_rad[k])
         return self.camera.with_mounting(pitch_down_rad=m.pitch_down_rad + pitch, roll_rad=m.roll_rad + roll)
 
     @cached_property
     def lanes(self) -> FrameLanes:
-        """The lane of each frame, and its direction of travel along the segment's path."""
+        """The lane of each frame."""
         n = len(self.frames)
         lane, forward = np.zeros(n, dtype=np.int64), np.ones(n, dtype=bool)
         between, away = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -130,7 +126,7 @@ def write_map(
     report: dict[str, Any],
     how_calibrated: str,
 ) -> None:
-    """Write a map into an existing (temporary) folder; pictures are the caller's."""
+    """Write a map, without its pictures, into an existing folder."""
     m = drive_map
     columns = {
         "frame": m.frames,
@@ -142,13 +138,11 @@ def write_map(
         "segment": m.segment,
         "s_cm": m.s_cm,
         "match": m.match,
+        "pitch_rad": m.tilt_rad[:, 0],
+        "roll_rad": m.tilt_rad[:, 1],
+        "held_out": m.held_out,
+        **dict(zip(_CONTRADICTED, m.contradicted.T, strict=True)),
     }
-    if m.tilt_rad is not None:
-        columns |= {"pitch_rad": m.tilt_rad[:, 0], "roll_rad": m.tilt_rad[:, 1]}
-    if m.held_out is not None:
-        columns["held_out"] = m.held_out
-    if m.contradicted is not None:
-        columns |= dict(zip(_CONTRADICTED, m.contradicted.T, strict=True))
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -164,17 +158,17 @@ def write_map(
             "supported_cm": line.supported_cm,
             "residual_cm": line.residual_cm,
             "marking_cm": line.marking_cm,
-            "bare_share": line.bare,
+            "bare_share": line.unpainted,
             "sigma_s_cm": line.sigma_s_cm,
             "sigma_at_cm": line.sigma_at_cm,
         }
         for segment, pair in m.lines.items()
         for line in pair
     ]
-    write_json(folder / "lanes.json", {"format": LANES_FORMATS[-1], "lines": lines})
-    write_columns(folder / "edges.parquet", edges, {"format": EDGES_FORMAT})
-    write_json(folder / "report.json", {"format": REPORT_FORMAT, **report})
-    # In full, so that the map leads to its drive from any folder.
+    write_json(folder / "lanes.json", {"format": _LANES_FORMAT, "lines": lines})
+    write_columns(folder / "edges.parquet", edges, {"format": _EDGES_FORMAT})
+    write_json(folder / "report.json", {"format": _REPORT_FORMAT, **report})
+    # The full path, so that the drive is found from any working folder.
     meta = {**m.meta.model_dump(), "drive": str(Path(m.meta.drive).resolve())}
     write_text(folder / "map.yaml", yaml.safe_dump(meta, sort_keys=False))
 
@@ -208,19 +202,12 @@ def read_map(folder: Path) -> DriveMap:
             "segment": ColumnSpec("int"),
             "s_cm": ColumnSpec(),
             "match": ColumnSpec(allow_empty=True),
-            # Older maps lack these.
-            "pitch_rad": ColumnSpec(required=False),
-            "roll_rad": ColumnSpec(required=False),
-            "held_out": ColumnSpec("int", required=False, low=0.0, high=1.0),
-            **{name: ColumnSpec("int", required=False, low=0.0, high=1.0) for name in _CONTRADICTED},
-            # Some older maps say it of both lines together.
-            "contradicted": ColumnSpec("int", required=False, low=0.0, high=1.0),
+            "pitch_rad": ColumnSpec(),
+            "roll_rad": ColumnSpec(),
+            **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
         },
         error=MapFormatError,
     )
-    n = len(table["frame"])
-    tilt = [table.get(name, np.zeros(n)) for name in ("pitch_rad", "roll_rad")]
-    both = table.get("contradicted", np.zeros(n))
     return DriveMap(
         meta=meta,
         camera=read_camera(folder / "camera.yaml"),
@@ -232,26 +219,26 @@ def read_map(folder: Path) -> DriveMap:
         s_cm=table["s_cm"],
         match=table["match"],
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
-        tilt_rad=np.stack(tilt, axis=1),
-        held_out=table.get("held_out", np.zeros(n)) > 0,
-        contradicted=np.stack([table.get(name, both) for name in _CONTRADICTED], axis=1) > 0,
+        tilt_rad=np.stack([table["pitch_rad"], table["roll_rad"]], axis=1),
+        held_out=table["held_out"] > 0,
+        contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,
     )
 
 
 def kept_map(out: Path) -> str:
-    """Say, after a refusal, that the map which lies where the new one was to be written is an older one.
+    """Say, after a mapping failed, that the map in its output folder is an older one.
 
     Args:
-        out: Where the new one was to be written.
+        out: Where the new map was to be written.
 
     Returns:
-        The end of a sentence; empty where no map lies there.
+        The end of a sentence; empty if there is no map.
     """
     if not (out / "map.yaml").is_file():
         return ""
     try:
         verdict = read_yaml(out / "map.yaml").get("verdict")
-    except ConfigError:  # it was kept, whatever it is
+    except ConfigError:  # a damaged map was kept, too
         verdict = None
     return f"; the map at {out} is an older one, which was kept (verdict: {verdict or 'none'})"
 
@@ -259,8 +246,8 @@ def kept_map(out: Path) -> str:
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     try:
         plain = json.loads(path.read_text(encoding="utf-8"))
-        if plain["format"] not in LANES_FORMATS:
-            raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {LANES_FORMATS[-1]!r}")
+        if plain["format"] != _LANES_FORMAT:
+            raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {_LANES_FORMAT!r}")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
             lines.setdefault(int(item["segment"]), []).append(_line(item))
@@ -268,18 +255,19 @@ def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
         raise MapFormatError(f"{path}: lane lines cannot be read ({error!r})") from None
     for segment in sorted(segments):
         found = sorted(line.index for line in lines.get(segment, []))
-        # Without gaps from left to right: a lane lies between neighbouring numbers.
+        # No gaps: a lane lies between neighbouring lines.
         if not {0, 1} <= set(found) or found != list(range(found[0], found[-1] + 1)):
             raise MapFormatError(
-                f"{path}: segment {segment} has lines {found} from left to right, expected one each, among "
-                "them 0 and 1, the left and right line of the driven lane"
+                f"{path}: segment {segment} has lines {found} from left to right, expected consecutive "
+                "numbers that include 0 and 1, the lines of the driven lane"
             )
     return lines
 
 
 def _line(item: dict[str, Any]) -> LaneLine:
-    knots, coefficients, supported = (
-        np.array(item[name], dtype=np.float64) for name in ("knots_cm", "coefficients_cm", "supported_cm")
+    knots, coefficients, supported, sigma_s, sigma_at = (
+        np.array(item[f"{name}_cm"], dtype=np.float64)
+        for name in ("knots", "coefficients", "supported", "sigma_s", "sigma_at")
     )
     if item["side"] not in ("left", "right"):
         raise ValueError(f"side is {item['side']!r}")
@@ -287,36 +275,27 @@ def _line(item: dict[str, Any]) -> LaneLine:
         raise ValueError(f"{len(knots)} knots with coefficients of shape {coefficients.shape}")
     if not (np.isfinite(knots).all() and np.isfinite(coefficients).all() and (np.diff(knots) >= 0.0).all()):
         raise ValueError("knots must not decrease, and all numbers must be finite")
-    rank, period = int(item.get("rank", 0)), _optional(item.get("period_cm"))
+    rank, period = int(item["rank"]), item["period_cm"]
     if rank < 0:
         raise ValueError(f"rank is {rank}")
     if period is not None and not np.isclose(knots[-4] - knots[3], period):
         raise ValueError(f"period_cm is {period}, the knots span {knots[-4] - knots[3]}")
-    sigma_s, sigma_at = (
-        np.array(item.get(name, []), dtype=np.float64) for name in ("sigma_s_cm", "sigma_at_cm")
-    )
     if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape or not np.isfinite([*sigma_s, *sigma_at]).all():
-        raise ValueError(f"uncertainty of shape {sigma_at.shape} at places of shape {sigma_s.shape}")
-    known = (
-        _optional(item["residual_cm"]),
-        _optional(item.get("marking_cm")),
-        _optional(item.get("bare_share")),
+        raise ValueError(f"sigma_at_cm has shape {sigma_at.shape}, sigma_s_cm {sigma_s.shape}")
+    residual, marking, unpainted = (
+        float("nan") if item[name] is None else float(item[name])
+        for name in ("residual_cm", "marking_cm", "bare_share")
     )
-    residual, marking, bare = (float("nan") if number is None else number for number in known)
     return LaneLine(
-        item["side"],
-        knots,
-        coefficients,
-        supported.reshape(-1, 2),
-        residual,
-        rank,
-        period,
-        sigma_s,
-        sigma_at,
-        marking,
-        bare,
+        side=item["side"],
+        knots_cm=knots,
+        coefficients_cm=coefficients,
+        supported_cm=supported.reshape(-1, 2),
+        residual_cm=residual,
+        rank=rank,
+        period_cm=None if period is None else float(period),
+        sigma_s_cm=sigma_s,
+        sigma_at_cm=sigma_at,
+        marking_cm=marking,
+        unpainted=unpainted,
     )
-
-
-def _optional(value: Any) -> float | None:
-    return None if value is None else float(value)

@@ -1,4 +1,4 @@
-"""Frames in their order with the lane that they should show: what detectors are compared on."""
+"""Frames with the six labels that they should give: what detectors are compared on."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from lanenet.perception.edges.road import PerceptionSettings
 
 @dataclass(frozen=True, eq=False)
 class LabelledFrames:
-    """A drive's frames, read on demand, and their labels.
+    """The frames of a drive, read on demand, with their labels.
 
-    Frames without a label belong to it too: a detector with a memory has to see them, as on the car.
+    Frames without a label are included: a detector with a memory has to see them, as on the car.
 
     Attributes:
-        name: The path, as people know it.
+        name: The path, for messages.
         reference: ``truth`` for a simulator's labels, ``map`` for labels from a map made of the drive.
         camera: Camera of the frames.
         lane_width_cm: Between the middles of the lane's two lines.
@@ -55,7 +55,7 @@ class LabelledFrames:
         return len(self.frames)
 
     def numbered(self, first: int, last: int) -> LabelledFrames:
-        """Return the part whose frame numbers are first to last, both included.
+        """Return the frames with numbers from first to last, both included.
 
         Raises:
             LabelFormatError: If there is none.
@@ -76,20 +76,20 @@ class LabelledFrames:
 def _image_from(
     whole: Callable[[int], UInt8[np.ndarray, "h w 3"]], start: int, i: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Frame i of a part that begins at ``start``; other processes can be given a module's function only."""
+    """Read frame i of a selection that begins at ``start``; at module level, so that it can be pickled."""
     return whole(start + i)
 
 
 def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> LabelledFrames:
-    """Read a simulated drive with its exact truth.
+    """Read a simulated drive with its ground truth.
 
     Args:
         path: Drive folder with ``truth.csv``.
-        window: Points beside this bird's-eye window have no label, as in label sets; None takes the default.
+        window: Points outside this bird's-eye window have no label, as in label sets; None takes the default.
 
     Raises:
-        DriveFormatError: If the drive has no truth, camera or lane width, or the truth is not one row for
-            each frame.
+        DriveFormatError: If the drive has no truth, camera or lane width, or the truth does not have
+            one row for each frame.
     """
     drive, truth = open_drive(path), read_truth(path)
     if truth is None or drive.camera is None or drive.lane_width_cm is None:
@@ -123,13 +123,13 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
 def read_map_frames(
     map_folder: Path, window: BirdseyeWindow | None = None, drive_path: Path | None = None
 ) -> LabelledFrames:
-    """Read the frames of a mapped drive with the labels that the map gives them.
+    """Read the frames of a mapped drive with their labels.
 
-    The labels are those of :func:`datagen.labels.label_map.label_map`; frames that get none are kept.
+    The labels are those of :func:`datagen.labels.label_map.label_map`; frames without a label are kept.
 
     Args:
         map_folder: Folder of the map.
-        window: Points beside this bird's-eye window have no label; None takes the default.
+        window: Points outside this bird's-eye window have no label; None takes the default.
         drive_path: Where the drive is now, if it has moved since it was mapped.
 
     Raises:
@@ -158,5 +158,5 @@ def read_map_frames(
 
 
 def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Frame i of a map; other processes can be given a module's function only."""
+    """Read frame i of a map; at module level, so that it can be pickled."""
     return drive.image(int(rows[i]))

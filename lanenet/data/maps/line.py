@@ -11,9 +11,9 @@ from scipy.interpolate import BSpline
 
 Side = Literal["left", "right"]
 
-#: Share of a line that is bare from which it is dashed. On ten simulated drives and three real ones, 0.18 to
-#: 0.47 of every dashed line and no more than 0.09 of every solid one, worn or not, was bare.
-_DASHED = 0.12
+#: Unpainted share above which a line is dashed. Measured on ten simulated and three real drives: 0.18 to 0.47
+#: for dashed lines, at most 0.09 for solid ones, worn or not.
+_DASHED_SHARE = 0.12
 
 
 def _none() -> Float[np.ndarray, "0"]:
@@ -25,19 +25,18 @@ class LaneLine:
     """One lane line: cubic B-splines x(s), y(s) over the position s along the path.
 
     Attributes:
-        side: On which side of the driven lane it lies, seen in the path's direction.
+        side: Side of the driven lane, seen in the path's direction.
         knots_cm: Knots in s, with three more on either side of the first and last break.
         coefficients_cm: Control points, frame map.
-        supported_cm: Stretches of s, (from, to), where the map has seen the line or bridges a gap; on a lap
-            a stretch over the seam ends beyond the period.
-        residual_cm: Robust standard deviation of the marking's borders about the fit.
-        rank: 0 for the line that bounds the driven lane, 1 for the next one outwards.
-        period_cm: Length of the lap where the line is closed; None where it is open.
-        sigma_s_cm: Places at which the uncertainty is given; empty where it is not known.
-        sigma_at_cm: Standard deviation of the line's position across the path there.
-        marking_cm: Width of the marking as measured; NaN where it is not known.
-        bare: Share of the line that is bare between pieces of paint, where frames see it from near; NaN
-            where it is not known.
+        supported_cm: Sections (from, to) of s where the map has seen the line or bridges a gap; on a lap, a
+            section across the seam ends beyond the period.
+        residual_cm: Robust standard deviation of the marking's borders about the fit; NaN if never seen.
+        rank: 0 for the lines that bound the driven lane, 1 for the next ones outwards.
+        period_cm: Length of the lap; None for an open line.
+        sigma_s_cm: Positions at which sigma is given; empty if it is unknown.
+        sigma_at_cm: Sigma of the line's position across the path there.
+        marking_cm: Measured width of the marking; NaN if unknown.
+        unpainted: Share of the line without paint, as near frames see it; NaN if unknown.
     """
 
     side: Side
@@ -50,33 +49,33 @@ class LaneLine:
     sigma_s_cm: Float[np.ndarray, "u"] = field(default_factory=_none)
     sigma_at_cm: Float[np.ndarray, "u"] = field(default_factory=_none)
     marking_cm: float = float("nan")
-    bare: float = float("nan")
+    unpainted: float = float("nan")
 
     @property
     def index(self) -> int:
-        """Number of the line from left to right; 0 and 1 bound the driven lane."""
+        """Number of the line, counted from left to right; 0 and 1 bound the driven lane."""
         return -self.rank if self.side == "left" else 1 + self.rank
 
     @property
     def dashed(self) -> bool:
-        """Whether it is a line of dashes, which may be crossed: there is a lane on either side of it."""
-        return self.bare > _DASHED
+        """Whether the line is dashed; then there is a lane on either side of it."""
+        return self.unpainted > _DASHED_SHARE
 
     def points(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
-        """Evaluate the line or a derivative of it along s, frame map; NaN where it is not supported."""
+        """Evaluate the line or a derivative along s, frame map; NaN where it is not supported."""
         points = self.everywhere(s_cm, derivative)
         points[~self.supported(s_cm)] = np.nan
         return points
 
     def everywhere(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
-        """Evaluate the line, also where nothing supports it."""
+        """Evaluate the line or a derivative, also where it is not supported."""
         low, high = self.knots_cm[3], self.knots_cm[-4]
         spline = BSpline(self.knots_cm, self.coefficients_cm, 3)
         s = np.clip(s_cm, low, high) if self.period_cm is None else low + np.mod(s_cm - low, self.period_cm)
         return np.array(spline(s, nu=derivative))
 
     def supported(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
-        """Tell where the line can be relied on."""
+        """Return which positions are supported."""
         inside = np.zeros(len(s_cm), dtype=bool)
         for start, end in self.supported_cm:
             if self.period_cm is None:
@@ -86,13 +85,13 @@ class LaneLine:
         return inside
 
     def sigma_cm(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-        """Standard deviation of the line's position across the path; NaN where it is not known."""
+        """Sigma of the line's position across the path; NaN if unknown."""
         if not len(self.sigma_s_cm):
             return np.full(len(s_cm), np.nan)
         return np.interp(s_cm, self.sigma_s_cm, self.sigma_at_cm, period=self.period_cm)
 
     def scaled(self, factor: float) -> LaneLine:
-        """Return the line with every length multiplied."""
+        """Return the line with every length multiplied by a factor."""
         return replace(
             self,
             knots_cm=self.knots_cm * factor,

@@ -198,7 +198,7 @@ def rewritten(tmp_path: Path, meta: dict[str, Any] | None = None, **columns: Any
         ({"new_key": 1}, "unknown key 'new_key'"),
         (
             {"window": {"left_cm": -24, "near_cm": 0, "cell_cm": 1.5, "rows": 16, "columns": 32}},
-            "column 'image', row 0: found 32x32 px, expected 32x16 px as the window says",
+            "column 'image', row 0: found 32x32 px, expected 32x16 px for the window",
         ),
     ],
 )
@@ -210,7 +210,7 @@ def test_metadata_is_checked(tmp_path: Path, meta: dict[str, Any], message: str)
 
 
 @pytest.mark.parametrize(
-    "name", ["t_s", "left_15_cm", "edges_normal_y", "right_line_x_cm", "image", "quality"]
+    "name", ["t_s", "left_15_cm", "edges_normal_y", "right_line_x_cm", "image", "quality", "left_divides"]
 )
 def test_a_missing_column_is_named(tmp_path: Path, name: str) -> None:
     with pytest.raises(LabelFormatError, match=rf"labels\.parquet: column '{name}' is missing"):

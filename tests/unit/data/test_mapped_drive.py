@@ -84,6 +84,9 @@ def folder(tmp_path: Path) -> Path:
         s_cm=s_cm,
         match=match,
         lines={0: lines, 1: lines},
+        tilt_rad=np.zeros((n, 2)),
+        held_out=np.zeros(n, dtype=bool),
+        contradicted=np.zeros((n, 2), dtype=bool),
     )
     out = tmp_path / "map"
     out.mkdir()
@@ -152,7 +155,7 @@ def test_why_a_frame_gets_no_labels(folder):
     doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
     assert label_frame(replace(mapped, drive_map=doubted), 6, window) == CONTRADICTED
     assert not isinstance(label_frame(mapped, 0, window), str)
-    dashed = [replace(line, bare=0.4) for line in mapped.drive_map.lines[0][:1]]
+    dashed = [replace(line, unpainted=0.4) for line in mapped.drive_map.lines[0][:1]]
     on_dashes = replace(
         mapped.drive_map,
         poses=mapped.drive_map.poses + [0.0, 17.0, 0.0],

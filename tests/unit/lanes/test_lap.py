@@ -224,16 +224,18 @@ def test_far_beyond_a_solid_line_the_car_is_in_no_lane_until_it_comes_back():
 @pytest.mark.parametrize("start_cm", [0.0, 36.0])
 def test_behind_dashes_there_is_a_lane_whether_its_far_line_is_known_or_not(offsets, start_cm):
     lines = _straight_lines(offsets, until_cm=5.0)
-    dashed = [replace(line, bare=0.4) if line.index == 0 else line for line in lines]
+    dashed = [replace(line, unpainted=0.4) if line.index == 0 else line for line in lines]
     poses, s = _drive(np.concatenate([np.full(20, start_cm), np.full(20, 36.0), np.full(20, 0.0)]))
     lane = assign_lanes(dashed, poses, s, WHEELBASE_CM).lane
     np.testing.assert_array_equal(lane, np.where(poses[:, 1] > 18.0, -1, 0))
-    solid = [replace(line, bare=0.05) for line in lines]
+    solid = [replace(line, unpainted=0.05) for line in lines]
     assert not assign_lanes(solid, poses, s, WHEELBASE_CM).lane.any()
 
 
 def test_swerves_from_a_lane_whose_far_line_is_unknown():
-    lines = [replace(line, bare=0.4 * (line.index == 0)) for line in _straight_lines({0: 18.0, 1: -18.0})]
+    lines = [
+        replace(line, unpainted=0.4 * (line.index == 0)) for line in _straight_lines({0: 18.0, 1: -18.0})
+    ]
     y = np.repeat([36.0, 14.0, 36.0, 0.0], 20)
     poses, s = _drive(y)
     lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
@@ -256,7 +258,7 @@ def _bent_in(line: LaneLine) -> LaneLine:
 
 
 def test_dashes_on_the_right_have_a_lane_behind_them_too():
-    lines = [replace(line, bare=0.3 * line.index) for line in _straight_lines({0: 18.0, 1: -18.0})]
+    lines = [replace(line, unpainted=0.3 * line.index) for line in _straight_lines({0: 18.0, 1: -18.0})]
     poses, s = _drive(np.concatenate([np.zeros(20), np.full(20, -36.0), np.zeros(20), np.full(20, 36.0)]))
     lane = assign_lanes(lines, poses, s, WHEELBASE_CM).lane
     np.testing.assert_array_equal(lane, np.where(poses[:, 1] < -18.0, 1, 0))

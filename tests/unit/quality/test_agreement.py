@@ -88,6 +88,8 @@ def _mapped(aside_cm: np.ndarray, painted: np.ndarray | None = None) -> MappedDr
         s_cm=poses[:, 0],
         match=np.full(N, 0.6),
         lines={0: [_line("left", 18.0), _line("right", -18.0)]},
+        tilt_rad=np.zeros((N, 2)),
+        held_out=np.zeros(N, dtype=bool), contradicted=np.zeros((N, 2), dtype=bool),
     )  # fmt: skip
     return MappedDrive(drive_map, drive, np.arange(N), PerceptionSettings())
 

@@ -52,6 +52,9 @@ def mapped() -> MappedDrive:
         s_cm=2.0 * np.arange(n),
         match=np.full(n, 0.6),
         lines={},
+        tilt_rad=np.zeros((n, 2)),
+        held_out=np.zeros(n, dtype=bool),
+        contradicted=np.zeros((n, 2), dtype=bool),
     )
     drive = Drive(
         name="made-up",

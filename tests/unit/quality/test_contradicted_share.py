@@ -19,7 +19,6 @@ def test_deleted_frames_say_nothing_of_the_map():
     assert contradicted_share(contradicted, known, first) == pytest.approx(10 / 80)
     assert contradicted_share(contradicted, known, ~first) == 1.0
     assert contradicted_share(contradicted, known, ~nothing) == 0.0
-    assert contradicted_share(None, known, nothing) == 0.0
     # One line of two is half of what a frame gives.
     contradicted[:, 1] = False
     assert contradicted_share(contradicted, known, nothing) == pytest.approx(0.15)
