@@ -14,8 +14,8 @@ from lanenet.geometry.lane import BESIDE_DIVIDER_LANES
 #: How far the car enters another lane at least, in lane widths; less is a swerve. Chosen: half of the 0.4 by
 #: which a car may be off the centre of its own lane (datagen/lanes/width.py).
 _ENTERED = 0.2
-#: How far beyond a line a car that means to stay in its lane may get, in lane widths. Chosen: the whole car is
-#: beyond the line then, since a 1:10 car is about half as wide as its lane.
+#: How far beyond a line a car that means to stay in its lane may get, in lane widths. Chosen: the whole car
+#: is beyond the line then, since a 1:10 car is about half as wide as its lane.
 _AWAY = 0.35
 #: Widths of an adjacent lane relative to the driven one. Chosen: a double line is below 0.2, a lay-by or two
 #: lanes without a line between them 1.8 and more.
