@@ -7,7 +7,7 @@ from dataclasses import replace
 from pydantic import Field, field_validator
 
 from datagen.lanes.fit import FitSettings
-from datagen.lanes.trace import TraceSettings
+from datagen.lanes.follow import TraceSettings
 from datagen.quality.verdict import VerdictSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.coarse import GuessSettings

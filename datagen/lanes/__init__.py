@@ -1,1 +1,1 @@
-"""Lane lines on the map: edges along the driven path -> tapes -> left and right line -> piecewise cubics."""
+"""Lane lines on the map: edges along the driven path -> markings -> traced lines -> piecewise cubics."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from datagen.lanes.beside import trace_beside
 from datagen.lanes.fit import fit_lines
-from datagen.lanes.lap import lap_path
 from datagen.lanes.mapped import MappedSegment, check_lane
-from datagen.lanes.path import without_frames
+from datagen.lanes.path import lap_path, without_frames
 from datagen.lanes.profile import without_crossings
 from datagen.lanes.scale import STEP_HEIGHTS, edges_beside
-from datagen.lanes.trace import trace_known_lane, trace_lane
+from datagen.lanes.trace import trace_adjacent, trace_known_lane, trace_lane
 from datagen.settings import MapSettings
 from datagen.slam.join import Stretch, frames_text, join_stretches
 from datagen.slam.odometry.scans import Progress
@@ -106,6 +104,6 @@ def _find_lane(
     # The far line of the next lane does so further ahead, also where the car drives near the line between.
     _, beside = edges_beside(solved, scans, path, 1.6 * lane.lane_cm)
     beside = without_crossings(path, beside, height, side_cm)
-    lane = trace_beside(path, beside, lane, height, settings.trace)
+    lane = trace_adjacent(path, beside, lane, height, settings.trace)
     lines = fit_lines(path, edges, lane, height, settings.fit, beside)
     return MappedSegment(stretch.rows, solved, path.s_frames_cm, lane, lines, free_cm)

@@ -1,10 +1,7 @@
-"""Piecewise cubic lane lines through the edges of the traced markings.
+"""Fit piecewise cubic lane lines to the edges of the traced markings.
 
-Lines that run side by side: how far apart they are, and where a line beside another one has to be.
-
-Both are measured across the lines, on the map. A difference of offsets from the path is not that: where the
-lines turn against the path, as they do wherever the car cuts a corner, it is longer: by the cosine of the
-angle between them.
+Distances between lines are measured across them, on the map. Where the lines run at an angle to the path, as
+where the car cuts a corner, the difference of their offsets is longer: by one over the cosine of that angle.
 """
 
 from __future__ import annotations
@@ -18,31 +15,246 @@ from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.offset import Borders, CubicBasis, FittedOffset, Prior, adapted_breaks, fit_offset
 from datagen.lanes.path import Path, PathEdges, left_of
-from datagen.lanes.support import stretches
+from datagen.lanes.support import supported_sections
 from datagen.lanes.trace import TracedLane
 from lanenet.config import Settings
 from lanenet.data.maps.line import LaneLine, Side
 
-#: How much further than the distance of the lines the place opposite may lie along the path.
-_SLACK = 1.2
+_SIGN: dict[Side, float] = {"left": 1.0, "right": -1.0}
+_OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
+#: Reach along the path in which the point opposite is looked for, in distances between the lines. Derived: at
+#: an angle a between line and path it lies sin(a) distances ahead; the rest is margin.
+_OPPOSITE_REACH = 1.2
+
+
+class FitSettings(Settings):
+    """Spacing of the cubics and the gaps that they bridge; lengths in camera heights where the name says so.
+
+    Where no other origin is given, values were chosen on simulated drives.
+
+    Attributes:
+        knot_heights: Length of a cubic on straight road.
+        corner_heights: Length of a cubic in tight bends (a study of three recorded drives found 0.3).
+        bridge_heights: Longest gap in the paint that is bridged; where the line on the other side of the lane
+            is seen, gaps count for less than half.
+        extend_heights: Extension of a line beyond the end of its paint.
+        reach_heights: Largest distance of edge points from the borders of the traced line, beyond 0.3 widths
+            of the marking.
+        bend_heights: Typical bend of a line against the path: inverse radius times camera height.
+        guide_lanes: Least sigma of a line's distance from the other one, in lane widths; the variation where
+            both are seen counts if it is larger.
+        loose_lanes: Sigma of the lane where neither of its lines is seen, in lane widths.
+        precise_heights: Distance at which an edge point has half its precision. One pixel spans road in
+            proportion to the squared distance, and tilt errors move points likewise.
+        min_aligned: Least cosine between a border and the traced line, 20 degrees: a line is not followed
+            into the mouth of a junction.
+    """
+
+    knot_heights: float = Field(default=0.6, gt=0.0)
+    corner_heights: float = Field(default=0.3, gt=0.0)
+    bridge_heights: float = Field(default=7.0, gt=0.0)
+    extend_heights: float = Field(default=0.5, ge=0.0)
+    reach_heights: float = Field(default=0.06, gt=0.0)
+    bend_heights: float = Field(default=0.08, gt=0.0)
+    guide_lanes: float = Field(default=0.03, gt=0.0)
+    loose_lanes: float = Field(default=0.3, gt=0.0)
+    precise_heights: float = Field(default=1.5, gt=0.0)
+    min_aligned: float = Field(default=0.94, gt=0.0, lt=1.0)
+
+
+def fit_lines(
+    path: Path,
+    edges: PathEdges,
+    lane: TracedLane,
+    camera_height_cm: float,
+    settings: FitSettings,
+    adjacent_edges: PathEdges | None = None,
+) -> list[LaneLine]:
+    """Fit the lines of the driven lane, then those of adjacent lanes.
+
+    Each line is first fitted alone. Where it has a gap and the other line has none, the other line then
+    guides it through the gap: at the distance that the two keep elsewhere, and with the same bends.
+
+    Args:
+        path: The path.
+        edges: Edge points in its coordinates.
+        lane: The traced lines.
+        camera_height_cm: Sets the scale of knots and bounds.
+        settings: Spacing and bounds.
+        adjacent_edges: Edge points for the lines of adjacent lanes; None for the same.
+
+    Returns:
+        Left and right line of the driven lane, then those of adjacent lanes.
+    """
+    widest = settings.knot_heights * camera_height_cm
+    narrowest = settings.corner_heights * camera_height_cm
+    basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
+    fitter = _Fitter(path, edges, basis, lane.lane_cm, camera_height_cm, settings)
+    traced: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
+        ("left", 0): lane.left_cm,
+        ("right", 0): lane.right_cm,
+        **lane.adjacent_cm,
+    }
+    # A line seen only from afar does not show its width; so the width of the best seen line is used for all.
+    first: Side = "left" if np.isfinite(lane.left_cm).sum() >= np.isfinite(lane.right_cm).sum() else "right"
+    alone: dict[Side, FittedOffset] = {}
+    tape = lane.tape_cm
+    for side in (first, _OTHER[first]):
+        by_centre = lane.centre_cm + 0.5 * _SIGN[side] * lane.lane_cm
+        alone[side] = fitter.alone(traced[side, 0], by_centre, tape)
+        tape = alone[first].marking_cm
+    apart = fitter.apart(alone["right"].d_cm, alone["left"].d_cm, alone["right"].seen & alone["left"].seen)
+    fitted: dict[tuple[Side, int], FittedOffset] = {}
+    for side, own in alone.items():
+        start = np.where(own.seen, own.d_cm, np.nan)
+        fitted[side, 0] = fitter.parallel(start, alone[_OTHER[side]], _SIGN[side], apart, own.marking_cm)
+    fitter = fitter if adjacent_edges is None else replace(fitter, edges=adjacent_edges)
+    for side, rank in sorted(lane.adjacent_cm, key=lambda name: name[1]):
+        inner, known = fitted[side, rank - 1], np.isfinite(traced[side, rank])
+        apart = fitter.apart(inner.d_cm, np.where(known, traced[side, rank], inner.d_cm), known)
+        fitted[side, rank] = fitter.parallel(traced[side, rank], inner, _SIGN[side], apart, tape)
+    lines = []
+    for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
+        guide = fitted[(side, rank - 1) if rank else (_OTHER[side], 0)]
+        lines.append(fitter.line(side, rank, fitted[side, rank], guide.seen))
+    return lines
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """What the fits of all lines share."""
+
+    path: Path
+    edges: PathEdges
+    basis: CubicBasis
+    lane_cm: float
+    height_cm: float
+    settings: FitSettings
+
+    def alone(
+        self, traced_cm: Float[np.ndarray, "m"], guess_cm: Float[np.ndarray, "m"], tape_cm: float
+    ) -> FittedOffset:
+        """Fit a line from its trace alone; the guess fills the gaps of the trace."""
+        start = np.where(np.isfinite(traced_cm), traced_cm, guess_cm)
+        loose = np.full(len(start), self.settings.loose_lanes * self.lane_cm)
+        return self._fit(start, self._smoothed(start), np.zeros(len(start)), loose, tape_cm)
+
+    def parallel(
+        self,
+        known_cm: Float[np.ndarray, "m"],
+        other: FittedOffset,
+        sign: float,
+        apart: tuple[Float[np.ndarray, "m"], float],
+        tape_cm: float,
+    ) -> FittedOffset:
+        """Fit a line that runs to the left (sign 1) or to the right (-1) of a fitted one."""
+        guess = parallel_offset(self.path, self._smoothed(other.d_cm), sign * apart[0])
+        sigma = np.where(
+            other.seen, np.hypot(apart[1], other.sigma_cm), self.settings.loose_lanes * self.lane_cm
+        )
+        start = np.where(np.isfinite(known_cm), known_cm, guess)
+        return self._fit(start, guess, guess, sigma, tape_cm)
+
+    def apart(
+        self, inner_cm: Float[np.ndarray, "m"], outer_cm: Float[np.ndarray, "m"], known: Bool[np.ndarray, "m"]
+    ) -> tuple[Float[np.ndarray, "m"], float]:
+        """Distance of two lines, smoothed and interpolated in gaps, and its variation."""
+        path, lane_cm = self.path, self.lane_cm
+        least = self.settings.guide_lanes * lane_cm
+        inner, outer = self._smoothed(inner_cm), self._smoothed(outer_cm)
+        found = distance_across(path, inner, outer, known)
+        good = known & (np.abs(found - lane_cm) < 0.35 * lane_cm)
+        if not good.any():
+            return np.full(len(found), lane_cm), self.settings.loose_lanes * lane_cm
+        filled = np.interp(path.s_cm, path.s_cm[good], found[good], period=path.period_cm)
+        varies = 1.4826 * float(np.median(np.abs(found[good] - np.median(found[good]))))
+        return _smoothed(path, filled, 0.5 * lane_cm), max(varies, least)
+
+    def line(self, side: Side, rank: int, offset: FittedOffset, guided: Bool[np.ndarray, "m"]) -> LaneLine:
+        """Turn an offset into a line on the map; ``guided`` is where a parallel line is seen."""
+        path, basis = self.path, self.basis
+        control = basis.fitted(path.s_cm, path.points(offset.d_cm))
+        bridge = self.settings.bridge_heights * self.height_cm
+        extend = self.settings.extend_heights * self.height_cm
+        return LaneLine(
+            side=side,
+            knots_cm=basis.knots_cm,
+            coefficients_cm=basis.unfolded(control),
+            supported_cm=supported_sections(path, offset.seen, bridge, extend, guided),
+            residual_cm=offset.residual_cm,
+            rank=rank,
+            period_cm=path.period_cm,
+            sigma_s_cm=path.s_cm,
+            sigma_at_cm=offset.sigma_cm,
+            marking_cm=offset.marking_cm,
+            unpainted=offset.unpainted,
+        )
+
+    def _smoothed(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        return _smoothed(self.path, d_cm, 0.25 * self.lane_cm)
+
+    def _fit(
+        self,
+        start_cm: Float[np.ndarray, "m"],
+        guess_cm: Float[np.ndarray, "m"],
+        shape_cm: Float[np.ndarray, "m"],
+        sigma_cm: Float[np.ndarray, "m"],
+        tape_cm: float,
+    ) -> FittedOffset:
+        smooth = self._smoothed(start_cm)
+        prior = Prior(
+            guess_cm=guess_cm,
+            shape_cm=shape_cm,
+            sigma_cm=sigma_cm,
+            lane_cm=self.lane_cm,
+            bend_per_cm=self.settings.bend_heights / self.height_cm,
+            knot_cm=self.settings.knot_heights * self.height_cm,
+            height_cm=self.height_cm,
+        )
+        points = self._borders(start_cm, smooth, tape_cm)
+        return fit_offset(self.path, self.basis, points, smooth, tape_cm, prior)
+
+    def _borders(
+        self, start_cm: Float[np.ndarray, "m"], smooth_cm: Float[np.ndarray, "m"], tape_cm: float
+    ) -> Borders:
+        """Edge points that may be borders of the marking whose middle is near the given offset."""
+        path, edges, settings = self.path, self.edges, self.settings
+        # The left border of a bright marking brightens to the right.
+        border = np.where(edges.side < 0.0, 1.0, -1.0)
+        off = edges.d_cm - np.interp(edges.s_cm, path.s_cm, start_cm, period=path.period_cm)
+        reach = 0.3 * tape_cm + settings.reach_heights * self.height_cm
+        slope = _slope(path, smooth_cm)[
+            np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
+        ]
+        aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
+        near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
+        distance = edges.distance_cm[near] / (settings.precise_heights * self.height_cm)
+        return Borders(
+            s_cm=edges.s_cm[near],
+            d_cm=edges.d_cm[near],
+            border=border[near],
+            weight=edges.weight[near],
+            precision=1.0 / (1.0 + distance**6),
+            frame=edges.frame[near],
+        )
 
 
 def parallel_offset(
     path: Path, d_cm: Float[np.ndarray, "m"], apart_cm: Float[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m"]:
-    """Offset from the path of the line that runs beside another one.
+    """Offset from the path of the line parallel to another one.
 
     Args:
         path: The path.
-        d_cm: Offset of the line that is known, smooth, at each path sample.
-        apart_cm: How far the other one lies to its left; negative to its right.
+        d_cm: Smooth offset of the known line at each path sample.
+        apart_cm: Distance of the parallel to its left; negative to its right.
     """
     line = path.points(d_cm)
-    beside = line + apart_cm[:, None] * left_of(_along(path, line))
+    parallel = line + apart_cm[:, None] * left_of(_along(path, line))
     rows = _around(path, float(np.abs(apart_cm).max()))
-    nearest = np.argmin(np.sum((path.xy_cm[rows] - beside[:, None]) ** 2, axis=2), axis=1)
+    nearest = np.argmin(np.sum((path.xy_cm[rows] - parallel[:, None]) ** 2, axis=2), axis=1)
     at = rows[np.arange(len(rows)), nearest]
-    step = beside - path.xy_cm[at]
+    step = parallel - path.xy_cm[at]
     ahead = step[:, 0] * path.left[at, 1] - step[:, 1] * path.left[at, 0]
     offset = np.sum(step * path.left[at], axis=1)
     s = path.s_cm[at] + ahead
@@ -56,7 +268,7 @@ def distance_across(
     to_cm: Float[np.ndarray, "m"],
     known: Bool[np.ndarray, "m"],
 ) -> Float[np.ndarray, "m"]:
-    """Distance from each sample of a line to another line; NaN where that is not known opposite.
+    """Distance from each sample of a line to another line; NaN where that is unknown opposite.
 
     Args:
         path: The path.
@@ -80,183 +292,11 @@ def _along(path: Path, line: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2
 
 
 def _around(path: Path, apart_cm: float) -> Int[np.ndarray, "m k"]:
-    """Samples of the path around each one; those beyond an open end repeat the last."""
+    """Samples of the path around each one; beyond an open end, the last one repeats."""
     m = len(path.xy_cm)
-    reach = min(int(_SLACK * apart_cm / path.step_cm) + 2, m // 4)
+    reach = min(int(_OPPOSITE_REACH * apart_cm / path.step_cm) + 2, m // 4)
     rows = np.arange(m)[:, None] + np.arange(-reach, reach + 1)
     return rows % m if path.closed else np.clip(rows, 0, m - 1)
-
-
-__all__ = ["FitSettings", "LaneLine", "Side", "fit_lines"]
-
-_SIGN: dict[Side, float] = {"left": 1.0, "right": -1.0}
-_OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
-
-
-class FitSettings(Settings):
-    """Spacing of the cubics, and the gaps that they bridge; lengths in camera heights where the name says so.
-
-    Attributes:
-        knot_heights: Length of a cubic on straight road.
-        corner_heights: Length of a cubic in tight bends.
-        bridge_heights: Longest gap in the paint that still counts as line, with paint on both sides; where
-            the line beside it is seen, a gap counts for less than half.
-        extend_heights: What is believed beyond the end of the paint.
-        reach_heights: How far from the traced line its edges are looked for, beyond half the marking.
-        bend_heights: Typical bend of a line against the path: its inverse radius times the height.
-        guide_lanes: How well a line keeps its distance from the one beside it at best, in lane widths; by how
-            much the two vary where both are seen counts where that is more.
-        loose_lanes: How well the lane is known where neither of its lines is seen, in lane widths.
-        precise_heights: Distance at which an edge point counts half. One pixel spans road in proportion to
-            the squared distance, and what a frame's tilt is off by moves its points likewise.
-        min_aligned: Cosine between a border and the line as traced: a line that turns off at the mouth of a
-            junction is followed no further.
-    """
-
-    knot_heights: float = Field(default=0.6, gt=0.0)
-    corner_heights: float = Field(default=0.3, gt=0.0)
-    bridge_heights: float = Field(default=7.0, gt=0.0)
-    extend_heights: float = Field(default=0.5, ge=0.0)
-    reach_heights: float = Field(default=0.06, gt=0.0)
-    bend_heights: float = Field(default=0.08, gt=0.0)
-    guide_lanes: float = Field(default=0.03, gt=0.0)
-    loose_lanes: float = Field(default=0.3, gt=0.0)
-    precise_heights: float = Field(default=1.5, gt=0.0)
-    min_aligned: float = Field(default=0.94, gt=0.0, lt=1.0)
-
-
-def fit_lines(
-    path: Path,
-    edges: PathEdges,
-    lane: TracedLane,
-    camera_height_cm: float,
-    settings: FitSettings,
-    beside: PathEdges | None = None,
-) -> list[LaneLine]:
-    """Fit the lines of the driven lane, then those beside it.
-
-    Each line is fitted alone first. Where it then has a gap and the line beside it has none, that one guides
-    the cubic through it, at the distance that the two keep where both are seen, and bends it likewise.
-
-    Args:
-        path: The path.
-        edges: Edge points in its coordinates.
-        lane: The traced lines.
-        camera_height_cm: Sets the scale of knots and bounds.
-        settings: Spacing and bounds.
-        beside: Edge points that show the lines beside the lane; None takes those that show its own.
-
-    Returns:
-        Left and right line of the driven lane, then the ones found beside it.
-    """
-    widest = settings.knot_heights * camera_height_cm
-    narrowest = settings.corner_heights * camera_height_cm
-    basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
-    fitter = _Fitter(path, edges, basis, lane.lane_cm, camera_height_cm, settings)
-    traced: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
-        ("left", 0): lane.left_cm,
-        ("right", 0): lane.right_cm,
-        **lane.beside_cm,
-    }
-    # A line that is only seen from afar does not show how wide it is; most are as wide as the best seen one.
-    first: Side = "left" if np.isfinite(lane.left_cm).sum() >= np.isfinite(lane.right_cm).sum() else "right"
-    alone: dict[Side, FittedOffset] = {}
-    tape = lane.tape_cm
-    for side in (first, _OTHER[first]):
-        by_centre = lane.centre_cm + 0.5 * _SIGN[side] * lane.lane_cm
-        alone[side] = fitter.alone(traced[side, 0], by_centre, tape)
-        tape = alone[first].marking_cm
-    apart = fitter.apart(alone["right"].d_cm, alone["left"].d_cm, alone["right"].seen & alone["left"].seen)
-    fitted: dict[tuple[Side, int], FittedOffset] = {}
-    for side, own in alone.items():
-        start = np.where(own.seen, own.d_cm, np.nan)
-        fitted[side, 0] = fitter.beside(start, alone[_OTHER[side]], _SIGN[side], apart, own.marking_cm)
-    fitter = fitter if beside is None else replace(fitter, edges=beside)
-    for side, rank in sorted(lane.beside_cm, key=lambda name: name[1]):
-        inner, known = fitted[side, rank - 1], np.isfinite(traced[side, rank])
-        apart = fitter.apart(inner.d_cm, np.where(known, traced[side, rank], inner.d_cm), known)
-        fitted[side, rank] = fitter.beside(traced[side, rank], inner, _SIGN[side], apart, tape)
-    lines = []
-    for side, rank in sorted(fitted, key=lambda name: (name[1], name[0])):
-        parallel = fitted[(side, rank - 1) if rank else (_OTHER[side], 0)].seen
-        offset = fitted[side, rank]
-        lines.append(_line(path, basis, side, rank, offset, parallel, camera_height_cm, settings))
-    return lines
-
-
-@dataclass(frozen=True)
-class _Fitter:
-    """What the fits of all lines have in common."""
-
-    path: Path
-    edges: PathEdges
-    basis: CubicBasis
-    lane_cm: float
-    height_cm: float
-    settings: FitSettings
-
-    def alone(
-        self, traced_cm: Float[np.ndarray, "m"], guess_cm: Float[np.ndarray, "m"], tape_cm: float
-    ) -> FittedOffset:
-        """Fit a line of which nothing but the trace is known; NaN where that has lost it."""
-        start = np.where(np.isfinite(traced_cm), traced_cm, guess_cm)
-        loose = np.full(len(start), self.settings.loose_lanes * self.lane_cm)
-        return self._fit(start, self._smoothed(start), np.zeros(len(start)), loose, tape_cm)
-
-    def beside(
-        self,
-        known_cm: Float[np.ndarray, "m"],
-        other: FittedOffset,
-        sign: float,
-        apart: tuple[Float[np.ndarray, "m"], float],
-        tape_cm: float,
-    ) -> FittedOffset:
-        """Fit a line that runs on the left (sign 1) or on the right (-1) of a fitted one."""
-        guess = parallel_offset(self.path, self._smoothed(other.d_cm), sign * apart[0])
-        sigma = np.where(
-            other.seen, np.hypot(apart[1], other.sigma_cm), self.settings.loose_lanes * self.lane_cm
-        )
-        start = np.where(np.isfinite(known_cm), known_cm, guess)
-        return self._fit(start, guess, guess, sigma, tape_cm)
-
-    def apart(
-        self, inner_cm: Float[np.ndarray, "m"], outer_cm: Float[np.ndarray, "m"], known: Bool[np.ndarray, "m"]
-    ) -> tuple[Float[np.ndarray, "m"], float]:
-        """Distance of two lines, smoothed over a lane's width and interpolated in gaps; what it varies by."""
-        path, lane_cm = self.path, self.lane_cm
-        least = self.settings.guide_lanes * lane_cm
-        inner, outer = self._smoothed(inner_cm), self._smoothed(outer_cm)
-        found = distance_across(path, inner, outer, known)
-        good = known & (np.abs(found - lane_cm) < 0.35 * lane_cm)
-        if not good.any():
-            return np.full(len(found), lane_cm), self.settings.loose_lanes * lane_cm
-        filled = np.interp(path.s_cm, path.s_cm[good], found[good], period=path.period_cm)
-        varies = 1.4826 * float(np.median(np.abs(found[good] - np.median(found[good]))))
-        return _smoothed(path, filled, 0.5 * lane_cm), max(varies, least)
-
-    def _smoothed(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-        return _smoothed(self.path, d_cm, 0.25 * self.lane_cm)
-
-    def _fit(
-        self,
-        start_cm: Float[np.ndarray, "m"],
-        guess_cm: Float[np.ndarray, "m"],
-        shape_cm: Float[np.ndarray, "m"],
-        sigma_cm: Float[np.ndarray, "m"],
-        tape_cm: float,
-    ) -> FittedOffset:
-        smooth = self._smoothed(start_cm)
-        points = _borders(self.path, self.edges, start_cm, smooth, tape_cm, self.height_cm, self.settings)
-        prior = Prior(
-            guess_cm=guess_cm,
-            shape_cm=shape_cm,
-            sigma_cm=sigma_cm,
-            lane_cm=self.lane_cm,
-            bend_per_cm=self.settings.bend_heights / self.height_cm,
-            knot_cm=self.settings.knot_heights * self.height_cm,
-            height_cm=self.height_cm,
-        )
-        return fit_offset(self.path, self.basis, points, smooth, tape_cm, prior)
 
 
 def _curvature(path: Path) -> Float[np.ndarray, "m"]:
@@ -272,60 +312,7 @@ def _smoothed(path: Path, values: Float[np.ndarray, "m"], over_cm: float) -> Flo
 
 
 def _slope(path: Path, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Change of an offset per length."""
+    """Derivative of an offset along the path."""
     if path.closed:
         return 0.5 * (np.roll(d_cm, -1) - np.roll(d_cm, 1)) / path.step_cm
     return np.gradient(d_cm) / path.step_cm
-
-
-def _borders(
-    path: Path,
-    edges: PathEdges,
-    start_cm: Float[np.ndarray, "m"],
-    smooth_cm: Float[np.ndarray, "m"],
-    tape_cm: float,
-    camera_height_cm: float,
-    settings: FitSettings,
-) -> Borders:
-    """Edge points that may be the borders of a marking whose middle is about at the given offset."""
-    # The left border of a bright marking brightens to the right.
-    border = np.where(edges.side < 0.0, 1.0, -1.0)
-    off = edges.d_cm - np.interp(edges.s_cm, path.s_cm, start_cm, period=path.period_cm)
-    reach = 0.3 * tape_cm + settings.reach_heights * camera_height_cm
-    slope = _slope(path, smooth_cm)[
-        np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
-    ]
-    aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
-    near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
-    precision = 1.0 / (1.0 + (edges.distance_cm[near] / (settings.precise_heights * camera_height_cm)) ** 6)
-    return Borders(
-        edges.s_cm[near], edges.d_cm[near], border[near], edges.weight[near], precision, edges.frame[near]
-    )
-
-
-def _line(
-    path: Path,
-    basis: CubicBasis,
-    side: Side,
-    rank: int,
-    offset: FittedOffset,
-    parallel: Bool[np.ndarray, "m"],
-    camera_height_cm: float,
-    settings: FitSettings,
-) -> LaneLine:
-    """Turn an offset from the path into a cubic on the map."""
-    control = basis.fitted(path.s_cm, path.points(offset.d_cm))
-    bridge, extend = settings.bridge_heights * camera_height_cm, settings.extend_heights * camera_height_cm
-    return LaneLine(
-        side,
-        basis.knots_cm,
-        basis.unfolded(control),
-        stretches(path, offset.seen, bridge, extend, parallel),
-        offset.residual_cm,
-        rank,
-        path.period_cm,
-        path.s_cm,
-        offset.sigma_cm,
-        offset.marking_cm,
-        offset.bare,
-    )

@@ -1,7 +1,4 @@
-"""Following a line, or the middle of a lane, along a path: dynamic programming over offsets.
-
-How lane lines are looked for.
-"""
+"""Follow a marking, or the centre of a lane, along a path by dynamic programming over offsets."""
 
 from __future__ import annotations
 
@@ -19,27 +16,29 @@ from lanenet.config import Settings
 
 
 class TraceSettings(Settings):
-    """How lane lines are looked for; lengths in camera heights where the name says so.
+    """How lane lines are traced; lengths in camera heights where the name says so.
+
+    Where no other origin is given, values were chosen on simulated drives.
 
     Attributes:
-        cell_heights: Cells across the path.
-        side_heights: How far beside the path edges count.
-        min_side: Component across the path of the normal of an edge that runs along it.
-        tape_heights: Narrowest and widest marking.
-        lane_heights: Narrowest and widest lane, where its width is not known.
-        smoothness: Cost of a step of one cell across per sample along the path, growing with its square.
-        sideways: Cost of a step of one cell where no paint is.
-        second_line: What the weaker one of the two lines counts beside the stronger one.
-        inside: What it costs per sample when the car is a lane further, less when it is only just outside:
-            more than a second line brings, so that a lane beside it with two solid lines does not take over;
-            not much more, or the lane changes sides with a car that does.
-        min_support: Density of edges from which a marking counts as seen, 0..1.
-        width_share: How much the lane's width may vary along the road.
-        neighbours: Lines to look for on each side beyond those of the driven lane.
-        neighbour_lanes: Length of paint that makes a neighbouring line, in lane widths.
-        neighbour_share: Share of the path along which a neighbouring line must be seen,
-        visit_share: or of the way that the car drives in the lane before it,
-        visit_lanes: where that is so long at least, in lane widths.
+        cell_heights: Cells across the path: 0.4 cm at a camera height of 15 cm, a fifth of a usual marking.
+        side_heights: Largest offset from the path at which edges count.
+        min_side: Least component of an edge's normal across the path: edges within 41 degrees of it.
+        tape_heights: Narrowest and widest marking: 0.75 to 9 cm at a camera height of 15 cm.
+        lane_heights: Narrowest and widest lane, if its width is not given: 12 to 98 cm at 15 cm.
+        smoothness: Cost of a step of one cell across, per sample along the path; it grows with the square.
+        sideways: Additional cost of a step of one cell where no paint is.
+        second_line: Weight of the weaker of the lane's two lines; the stronger one counts 1.
+        inside: Cost per sample if the car is a lane's width outside the lane, less if it is only just
+            outside. It exceeds ``second_line``, so that an adjacent lane with two solid lines does not win; a
+            much higher value makes the lane change sides with the car.
+        min_support: Density of edges above which a marking counts as seen, 0..1.
+        width_share: Largest variation of the lane's width along the road, as a share of it.
+        neighbours: Number of lines to look for on each side beyond the driven lane.
+        neighbour_lanes: Least length of paint of an adjacent line, in lane widths.
+        neighbour_share: Least share of the path along which an adjacent line is seen,
+        visit_share: or of the path that the car drives in the lane in front of it,
+        visit_lanes: if that path has at least this length, in lane widths.
     """
 
     cell_heights: float = Field(default=0.03, gt=0.0)
@@ -67,13 +66,14 @@ def best_lane(
     lane_width_cm: float,
     settings: TraceSettings,
 ) -> tuple[float, Float[np.ndarray, "m"]]:
-    """Track the lane's centre; the width may differ by a tenth from what the user gave."""
+    """Find the lane's width, within a tenth of the given one, and the offset of its centre."""
     best: tuple[float, float, Float[np.ndarray, "m"]] | None = None
     outside = settings.inside * _car_outside(path, profile, lane_width_cm)
     for width in lane_width_cm * np.linspace(0.9, 1.1, 9):
         cells = width / profile.cell_cm
         left, right = shifted(tapes, 0.5 * cells), shifted(tapes, -0.5 * cells)
-        # One line is nearly as good as two: a lane with a worn line must not be left for its neighbour.
+        # One line counts nearly as much as two, so that a lane with a worn line does not lose to its
+        # neighbour.
         support = np.maximum(left, right) + settings.second_line * np.minimum(left, right)
         centre, score = _best_track(path, support, outside, settings)
         if best is None or score > best[0]:
@@ -90,21 +90,21 @@ def follow_line(
     band_cm: float,
     settings: TraceSettings,
 ) -> Float[np.ndarray, "m"]:
-    """Follow one marking within a band about a guess."""
+    """Follow one marking within a band about a guess; returns its offset."""
     reach = max(2, int(band_cm / profile.cell_cm))
     offsets = np.arange(-reach, reach + 1)
     column = np.clip(guess_cm / profile.cell_cm + profile.half_cells, 0.0, tapes.shape[1] - 1.0)
     nearest = np.rint(column).astype(np.intp)
     window = np.clip(nearest[:, None] + offsets, 0, tapes.shape[1] - 1)
     support = np.take_along_axis(tapes, window, axis=1)
-    # Of two tapes side by side the one nearer to the guess.
+    # Of two markings side by side, prefer the one nearer to the guess.
     against = np.broadcast_to(0.1 * np.abs(offsets) / reach, support.shape)
     track, _ = _best_track(path, support, np.ascontiguousarray(against), settings)
     return (nearest + track - reach - profile.half_cells) * profile.cell_cm
 
 
 def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.ndarray, "m c"]:
-    """How far outside a lane centred at each offset the car is, 1 from a lane away, mean of all visits."""
+    """Mean over all visits of how far the car is outside a lane centred at each offset, 0..1."""
     m, columns = profile.left.shape
     at = (np.arange(columns) - profile.half_cells) * profile.cell_cm
     forward = path.drives_forward
@@ -122,7 +122,7 @@ def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.n
 def _best_track(
     path: Path, support: Float[np.ndarray, "m c"], against: Float[np.ndarray, "m c"], settings: TraceSettings
 ) -> tuple[Float[np.ndarray, "m"], float]:
-    """Columns with the most support along the path; a closed path is followed once more on either side."""
+    """Columns with the most support; a closed path is extended by half a lap at either end."""
     m = len(support)
     lead = m // 2 if path.closed else 0
     if lead:
@@ -136,7 +136,7 @@ def _best_track(
 @njit(cache=True)
 @no_type_check
 def _viterbi(support, against, smoothness, sideways):
-    """Path of columns with the most support; steps of up to four columns, dearer where no paint is."""
+    """Sequence of columns with the most support; steps of up to four columns, dearer without paint."""
     m, columns = support.shape
     cost = np.empty((m, columns), np.float32)
     back = np.zeros((m, columns), np.int8)
@@ -145,10 +145,10 @@ def _viterbi(support, against, smoothness, sideways):
     for i in range(1, m):
         for c in range(columns):
             best, step = -1e18, 0
-            bare = sideways * max(0.0, 1.0 - support[i, c])
+            unpainted = sideways * max(0.0, 1.0 - support[i, c])
             for j in range(-4, 5):
                 if 0 <= c + j < columns:
-                    value = cost[i - 1, c + j] - smoothness * j * j - bare * abs(j)
+                    value = cost[i - 1, c + j] - smoothness * j * j - unpainted * abs(j)
                     if value > best:
                         best, step = value, j
             cost[i, c] = best + support[i, c] - against[i, c]

@@ -1,4 +1,4 @@
-"""A segment of the drive with its lane."""
+"""A segment with its lane lines, and the check that both lines are seen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from lanenet.data.maps.line import LaneLine
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.lane import SIDES
 
-#: Seen along more of the path than this, it is a line.
+#: Share of the path above which a line is certain. Chosen: interruptions and worn places take a tenth at
+#: most.
 _WHOLE_LINE = 0.9
 
 
@@ -23,13 +24,12 @@ class MappedSegment:
     """A segment with its lane, in the scale of its camera.
 
     Attributes:
-        rows: Frames of the drive that it covers, as positions among those that count.
+        rows: Its frames, as positions in the drive.
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
-        lines: Its two lines, then those of the lanes beside it.
-        free_lane_cm: Width of the lane as found without the user's number; None where that fails, or where
-            the user's number was not used in the first place.
+        lines: Its two lines, then those of adjacent lanes.
+        free_lane_cm: Lane width found without the given one, if it fits better; else None.
     """
 
     rows: Int[np.ndarray, "n"]
@@ -41,10 +41,10 @@ class MappedSegment:
 
 
 def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
-    """Refuse a map in which one of the lines is hardly ever seen.
+    """Refuse a map in which one of the lines is hardly seen.
 
     Raises:
-        TrackingLostError: Says how much of the way each line was seen.
+        TrackingLostError: Names the share of the path along which each line was seen.
     """
     seen: dict[str, list[Bool[np.ndarray, "_"]]] = {side: [] for side in SIDES}
     for part in parts:
@@ -54,7 +54,7 @@ def check_lane(parts: list[MappedSegment], drive: Drive) -> None:
     share = {side: float(np.mean(np.concatenate(found))) if found else 0.0 for side, found in seen.items()}
     if min(share.values()) >= LEAST_SEEN:
         return
-    found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the way" for side in SIDES)
+    found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the path" for side in SIDES)
     most = max(share.values())
     what = "no line" if most < MAYBE_LINE else "one line only" if most > _WHOLE_LINE else "one line at most"
     raise TrackingLostError(

@@ -1,8 +1,8 @@
-"""Curvilinear coordinates along a path: s along it, d to its left; the path is open or one closed lap."""
+"""The driven path, open or one closed lap, and curvilinear coordinates along it: s ahead, d to the left."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import no_type_check
 
 import numpy as np
@@ -12,23 +12,35 @@ from scipy.ndimage import gaussian_filter1d
 
 from datagen.slam.odometry.scans import Scans
 from lanenet.errors import TrackingLostError
+from lanenet.geometry.frames import wrap_angle
 from lanenet.geometry.poses import path_lengths
 
+#: Shortest path along which lines are looked for. Chosen: about the length of one dash.
 _SHORTEST_CM = 20.0
+#: Cosine of the largest angle between a frame's heading and the road's, either way round: 60 degrees. Chosen:
+#: cars that follow a lane stay below 30 degrees, roads that cross are at 90.
+_MIN_COSINE = 0.5
+#: A frame further than this from the lap, in camera heights, is on another road; a drive with a larger share
+#: of such frames is no lap. Chosen: about the widest lane that is
+#: looked for (6.5 heights).
+_OFF_HEIGHTS, _MAX_OFF = 6.0, 0.15
+#: Smoothing of the lap. Chosen: longer than the noise of poses from frame to frame (a few cm), a tenth of the
+#: tightest bends' radius, so that a line's offset is a smooth function of the position.
+_SMOOTH_CM = 6.0
 
 
 @dataclass(frozen=True)
 class Path:
-    """A smooth path, sampled evenly.
+    """A smooth path with even samples.
 
     Attributes:
         step_cm: Distance between samples.
         xy_cm: Samples, frame map.
         left: Unit vector to the left at each sample.
         s_frames_cm: Position of each frame's rear axle along the path.
-        d_frames_cm: Offset of each frame's rear axle; None for a car on its path.
+        d_frames_cm: Offset of each frame's rear axle; None for zero.
         forward: Which frames drive in the path's direction; None for all.
-        closed: Whether the path is one lap, whose last sample comes a step before the first.
+        closed: Whether the path is one lap, with its last sample one step before the first.
     """
 
     step_cm: float
@@ -41,7 +53,7 @@ class Path:
 
     @property
     def period_cm(self) -> float | None:
-        """Length of a lap; None where the path is open."""
+        """Length of the lap; None for an open path."""
         return len(self.xy_cm) * self.step_cm if self.closed else None
 
     @property
@@ -65,10 +77,10 @@ class Path:
 
 
 def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: float) -> Path:
-    """Smooth a trajectory of rear-axle poses and sample it evenly.
+    """Smooth a trajectory and sample it evenly.
 
-    The path is carried on beyond the last pose with its last curvature, because the last frames see road
-    that was never driven.
+    The path is extended beyond the last pose at its last curvature, because the last frames see road that was
+    not driven.
 
     Args:
         poses: Rear-axle poses, frame map.
@@ -80,12 +92,12 @@ def path_of_poses(poses: Float[np.ndarray, "n 3"], step_cm: float, ahead_cm: flo
     """
     smooth = gaussian_filter1d(poses[:, :2], 2.0, axis=0, mode="nearest")
     distance = path_lengths(smooth)
-    # Standing still gives several frames at one place; interpolation needs a strictly growing argument.
+    # Interpolation needs strictly increasing positions, also where the car stands still.
     s = distance + np.arange(len(distance)) * 1e-6
     if s[-1] < max(_SHORTEST_CM, 3.0 * step_cm):
         raise TrackingLostError(
             f"the car moved {distance[-1]:.1f} cm in {len(poses)} frames, expected {_SHORTEST_CM:.0f} cm: "
-            "there is no path to look for lines along"
+            "no path along which to look for lines"
         )
     samples = np.arange(0.0, s[-1], step_cm)
     xy = np.stack([np.interp(samples, s, smooth[:, i]) for i in range(2)], axis=1)
@@ -106,6 +118,110 @@ def left_of(direction: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
     return np.stack([-unit[:, 1], unit[:, 0]], axis=1)
 
 
+def lap_path(
+    poses: Float[np.ndarray, "n 3"],
+    revisits: list[tuple[int, int]],
+    step_cm: float,
+    camera_height_cm: float,
+) -> Path | None:
+    """Close one lap of a drive and find the position of every frame on it.
+
+    The lap is the section between the two visits of one place that are closest together; the remaining gap is
+    distributed over the lap.
+
+    Args:
+        poses: Rear-axle poses after closing loops, frame map.
+        revisits: Pairs of frames, earlier and later, that show the same place in the same direction.
+        step_cm: Approximate distance between samples.
+        camera_height_cm: Sets the scale of bounds.
+
+    Returns:
+        The closed path; None if the drive does not repeat one lap: it has no revisit, or too many frames lie
+        elsewhere.
+    """
+    ends = _ends_of_lap(poses, revisits)
+    if ends is None:
+        return None
+    first, last = ends
+    xy = poses[first : last + 1, :2]
+    along = path_lengths(xy)
+    xy = xy - (along / along[-1])[:, None] * (xy[-1] - xy[0])
+    xy = _even(xy, step_cm)
+    for _ in range(2):
+        # Smoothing shortens bends, so the samples are made even again.
+        spacing = float(np.linalg.norm(np.diff(xy, axis=0, append=xy[:1]), axis=1).mean())
+        xy = gaussian_filter1d(xy, _SMOOTH_CM / spacing, axis=0, mode="wrap")
+        xy = _even(np.concatenate([xy, xy[:1]]), step_cm)
+    step = float(np.linalg.norm(np.diff(xy, axis=0, append=xy[:1]), axis=1).mean())
+    path = Path(step, xy, left_of(np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)), np.empty(0), closed=True)
+    s, d, forward = positions_on_lap(path, poses)
+    if np.mean(np.abs(d) > _OFF_HEIGHTS * camera_height_cm) > _MAX_OFF:
+        return None
+    return replace(path, s_frames_cm=s, d_frames_cm=d, forward=forward)
+
+
+def positions_on_lap(
+    path: Path, poses: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Find each pose's position along a closed path, its offset to the left, and whether it drives forward.
+
+    Where roads cross or lie side by side, heading and the position of the frame before decide.
+    """
+    n, m = len(poses), len(path.xy_cm)
+    period = m * path.step_cm
+    s_all = path.s_cm
+    road = np.arctan2(-path.left[:, 0], path.left[:, 1])
+    s, d, forward = np.empty(n), np.empty(n), np.ones(n, dtype=bool)
+    moved = np.concatenate([[0.0], np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)])
+    expected: float | None = None
+    for k in range(n):
+        apart = poses[k, :2] - path.xy_cm
+        cosine = np.cos(poses[k, 2] - road)
+        cost = np.linalg.norm(apart, axis=1)
+        if expected is not None:
+            miss = np.abs(np.mod(s_all - expected + 0.5 * period, period) - 0.5 * period)
+            # Bounded by about the width of a road, so that a wrong position is left again.
+            cost = cost + np.minimum(0.5 * miss, 30.0)
+        cost = cost + np.where(np.abs(cosine) < _MIN_COSINE, 1e6, 0.0)
+        i = int(np.argmin(cost))
+        along = float(apart[i] @ [path.left[i, 1], -path.left[i, 0]])
+        s[k] = np.mod(s_all[i] + np.clip(along, -path.step_cm, path.step_cm), period)
+        d[k] = float(apart[i] @ path.left[i])
+        forward[k] = bool(cosine[i] > 0.0)
+        if k + 1 < n:
+            expected = s[k] + (moved[k + 1] if forward[k] else -moved[k + 1])
+    return s, d, forward
+
+
+def _ends_of_lap(poses: Float[np.ndarray, "n 3"], revisits: list[tuple[int, int]]) -> tuple[int, int] | None:
+    """Find the two frames one lap apart that are closest together."""
+    if not revisits:
+        return None
+    path = path_lengths(poses)
+    pairs = np.array(revisits)
+    gaps = path[pairs[:, 1]] - path[pairs[:, 0]]
+    # Later visits may skip laps; the shortest distances are those of one lap.
+    pairs = pairs[gaps < 1.4 * np.percentile(gaps, 10)]
+    step = poses[pairs[:, 1]] - poses[pairs[:, 0]]
+    turn = np.abs(wrap_angle(step[:, 2]))
+    apart = np.linalg.norm(step[:, :2], axis=1) * (1.0 + turn)
+    first, last = (int(k) for k in pairs[int(np.argmin(np.where(turn < np.pi / 3.0, apart, np.inf)))])
+    # Of the frames around the second visit, the one nearest to the first frame along the road.
+    near = np.arange(max(first + 2, last - 20), min(len(poses), last + 21))
+    ahead = np.stack([np.cos(poses[first, 2]), np.sin(poses[first, 2])])
+    last = int(near[int(np.argmin(np.abs((poses[near, :2] - poses[first, :2]) @ ahead)))])
+    closed = path[last] - path[first]
+    missed = float(np.linalg.norm(poses[last, :2] - poses[first, :2]))
+    return None if missed > 0.1 * closed else (first, last)
+
+
+def _even(xy: Float[np.ndarray, "m 2"], step_cm: float) -> Float[np.ndarray, "k 2"]:
+    """Sample a closed polygon, whose last point repeats the first, evenly."""
+    along = path_lengths(xy) + 1e-6 * np.arange(len(xy))
+    samples = np.linspace(0.0, along[-1], max(8, round(along[-1] / step_cm)) + 1)[:-1]
+    return np.stack([np.interp(samples, along, xy[:, i]) for i in range(2)], axis=1)
+
+
 @dataclass(frozen=True)
 class PathEdges:
     """Edge points in the coordinates of a path.
@@ -113,10 +229,10 @@ class PathEdges:
     Attributes:
         s_cm: Position along the path.
         d_cm: Offset to the left.
-        side: Component of the edge's normal (towards the brighter side) to the left, -1..1.
-        along: Component of it along the path.
-        weight: Trust in the point.
-        distance_cm: How far from the front axle it was seen.
+        side: Component to the left of the edge's unit normal, which points to the brighter side.
+        along: Component of the normal along the path.
+        weight: Weight of the point.
+        distance_cm: Distance from the front axle at which it was seen.
         frame: Frame that saw it.
     """
 
@@ -128,17 +244,9 @@ class PathEdges:
     distance_cm: Float[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
 
-    def part(self, rows: Bool[np.ndarray, "m"]) -> PathEdges:
+    def select(self, rows: Bool[np.ndarray, "m"]) -> PathEdges:
         """Return some of the points."""
-        return PathEdges(
-            self.s_cm[rows],
-            self.d_cm[rows],
-            self.side[rows],
-            self.along[rows],
-            self.weight[rows],
-            self.distance_cm[rows],
-            self.frame[rows],
-        )
+        return PathEdges(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 def edges_along_path(
@@ -146,27 +254,26 @@ def edges_along_path(
 ) -> PathEdges:
     """Express every frame's edge points in path coordinates.
 
-    A point is looked for only on the stretch of path that its frame could see, so that neighbouring stretches
-    never take it. On a closed path the edges of all laps and of both directions come to lie on one another.
+    A point is assigned only to the section of the path that its frame could see, never to a section of road
+    beside it. On a closed path, the edges of all laps and both directions coincide.
 
     Args:
-        path: The path of these poses.
+        path: The path, with the frames' positions.
         scans: Edge points per frame.
         poses: Rear-axle poses, frame map.
         wheelbase_cm: Distance between the axles.
-        reach_cm: Edge points further than this from the front axle are left out.
+        reach_cm: Largest distance of edge points from the front axle.
     """
     distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
     keep = distance <= reach_cm
     frame = scans.frame_of_point[keep]
-    forward = path.drives_forward
     s, d, side, along = _project(
         path.xy_cm,
         path.left,
         path.step_cm,
         path.closed,
         path.s_frames_cm[frame],
-        forward[frame],
+        path.drives_forward[frame],
         poses[frame],
         scans.points_cm[keep],
         scans.normals[keep],
@@ -186,7 +293,7 @@ def edges_along_path(
 
 
 def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
-    """Return the scans with some frames emptied; the others stay at their index."""
+    """Return the scans with some frames emptied; frames keep their index."""
     kept = ~left_out[scans.frame_of_point]
     counts = np.where(left_out, 0, np.diff(scans.starts))
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -220,7 +327,7 @@ def _project(xy, left, step, closed, s_frame, forward, pose, points, normals, wh
             continue
         nearest = nearest % m
         dx, dy = x - xy[nearest, 0], y - xy[nearest, 1]
-        # The tangent is the left normal turned clockwise.
+        # The tangent is the left normal rotated clockwise by 90 degrees.
         along = dx * left[nearest, 1] - dy * left[nearest, 0]
         s_out[i] = nearest * step + along
         if closed:

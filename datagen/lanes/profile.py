@@ -1,9 +1,7 @@
-"""Density of edges over the position along a path and the offset from it.
+"""Density of edges over position along a path and offset from it, and the removal of zebra crossings.
 
-Stripes of zebra crossings: paint along the road that is no line of it.
-
-A stripe by itself looks like a dash. What tells it is its company: stripes close by on both sides of it. A
-line has none, or, where it is double or runs beside a crossing, on one side only.
+A stripe of a crossing by itself looks like a dash, but has stripes close by on both sides. A lane line has
+none, or on one side only, where it is double or runs beside a crossing.
 """
 
 from __future__ import annotations
@@ -17,10 +15,24 @@ from scipy.ndimage import binary_opening, gaussian_filter1d, maximum_filter1d
 
 from datagen.lanes.path import Path, PathEdges
 
-#: Weight of edges in a cell at which it counts half.
-_HALF_FULL = 0.15
-#: Smoothing across the path, in cells.
+#: Weight of edges in a cell at which its density is one half. Chosen: after smoothing, a line of one
+#: point per path sample has the density 0.7, a single point 0.3.
+_HALF_DENSITY = 0.15
+#: Smoothing across the path, in cells. Chosen: the scatter of a border between frames (0.035 camera heights).
 _ACROSS_CELLS = 1.2
+#: Distance to the next stripe of a crossing, between like borders, in camera heights. Chosen: periods of 3 to
+#: 9 cm at a camera height of 15 cm; stripes are about as wide as lane markings.
+_PERIOD_HEIGHTS = (0.18, 0.6)
+#: Least number of edges of a neighbouring stripe relative to the stripe itself. Chosen: stripes are alike,
+#: clutter has fewer edges.
+_AS_MANY = 0.5
+#: Density of edges above which there is something. By definition half of saturation.
+_PAINT = 0.5
+#: Least length of a crossing's stripes, in camera heights. Chosen: half of the shortest usual stripe (20 cm).
+_LONG_HEIGHTS = 0.5
+#: Cells and smoothing along the path, in camera heights, and alignment, of the profile in which stripes are
+#: found: as for lines, see :class:`datagen.lanes.follow.TraceSettings`.
+_CELL_HEIGHTS, _ALONG_HEIGHTS, _MIN_SIDE = 0.03, 0.25, 0.75
 
 
 @dataclass(frozen=True)
@@ -30,8 +42,8 @@ class EdgeProfile:
     Attributes:
         cell_cm: Width of a column.
         half_cells: Columns on each side of the path; offset d is column half_cells + d / cell_cm.
-        left: Edges that brighten to the right (left side of a bright marking), m x columns, 0..1.
-        right: Edges that brighten to the left (right side of a bright marking), m x columns, 0..1.
+        left: Edges that brighten to the right (left border of a bright marking), 0..1.
+        right: Edges that brighten to the left (right border of a bright marking), 0..1.
     """
 
     cell_cm: float
@@ -40,7 +52,7 @@ class EdgeProfile:
     right: Float[np.ndarray, "m c"]
 
     def tapes(self, width_cm: float) -> Float[np.ndarray, "m c"]:
-        """Return how well a marking of this width, with its middle at each offset, is supported."""
+        """Return the support of a marking of this width with its middle at each offset, 0..1."""
         return np.sqrt(
             shifted(self.left, 0.5 * width_cm / self.cell_cm)
             * shifted(self.right, -0.5 * width_cm / self.cell_cm)
@@ -50,9 +62,9 @@ class EdgeProfile:
 def edge_profile(
     path: Path, edges: PathEdges, cell_cm: float, half_cells: int, along_cm: float, min_side: float
 ) -> EdgeProfile:
-    """Count edges that run along the path, per direction, in cells of path position and offset.
+    """Count edges that run along the path, by direction, in cells of position and offset.
 
-    Counts saturate, so that a stretch where the car stood does not outweigh the rest.
+    Counts saturate, so that a section where the car stood does not outweigh the rest.
 
     Args:
         path: The path.
@@ -60,7 +72,7 @@ def edge_profile(
         cell_cm: Width of a column.
         half_cells: Columns on each side of the path.
         along_cm: Smoothing along the path.
-        min_side: Component across the path that the normal of an edge along it has at least.
+        min_side: Least component of an edge's normal across the path.
     """
     shape = (len(path.xy_cm), 2 * half_cells + 1)
     column = np.rint(edges.d_cm / cell_cm).astype(np.intp) + half_cells
@@ -79,7 +91,7 @@ def edge_profile(
         )
         mode: Literal["wrap", "nearest"] = "wrap" if path.closed else "nearest"
         density = gaussian_filter1d(density, along_cm / path.step_cm, axis=0, mode=mode)
-        profiles.append(density / (density + _HALF_FULL))
+        profiles.append(density / (density + _HALF_DENSITY))
     return EdgeProfile(cell_cm, half_cells, profiles[0], profiles[1])
 
 
@@ -92,25 +104,14 @@ def shifted(image: Float[np.ndarray, "m c"], cells: float) -> Float[np.ndarray, 
     return (1.0 - part) * padded[:, start : start + width] + part * padded[:, start + 1 : start + 1 + width]
 
 
-#: How far away the next stripe is, from border to like border, in camera heights.
-_PERIOD_HEIGHTS = (0.18, 0.6)
-#: Edges that the stripes on either side have at least, as a share of the own ones: clutter has fewer.
-_AS_MANY = 0.5
-#: Density of edges from which there is anything.
-_PAINT = 0.5
-#: Length of a crossing's stripes at least, in camera heights.
-_LONG_HEIGHTS = 0.5
-_CELL_HEIGHTS, _ALONG_HEIGHTS, _MIN_SIDE = 0.03, 0.25, 0.75
-
-
 def without_crossings(path: Path, edges: PathEdges, camera_height_cm: float, side_cm: float) -> PathEdges:
-    """Leave out the edges of stripes that have others on both sides.
+    """Remove the edges of stripes that have other stripes on both sides.
 
     Args:
         path: The path.
         edges: Edge points in its coordinates.
         camera_height_cm: Sets the scale of bounds.
-        side_cm: How far beside the path stripes are looked for.
+        side_cm: Largest offset from the path at which stripes are looked for.
     """
     cell = _CELL_HEIGHTS * camera_height_cm
     half = int(side_cm / cell)
@@ -130,11 +131,11 @@ def without_crossings(path: Path, edges: PathEdges, camera_height_cm: float, sid
     column = np.rint(edges.d_cm / cell).astype(np.intp) + half
     inside = (column >= 0) & (column <= 2 * half)
     kept = ~(inside & striped[row, np.where(inside, column, 0)])
-    return edges.part(kept)
+    return edges.select(kept)
 
 
 def _within(density: Float[np.ndarray, "m c"], low: int, high: int) -> Float[np.ndarray, "m c"]:
-    """Highest density between two distances to the left of each cell, in cells."""
+    """Highest density between two distances to the left of each cell, both in cells."""
     size = high - low + 1
     padded = np.pad(density, ((0, 0), (abs(low) + size, abs(high) + size)))
     highest = maximum_filter1d(padded, size, axis=1, mode="constant")
@@ -143,12 +144,12 @@ def _within(density: Float[np.ndarray, "m c"], low: int, high: int) -> Float[np.
 
 
 def _edges_of(density: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
-    """Number of edges behind a density, which saturates."""
+    """Number of edges that gives a density; inverse of the saturation."""
     return density / np.maximum(1.0 - density, 1e-6)
 
 
 def _opened(mask: Bool[np.ndarray, "m c"], rows: int, closed: bool) -> Bool[np.ndarray, "m c"]:
-    """Keep what is that many rows long."""
+    """Keep runs of at least that many rows."""
     mode: Literal["wrap", "constant"] = "wrap" if closed else "constant"
     padded = np.pad(mask, ((rows, rows), (0, 0)), mode=mode)
     return np.asarray(binary_opening(padded, np.ones((rows, 1), dtype=bool)))[rows:-rows]

@@ -1,4 +1,4 @@
-"""Where a line was seen, which gaps in its paint are bridged, and whether it is one of dashes."""
+"""Where a line was seen, which gaps in its paint are bridged, and how much of it is unpainted."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from datagen.lanes.path import Path
 
-#: Weight of the edge points of one border per path sample from which it counts as seen: at least, and as a
-#: share of what the line usually shows. Clutter is sparse.
+#: Weight of one border's edge points per path sample above which it counts as seen: absolute, and relative to
+#: the line's median. Chosen: paint shows several points per sample and frame, clutter one now and then.
 _SEEN, _SEEN_SHARE = 0.5, 0.15
-#: What a gap counts where a parallel line is seen.
-_HELD = 0.4
-#: Cells with paint from which a frame tells what there is between them.
-_TELLING = 4
+#: Weight of a gap's length where a parallel line is seen. Chosen: that line fixes the offset, not the kinks.
+_GUIDED_GAP = 0.4
+#: Least number of painted cells in a frame for its share without paint to count. Chosen: two dashes.
+_MIN_CELLS = 4
 
 
 def seen_samples(
@@ -27,18 +27,17 @@ def seen_samples(
     along_cm: float,
     alone_cm: float,
 ) -> Bool[np.ndarray, "m"]:
-    """Tell at which path samples a marking is seen.
+    """Return at which path samples a marking is seen.
 
-    A place where one border alone is seen counts only near a place where both are: elsewhere it may be
-    anything, a joint or a shadow, and the marking's width does not tell its middle.
+    A single border counts only close to a place where both are seen: elsewhere it may be a joint or a shadow.
 
     Args:
         path: The path.
         s_cm: Position of the marking's edge points.
         border: 1 for points of the left border, -1 for the right one.
-        weight: Trust in each point.
+        weight: Weight of each point.
         along_cm: Smoothing along the path.
-        alone_cm: How far from both borders one alone is believed.
+        alone_cm: Largest distance of a single border from a place with both.
     """
     m = len(path.xy_cm)
     row = np.clip(np.rint(s_cm / path.step_cm).astype(np.intp), 0, m)
@@ -63,37 +62,38 @@ def seen_samples(
     return both | ((np.maximum(left, right) > enough) & (apart * path.step_cm <= alone_cm))
 
 
-def stretches(
+def supported_sections(
     path: Path,
     seen: Bool[np.ndarray, "m"],
     bridge_cm: float,
     extend_cm: float,
-    held: Bool[np.ndarray, "m"] | None = None,
+    guided: Bool[np.ndarray, "m"] | None = None,
 ) -> Float[np.ndarray, "g 2"]:
-    """Stretches between seen samples whose gaps are no longer than the bridge.
+    """Join seen samples to sections, across gaps that are no longer than the bridge.
 
     Args:
         path: The path.
         seen: Where the marking was seen.
         bridge_cm: Longest gap, with the marking seen on both sides.
-        extend_cm: What is believed beyond either end; a stretch shorter than this between two gaps is as
-            likely clutter as line.
-        held: Where a parallel line is seen; a gap counts less there.
+        extend_cm: Extension beyond either end. A section shorter than this is dropped: it is as likely
+            clutter as line.
+        guided: Where a parallel line is seen; gaps count less there.
 
     Returns:
-        (from, to); on a closed path a stretch over the seam ends beyond the period.
+        (from, to); on a closed path a section across the seam ends beyond the period.
     """
     period, at = path.period_cm, path.s_cm[seen]
     if at.size < 2:
         return np.empty((0, 2))
-    cost = np.full(len(seen), path.step_cm) if held is None else np.where(held, _HELD, 1.0) * path.step_cm
-    bare = np.cumsum(cost)[seen]
+    weight = np.ones(len(seen)) if guided is None else np.where(guided, _GUIDED_GAP, 1.0)
+    cost = weight * path.step_cm
+    travelled = np.cumsum(cost)[seen]
     if period is None:
-        cuts = np.flatnonzero(np.diff(bare) > bridge_cm)
+        cuts = np.flatnonzero(np.diff(travelled) > bridge_cm)
         first, last = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(at) - 1]])
         found = np.stack([at[first], at[last]], axis=1)
     else:
-        cuts = np.flatnonzero(np.diff(bare, append=bare[0] + cost.sum()) > bridge_cm)
+        cuts = np.flatnonzero(np.diff(travelled, append=travelled[0] + cost.sum()) > bridge_cm)
         if not cuts.size:
             return np.array([[0.0, period]])
         first, last = (cuts + 1) % len(at), np.roll(cuts, -1)
@@ -102,21 +102,21 @@ def stretches(
     return found if period is not None else np.clip(found, 0.0, path.s_cm[-1])
 
 
-def bare_share(
+def unpainted_share(
     s_cm: Float[np.ndarray, "n"], frame: Int[np.ndarray, "n"], cell_cm: float, reach_cm: float
 ) -> float:
-    """Share of a line that is bare between pieces of paint, as single frames see it.
+    """Share of a line without paint, as single frames see it.
 
-    On the map, the dashes of several laps need not lie on one another; in a frame they do not move.
+    On the map, the dashes of several laps need not coincide; in one frame they do not move.
 
     Args:
         s_cm: Position of the line's edge points along the path.
         frame: Frame that saw each.
-        cell_cm: Length without edge points that counts as bare.
-        reach_cm: Length that a frame sees at most.
+        cell_cm: Length without edge points that counts as unpainted.
+        reach_cm: Largest length that a frame sees.
 
     Returns:
-        0..1; NaN where no frame sees enough of the line.
+        0..1; NaN if no frame sees enough of the line.
     """
     seen = np.unique(np.stack([frame, np.floor(s_cm / cell_cm).astype(np.int64)], axis=1), axis=0)
     if not len(seen):
@@ -124,15 +124,15 @@ def bare_share(
     first = np.flatnonzero(np.diff(seen[:, 0], prepend=seen[0, 0] - 1))
     cells = np.diff(first, append=len(seen))
     length = seen[first + cells - 1, 1] - seen[first, 1] + 1
-    # What a frame sees on both sides of a lap's seam seems to be a lap long.
-    told = (cells >= _TELLING) & (length * cell_cm <= reach_cm)
-    return 1.0 - float(cells[told].sum() / length[told].sum()) if told.any() else float("nan")
+    # A frame that sees both sides of a lap's seam appears to see a whole lap.
+    counts = (cells >= _MIN_CELLS) & (length * cell_cm <= reach_cm)
+    return 1.0 - float(cells[counts].sum() / length[counts].sum()) if counts.any() else float("nan")
 
 
-def within(path: Path, parts_cm: Float[np.ndarray, "g 2"]) -> Bool[np.ndarray, "m"]:
-    """Tell which path samples lie in any of the stretches."""
+def within(path: Path, sections_cm: Float[np.ndarray, "g 2"]) -> Bool[np.ndarray, "m"]:
+    """Return which path samples lie in any of the sections."""
     inside = np.zeros(len(path.xy_cm), dtype=bool)
-    for start, end in parts_cm:
+    for start, end in sections_cm:
         past = path.s_cm - start
         inside |= (past >= 0.0) & (past <= end - start)
         if path.period_cm is not None:

@@ -1,17 +1,17 @@
-"""From edges along the path to the offsets of the lane lines.
+"""Trace lane lines: from edges along the path to the offsets of the lines.
 
-A marking shows as two edges of opposite direction, a tape's width apart. The driven lane is the pair of
-markings a lane's width apart that runs along the whole path, with the car inside it most of the way; both are
-found together by dynamic programming, so that a dashed line and an interrupted one are carried by the other.
-The lines of the neighbouring lanes follow in :mod:`datagen.lanes.beside`.
+A marking shows as two edges of opposite direction, its width apart. The driven lane is the pair of markings,
+a lane's width apart, that runs along the whole path with the car inside it most of the time. Dynamic
+programming finds both together, so that one line carries the other through gaps. The lines of adjacent lanes
+follow from there outwards.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from datagen.lanes.follow import TraceSettings, best_lane, follow_line
 from datagen.lanes.path import Path, PathEdges
@@ -21,33 +21,35 @@ from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, TrackingLostError
 
-__all__ = ["TraceSettings", "TracedLane", "trace_known_lane", "trace_lane"]
-
-
-#: How far a line may lie beside its usual offset, as a share of the lane's width: beyond the first, what is
-#: off by the second goes as well; and how far around the usual offset is looked for, in lane widths.
-_STRAY, _BESIDE, _STRAY_REACH_LANES = 0.08, 0.04, 1.5
-
-#: A line that is there along less of the way than this does not bound a lane.
+#: A bulge is a short section off the line's median offset by more than the first of these, and as far as it
+#: is off by the second, in lane widths; the third is the half length of the median's window. Chosen: dashes
+#: lie on one curve, and lanes widen over more than their own width.
+_BULGE, _BULGE_BASE, _BULGE_WINDOW_LANES = 0.08, 0.04, 1.5
+#: Least share of the path along which a line is seen that bounds a lane. Chosen: short dashes leave a third.
 LEAST_SEEN = 0.2
-#: Less than this of a line is clutter that happens to lie along the way.
+#: Share of the path below which a line may be clutter. Chosen: clutter rarely lies along half of a path.
 MAYBE_LINE = 0.5
-#: A line of the given lane that is seen along less than this share of the way along which one of another
-#: width is: gaps between dashes leave more.
-_HARDLY = 0.4
+#: Least visibility of the given lane's weaker line relative to that of a lane of another width. Chosen: gaps
+#: between dashes leave more.
+_WEAKER = 0.4
+#: Offsets from a line between two lanes at which a car drives in the further lane, in lane widths. Chosen:
+#: clearly beyond the line, and not beyond that lane.
+_VISITS = (0.1, 1.0)
+#: Shortest piece of paint that counts, in lane widths. Chosen: about a marking's length across, 3 cm.
+_SPECK = 0.1
 
 
 @dataclass(frozen=True)
 class TracedLane:
-    """The lines of the driven lane and beside it, in path coordinates.
+    """The lines of the driven lane and of adjacent lanes, as offsets from the path.
 
     Attributes:
-        left_cm: Offset of the left line's middle at each path sample; NaN where nothing supports it.
+        left_cm: Offset of the left line's middle at each path sample; NaN where it is not supported.
         right_cm: Offset of the right line's middle.
-        centre_cm: Offset of the lane's centre as found from both, everywhere.
+        centre_cm: Offset of the lane's centre, without gaps.
         lane_cm: Lane width.
         tape_cm: Width of the markings.
-        beside_cm: Further lines likewise, by side and rank from 1, counted outwards.
+        adjacent_cm: Further lines, by side and rank; ranks count outwards from 1.
     """
 
     left_cm: Float[np.ndarray, "m"]
@@ -55,7 +57,7 @@ class TracedLane:
     centre_cm: Float[np.ndarray, "m"]
     lane_cm: float
     tape_cm: float
-    beside_cm: dict[tuple[Side, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
+    adjacent_cm: dict[tuple[Side, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
 
 
 def trace_lane(
@@ -71,13 +73,13 @@ def trace_lane(
         path: The driven path.
         edges: Edge points in its coordinates.
         camera_height_cm: Sets the scale of cells and bounds.
-        lane_width_cm: Distance between the lines where the scale is known; None looks for it.
+        lane_width_cm: Distance between the lines; None if it is to be found.
         settings: Cell sizes and bounds.
 
     Raises:
         TrackingLostError: If no pair of lines runs along the path.
     """
-    profile = profile_along(path, edges, camera_height_cm, settings)
+    profile = _profile_along(path, edges, camera_height_cm, settings)
     driven = len(path.xy_cm)
     if not path.closed:
         driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
@@ -90,71 +92,25 @@ def trace_lane(
     left = follow_line(path, tapes, profile, centre + 0.5 * lane, band, settings)
     right = follow_line(path, tapes, profile, centre - 0.5 * lane, band, settings)
     left, right = (
-        _without_strays(path, known_middle(profile, line, tape, settings), centre, lane)
+        _without_bulges(path, _seen_middle(profile, line, tape, settings), centre, lane)
         for line in (left, right)
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
         raise TrackingLostError(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
-            "and the camera's height, and look at the map's picture"
+            "and the camera's height"
         )
     return TracedLane(left, right, centre, lane, tape)
-
-
-def profile_along(
-    path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings
-) -> EdgeProfile:
-    """Density of edges beside the path in which lines are followed."""
-    cell = settings.cell_heights * camera_height_cm
-    half = int(settings.side_heights / settings.cell_heights)
-    return edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
-
-
-def known_middle(
-    profile: EdgeProfile, line_cm: Float[np.ndarray, "m"], tape_cm: float, settings: TraceSettings
-) -> Float[np.ndarray, "m"]:
-    """Keep a followed line where both edges of its marking are seen; NaN elsewhere."""
-    edges = []
-    for density, offset in ((profile.left, 0.5 * tape_cm), (profile.right, -0.5 * tape_cm)):
-        column = np.rint((line_cm + offset) / profile.cell_cm).astype(np.intp) + profile.half_cells
-        window = np.clip(column[:, None] + np.arange(-1, 2), 0, density.shape[1] - 1)
-        edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
-    return np.where(np.minimum(*edges) >= settings.min_support, line_cm, np.nan)
-
-
-def _without_strays(
-    path: Path, line_cm: Float[np.ndarray, "m"], centre_cm: Float[np.ndarray, "m"], lane_cm: float
-) -> Float[np.ndarray, "m"]:
-    """Drop short stretches that bulge out of the way of the line before and after them.
-
-    Where a line is hidden or worn away, a strip of tape on the floor is followed instead. Dashes lie on one
-    way, all of them, and a lane becomes wider over more than its own width.
-    """
-    offset, m = line_cm - centre_cm, len(line_cm)
-    reach = round(_STRAY_REACH_LANES * lane_cm / path.step_cm)
-    index = np.arange(m)[:, None] + np.arange(-reach, reach + 1)
-    around = offset[index % m]
-    if not path.closed:
-        around[(index < 0) | (index >= m)] = np.nan
-    usual = np.full(m, np.nan)
-    some = np.isfinite(around).any(axis=1)
-    usual[some] = np.nanmedian(around[some], axis=1)
-    off = np.nan_to_num(np.abs(offset - usual)) / lane_cm
-    kept = line_cm.copy()
-    for piece in true_runs(off > _BESIDE, path.closed):
-        if off[piece].max() > _STRAY:
-            kept[piece] = np.nan
-    return kept
 
 
 def trace_known_lane(
     path: Path, edges: PathEdges, height_cm: float, lane_width_cm: float, settings: TraceSettings
 ) -> tuple[TracedLane, float | None]:
-    """Trace the lane of the given width, and look for the lane's width without that number too.
+    """Trace the lane of the given width, and compare it with a search without that width.
 
     Returns:
-        The lane, and the width of the lane that is found freely; None where none is, or where the lane of the
-        given width fits the road as well.
+        The lane, and the width that the free search found; None if it found none, or if the given width fits
+        the road as well.
 
     Raises:
         CalibrationError: If there is no lane of this width but one of another; names both.
@@ -173,7 +129,7 @@ def trace_known_lane(
         lane = None
     if (
         free is not None
-        # Clutter that lies along the way makes pairs of any width.
+        # Clutter along the path makes pairs of any width.
         and min(_seen(free)) >= MAYBE_LINE
         and (lane is None or min(_seen(lane)) < LEAST_SEEN)
     ):
@@ -184,6 +140,7 @@ def trace_known_lane(
 
 
 def other_lane(given_cm: float, found_cm: float) -> CalibrationError:
+    """Return the error for a lane of another width than the given one."""
     return CalibrationError(
         f"no two lines {given_cm:g} cm apart run along the drive, but two that are {found_cm:.0f} cm apart "
         "with this camera: check the lane width and the camera's height"
@@ -191,19 +148,149 @@ def other_lane(given_cm: float, found_cm: float) -> CalibrationError:
 
 
 def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
-    """Whether the lane that was found freely is more likely the driven one than that of the given width.
+    """Whether the freely found lane is more likely the driven one than the lane of the given width.
 
-    The free search alone is no proof: clutter beside a line makes a narrower lane, and the far line of a road
-    of two lanes, where the one in its middle is dashed, a wider one. It counts where the weaker line of the
-    given lane is hardly seen beside its own, or where the car keeps to its middle and not to that of the
-    given lane, as on a road of two lanes whose whole width was given.
+    The free search alone is no proof: clutter beside a line makes a narrower lane, and a dashed line in the
+    middle of the road a wider one. Two things count against the given width: its weaker line is seen much
+    less than that of the free lane, or the car keeps to the centre of the free lane and not to that of the
+    given one, as on a road of two lanes whose whole width was given.
     """
-    if min(_seen(lane)) < _HARDLY * min(_seen(free)):
+    if min(_seen(lane)) < _WEAKER * min(_seen(free)):
         return True
     aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
     return min(_seen(free)) >= LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
 
 
 def _seen(lane: TracedLane) -> tuple[float, float]:
-    """Share of the way along which the left and the right line were seen."""
+    """Share of the path along which the left and the right line were seen."""
     return float(np.isfinite(lane.left_cm).mean()), float(np.isfinite(lane.right_cm).mean())
+
+
+def trace_adjacent(
+    path: Path, edges: PathEdges, lane: TracedLane, camera_height_cm: float, settings: TraceSettings
+) -> TracedLane:
+    """Find the lines of adjacent lanes, from the driven lane outwards.
+
+    From its own lane, a car sees the far line of the next one only from afar or not at all. Where it drives
+    in that lane, it sees the line well; then the line counts however little of it is seen elsewhere.
+
+    Args:
+        path: The driven path.
+        edges: Edge points in its coordinates, up to where the next lane's far line comes into view.
+        lane: The driven lane.
+        camera_height_cm: Sets the scale of cells.
+        settings: Cell sizes and bounds.
+
+    Returns:
+        The driven lane, with the lines of adjacent lanes.
+    """
+    profile = _profile_along(path, edges, camera_height_cm, settings)
+    tapes = profile.tapes(lane.tape_cm)
+    band = 2.0 * settings.width_share * lane.lane_cm
+    adjacent: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
+    sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [
+        ("left", 1.0, lane.left_cm),
+        ("right", -1.0, lane.right_cm),
+    ]
+    for side, sign, line in sides:
+        inner = np.where(np.isfinite(line), line, lane.centre_cm + 0.5 * sign * lane.lane_cm)
+        for rank in range(1, settings.neighbours + 1):
+            found = follow_line(path, tapes, profile, inner + sign * lane.lane_cm, band, settings)
+            known = _seen_middle(profile, found, lane.tape_cm, settings)
+            visits = _visits(path, sign * inner, sign, lane.lane_cm)
+            if not _is_line(path, known, visits, lane.lane_cm, settings):
+                break
+            adjacent[side, rank] = known
+            inner = np.where(np.isfinite(known), known, found)
+    return replace(lane, adjacent_cm=adjacent)
+
+
+def _visits(
+    path: Path, outwards_cm: Float[np.ndarray, "m"], sign: float, lane_cm: float
+) -> Bool[np.ndarray, "n"]:
+    """Return which frames drive in the lane beyond a line; ``outwards_cm`` is the line's offset outwards."""
+    line = np.interp(path.s_frames_cm, path.s_cm, outwards_cm, period=path.period_cm)
+    beyond = (sign * path.offsets_cm - line) / lane_cm
+    return (beyond > _VISITS[0]) & (beyond < _VISITS[1])
+
+
+def _is_line(
+    path: Path,
+    line_cm: Float[np.ndarray, "m"],
+    visits: Bool[np.ndarray, "n"],
+    lane_cm: float,
+    settings: TraceSettings,
+) -> bool:
+    """Whether it is a painted line rather than clutter: enough of it, in runs rather than specks."""
+    shortest = max(2, int(_SPECK * lane_cm / path.step_cm))
+    seen = _in_runs(np.isfinite(line_cm), shortest, path.closed)
+    if float(seen.sum()) * path.step_cm < settings.neighbour_lanes * lane_cm:
+        return False
+    if float(seen.mean()) >= settings.neighbour_share:
+        return True
+    row = np.rint(path.s_frames_cm[visits] / path.step_cm).astype(np.intp)
+    row = row % len(seen) if path.closed else np.clip(row, 0, len(seen) - 1)
+    if _driven_cm(path)[visits].sum() < settings.visit_lanes * lane_cm:
+        return False
+    return float(seen[row].mean()) >= settings.visit_share
+
+
+def _driven_cm(path: Path) -> Float[np.ndarray, "n"]:
+    """Distance to each next frame along the path."""
+    step = np.diff(path.s_frames_cm, append=path.s_frames_cm[-1:])
+    if path.period_cm is not None:
+        step = np.mod(step + 0.5 * path.period_cm, path.period_cm) - 0.5 * path.period_cm
+    return np.abs(step)
+
+
+def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int, closed: bool) -> Bool[np.ndarray, "m"]:
+    """Drop runs of fewer samples than ``shortest``."""
+    kept = np.zeros(len(seen), dtype=bool)
+    for run in true_runs(seen, closed):
+        kept[run] = len(run) >= shortest
+    return kept
+
+
+def _profile_along(
+    path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings
+) -> EdgeProfile:
+    """Density of edges along the path, in which lines are followed."""
+    cell = settings.cell_heights * camera_height_cm
+    half = int(settings.side_heights / settings.cell_heights)
+    return edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
+
+
+def _seen_middle(
+    profile: EdgeProfile, line_cm: Float[np.ndarray, "m"], tape_cm: float, settings: TraceSettings
+) -> Float[np.ndarray, "m"]:
+    """Keep a followed line where both borders of its marking are seen; NaN elsewhere."""
+    edges = []
+    for density, offset in ((profile.left, 0.5 * tape_cm), (profile.right, -0.5 * tape_cm)):
+        column = np.rint((line_cm + offset) / profile.cell_cm).astype(np.intp) + profile.half_cells
+        window = np.clip(column[:, None] + np.arange(-1, 2), 0, density.shape[1] - 1)
+        edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
+    return np.where(np.minimum(*edges) >= settings.min_support, line_cm, np.nan)
+
+
+def _without_bulges(
+    path: Path, line_cm: Float[np.ndarray, "m"], centre_cm: Float[np.ndarray, "m"], lane_cm: float
+) -> Float[np.ndarray, "m"]:
+    """Drop short sections that bulge out of the line before and after them.
+
+    Where a line is hidden or worn away, another strip on the floor may have been followed instead.
+    """
+    offset, m = line_cm - centre_cm, len(line_cm)
+    reach = round(_BULGE_WINDOW_LANES * lane_cm / path.step_cm)
+    index = np.arange(m)[:, None] + np.arange(-reach, reach + 1)
+    around = offset[index % m]
+    if not path.closed:
+        around[(index < 0) | (index >= m)] = np.nan
+    median = np.full(m, np.nan)
+    some = np.isfinite(around).any(axis=1)
+    median[some] = np.nanmedian(around[some], axis=1)
+    off = np.nan_to_num(np.abs(offset - median)) / lane_cm
+    kept = line_cm.copy()
+    for run in true_runs(off > _BULGE_BASE, path.closed):
+        if off[run].max() > _BULGE:
+            kept[run] = np.nan
+    return kept

@@ -1,9 +1,8 @@
-"""How wide the markings are and the driven lane is, where nobody has said so.
+"""The width of the markings, and of the driven lane if it is not given.
 
-Two lines side by side are not yet a lane. Where three lines run side by side at even distances, the road has
-two lanes, or it is one with a line in its middle: which of the two tells the car. One that keeps to the
-middle of one half drives in a lane of that width; one that drives on the middle line, or changes sides all
-the time, has the whole road for its lane.
+Two lines side by side are not necessarily the lane. Where three lines run side by side at equal distances,
+the road has two lanes, or one lane with a line in its middle. The car decides: if it keeps to one half, that
+half is its lane; if it drives on the middle line or changes sides often, its lane is the whole road.
 """
 
 from __future__ import annotations
@@ -17,30 +16,32 @@ from datagen.lanes.path import Path
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.errors import TrackingLostError
 
-#: Shares of the distance of two lines within which a third one lies in the middle between them.
+#: Ratio of two line distances at which one counts as half of the other. Chosen: widths are known to a cell of
+#: 0.06 camera heights, 3 % of a usual lane.
 _HALF = (0.44, 0.56)
-#: How well lines have to be seen at half or twice the distance of those seen best: one may be dashed.
+#: Least support of lines at half or twice the distance of the best ones. Chosen: one of them may be dashed.
 _AS_WELL = 0.8
-#: How much better each of three lines is seen than what lies between them, in the middles of the two lanes.
+#: Least support of each of three lines relative to what lies in the middles of the two lanes. Chosen: on a
+#: mottled floor, any place across the road has some support.
 _CLEAR = 1.25
-#: How far off the middle of its lane the car may drive, as a share of the lane's width: what is further off
-#: is half of a lane, beside a crack or a shadow that it drives over.
+#: Largest offset of the car from the centre of its lane, as a share of the lane's width. Chosen: a pair of
+#: lines further off is half of a lane, next to a crack or shadow that the car drives over.
 _OFF_CENTRE = 0.4
-#: A car that is further than this off the middle of a road of two lanes, in widths of the road, is nearer to
-#: the middle of one lane than to that of the road; one that is further off than this is not on it.
+#: Offsets from the middle of a road with two lanes, in widths of the road. Derived: beyond the first, the car
+#: is nearer to the centre of one lane (at 0.25) than to the middle; beyond the second, it is not on the road.
 _IN_HALF, _ON_ROAD = 0.125, 1.0
-#: Share of the frames that a car is in the same half of the road if it keeps to it: on simulated drives in
-#: one of two lanes 0.88 with wide swerves, else 0.96 and more.
+#: Least share of frames in the same half of the road if the car keeps to it. Measured on simulated drives in
+#: one of two lanes: 0.88 with wide swerves, else 0.96 and more.
 _MOST = 0.5
 
 
 def find_tape_width(
     profile: EdgeProfile, driven: int, camera_height_cm: float, settings: TraceSettings
 ) -> float:
-    """Width at which left and right edges pair up best, over the driven stretch."""
+    """Find the width at which left and right edges pair up best, over the driven section."""
     low, high = (t * camera_height_cm for t in settings.tape_heights)
     widths = np.arange(low, high, 0.5 * profile.cell_cm)
-    # The best pairing at each path position, on either side; a wrong width pairs by chance only.
+    # The six best pairings at each position: two or three lines, each some cells wide.
     scores = [np.sort(profile.tapes(w)[:driven], axis=1)[:, -6:].mean() for w in widths]
     return float(widths[int(np.argmax(gaussian_filter1d(np.array(scores), 1.0)))])
 
@@ -53,13 +54,13 @@ def find_lane_width(
     camera_height_cm: float,
     settings: TraceSettings,
 ) -> float:
-    """Distance at which two markings run side by side along the path, one on either side of the car.
+    """Find the distance at which two markings run along the path, one on either side of the car.
 
     Args:
-        path: The path, with the frames' places on it.
-        tapes: Support of a marking at each place of the profile.
+        path: The path, with the frames' positions.
+        tapes: Support of a marking in each cell of the profile.
         profile: Density of edges.
-        driven: Samples of the path that the car has driven over.
+        driven: Number of path samples that the car has driven over.
         camera_height_cm: Sets the scale of bounds.
         settings: Bounds.
 
@@ -79,7 +80,7 @@ def find_lane_width(
     score = gaussian_filter1d(np.array(scores), 1.5)
     peaks = [i for i in range(1, len(score) - 1) if score[i] >= score[i - 1] and score[i] > score[i + 1]]
     if not peaks:
-        raise TrackingLostError("no two lines run side by side along the drive, so that its scale is unknown")
+        raise TrackingLostError("no two lines run side by side along the drive, so its scale is unknown")
     peaks.sort(key=lambda i: -score[i])
     best = peaks[0]
     for other in peaks[1:]:
@@ -100,7 +101,7 @@ def _has_middle_line(
     whole_cm: float,
     settings: TraceSettings,
 ) -> bool:
-    """Whether three lines run along a road: on a mottled floor any place across it looks half like one."""
+    """Whether three lines run along the road."""
     left, left_lane, middle, right_lane, right = (
         _followed_support(path, tapes, profile, middle_cm + share * whole_cm, whole_cm, settings)
         for share in (0.5, 0.25, 0.0, -0.25, -0.5)
@@ -109,10 +110,10 @@ def _has_middle_line(
 
 
 def _keeps_to_a_half(path: Path, middle_cm: Float[np.ndarray, "m"], whole_cm: float) -> bool:
-    """Whether the car is in the same half of the road, as it drives, most of the time."""
+    """Whether the car is most of the time in the same half of the road, in its direction of travel."""
     middle = np.interp(path.s_frames_cm, path.s_cm, middle_cm, period=path.period_cm)
-    beside = path.offsets_cm - middle
-    left = np.where(path.drives_forward, beside, -beside) / whole_cm
+    offset = path.offsets_cm - middle
+    left = np.where(path.drives_forward, offset, -offset) / whole_cm
     left = left[np.abs(left) < _ON_ROAD]
     return bool(max(np.sum(left > _IN_HALF), np.sum(left < -_IN_HALF)) > _MOST * len(left))
 
@@ -125,7 +126,7 @@ def _followed_support(
     whole_cm: float,
     settings: TraceSettings,
 ) -> float:
-    """Mean support of the marking, or what looks most like one, that runs about these offsets."""
+    """Mean support of the best marking along these offsets."""
     followed = follow_line(path, tapes, profile, guess_cm, (max(_HALF) - 0.5) * whole_cm, settings)
     column = np.rint(followed / profile.cell_cm).astype(np.intp) + profile.half_cells
     return float(tapes[np.arange(len(tapes)), np.clip(column, 0, tapes.shape[1] - 1)].mean())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.lanes.support import bare_share
+from datagen.lanes.support import unpainted_share
 
 CELL_CM, REACH_CM = 1.5, 60.0
 
@@ -20,33 +20,33 @@ def _seen(painted: np.ndarray, s_cm: np.ndarray, frames: int, moved_cm: float = 
 
 
 @pytest.mark.parametrize("moved_cm", [0.0, 2.0])
-def test_the_bare_share_of_dashes_also_where_those_of_the_laps_do_not_lie_on_one_another(moved_cm):
+def test_the_unpainted_share_of_dashes_also_where_those_of_the_laps_do_not_lie_on_one_another(moved_cm):
     s = np.arange(0.0, 400.0, 0.5) + 0.1
     dashes = np.mod(s, 12.0) < 6.0
     seen = _seen(dashes, s, 100, moved_cm)
-    share = bare_share(seen[:, 0], seen[:, 1].astype(np.int64), CELL_CM, REACH_CM)
+    share = unpainted_share(seen[:, 0], seen[:, 1].astype(np.int64), CELL_CM, REACH_CM)
     # Half is bare, less what lies beyond the outermost dash in view, and what a cell at either end swallows.
     assert 0.3 < share < 0.5
     if moved_cm:
-        on_the_map = bare_share(seen[:, 0], np.zeros(len(seen), dtype=np.int64), CELL_CM, 1e9)
+        on_the_map = unpainted_share(seen[:, 0], np.zeros(len(seen), dtype=np.int64), CELL_CM, 1e9)
         assert on_the_map < 0.2
 
 
 def test_a_solid_line_has_no_bare_places_and_a_crack_is_its_length():
     s = np.arange(0.0, 400.0, 0.5) + 0.1
     seen = _seen(np.ones(len(s), dtype=bool), s, 100)
-    assert bare_share(seen[:, 0], seen[:, 1].astype(np.int64), CELL_CM, REACH_CM) == 0.0
+    assert unpainted_share(seen[:, 0], seen[:, 1].astype(np.int64), CELL_CM, REACH_CM) == 0.0
     one = np.arange(0.0, 30.0, 0.5)
     cracked = one[(one < 12.0) | (one >= 18.0)]
     # Four of twenty cells.
     frame = np.zeros(len(cracked), dtype=np.int64)
-    assert bare_share(cracked, frame, CELL_CM, REACH_CM) == pytest.approx(0.2)
+    assert unpainted_share(cracked, frame, CELL_CM, REACH_CM) == pytest.approx(0.2)
 
 
 def test_what_tells_nothing_is_left_out():
     none = np.empty(0)
-    assert np.isnan(bare_share(none, none.astype(np.int64), CELL_CM, REACH_CM))
+    assert np.isnan(unpainted_share(none, none.astype(np.int64), CELL_CM, REACH_CM))
     # Three cells are too few, and a line on both sides of a lap's seam seems as long as the lap.
     few, seam = np.array([0.0, 2.0, 40.0]), np.array([0.0, 2.0, 4.0, 496.0, 498.0])
     for s in (few, seam):
-        assert np.isnan(bare_share(s, np.zeros(len(s), dtype=np.int64), CELL_CM, REACH_CM))
+        assert np.isnan(unpainted_share(s, np.zeros(len(s), dtype=np.int64), CELL_CM, REACH_CM))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from lane_edges import arc_path, joined, paint, ring_path, speckle
 
-from datagen.lanes.beside import trace_beside
-from datagen.lanes.fit import FitSettings, LaneLine, fit_lines
+from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.path import Path, PathEdges
-from datagen.lanes.trace import TracedLane, TraceSettings, trace_lane
+from datagen.lanes.trace import TracedLane, TraceSettings, trace_adjacent, trace_lane
+from lanenet.data.maps.line import LaneLine
 
 HEIGHT_CM = 15.0
 LANE_CM = 36.0
@@ -33,7 +33,7 @@ def _everywhere(path: Path) -> np.ndarray:
 def _fit(path: Path, left: PathEdges, right: PathEdges, *others: PathEdges) -> list[LaneLine]:
     edges = joined(left, right, *others)
     lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, TraceSettings())
-    lane = trace_beside(path, edges, lane, HEIGHT_CM, TraceSettings())
+    lane = trace_adjacent(path, edges, lane, HEIGHT_CM, TraceSettings())
     return fit_lines(path, edges, lane, HEIGHT_CM, SETTINGS)
 
 

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_edges import arc_path
 
-from datagen.lanes.lap import lap_path, places_on_lap
 from datagen.lanes.offset import CubicBasis, adapted_breaks
-from datagen.lanes.path import edges_along_path
+from datagen.lanes.path import edges_along_path, lap_path, positions_on_lap
 from datagen.slam.odometry.scans import pack_scans
 from lanenet.data.maps.lanes import assign_lanes
 from lanenet.data.maps.line import LaneLine, Side
@@ -115,7 +114,7 @@ def test_edges_of_all_laps_and_directions_lie_on_one_another(forward):
     rng = np.random.default_rng(1)
     truth, scans = [], []
     turned = poses if forward else poses + [0.0, 0.0, np.pi]
-    s_frames, _, found = places_on_lap(path, turned)
+    s_frames, _, found = positions_on_lap(path, turned)
     assert (found == forward).all()
     placed = type(path)(path.step_cm, path.xy_cm, path.left, s_frames, None, found, closed=True)
     for pose in turned:

@@ -9,7 +9,7 @@ import pytest
 
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.profile import EdgeProfile, edge_profile
-from datagen.lanes.trace import TracedLane, TraceSettings, _without_strays, trace_lane
+from datagen.lanes.trace import TracedLane, TraceSettings, _without_bulges, trace_lane
 from lanenet.errors import TrackingLostError
 
 HEIGHT_CM = 15.0
@@ -304,7 +304,7 @@ def test_a_strip_of_tape_where_the_line_is_hidden_is_not_the_line(closed):
     line = np.full(n, -18.0) + 0.2 * np.sin(s / 7.0)
     line[60:100] = np.nan
     line[70:84] = -12.0
-    found = _without_strays(path, line, centre, LANE_CM)
+    found = _without_bulges(path, line, centre, LANE_CM)
     assert np.isnan(found[60:100]).all()
     rest = np.setdiff1d(s, np.arange(60, 100))
     np.testing.assert_array_equal(found[rest], line[rest])
@@ -320,7 +320,7 @@ def test_a_strip_across_the_seam_of_a_lap_is_judged_as_one(middle):
     bulge = np.concatenate([np.full(6, -16.0), np.full(6, -13.0)])
     rows = (middle - 6 + np.arange(12)) % n
     line[rows] = bulge
-    found = _without_strays(path, line, np.zeros(n), LANE_CM)
+    found = _without_bulges(path, line, np.zeros(n), LANE_CM)
     assert np.isnan(found[rows]).all()
     rest = np.setdiff1d(np.arange(n), rows)
     np.testing.assert_array_equal(found[rest], line[rest])
@@ -331,14 +331,14 @@ def test_dashes_stay_also_beside_a_strip_and_where_the_lane_becomes_wider():
     n = len(path.xy_cm)
     s = np.arange(n)
     line = np.where(s % 20 < 10, -18.0 - 8.0 / (1.0 + np.exp(-(s - 100) / 15.0)), np.nan)
-    np.testing.assert_array_equal(_without_strays(path, line, np.zeros(n), LANE_CM), line)
+    np.testing.assert_array_equal(_without_bulges(path, line, np.zeros(n), LANE_CM), line)
     astray = line.copy()
     astray[200:210] += 7.0
-    found = _without_strays(path, astray, np.zeros(n), LANE_CM)
+    found = _without_bulges(path, astray, np.zeros(n), LANE_CM)
     assert np.isnan(found[200:210]).all()
     kept = np.setdiff1d(s, np.arange(200, 210))
     np.testing.assert_array_equal(found[kept], line[kept])
     # A single piece, or none, is left as it is; so is a bulge that lasts.
     bay = np.where((s > 60) & (s < 160), -24.0, -18.0)
     for alone in (np.full(n, np.nan), np.where(s < 15, -18.0, np.nan), bay):
-        np.testing.assert_array_equal(_without_strays(path, alone, np.zeros(n), LANE_CM), alone)
+        np.testing.assert_array_equal(_without_bulges(path, alone, np.zeros(n), LANE_CM), alone)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from lane_edges import FRAME_CM, joined, paint, ring_path, speckle
 
-from datagen.lanes.beside import trace_beside
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.path import Path, PathEdges
-from datagen.lanes.trace import TraceSettings, trace_lane
+from datagen.lanes.trace import TraceSettings, trace_adjacent, trace_lane
 from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame
 from lanenet.data.maps.lanes import FrameLanes, assign_lanes
 from lanenet.data.maps.line import LaneLine
@@ -57,7 +56,7 @@ def _edges(path: Path, dashed: bool = True, far: bool = True) -> PathEdges:
 def _lines(path: Path, edges: PathEdges) -> list[LaneLine]:
     settings = TraceSettings()
     lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, settings)
-    lane = trace_beside(path, edges, lane, HEIGHT_CM, settings)
+    lane = trace_adjacent(path, edges, lane, HEIGHT_CM, settings)
     return fit_lines(path, edges, lane, HEIGHT_CM, FitSettings(), edges)
 
 
