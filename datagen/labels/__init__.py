@@ -1,1 +1,1 @@
-"""From lane lines on the map to six numbers per frame, and how far they can be trusted."""
+"""Label sets: from lane lines on a map, or from a simulator's ground truth, to six labels per frame."""

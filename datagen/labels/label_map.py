@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from datagen.labels.quality import frame_residual_cm, label_report
 from datagen.quality.figures import Report
 from datagen.quality.page import PAGE_NAME
 from datagen.quality.pictures import draw_contact_sheet
@@ -15,6 +17,7 @@ from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
@@ -23,6 +26,7 @@ from lanenet.data.maps.mapped_drive import (
     NO_LINE,
     NOT_TO_LABEL,
     UNCERTAIN,
+    MappedDrive,
     label_frame,
     labelled_points,
     open_mapped_drive,
@@ -31,8 +35,15 @@ from lanenet.data.maps.mapped_drive import (
 )
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
+
+_REPORT_FORMAT = "lanenet-label-report/1"
+#: Edge points up to this distance ahead count for the residual of a frame. Chosen: twice the farthest label
+#: row.
+_REACH_CM = 60.0
+#: Frames in each row of the contact sheet: the best, the middle and the worst.
+_SHOWN = 8
 
 
 def label_map(
@@ -40,58 +51,38 @@ def label_map(
     out: Path,
     progress: Progress | None = None,
     *,
-    drive_path: Path | None = None,
     colour_weight: float = COLOUR_WEIGHT,
     window: BirdseyeWindow | None = None,
     force: bool = False,
     pictures: bool = True,
 ) -> Report:
-    """Project a map's lines into each frame and write the label set, its report and a contact sheet.
+    """Project a map's lines into each frame; write the label set, its report and a contact sheet.
 
-    Which frames and points get labels is decided by :func:`label_frame`.
+    Which frames and points have labels is decided by :func:`label_frame`.
 
     Args:
         map_folder: Folder that :func:`map_drive` wrote.
         out: Parquet file.
         progress: Called with (done, total).
-        drive_path: Where the drive is now, if it has moved since it was mapped.
-        colour_weight: What colours count beside brightness in the edges that the network sees; else they are
-            found as the map's were.
-        window: The network's window.
-        force: Label a map that was rejected, too.
+        colour_weight: Weight of colour beside brightness in the edges that the network sees; otherwise they
+            are found like the map's.
+        window: The network's window; None takes the default.
+        force: Label a rejected map, too.
         pictures: Draw the contact sheet.
+
+    Raises:
+        TrackingLostError: If the map was rejected, or no frame can be labelled.
     """
-    mapped = open_mapped_drive(map_folder, drive_path)
-    drive_map, drive = mapped.drive_map, mapped.drive
+    mapped = open_mapped_drive(map_folder)
+    drive_map = mapped.drive_map
     if not force:
         refuse_rejected(map_folder, drive_map)
     perception = mapped.perception.with_colours(colour_weight)
     window = BirdseyeWindow() if window is None else window
-    extractor = RoadEdgeExtractor(drive_map.camera, perception)
-    rows: list[int] = []
-    edges, lines, residuals = [], [], []
-    skipped = dict.fromkeys((DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE), 0)
-    kept_points = np.full((len(drive_map.frames), N_POINTS), np.nan)
-    in_window = np.zeros(kept_points.shape, dtype=bool)
-    for k in range(len(drive_map.frames)):
-        if progress is not None:
-            progress(k + 1, len(drive_map.frames))
-        labelled = label_frame(mapped, k, window)
-        if labelled not in NOT_TO_LABEL:
-            in_window[k] = points_in_window(drive_map, k, window)
-        if isinstance(labelled, str):
-            skipped[labelled] += 1
-            continue
-        seen, visible = labelled
-        road = extractor.extract(drive.image(int(mapped.rows[k])))
-        rows.append(k)
-        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
-        lines.append((seen.left_cm, seen.right_cm))
-        kept_points[k] = visible
-        residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
-    if not rows:
-        raise TrackingLostError(f"{map_folder}: no frame can be labelled ({skipped})")
-    residual = np.array(residuals)
+    found = _label_frames(mapped, window, RoadEdgeExtractor(drive_map.camera, perception), progress)
+    rows = found.rows
+    if not rows.size:
+        raise TrackingLostError(f"{map_folder}: no frame can be labelled ({found.left_out})")
     labels = LabelSet(
         meta=LabelMeta(
             window=window,
@@ -103,47 +94,171 @@ def label_map(
             marking_cm=drive_map.meta.tape_cm,
             camera_cm=drive_map.camera.mounting.at_cm,
         ),
-        drive=[drive.name] * len(rows),
+        drive=[mapped.drive.name] * len(rows),
         file=[""] * len(rows),
         frame=drive_map.frames[rows],
         t_s=drive_map.t_s[rows],
         lap=drive_map.lap[rows],
         poses=drive_map.poses[rows],
-        points_cm=kept_points[rows],
-        edges=edges,
-        lines=lines,
-        quality=np.exp(-np.nan_to_num(residual, nan=2.0)),
+        points_cm=found.points_cm,
+        edges=found.edges,
+        lines=found.lines,
+        quality=np.exp(-np.nan_to_num(found.residual_cm, nan=2.0)),
         divides=drive_map.lanes.divides[rows],
     )
-    shares = labelled_points(kept_points, in_window)
-    report = label_report(labels, residual, len(drive_map.frames), skipped, shares)
+    mapped_frames = len(drive_map.frames)
+    report = label_report(labels, found.residual_cm, mapped_frames, found.left_out, found.point_shares)
     write_labels(out, labels)
     write_json(out.with_suffix(".json"), report)
     if pictures:
-        order = np.argsort(np.nan_to_num(residual, nan=9.0))
-        picks = np.concatenate([order[:8], order[len(order) // 2 - 4 : len(order) // 2 + 4], order[-8:]])
+        order = np.argsort(np.nan_to_num(found.residual_cm, nan=9.0))
+        middle = len(order) // 2
+        half = _SHOWN // 2
+        picks = np.concatenate([order[:_SHOWN], order[middle - half : middle + half], order[-_SHOWN:]])
         with atomic_file(out.with_suffix(".png")) as temporary:
-            draw_contact_sheet(temporary, mapped, np.array(rows)[picks])
-    share = report["labelled_share"]
-    lines_out = [
-        f"{len(rows)} of {len(drive_map.frames)} frames labelled ({100 * share:.0f} %)",
-        points_text(shares),
-        *(f"{count} frames left out: {reason}" for reason, count in skipped.items() if count),
-        f"markings lie {report['residual_cm']['median']:.2f} cm (median), "
-        f"{report['residual_cm']['p95']:.2f} cm (p95) from the projected lines",
+            draw_contact_sheet(temporary, mapped, rows[picks])
+    residual = report["residual_cm"]
+    text = [
+        f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",
+        points_text(found.point_shares),
+        *(f"{count} frames left out: {reason}" for reason, count in found.left_out.items() if count),
+        f"distance of markings from the projected lines: {residual['median']:.2f} cm (median), "
+        f"{residual['p95']:.2f} cm (p95)",
     ]
-    return Report(tuple(lines_out), report)
+    return Report(tuple(text), report)
+
+
+@dataclass(frozen=True, eq=False)
+class _LabelledRows:
+    """The labelled frames of a map.
+
+    Attributes:
+        rows: Their positions in the map.
+        edges: Edge points and normals of each, as in :class:`LabelSet`.
+        lines: Lines of each, as in :class:`LabelSet`.
+        points_cm: Six labels of each.
+        residual_cm: Residual of each, see :func:`frame_residual_cm`.
+        left_out: Number of the other frames, by reason.
+        point_shares: See :func:`labelled_points`.
+    """
+
+    rows: Int[np.ndarray, "n"]
+    edges: list[Float[np.ndarray, "_ 4"]]
+    lines: list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]
+    points_cm: Float[np.ndarray, "n 6"]
+    residual_cm: Float[np.ndarray, "n"]
+    left_out: dict[str, int]
+    point_shares: dict[str, float]
+
+
+def _label_frames(
+    mapped: MappedDrive, window: BirdseyeWindow, extractor: RoadEdgeExtractor, progress: Progress | None
+) -> _LabelledRows:
+    drive_map = mapped.drive_map
+    n = len(drive_map.frames)
+    rows: list[int] = []
+    edges, lines, residuals = [], [], []
+    left_out = dict.fromkeys((DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE), 0)
+    points = np.full((n, N_POINTS), np.nan)
+    in_window = np.zeros(points.shape, dtype=bool)
+    for k in range(n):
+        if progress is not None:
+            progress(k + 1, n)
+        labelled = label_frame(mapped, k, window)
+        if labelled not in NOT_TO_LABEL:
+            in_window[k] = points_in_window(drive_map, k, window)
+        if isinstance(labelled, str):
+            left_out[labelled] += 1
+            continue
+        seen, points[k] = labelled
+        road = extractor.extract(mapped.drive.image(int(mapped.rows[k])))
+        rows.append(k)
+        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
+        lines.append((seen.left_cm, seen.right_cm))
+        residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
+    kept = np.array(rows, dtype=np.int64)
+    shares = labelled_points(points, in_window)
+    return _LabelledRows(kept, edges, lines, points[kept], np.array(residuals), left_out, shares)
+
+
+def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, tape_cm: float) -> float:
+    """Median distance of edge points from the projected borders of the markings.
+
+    Args:
+        points_cm: Edge points of the frame, frame car.
+        lines: The frame's lane.
+        tape_cm: Width of a marking that has no measured width.
+
+    Returns:
+        [cm]; NaN if the frame shows fewer than ten edge points near the lines.
+    """
+    near = points_cm[points_cm[:, 1] <= _REACH_CM]
+    distances = []
+    for side, line in enumerate((lines.left_cm, lines.right_cm)):
+        known = line[np.isfinite(line[:, 0])]
+        if len(known) < 2 or not len(near):
+            continue
+        offset = np.abs(_distance_to_polyline(near, known))
+        marking_cm = lines.marking_cm(side, tape_cm)
+        distances.append(np.abs(offset[offset < 1.5 * marking_cm + 1.0] - 0.5 * marking_cm))
+    found = np.concatenate(distances) if distances else np.empty(0)
+    return float(np.median(found)) if found.size >= 10 else float("nan")
+
+
+def _distance_to_polyline(
+    points: Float[np.ndarray, "m 2"], line: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "m"]:
+    start, step = line[:-1], np.diff(line, axis=0)
+    step_x, step_y = step.T
+    length2 = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
+    to_x, to_y = points[:, :1] - start[:, 0], points[:, 1:] - start[:, 1]
+    t = np.clip((to_x * step_x + to_y * step_y) / length2, 0.0, 1.0)
+    off_x, off_y = to_x - t * step_x, to_y - t * step_y
+    return np.sqrt((off_x * off_x + off_y * off_y).min(axis=1))
+
+
+def label_report(
+    labels: LabelSet,
+    residual_cm: Float[np.ndarray, "n"],
+    mapped_frames: int,
+    left_out: dict[str, int],
+    point_shares: dict[str, float],
+) -> dict[str, Any]:
+    """Collect the figures of a label set's report.
+
+    Args:
+        labels: The labels.
+        residual_cm: Residual of each frame, see :func:`frame_residual_cm`.
+        mapped_frames: Number of frames of the map.
+        left_out: Number of frames without labels, by reason.
+        point_shares: See :func:`lanenet.data.maps.mapped_drive.labelled_points`.
+    """
+    known = np.isfinite(labels.points_cm)
+    finite = residual_cm[np.isfinite(residual_cm)]
+
+    def percentile(q: float) -> float:
+        return float(np.percentile(finite, q)) if finite.size else float("nan")
+
+    return {
+        "format": _REPORT_FORMAT,
+        "frames_mapped": mapped_frames,
+        "frames_labelled": len(labels),
+        "labelled_share": len(labels) / max(mapped_frames, 1),
+        "frames_left_out": left_out,
+        "points_in_window_labelled_share": point_shares,
+        "points_labelled_share": {
+            name: float(known[:, i].sum()) / max(mapped_frames, 1) for i, name in enumerate(POINT_NAMES)
+        },
+        "residual_cm": {"median": percentile(50.0), "p95": percentile(95.0), "frames": int(finite.size)},
+        "residual_of": "edge points within 60 cm, of frames that made the map, from the marking's borders",
+    }
 
 
 def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
-    """Raise if the map was rejected.
-
-    Args:
-        map_folder: Where it lies, with its report.
-        drive_map: The map.
+    """Refuse to label a rejected map.
 
     Raises:
-        TrackingLostError: With the first reason, and where the others stand.
+        TrackingLostError: With the first reason, and the file that holds the others.
     """
     if drive_map.meta.verdict != "reject":
         return
@@ -153,9 +268,8 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
-    # Maps of which nobody wants pictures have no page.
-    told_by = page if page.is_file() else map_folder / "report.json"
+    # A map without pictures has no page.
+    details = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
-        f"{map_folder}: the map was rejected: {reason}; see {told_by}, and label it with --force if it is to "
-        "be used all the same"
+        f"{map_folder}: the map was rejected: {reason}; see {details}; --force labels it all the same"
     )

@@ -1,4 +1,4 @@
-"""Label sets from a simulator's truth: for scoring, never for training."""
+"""Label sets from a simulator's ground truth, for evaluation only."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, POINT_NAMES, SIDES
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 
+#: Spacing of a line's points, as in labels from a map (:mod:`lanenet.data.maps.frame_lines`).
 _SAMPLE_CM = 2.0
 
 
@@ -25,19 +26,19 @@ def truth_labels(
     window: BirdseyeWindow | None = None,
     marking_cm: float | None = None,
 ) -> LabelSet:
-    """Make a label set from a simulator's truth, for scoring.
+    """Make a label set from a simulator's ground truth.
 
-    As in a map's labels, the frames on the line between two lanes have none. A map also takes the road beyond
-    a dashed line on the outside for a lane, since it cannot know; the truth does not.
+    As with a map, frames on the line between two lanes have no labels. Unlike a map, the ground truth does
+    not take the road beyond an outer dashed line for a lane.
 
     Args:
         drive_path: Simulated drive.
         perception: How edge points are found; None takes the defaults.
         window: The network's window; None takes the default.
-        marking_cm: Width of the markings, if known.
+        marking_cm: Width of the markings; None if unknown.
 
     Raises:
-        DriveFormatError: If the drive has no truth, or no camera or lane width.
+        DriveFormatError: If the drive has no ground truth, camera or lane width.
     """
     drive, truth = open_drive(drive_path), read_truth(drive_path / "truth.csv")
     if truth is None or drive.camera is None or drive.lane_width_cm is None:
@@ -82,16 +83,16 @@ def truth_labels(
 def true_lines(
     drive_path: Path, truth: dict[str, np.ndarray], wheelbase_cm: float
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Bool[np.ndarray, "n"], Bool[np.ndarray, "n 2"]]:
-    """Return the lines of each frame's lane, as thin as a map's, and where the other lane is.
-
-    The second part of the answer tells which frames are between two lanes, the third whether the other lane
-    is beyond the left or beyond the right line. As in a map's labels, a frame is between two lanes that is
-    not clearly inside its own on the other's side.
+    """Return the lines of each frame's lane, and where the other lane is.
 
     Args:
         drive_path: Simulated drive; without a road there are no lines.
-        truth: Its truth, see :func:`lanenet.data.drives.read_truth`.
+        truth: Its ground truth, see :func:`lanenet.data.drives.read_truth`.
         wheelbase_cm: Distance between the axles.
+
+    Returns:
+        The lines, sampled like those of a map; which frames are not clearly inside their lane on the side of
+        the other one; and whether the other lane is beyond the left, beyond the right line.
     """
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)
     between = np.zeros(len(poses), dtype=bool)
@@ -105,7 +106,7 @@ def true_lines(
     lines = []
     place: float | None = None
     for k, pose in enumerate(poses):
-        # Where the road comes near itself, the car is on the stretch that it was on before.
+        # Where two sections of the road are close, the car is on the one that it was on before.
         front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
         place, offset_cm = track.nearest(front, place)
         lane_cm = 0.0
@@ -113,7 +114,7 @@ def true_lines(
             to_centre_cm = 0.5 * (truth["left_0_cm"][k] + truth["right_0_cm"][k])
             in_other = (offset_cm - to_centre_cm) / other_cm > 0.5
             lane_cm = other_cm if in_other else 0.0
-            # How far the front axle's middle is beyond the line between the lanes, seen from the right one.
+            # Distance of the front axle's middle beyond the line between the lanes, in lane widths.
             beyond_lanes = offset_cm / other_cm - 0.5
             between[k] = (beyond_lanes if in_other else -beyond_lanes) < BESIDE_DIVIDER_LANES
             divides[k, 0 if (other_cm > 0.0) != in_other else 1] = True

@@ -1,1 +1,1 @@
-"""How far a map can be trusted: residuals on held-out frames, local checks, the verdict and the report."""
+"""How far a map can be trusted: residuals on held-out frames, local checks, verdict and report."""

@@ -1,9 +1,9 @@
-"""Frames that show the lines elsewhere than the map does: where a map is bent or its poses are lost.
+"""Frames that contradict the map: where the map is bent or its poses are lost.
 
-A wrong map agrees with itself in most places, so that its figures look well as a whole. Where it is wrong,
-the frames say so: the borders of the lines meet no edge, or edges beside them. Such frames get no labels, nor
-do those next to them on the road, whose near points these frames alone have seen. Where only one of the two
-lines is contradicted, only that one gets none.
+A map that is wrong in one place has good figures as a whole. At that place, the frames contradict it: the
+borders of its lines meet no edge, or edges beside them. Such frames get no labels, and neither do frames
+close to them on the road, since only these frames saw their near points. If one of the two lines is
+contradicted, only that line is masked.
 """
 
 from __future__ import annotations
@@ -18,31 +18,35 @@ from lanenet.geometry.poses import path_lengths
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 
-#: One frame in so many is looked at: neighbours show the same.
+#: Every how many frames one is checked. Chosen: neighbouring frames show nearly the same.
 _EVERY = 3
-#: A frame disagrees where the edges lie further off than this as median, in pixels of an image 160 px wide,
-#: or where less than this share of the borders in view met any: both lines are seldom interrupted at once.
+#: A frame contradicts the map if the median distance of the edges exceeds the first, in pixels of an image
+#: 160 px wide, or if the coverage is below the second. Chosen: right maps keep below 0.5 px; both lines are
+#: seldom interrupted at once.
 _OFF_PX, _LEAST_MET = 1.0, 0.15
-#: The same for one line where both together agree. Edges met by chance lie 2 px off as median, half the gate,
-#: so that every other frame speaks against a line that is none; a lower bound masks lines that are right.
+#: The same for one line, if both together agree. Derived: edges met by chance have a median of 2 px, half the
+#: gate, so every other frame contradicts a wrong line; a lower bound masks lines that are right.
 _ALONE_PX = 2.0
-#: Lines that are less certain than this, in lane widths, bridge gaps: no paint is expected there.
+#: Sigma up to which a line is checked, in lane widths. Chosen: lines with a larger sigma bridge gaps, where
+#: no paint is expected.
 _KNOWN_LANES = 0.02
-#: Samples that tell it at least: in view, and met.
+#: Least number of samples of a frame: in view, and with an edge. Chosen: one border over 15 cm.
 _MIN_VIEW, _MIN_MET = 15, 8
+#: Samples up to this distance ahead count. Chosen: beyond it, a pixel is more than a centimetre on most cars.
 _REACH_CM = 60.0
-#: Way on either side of a place over which frames are asked, and the share that has to disagree.
+#: Distance along the path up to which frames count for a place, and the share that has to contradict the map.
+#: Chosen: a single bad frame is outvoted, and an error over 20 cm of road is not.
 _AROUND_CM, _SHARE = 20.0, 0.3
 
 
 def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
-    """Find the left and right lines of the map's frames with which the pictures around disagree."""
+    """Return which left and right lines of the map's frames are contradicted by the images around."""
     drive_map = mapped.drive_map
     camera, n = drive_map.camera, len(drive_map.frames)
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, mapped.perception.range))
-    asked = np.arange(0, n, _EVERY)
-    disagrees, told = np.zeros((len(asked), 2), dtype=bool), np.zeros(len(asked), dtype=bool)
-    for i, k in enumerate(asked.tolist()):
+    checked = np.arange(0, n, _EVERY)
+    against, counts = np.zeros((len(checked), 2), dtype=bool), np.zeros(len(checked), dtype=bool)
+    for i, k in enumerate(checked.tolist()):
         image = mapped.drive.image(int(mapped.rows[k]))
         edges = find_edges(image, mapped.perception.edges, table.keep, table.scale)
         samples = border_samples(
@@ -53,35 +57,35 @@ def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
             table.keep,
             ResidualSettings(),
         )
-        samples = samples.part(samples.ahead_cm < _REACH_CM)
-        told[i] = len(samples.residual_px) >= _MIN_VIEW
-        if told[i]:
-            disagrees[i] = _disagrees(samples, camera.width)
+        samples = samples.select(samples.ahead_cm < _REACH_CM)
+        counts[i] = len(samples.residual_px) >= _MIN_VIEW
+        if counts[i]:
+            against[i] = _contradicts(samples, camera.width)
     contradicted = np.zeros((n, 2), dtype=bool)
-    way = path_lengths(drive_map.poses)
+    distance = path_lengths(drive_map.poses)
     for k in range(n):
-        telling = np.flatnonzero(told & (drive_map.segment[asked] == drive_map.segment[k]))
-        near = telling[np.abs(way[asked[telling]] - way[k]) < _AROUND_CM]
+        valid = np.flatnonzero(counts & (drive_map.segment[checked] == drive_map.segment[k]))
+        near = valid[np.abs(distance[checked[valid]] - distance[k]) < _AROUND_CM]
         if not near.size:
-            # In a long gap the last frame before it and the first one after it tell.
-            i = int(np.searchsorted(asked[telling], k))
-            near = telling[max(i - 1, 0) : i + 1]
+            # In a long gap, the last frame before it and the first one after it decide.
+            i = int(np.searchsorted(checked[valid], k))
+            near = valid[max(i - 1, 0) : i + 1]
         if near.size:
-            contradicted[k] = disagrees[near].mean(axis=0) > _SHARE
+            contradicted[k] = against[near].mean(axis=0) > _SHARE
     return contradicted
 
 
-def _disagrees(samples: BorderSamples, width: int) -> tuple[bool, bool]:
-    """Whether a frame disagrees with its left and with its right line.
+def _contradicts(samples: BorderSamples, width: int) -> tuple[bool, bool]:
+    """Whether a frame contradicts its left and its right line.
 
-    Missing paint speaks against the map only where both lines lack it, and a line that met too few edges does
-    not speak for itself.
+    Missing paint counts against the map only where both lines lack it; a line that met too few edges by
+    itself is not contradicted.
     """
     met = samples.residual_px[samples.found]
     if met.size < _LEAST_MET * len(samples.residual_px):
         return True, True
     if _off_px(met, width) > _OFF_PX:
-        # Where the frame is lost, one of its lines may meet something by chance.
+        # Both: if the pose is lost, one of the lines may meet edges by chance.
         return True, True
     left, right = (
         _off_px(samples.residual_px[samples.found & (samples.right == side)], width) > _ALONE_PX
@@ -91,7 +95,7 @@ def _disagrees(samples: BorderSamples, width: int) -> tuple[bool, bool]:
 
 
 def _off_px(met_px: Float[np.ndarray, "m"], width: int) -> float:
-    """How far off the edges are that were met, as median, image 160 px wide; NaN where they are too few."""
+    """Median distance of the edges, in pixels of an image 160 px wide; NaN if they are too few."""
     if met_px.size < _MIN_MET:
         return float("nan")
     return float(np.median(np.abs(met_px))) * REFERENCE_WIDTH / width

@@ -1,4 +1,4 @@
-"""What a map's report says: figures for machines, sentences for people, and the edges as a table."""
+"""The contents of a map's report: figures for programs, sentences for people, and the map's edge points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 @dataclass(frozen=True)
 class Report:
-    """What a stage found, for people (lines) and for machines (figures)."""
+    """The result of a command: sentences for people (lines), figures for programs."""
 
     lines: tuple[str, ...]
     figures: dict[str, Any]
@@ -28,13 +28,13 @@ class Report:
 def map_edges(
     parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], camera: Camera, factor: float
 ) -> dict[str, np.ndarray]:
-    """Every edge point with its direction, frame map, float32, and the number of its frame.
+    """Return the columns of all edge points with their directions, frame map, as float32.
 
     Args:
         parts: Segments.
-        numbers: Frame number, as the drive counts, by the positions that the segments know.
+        numbers: Frame number of each position in the drive.
         camera: The map's camera.
-        factor: Turns the segments' lengths into centimetres.
+        factor: Converts the segments' lengths to centimetres.
     """
     points, normals, frames, segments = [], [], [], []
     for i, part in enumerate(parts):
@@ -106,7 +106,7 @@ def map_figures(
 
 
 def free_lane_cm(parts: list[MappedSegment]) -> float | None:
-    """Width of the lane as found without the user's number, over all segments; None where there is none."""
+    """Median of the segments' freely found lane widths; None if they have none."""
     free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
     return float(np.median(free)) if free else None
 
@@ -116,15 +116,13 @@ def contradicted_share(
     known: Bool[np.ndarray, "n 2"],
     deleted: Bool[np.ndarray, "n"],
 ) -> float:
-    """Share of the frames' lines with which the pictures disagree.
-
-    A line that a frame does not have is neither right nor wrong. Frames that the driver deleted get no
-    labels: where the car leaves the road, it says nothing of the map.
+    """Share of the frames' lines that the images contradict.
 
     Args:
         contradicted: Left and right line of the map's frames.
-        known: Which of them the frames have, see :func:`lanenet.data.maps.mapped_drive.known_lines`.
-        deleted: Which frames the driver deleted.
+        known: Which of them the frames have, see :func:`lanenet.data.maps.mapped_drive.known_lines`; only
+            these count.
+        deleted: Frames that the driver deleted; they do not count, since the car may have left the road.
     """
     counted = known & ~deleted[:, None]
     if not counted.any():
@@ -138,12 +136,12 @@ def map_evidence(
     deleted: Bool[np.ndarray, "n"],
     free_cm: float | None,
 ) -> MapEvidence:
-    """Collect what the verdict rests on.
+    """Collect the evidence for the verdict.
 
     Args:
         drive_map: The map.
-        figures: Those of the map and of its quality.
-        deleted: Which frames of the map the driver deleted.
+        figures: Figures of the map and of its quality.
+        deleted: Frames of the map that the driver deleted.
         free_cm: See :func:`free_lane_cm`.
     """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
@@ -155,7 +153,7 @@ def map_evidence(
         if segment["revisits"]
     ]
     revisits = sum(count for _, count in across)
-    # A camera that was given stays known when the drive has refined it: no search has guessed its lens.
+    # A given camera that the drive has refined counts as known: its lens was not searched for.
     known = not figures.get("calibration", {}).get("candidates")
     return MapEvidence(
         lines={
@@ -180,7 +178,7 @@ def map_evidence(
         camera_known=known,
         sigma={} if known else figures["calibration"]["sigma"],
         given_lane_cm=meta.lane_width_cm,
-        # Where the free search finds nothing better, the lane that was traced at the given width is it.
+        # If the free search found nothing better, the traced lane.
         found_lane_cm=None
         if meta.scale_from == "lane width"
         else meta.mapped_lane_cm
@@ -192,21 +190,21 @@ def map_evidence(
 def map_notes(
     drive_map: DriveMap, figures: dict[str, Any], camera_known: bool, free_cm: float | None
 ) -> list[str]:
-    """Say what was mapped, in sentences.
+    """Say in sentences what was mapped.
 
     Args:
         drive_map: The map.
         figures: Its figures.
         camera_known: Whether the camera was given.
-        free_cm: See :func:`free_lane_cm`; where there is such a lane, that of the map is not the road's.
+        free_cm: See :func:`free_lane_cm`; if there is one, the mapped lane is not the road's.
     """
     meta = drive_map.meta
     revisits = sum(segment["revisits"] for segment in figures["segments_mapped"])
     path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
-    lane = "lane" if free_cm is None else "mapped lines, apart by"
+    lane = "lane" if free_cm is None else "distance of the mapped lines"
     notes = [
         f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
-        f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, nothing to close"),
+        f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, so no loop was closed"),
         f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
         f"scale from the {meta.scale_from}",
     ]

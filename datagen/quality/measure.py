@@ -1,10 +1,8 @@
-"""A finished map against the frames that had no say in its lines, and which frames get labels.
+"""Compare a map with its held-out frames, and find which frames get labels.
 
-Frames that have no say in the lines of the map, so that the map can be checked against them.
-
-A held-out frame keeps its place in the chain: its edges take part in finding its own pose, or it would have
-none. What it is held out from is the lines. So the check sees what is wrong with the lines and with the poses
-of its neighbours relative to its own, and not what all of them have in common.
+A held-out frame is left out of the lines only. Its edges are still used to find its own pose, without which
+it could not be compared. So the comparison shows errors of the lines and of neighbouring poses relative to
+its own, but not errors that all poses share.
 """
 
 from __future__ import annotations
@@ -33,24 +31,27 @@ from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.perception.edges.canny import EdgePixels, find_edges
 from lanenet.perception.edges.road import RoadTable
 
+#: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
 NOT_MAPPED, LABELLED = "stretch not mapped", "labelled"
-#: The residuals of the verdict reach this far; beyond, a pixel is more than a centimetre on most cars.
+#: Residuals up to this distance ahead count for the verdict. Chosen: the label rows and one row beyond.
 VERDICT_REACH_CM = 45.0
-#: Fewer samples than this give no median of a frame.
+#: Random stream for held-out frames, so that other draws do not depend on them.
+_STREAM = 1
+#: Least number of residuals for the median of a frame. Chosen: one border over 10 cm.
 _MIN_SAMPLES = 10
 
 
 @dataclass(frozen=True, eq=False)
 class MapQuality:
-    """What the frames say of a map.
+    """How well a map agrees with its frames.
 
     Attributes:
-        held_out: Rows of the map's frames that were looked at.
-        samples: Their samples on the borders of the lines, per frame.
-        chance: Samples of one line moved into the middle of the lane, where no marking is.
-        status: Per frame of the drive: labelled, or why not.
+        held_out: Positions of the held-out frames in the map.
+        samples: Samples on the borders of the lines, per held-out frame.
+        chance: Samples of a line shifted into the middle of the lane, where no marking is.
+        status: Per frame of the drive: labelled, or the reason why not.
         points_cm: Six labels per frame of the map.
-        in_window: Which of them a map that lacks nothing would give; none of frames not to be labelled.
+        in_window: Which points a complete map would label; none for frames that are not to be labelled.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -62,13 +63,13 @@ class MapQuality:
 
     @property
     def near(self) -> BorderSamples:
-        """Samples that count for the verdict, of all held-out frames."""
+        """Samples of all held-out frames that count for the verdict."""
         every = join_samples(self.samples)
-        return every.part(every.ahead_cm < VERDICT_REACH_CM)
+        return every.select(every.ahead_cm < VERDICT_REACH_CM)
 
     @property
     def frame_median_px(self) -> Float[np.ndarray, "h"]:
-        """Median size of the near residuals of each held-out frame; NaN where few were found."""
+        """Median absolute residual of each held-out frame; NaN if few were found."""
         medians = np.full(len(self.samples), np.nan)
         for i, samples in enumerate(self.samples):
             found = samples.residual_px[samples.found & (samples.ahead_cm < VERDICT_REACH_CM)]
@@ -78,24 +79,24 @@ class MapQuality:
 
     @property
     def labelled_share(self) -> float:
-        """Share of the frames that get labels, of those that are not deleted nor between two lanes."""
+        """Share of frames with labels, of those that are neither deleted nor between two lanes."""
         kept = [status for status in self.status if status not in NOT_TO_LABEL]
         return sum(status == LABELLED for status in kept) / max(len(kept), 1)
 
     @property
     def point_shares(self) -> dict[str, float]:
-        """Share of each line's points in the window that are labelled, of the same frames."""
+        """Share of each line's points in the window that are labelled, in the same frames."""
         return labelled_points(self.points_cm, self.in_window, self.status.count(NOT_MAPPED))
 
     @property
     def not_labelled(self) -> dict[str, int]:
-        """Why frames have no labels, and how many, the most frequent reason first."""
+        """Number of frames without labels by reason, the most frequent reason first."""
         counts = Counter(status for status in self.status if status != LABELLED)
         return dict(counts.most_common())
 
 
 def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
-    """Compare the map's lines with its held-out frames, and see which frames get labels."""
+    """Compare the map's lines with its held-out frames, and find which frames get labels."""
     drive_map, drive = mapped.drive_map, mapped.drive
     camera = drive_map.camera
     limits = mapping_range(camera.mounting.height_cm, mapped.perception.range)
@@ -127,19 +128,19 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
 
 
 def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings) -> dict[str, Any]:
-    """Figures for the report: residuals per line and distance, coverage, and the labelled share."""
+    """Return the report's figures: residuals by line and distance, coverage, and labelled shares."""
     every, near = join_samples(quality.samples), quality.near
-    chance = quality.chance.part(quality.chance.ahead_cm < VERDICT_REACH_CM)
+    chance = quality.chance.select(quality.chance.ahead_cm < VERDICT_REACH_CM)
     lines: dict[str, Any] = {}
     for side in SIDES:
-        part = every.part(every.right == (side == "right"))
+        part = every.select(every.right == (side == "right"))
         bands = {
             f"{low:g}-{high:g} cm": summarise(
-                part.part((part.ahead_cm >= low) & (part.ahead_cm < high))
+                part.select((part.ahead_cm >= low) & (part.ahead_cm < high))
             ).as_dict(width)
             for low, high in pairwise(settings.bands_cm)
         }
-        within = part.part(part.ahead_cm < VERDICT_REACH_CM)
+        within = part.select(part.ahead_cm < VERDICT_REACH_CM)
         lines[side] = {f"0-{VERDICT_REACH_CM:g} cm": summarise(within).as_dict(width), "bands": bands}
     medians = quality.frame_median_px
     known = medians[np.isfinite(medians)]
@@ -168,17 +169,13 @@ def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings)
     }
 
 
-#: A stream of its own, so that holding frames out changes nothing else that is drawn.
-_STREAM = 1
-
-
 def held_out_frames(count: int, every: int, seed: int) -> Bool[np.ndarray, "n"]:
-    """Choose one of every so many frames, from a first one that the seed decides.
+    """Choose every n-th frame; the seed decides the first one.
 
     Args:
-        count: Frames of the drive.
-        every: Distance between the chosen ones; 0 for none.
-        seed: Of the drive's settings.
+        count: Number of frames of the drive.
+        every: n; 0 chooses none.
+        seed: Seed of the map's settings.
     """
     chosen = np.zeros(count, dtype=bool)
     if every:

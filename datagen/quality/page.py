@@ -1,7 +1,4 @@
-"""The report for people: one HTML file that needs no other, readable on a phone.
-
-The report's tables as rows of text, the first one the header.
-"""
+"""The report page of a map: one self-contained HTML file, readable on a phone."""
 
 from __future__ import annotations
 
@@ -27,123 +24,10 @@ from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 
-Row = tuple[str, ...]
-
-
-def _number(value: float | None, decimals: int = 2) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
-
-
-def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
-    """Residuals per line and distance; in the image's pixels and those of an image 160 px wide."""
-    wide = width != REFERENCE_WIDTH
-    own = ("sd, px", "p95, px", "offset, px")
-    header = ("", "places", "found, %", *own, *(f"{name} at 160" for name in own if wide))
-    keys = ("robust_sd_px", "p95_px", "median_px")
-    rows: list[Row] = [header]
-    reach = f"0-{held_out['reach_cm']:g} cm"
-    parts = [(f"both lines, {reach}", held_out["both_lines"])]
-    for side in SIDES:
-        line = held_out["lines"][side]
-        parts.append((f"{side} line, {reach}", line[reach]))
-        parts += [(f"{side} line, {band}", figures) for band, figures in line["bands"].items()]
-    for name, figures in parts:
-        values = [_number(figures[key]) for key in keys]
-        values += [_number(figures[f"{key}_at_160"]) for key in keys if wide]
-        coverage = _number(100.0 * figures["coverage"], 0)
-        rows.append((name, str(figures["samples"]), coverage, *values))
-    return rows
-
-
-def share_rows(labelled: dict[str, Any]) -> list[Row]:
-    """Which frames have labels, and why others have none."""
-    rows: list[Row] = [
-        ("frames", ""),
-        ("labelled, of those not deleted", f"{100.0 * labelled['share']:.1f} %"),
-        ("labelled, of all", f"{100.0 * labelled['share_of_all_frames']:.1f} %"),
-        *(
-            (f"{side} points labelled, of those in the window", f"{100.0 * share:.1f} %")
-            for side, share in labelled["points_in_window"].items()
-        ),
-    ]
-    rows += [(f"left out: {reason}", str(count)) for reason, count in labelled["why_not"].items()]
-    return rows + [
-        (f"{name} known", f"{100.0 * share:.1f} %")
-        for name, share in zip(POINT_NAMES, labelled["points_share"], strict=True)
-    ]
-
-
-def loop_rows(segments: list[dict[str, Any]]) -> list[Row]:
-    """Way, revisits, closure and residuals between frames of each segment."""
-    rows: list[Row] = [
-        (
-            "first frame",
-            "frames",
-            "way, m",
-            "revisits",
-            "closure along, cm",
-            "across, cm",
-            "heading, deg",
-            "drift, deg/m",
-            "between frames, px",
-        )
-    ]
-    for segment in segments:
-        closure = segment["closure_residual_median"]
-        heading, drift = closure["heading_rad"], segment["heading_drift_rad_per_m"]
-        rows.append(
-            (
-                str(segment["first_frame"]),
-                str(segment["frames"]),
-                _number(0.01 * segment["path_cm"], 1),
-                str(segment["revisits"]),
-                _number(closure["along_cm"]),
-                _number(closure["across_cm"]),
-                _number(None if heading is None else math.degrees(heading)),
-                _number(None if drift is None else math.degrees(drift)),
-                _number(segment["reprojection_robust_sd_px"]),
-            )
-        )
-    return rows
-
-
-def camera_rows(camera: Camera, calibration: dict[str, Any] | None) -> list[Row]:
-    """The camera's numbers, with their uncertainty where the drive told them."""
-    m, height_cm = camera.mounting, camera.mounting.height_cm
-    sigma: dict[str, float] = {} if calibration is None else calibration["sigma"]
-    focal = float(camera.K[0, 0])
-    degree = math.degrees(1.0)
-    # Name, value, decimals, name of the uncertainty and the factor that turns it into this unit.
-    values = [
-        ("focal length, px", focal, 2, "focal", focal),
-        ("principal point u, px", float(camera.K[0, 2]), 2, "cx", 1.0),
-        ("principal point v, px", float(camera.K[1, 2]), 2, "cy", 1.0),
-        ("k1", float(camera.D[0]) if len(camera.D) else 0.0, 4, "k1", 1.0),
-        ("pitch down, deg", math.degrees(m.pitch_down_rad), 2, "pitch", degree),
-        ("roll, deg", math.degrees(m.roll_rad), 2, "roll", degree),
-        ("yaw, deg", math.degrees(m.yaw_rad), 2, "yaw", degree),
-        ("ahead of the rear axle, cm", m.ahead_of_front_axle_cm + camera.wheelbase_cm, 2, "lever", height_cm),
-        ("height, cm", height_cm, 2, None, 1.0),
-    ]
-    rows: list[Row] = [(f"camera ({camera.model})", "value", "sigma")]
-    for name, value, decimals, key, factor in values:
-        known = None if key is None or key not in sigma else sigma[key] * factor
-        rows.append((name, _number(value, decimals), _number(known, decimals)))
-    return rows
-
-
-def scale_rows(meta: MapMeta) -> list[Row]:
-    """What sets the scale, and the widths that follow."""
-    return [
-        ("scale from", meta.scale_from),
-        ("lane width given, cm", f"{meta.lane_width_cm:.1f}"),
-        ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
-        ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
-    ]
-
-
 #: The report in a map's folder.
 PAGE_NAME = "report.html"
+
+Row = tuple[str, ...]
 
 _PAGE = Template(
     """<!DOCTYPE html>
@@ -183,12 +67,12 @@ def report_page(
 
     Args:
         mapped: The map with its drive.
-        quality: What the held-out frames say.
-        verdict: What it amounts to.
-        figures: Everything that ``report.json`` holds.
+        quality: The map compared with its held-out frames.
+        verdict: The verdict.
+        figures: The contents of ``report.json``.
         opened_poses: Poses before the loops were closed, in the map's scale.
         map_png: Picture of the map from above.
-        settings: Bounds of the verdict, drawn beside the residuals.
+        settings: Bounds of the verdict, drawn in the residual plot.
     """
     drive, drive_map = mapped.drive, mapped.drive_map
     fits = [
@@ -200,36 +84,35 @@ def report_page(
         _list(figures["notes"]),
         _section("Held-out frames"),
         _note(
-            f"Distance in pixels between the projected borders of the two lines of the driven lane and the "
-            f"edges in {held['frames']} frames that had no say in the lines; their poses come from the "
-            f"chain, as all do. An edge counts within {held['gate_px_at_160']:g} px (of an image 160 px "
-            "wide) and if it brightens the same way. “Found” is the share of the borders in view that met "
-            f"one. In the middle of the lane it is {_percent(chance)}: by chance, or because something is "
-            "painted there."
+            "Distance in pixels between the projected borders of the driven lane's two lines and the edges "
+            f"in {held['frames']} held-out frames, whose edges were used for their own poses but not for the "
+            f"lines. An edge counts if it lies within {held['gate_px_at_160']:g} px (of an image 160 px "
+            "wide) and brightens in the same direction. “Found” is the share of the borders in view that met "
+            f"an edge. In the middle of the lane it is {_percent(chance)}: by chance, or because of paint."
         ),
         _table(residual_rows(held, drive.width)),
-        _picture(plots.residual_plot(quality, drive.width, settings.max_sd_px, settings.max_p95_px)),
+        _png(plots.residual_plot(quality, drive.width, settings.max_sd_px, settings.max_p95_px)),
         *(
             f"<h3>{sheet.title.capitalize()} held-out frames</h3>{_jpeg(sheet.picture)}"
             for sheet in contact_sheets(mapped, quality)
         ),
         _section("Labels"),
         _table(share_rows(figures["labelled"])),
-        _picture(plots.frames_plot(quality, drive, drive_map, drive.width)),
+        _png(plots.frames_plot(quality, drive, drive_map, drive.width)),
         _section("Map"),
-        _note("Edges by time (hue), driven path (white), left line (green), right line (magenta)."),
+        _note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
         _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
         _section("Path and loops"),
         _table(loop_rows(figures["segments_mapped"])),
-        _picture(plots.trajectory_plot(mapped, opened_poses)),
+        _png(plots.trajectory_plot(mapped, opened_poses)),
         _section("Camera and scale"),
         _table(camera_rows(drive_map.camera, figures.get("calibration"))),
         _table(scale_rows(drive_map.meta)),
         _list(verdict.remarks),
         _section("Steering and speed"),
-        _picture(plots.steering_plot(mapped, fits))
-        or _note("The steering command does not explain the path, or there is none."),
-        _picture(plots.speed_plot(mapped)),
+        _png(plots.steering_plot(mapped, fits))
+        or _note("There is no steering command, or it does not explain the path."),
+        _png(plots.speed_plot(mapped)),
     ]
     return _PAGE.substitute(
         title=html.escape(f"Map of {drive.name}"),
@@ -256,13 +139,13 @@ def _list(lines: Sequence[str]) -> str:
 
 
 def _table(rows: list[Row]) -> str:
-    """Lay out rows of text; the first one is the header."""
+    """Lay out rows of text; the first row is the header."""
     head, *rest = ("".join(f"<T>{html.escape(cell)}</T>" for cell in row) for row in rows)
     lines = [head.replace("T>", "th>"), *(row.replace("T>", "td>") for row in rest)]
     return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
 
 
-def _picture(png: bytes | None) -> str:
+def _png(png: bytes | None) -> str:
     return "" if png is None else _inline(png, "png")
 
 
@@ -273,3 +156,115 @@ def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> str:
 
 def _inline(data: bytes, kind: str) -> str:
     return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(data).decode("ascii")}">'
+
+
+def _number(value: float | None, decimals: int = 2) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
+    """Residuals by line and distance, in pixels of the image and of an image 160 px wide."""
+    wide = width != REFERENCE_WIDTH
+    own = ("sd, px", "p95, px", "offset, px")
+    header = ("", "places", "found, %", *own, *(f"{name} at 160" for name in own if wide))
+    keys = ("robust_sd_px", "p95_px", "median_px")
+    rows: list[Row] = [header]
+    reach = f"0-{held_out['reach_cm']:g} cm"
+    parts = [(f"both lines, {reach}", held_out["both_lines"])]
+    for side in SIDES:
+        line = held_out["lines"][side]
+        parts.append((f"{side} line, {reach}", line[reach]))
+        parts += [(f"{side} line, {band}", figures) for band, figures in line["bands"].items()]
+    for name, figures in parts:
+        values = [_number(figures[key]) for key in keys]
+        values += [_number(figures[f"{key}_at_160"]) for key in keys if wide]
+        coverage = _number(100.0 * figures["coverage"], 0)
+        rows.append((name, str(figures["samples"]), coverage, *values))
+    return rows
+
+
+def share_rows(labelled: dict[str, Any]) -> list[Row]:
+    """Shares of labelled frames and points, and reasons for frames without labels."""
+    rows: list[Row] = [
+        ("frames", ""),
+        ("labelled, of those not deleted", f"{100.0 * labelled['share']:.1f} %"),
+        ("labelled, of all", f"{100.0 * labelled['share_of_all_frames']:.1f} %"),
+        *(
+            (f"{side} points labelled, of those in the window", f"{100.0 * share:.1f} %")
+            for side, share in labelled["points_in_window"].items()
+        ),
+    ]
+    rows += [(f"left out: {reason}", str(count)) for reason, count in labelled["why_not"].items()]
+    return rows + [
+        (f"{name} known", f"{100.0 * share:.1f} %")
+        for name, share in zip(POINT_NAMES, labelled["points_share"], strict=True)
+    ]
+
+
+def loop_rows(segments: list[dict[str, Any]]) -> list[Row]:
+    """Distance, revisits, loop closure and residuals between frames, by segment."""
+    rows: list[Row] = [
+        (
+            "first frame",
+            "frames",
+            "distance, m",
+            "revisits",
+            "closure along, cm",
+            "across, cm",
+            "heading, deg",
+            "drift, deg/m",
+            "between frames, px",
+        )
+    ]
+    for segment in segments:
+        closure = segment["closure_residual_median"]
+        heading, drift = closure["heading_rad"], segment["heading_drift_rad_per_m"]
+        rows.append(
+            (
+                str(segment["first_frame"]),
+                str(segment["frames"]),
+                _number(0.01 * segment["path_cm"], 1),
+                str(segment["revisits"]),
+                _number(closure["along_cm"]),
+                _number(closure["across_cm"]),
+                _number(None if heading is None else math.degrees(heading)),
+                _number(None if drift is None else math.degrees(drift)),
+                _number(segment["reprojection_robust_sd_px"]),
+            )
+        )
+    return rows
+
+
+def camera_rows(camera: Camera, calibration: dict[str, Any] | None) -> list[Row]:
+    """The camera's parameters, with their sigmas if they were found from the drive."""
+    m, height_cm = camera.mounting, camera.mounting.height_cm
+    sigma: dict[str, float] = {} if calibration is None else calibration["sigma"]
+    focal = float(camera.K[0, 0])
+    degree = math.degrees(1.0)
+    # Name, value, decimals, key of the sigma, and the factor that converts the sigma to this unit.
+    values = [
+        ("focal length, px", focal, 2, "focal", focal),
+        ("principal point u, px", float(camera.K[0, 2]), 2, "cx", 1.0),
+        ("principal point v, px", float(camera.K[1, 2]), 2, "cy", 1.0),
+        ("k1", float(camera.D[0]) if len(camera.D) else 0.0, 4, "k1", 1.0),
+        ("pitch down, deg", math.degrees(m.pitch_down_rad), 2, "pitch", degree),
+        ("roll, deg", math.degrees(m.roll_rad), 2, "roll", degree),
+        ("yaw, deg", math.degrees(m.yaw_rad), 2, "yaw", degree),
+        ("ahead of the rear axle, cm", m.ahead_of_front_axle_cm + camera.wheelbase_cm, 2, "lever", height_cm),
+        ("height, cm", height_cm, 2, None, 1.0),
+    ]
+    rows: list[Row] = [(f"camera ({camera.model})", "value", "sigma")]
+    for name, value, decimals, key, factor in values:
+        known = None if key is None or key not in sigma else sigma[key] * factor
+        rows.append((name, _number(value, decimals), _number(known, decimals)))
+    return rows
+
+
+def scale_rows(meta: MapMeta) -> list[Row]:
+    """What sets the scale, and the resulting widths."""
+    return [
+        ("scale from", meta.scale_from),
+        ("lane width given, cm", f"{meta.lane_width_cm:.1f}"),
+        ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
+        ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
+    ]

@@ -1,7 +1,4 @@
-"""Pictures for the eye: the map from above, and projected lines on frames.
-
-Contact sheet of held-out frames: the best, those in the middle, and the worst.
-"""
+"""Pictures of a map: from above, and its lines projected into frames."""
 
 from __future__ import annotations
 
@@ -25,9 +22,14 @@ from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.geometry.poses import path_lengths
 
-_LEFT, _RIGHT, _POINT = (80, 220, 80), (220, 80, 220), (60, 60, 255)
-_BESIDE = (200, 200, 80)
+#: Colours, BGR.
+_LEFT, _RIGHT, _ADJACENT, _POINT = (80, 220, 80), (220, 80, 220), (200, 200, 80), (60, 60, 255)
+#: Least width of an enlarged frame, and width of a frame on the report's sheets with the height of its title,
+#: [px]. Chosen: four frames side by side fit a page.
 _TILE_WIDTH = 400
+_SHEET_TILE_WIDTH, _TITLE_HEIGHT = 320, 22
+#: Frames in a row of a sheet, and frames on a sheet.
+_COLUMNS, _TILES = 4, 8
 
 
 def draw_map(
@@ -37,13 +39,13 @@ def draw_map(
     starts: Bool[np.ndarray, "f"],
     size_px: int = 1600,
 ) -> None:
-    """Draw edges (hue = time), driven path (white), lane lines (green left, magenta right), a metre of scale.
+    """Draw edge points (hue: time), driven path (white), lane lines (green left, magenta right) and a scale.
 
     Args:
         path: PNG to write.
         drive_map: The map.
-        parts: Scans, poses in map scale and scale factor of the scans, per segment.
-        starts: Frames of the map that do not follow the one before them; the path is not drawn to them.
+        parts: Per segment, its scans, its poses in map scale, and the scale factor of the scans.
+        starts: Frames that do not continue the frame before them; no path is drawn between the two.
         size_px: Longer side of the picture.
     """
     clouds = []
@@ -59,9 +61,9 @@ def draw_map(
         s = drive_map.s_cm[drive_map.segment == segment]
         for line in lines:
             end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
-            colour = _BESIDE if line.rank else _LEFT if line.side == "left" else _RIGHT
+            colour = _ADJACENT if line.rank else _LEFT if line.side == "left" else _RIGHT
             lanes.append((line.points(np.arange(s.min(), end, 2.0)), colour))
-    # A line of the next lane may lie beyond all edges that are drawn.
+    # A line of an adjacent lane may lie beyond all edge points that are drawn.
     known = [points[np.isfinite(points[:, 0])] for points, _ in lanes]
     xy = np.concatenate([*clouds, *known, drive_map.poses[:, :2]])
     low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
@@ -84,14 +86,14 @@ def draw_map(
         image[at[:, 1], at[:, 0]] = colour
     for points, colour in lanes:
         _polyline(image, pixels, points, colour)
-    for stretch in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
-        _polyline(image, pixels, stretch, (255, 255, 255))
+    for driven in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
+        _polyline(image, pixels, driven, (255, 255, 255))
     draw_metre(image, scale)
     write_png(path, image)
 
 
 def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
-    """Draw a metre of scale into the lower left corner."""
+    """Draw a scale of one metre into the lower left corner."""
     y, end = image.shape[0] - 20, 20 + int(100.0 * px_per_cm)
     cv2.line(image, (20, y), (end, y), (255, 255, 255), 2)
     cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
@@ -103,10 +105,8 @@ def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarra
             cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
 
 
-def draw_contact_sheet(
-    path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"], columns: int = 4
-) -> None:
-    """Draw some frames of a map with their projected lines (green left, magenta right) and six points."""
+def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"]) -> None:
+    """Draw the chosen frames of a map with their projected lines (green left, magenta right) and points."""
     drive_map = mapped.drive_map
     tiles = [
         draw_lines(
@@ -117,26 +117,23 @@ def draw_contact_sheet(
         )
         for k in map(int, chosen)
     ]
-    while len(tiles) % columns:
-        tiles.append(np.zeros_like(tiles[0]))
-    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-    write_png(path, np.vstack(rows))
+    write_png(path, _tiled(tiles, background=0))
 
 
 def draw_lines(
     image: UInt8[np.ndarray, "h w 3"], lines: FrameLines, camera: Camera, text: str
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Enlarge a frame and draw its lane."""
+    """Enlarge a frame and draw its lane with a text in the corner."""
     zoom = max(1, round(_TILE_WIDTH / camera.width))
     big = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
 
     def pixels(points_cm: Float[np.ndarray, "m 2"]) -> np.ndarray:
-        # Pixel centres are at integers, so that an enlarged pixel's middle moves by half the zoom less one.
+        # Pixel centres are at integers; enlarging moves them by (zoom - 1) / 2.
         return camera.project_ground(points_cm) * zoom + 0.5 * (zoom - 1)
 
     for line, colour in ((lines.left_cm, _LEFT), (lines.right_cm, _RIGHT)):
         at = pixels(line)
-        # Behind the bumper a fisheye still projects; what lies outside the picture is not drawn.
+        # A fisheye projects points far behind the bumper, too; these are not drawn.
         inside = (
             np.isfinite(at).all(axis=1) & (np.abs(at) < 4 * big.shape[1]).all(axis=1) & (line[:, 1] > -5.0)
         )
@@ -153,10 +150,10 @@ def draw_lines(
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
-    """Write a picture.
+    """Write an image as PNG.
 
     Raises:
-        LanenetError: If the disk refuses it.
+        LanenetError: If it cannot be encoded.
     """
     done, data = cv2.imencode(".png", image)
     if not done:
@@ -165,39 +162,35 @@ def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
 
 
 def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int) -> tuple[int, ...]:
-    """Pick the frame of each part of a drive from which the car drives straightest: its lines are straight.
+    """Pick the frame with the straightest path ahead in each of several equal parts of a drive.
 
     Args:
         poses: Poses, heading unwrapped.
-        ahead_cm: Way that has to be straight, from the frame on.
-        count: Number of equal parts.
+        ahead_cm: Distance over which the path should be straight.
+        count: Number of parts.
     """
     n = len(poses)
     path = path_lengths(poses)
     last = np.minimum(np.searchsorted(path, path + ahead_cm), n - 1)
     turn = np.array([np.ptp(poses[k : last[k] + 1, 2]) for k in range(n)])
-    # Near the end, less than the whole way is known.
+    # Near the end, less than the whole distance is known.
     turn[path + ahead_cm > path[-1]] += 2.0 * np.pi
     parts = np.array_split(np.arange(n), count)
     return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))
 
 
-_TILES = 8
-_SHEET_TILE_WIDTH, _TITLE_HEIGHT, _COLUMNS = 320, 22, 4
-
-
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """One row of the contact sheet: its title and its picture."""
+    """A sheet of held-out frames: its title and its picture."""
 
     title: str
     picture: UInt8[np.ndarray, "h w 3"]
 
 
 def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> list[Sheet]:
-    """Draw best, median and worst held-out frames, each with its lines and its median residual.
+    """Draw the best, median and worst held-out frames, each with its lines and its median residual.
 
-    A frame in which no residual was found counts as worst: there the map expects a line that is not seen.
+    A frame without residuals counts as worst: the map expects a line there that is not seen.
     """
     medians = quality.frame_median_px
     order = np.argsort(np.nan_to_num(medians, nan=np.inf), kind="stable")
@@ -232,7 +225,12 @@ def _sheet(
         tiles.append(
             np.vstack([title, cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)])
         )
-    while len(tiles) % _COLUMNS:
-        tiles.append(np.full_like(tiles[0], 255))
+    return _tiled(tiles, background=255)
+
+
+def _tiled(tiles: list[UInt8[np.ndarray, "h w 3"]], background: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Lay out pictures of one size in rows."""
+    empty = [np.full_like(tiles[0], background)] * (-len(tiles) % _COLUMNS)
+    tiles = [*tiles, *empty]
     rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
     return np.asarray(np.vstack(rows), dtype=np.uint8)

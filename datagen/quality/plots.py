@@ -1,4 +1,4 @@
-"""Curves of the report, as PNG; without Matplotlib there are none."""
+"""Plots of the report page, as PNG; None without Matplotlib."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
 from lanenet.geometry.lane import SIDES
 
-#: One colour per line, that of the pictures: left green, right magenta.
-COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
+#: Colours of the lines, as in the pictures.
+_COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
+#: Distance bins of the residuals. Chosen: three per label row.
 _BIN_CM = 5.0
 
 
@@ -28,7 +29,7 @@ def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any
         from matplotlib.figure import Figure
     except ImportError:
         return None
-    # The figure is made without pyplot, which would pick a window system and keep global state.
+    # Without pyplot, which selects a window system and keeps global state.
     figure = Figure(figsize=(width, height), dpi=110)
     FigureCanvasAgg(figure)
     axes = figure.subplots(panels, 1, sharex=panels > 1, squeeze=False)[:, 0]
@@ -38,13 +39,13 @@ def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any
 
 
 def _png(figure: Any) -> bytes:
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
-    return picture.getvalue()
+    data = io.BytesIO()
+    figure.savefig(data, format="png", bbox_inches="tight")
+    return data.getvalue()
 
 
 def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
-    """Put a row of NaN before each row that does not follow the one before it: no line is drawn across."""
+    """Insert a row of NaN before each row that does not continue the one before: no line is drawn there."""
     return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
 
 
@@ -70,7 +71,7 @@ def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"])
 
 
 def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes | None:
-    """Residuals and coverage over the distance ahead, per line."""
+    """Residuals and coverage over the distance ahead, by line."""
     made = _figure(6.5, 4.6, 2)
     if made is None:
         return None
@@ -80,17 +81,17 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
     edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
     centres = 0.5 * (edges[:-1] + edges[1:])
     for side in SIDES:
-        part = every.part(every.right == (side == "right"))
+        part = every.select(every.right == (side == "right"))
         bins = [
-            summarise(part.part((part.ahead_cm >= a) & (part.ahead_cm < b)))
+            summarise(part.select((part.ahead_cm >= a) & (part.ahead_cm < b)))
             for a, b in pairwise(edges.tolist())
         ]
         for name, style, values in (
             ("p95", ".--", [scale * b.p95_px for b in bins]),
             ("robust sd", "o-", [scale * b.robust_sd_px for b in bins]),
         ):
-            axes.plot(centres, values, style, color=COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
-        below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=COLOURS[side], label=side, ms=3)
+            axes.plot(centres, values, style, color=_COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
+        below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=_COLOURS[side], label=side, ms=3)
     for bound in (max_sd_px, max_p95_px):
         axes.axhline(bound, color="gray", lw=0.8, ls=":")
     for ax in (axes, below):
@@ -105,7 +106,7 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
 
 
 def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes | None:
-    """Along the drive: which frames have labels and why others have none, and the held-out residuals."""
+    """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
     made = _figure(6.5, 3.8, 2)
     if made is None:
         return None
@@ -132,7 +133,7 @@ def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: i
 
 
 def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
-    """Curvature of the driven path against the steering command, with the line that was fitted."""
+    """Curvature of the driven path over the steering command, with a fitted line."""
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
     if turn is None or not any(fits):
@@ -153,7 +154,7 @@ def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes 
         axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
         if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
             continue
-        # Once more, since the filter's own fit came before the adjustment, with another camera and speed.
+        # Fitted again: the filter's own fit preceded the adjustment of camera and poses.
         gain, trim = np.polyfit(command, curvature, 1)
         r = float(np.corrcoef(command, curvature)[0, 1])
         ends = np.array([command.min(), command.max()])
@@ -172,19 +173,19 @@ def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes 
 
 
 def speed_plot(mapped: MappedDrive) -> bytes | None:
-    """Way per frame as found, with the commanded speed or throttle beside it."""
+    """Step length of each frame, with the commanded speed or throttle."""
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     made = _figure(6.5, 2.8)
     if made is None:
         return None
     figure, (axes,) = made
     step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
-    # A step across a break was not driven.
+    # A step across a break was not driven by the car.
     step[mapped.starts[1:]] = np.nan
     axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("frame")
-    axes.set_ylabel("way per frame, cm", color="#2060c0")
+    axes.set_ylabel("step length, cm", color="#2060c0")
     commands = drive.commands
     for values, name in ((commands.speed_cm_s, "commanded speed, cm/s"), (commands.throttle, "throttle")):
         if values is not None:

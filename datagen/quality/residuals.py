@@ -1,8 +1,8 @@
-"""Distance in pixels between the projected borders of the lane lines and the edges that a frame shows.
+"""Residuals: distance in pixels between the projected borders of the lane lines and the edges of a frame.
 
-The nearest edge is an optimist: where the floor is full of edges there is always one close by. So an edge
-only counts if it brightens towards the marking as the border does, and two shares stand beside the distances:
-how much of the border in view met an edge at all, and how much of a line moved aside, off the marking, did.
+On a textured floor there is always some edge close by. So an edge counts only if it brightens towards the
+marking, as the border does. Two coverages put the residuals into perspective: the share of the border in view
+that met an edge, and the same share for a line shifted off its marking.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 from lanenet.perception.edges.canny import EdgePixels
 
-#: Image width to which pixels are converted where drives are compared.
+#: Image width to which pixels are converted so that drives can be compared: that of Donkeycar images.
 REFERENCE_WIDTH = 160.0
 
 
 class ResidualSettings(Settings):
-    """How the borders of the lines are compared with edges; pixels are those of an image 160 px wide.
+    """How borders are compared with edges; pixels are those of an image 160 px wide.
 
     Attributes:
-        gate_px: An edge further than this from the border is not the border's.
-        min_agreement: Cosine between the gradients of edge and border at least.
+        gate_px: Largest distance of an edge from its border. Chosen: eight times the residuals of good maps.
+        min_agreement: Least cosine between the gradients of edge and border: 37 degrees, for blur and noise.
         step_cm: Distance of the samples along a border.
-        bands_cm: Limits of the distance bands, ahead of the front axle.
+        bands_cm: Limits of the distance bands ahead of the front axle: the label rows and beyond.
     """
 
     gate_px: float = Field(default=4.0, gt=0.0)
@@ -43,13 +43,13 @@ class ResidualSettings(Settings):
 
 @dataclass(frozen=True)
 class BorderSamples:
-    """Places on the borders of the lines that a frame can see, and what it shows there.
+    """Places on the borders of the lines that are in view of a frame, with the residuals there.
 
     Attributes:
         right: Whether the sample belongs to the right line.
         ahead_cm: Distance ahead of the front axle.
-        residual_px: Signed distance across the border to the edge, towards the marking's middle positive,
-            in pixels of the image; NaN where no edge of this direction lies within the gate.
+        residual_px: Distance across the border to the edge, positive towards the marking's middle, in pixels
+            of the image; NaN if no edge of this direction lies within the gate.
     """
 
     right: Bool[np.ndarray, "m"]
@@ -61,13 +61,13 @@ class BorderSamples:
         """Whether the sample met an edge."""
         return np.isfinite(self.residual_px)
 
-    def part(self, rows: Bool[np.ndarray, "m"]) -> BorderSamples:
+    def select(self, rows: Bool[np.ndarray, "m"]) -> BorderSamples:
         """Return some of the samples."""
         return BorderSamples(self.right[rows], self.ahead_cm[rows], self.residual_px[rows])
 
 
 def join_samples(parts: list[BorderSamples]) -> BorderSamples:
-    """Put the samples of several frames together."""
+    """Concatenate the samples of several frames."""
     return BorderSamples(
         np.concatenate([np.zeros(0, dtype=bool), *(part.right for part in parts)]),
         np.concatenate([np.zeros(0), *(part.ahead_cm for part in parts)]),
@@ -84,16 +84,16 @@ def border_samples(
     settings: ResidualSettings,
     aside_cm: float = 0.0,
 ) -> BorderSamples:
-    """Measure how far the edges of a frame lie from where its lines say that markings have their borders.
+    """Measure the distance of a frame's edges from the borders that its lines predict.
 
     Args:
         edges: Edge pixels of the frame.
         lines: Its lane, frame car.
-        tape_cm: Width of a marking whose own one is not known.
-        camera: Camera of the frame, with the tilt that it had in it.
+        tape_cm: Width of a marking that has no measured width.
+        camera: Camera with the tilt of the frame.
         keep: Nonzero where the image shows road.
         settings: Gate and sampling.
-        aside_cm: Move both lines to the right by this, to where no marking is.
+        aside_cm: Shift both lines to the right by this, off their markings.
     """
     parts = []
     for i, line in enumerate((lines.left_cm, lines.right_cm)):
@@ -101,7 +101,7 @@ def border_samples(
         at = at + aside_cm * across
         marking_cm = lines.marking_cm(i, tape_cm)
         for border in (-0.5, 0.5):
-            # ``across`` points to the right, so that the left border lies against it.
+            # ``across`` points to the right; the left border lies on its negative side.
             place = at + border * marking_cm * across
             uv, gradient = _in_image(place, -np.sign(border) * across, camera)
             seen = _in_view(uv, gradient, keep)
@@ -113,12 +113,12 @@ def border_samples(
 def _along(
     line_cm: Float[np.ndarray, "k 2"], settings: ResidualSettings
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Sample a polyline evenly within the bands; with unit vectors across it, to the right."""
+    """Sample a polyline evenly within the bands; return points and unit vectors to its right."""
     step = np.diff(line_cm, axis=0)
     length = np.linalg.norm(step, axis=1)
     good = np.isfinite(length) & (length > 1e-9)
     places, across = [np.empty((0, 2))], [np.empty((0, 2))]
-    # A length that spacing does not divide carries on in the next piece, or short pieces would get no sample.
+    # The spacing continues from one segment to the next, so that short segments get their share of samples.
     offset = 0.0
     for k in np.flatnonzero(good):
         s = np.arange(offset, length[k], settings.step_cm)
@@ -134,7 +134,7 @@ def _along(
 def _in_image(
     place_cm: Float[np.ndarray, "m 2"], towards: Float[np.ndarray, "m 2"], camera: Camera
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Project a border and its unit normal, towards the marking, into the image."""
+    """Project a border and its unit normal, which points into the marking, into the image."""
     along = np.stack([-towards[:, 1], towards[:, 0]], axis=1)
     uv, ahead, inwards = (
         camera.project_ground(points)
@@ -165,7 +165,7 @@ def _nearest(
     scale: float,
     settings: ResidualSettings,
 ) -> Float[np.ndarray, "m"]:
-    """Signed distance along the gradient to the edge that lies closest across the border; NaN without one."""
+    """Signed distance along the gradient to the closest edge across the border; NaN without one."""
     found = np.full(len(uv), np.nan)
     _meet(edges.uv_px, edges.normals, uv, gradient, settings.min_agreement, settings.gate_px * scale, found)
     return found
@@ -180,7 +180,7 @@ def _meet(edge_uv, edge_normal, uv, gradient, least, gate, found):
         for j in range(edge_uv.shape[0]):
             dx, dy = edge_uv[j, 0] - uv[i, 0], edge_uv[j, 1] - uv[i, 1]
             across = dx * gx + dy * gy
-            # Edges are about a pixel apart along their line, whatever the size of the image.
+            # Edge pixels of a line are about one pixel apart, at any image size.
             if abs(across) > best or abs(dx * gy - dy * gx) > 0.75:
                 continue
             if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= least:
@@ -189,14 +189,14 @@ def _meet(edge_uv, edge_normal, uv, gradient, least, gate, found):
 
 @dataclass(frozen=True)
 class ResidualFigures:
-    """Residuals of one part of the road.
+    """Summary of some residuals.
 
     Attributes:
-        samples: Places in view.
+        samples: Number of places in view.
         coverage: Share of them that met an edge.
-        robust_sd_px: 1.4826 times the median of the absolute residuals; an offset counts too.
+        robust_sd_px: 1.4826 times the median of the absolute residuals; includes a common offset.
         p95_px: 95th percentile of the absolute residuals.
-        median_px: Median residual, towards the markings' middle positive.
+        median_px: Median residual, positive towards the markings' middle.
     """
 
     samples: int
@@ -206,7 +206,7 @@ class ResidualFigures:
     median_px: float
 
     def as_dict(self, width: int) -> dict[str, float | int]:
-        """Figures in pixels of the image, and of one 160 px wide beside them."""
+        """Return the figures in pixels of the image and of an image 160 px wide."""
         scale = REFERENCE_WIDTH / width
         return {
             **vars(self),
@@ -217,7 +217,7 @@ class ResidualFigures:
 
 
 def summarise(samples: BorderSamples) -> ResidualFigures:
-    """Figures of some samples; NaN where there are none."""
+    """Summarise samples; NaN where there are none."""
     found = samples.residual_px[samples.found]
     if not found.size:
         share = 0.0 if len(samples.residual_px) else float("nan")

@@ -1,7 +1,4 @@
-"""Good, usable or reject: what a map's figures amount to, with the reasons.
-
-What is known of a finished map, as plain numbers: what a verdict rests on.
-"""
+"""The verdict on a map: good, usable or reject, with reasons."""
 
 from __future__ import annotations
 
@@ -15,13 +12,13 @@ from lanenet.config import Settings
 
 @dataclass(frozen=True)
 class LineEvidence:
-    """What held-out frames show of one line.
+    """Figures of one line in held-out frames; pixels of an image 160 px wide.
 
     Attributes:
-        samples: Places on its borders in view.
-        coverage: Share of them that met an edge; NaN where none was in view.
-        robust_sd_px: Of the residuals, image 160 px wide; NaN where nothing was found.
-        p95_px: Likewise.
+        samples: Number of places in view on its borders.
+        coverage: Share of them that met an edge; NaN if none was in view.
+        robust_sd_px: Robust standard deviation of the residuals; NaN if no edge was found.
+        p95_px: 95th percentile of the absolute residuals; NaN if no edge was found.
     """
 
     samples: int
@@ -32,24 +29,24 @@ class LineEvidence:
 
 @dataclass(frozen=True)
 class MapEvidence:
-    """What a verdict rests on.
+    """The figures that decide the verdict.
 
     Attributes:
         lines: The left and the right line in held-out frames.
-        p95_px: Of the residuals of both, image 160 px wide; NaN where nothing was held out or found.
-        coverage: Share of both lines' borders in view that met an edge; NaN where nothing was held out.
-        labelled_share: Of the frames that the driver did not delete.
-        point_shares: Of the left and the right line's points that lie in the window in these frames: those
-            that have labels.
-        contradicted_share: Of the lines that these frames have: those with which the pictures around
-            disagree.
-        not_labelled: Why the others have none, and how many.
-        revisits: Places seen twice.
-        closure_across_heights: What the revisits miss across the road, as median; None without any.
+        p95_px: 95th percentile of both lines' absolute residuals, image 160 px wide; NaN if there are none.
+        coverage: Share of both lines' borders in view that met an edge; NaN if no frame was held out.
+        labelled_share: Share of frames with labels, of those that are to be labelled.
+        point_shares: Share of each line's points in the window that have labels, in the same frames.
+        not_labelled: Number of frames without labels, by reason.
+        revisits: Number of revisits.
+        closure_across_heights: Median error of the revisits across the road, in camera heights; None without
+            a revisit.
         camera_known: Whether the camera was given.
-        sigma: Uncertainty of the camera's numbers where the drive told them (focal length relative, [rad]).
+        sigma: Sigmas of the camera's parameters if it was found from the drive (focal length relative,
+            [rad]).
         given_lane_cm: Lane width that the user gave.
-        found_lane_cm: Lane width on the road as the camera sees it; None where the lane sets the scale.
+        found_lane_cm: Lane width that the camera measures; None if the lane sets the scale.
+        contradicted_share: Share of the frames' lines that the images contradict.
     """
 
     lines: dict[str, LineEvidence]
@@ -73,32 +70,32 @@ _ORDER: tuple[Grade, ...] = ("good", "usable", "reject")
 
 
 class VerdictSettings(Settings):
-    """What counts as a good map; a usable one may miss each bound by the factor ``usable``.
+    """Bounds of a good map; a usable one may exceed each bound by the factor ``usable``.
 
-    Residuals are in pixels of an image 160 px wide, on frames held out from the map, up to 45 cm ahead.
+    Residuals are in pixels of an image 160 px wide, on held-out frames, up to 45 cm ahead.
 
     Attributes:
-        max_sd_px: Robust standard deviation of the residuals of each line by itself: one perfect line does
-            not make up for one that is not there. Of 122 lines on 61 maps of simulated drives all keep below
-            0.23 px, of real drives below 0.5; edges met by chance have 3.
-        max_p95_px: 95th percentile of the size of both lines' residuals. A map beyond it is usable: marks
-            beside a line make long tails, also where it is right.
-        min_samples: Places on a line in view, of all held-out frames, that tell whether it is right.
-        min_labelled: Share of the frames, without those that the driver deleted, that get labels: one of six
-            points at least. A usable map may leave out ``usable`` times as many. Where the points of one line
-            have fewer, of those that lie in the window, the map is usable.
-        min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; a map
-            below it may be right, but the frames do not show that it is.
-        max_contradicted: Share of the frames' lines with which the pictures around disagree, which get no
-            labels: half of what may go without. A map that is bent in many places is not to be trusted in
-            others.
-        max_focal_sigma: Relative uncertainty of the focal length, where the drive had to tell it.
-        max_pitch_sigma_rad: Uncertainty of the camera's pitch, likewise.
-        max_closure_heights: What a revisit misses across the road, in camera heights, as median.
-        lane_mismatch: Share by which the lane on the road may differ from the given width, where the camera
-            sets the scale, before a map is no longer good.
-        lane_reject: The same for a map that is not to be used.
-        usable: Factor on the bounds of a good map up to which it is usable.
+        max_sd_px: Robust standard deviation of each line by itself; a perfect line does not make up for a
+            missing one. Measured: all 122 lines on 61 maps of simulated drives keep below 0.23 px, those of
+            recorded drives below 0.5; edges met by chance have 3.
+        max_p95_px: 95th percentile of both lines' absolute residuals. A map beyond it is usable: marks beside
+            a line make long tails even if the line is right. Chosen: three times ``max_sd_px``.
+        min_samples: Least number of places in view to judge a line. Chosen: about half of one
+            frame's samples of a line (two borders over 45 cm).
+        min_labelled: Share of frames with labels (one of six points at least), without those that the driver
+            deleted. Where one line's points in the window have a smaller share, the map is usable. Chosen.
+        min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; below it,
+            a map may be right, but the frames do not show it. Chosen: short dashes leave a third.
+        max_contradicted: Share of the frames' lines that the images contradict. Derived: half of the frames
+            that may have no labels; a map that is wrong in many places is not trusted elsewhere.
+        max_focal_sigma: Relative sigma of the focal length, if it was found from the drive. Chosen.
+        max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1 degree.
+        max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
+            recorded drives reached 0.03.
+        lane_mismatch: Relative difference between measured and given lane width, if the camera sets the
+            scale, up to which a map is good. Chosen: lanes of one road vary by less.
+        lane_reject: The same, beyond which a map is rejected. Chosen: short of a lane mistaken for a road.
+        usable: Factor on the bounds of a good map up to which it is usable. Chosen.
     """
 
     max_sd_px: float = Field(default=0.5, gt=0.0)
@@ -120,9 +117,9 @@ class Verdict:
     """How far a map can be trusted.
 
     Attributes:
-        grade: The worst of all that was looked at.
-        reasons: What kept it from being better; what a good map rests on if nothing did.
-        remarks: What to know besides.
+        grade: The worst grade of all checks.
+        reasons: Why it is not better; if it is good, what that is based on.
+        remarks: What else to know.
     """
 
     grade: Grade
@@ -130,45 +127,55 @@ class Verdict:
     remarks: tuple[str, ...]
 
 
+#: One check's grade, with its reason.
+_Finding = tuple[Grade, str]
+
+
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
-    found: list[tuple[Grade, str]] = [
+    found = [
         *_residuals(evidence, settings),
         *_labelled(evidence, settings),
         *_contradicted(evidence, settings),
         *_camera(evidence, settings),
         *_lane_width(evidence, settings),
     ]
-    grades: list[Grade] = [grade for grade, _ in found]
-    grade: Grade = max(grades, key=_ORDER.index, default="good")
+    grade: Grade = max((grade for grade, _ in found), key=_ORDER.index, default="good")
     if grade == "good":
+        sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
         reasons = [
-            "held-out frames agree with the map to "
-            + ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
-            + f" as robust sd, {evidence.p95_px:.2f} px as p95, and {100.0 * evidence.labelled_share:.0f} % "
-            "of the frames have labels"
+            f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; "
+            f"{_percent(evidence.labelled_share)} of the frames have labels"
         ]
     else:
-        # The worst first; the rest of the list says what else to look at.
+        # The worst first.
         reasons = [text for _, text in sorted(found, key=lambda item: -_ORDER.index(item[0]))]
-    return Verdict(grade, tuple(reasons), tuple(_remarks(evidence)))
+    remarks = []
+    if evidence.found_lane_cm is None:
+        remarks.append(
+            f"the lane width of {evidence.given_lane_cm:g} cm is the one thing that sets the scale: if it is "
+            "wrong, every length is wrong by the same share, and no check here can show it"
+        )
+    return Verdict(grade, tuple(reasons), tuple(remarks))
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:
-    """Grade a number that should be small; NaN is not good."""
+    """Grade a number that should be small; NaN is rejected."""
     if value <= bound:
         return "good"
     return "usable" if value <= settings.usable * bound else "reject"
 
 
-def _residuals(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
+
+
+def _residuals(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
     if e.coverage != e.coverage:
-        return [("usable", "no frame was held out that shows the lines, so that nothing checks the map")]
+        return [("usable", "no frame was held out that shows the lines, so the map could not be checked")]
     if not e.coverage > 0.0:
         return [("reject", "no edge was found where the map expects the borders of its lines")]
-    found: list[tuple[Grade, str]] = [
-        reason for side, line in e.lines.items() for reason in _line(side, line, s)
-    ]
+    found = [finding for side, line in e.lines.items() for finding in _line(side, line, s)]
     if e.p95_px > s.max_p95_px:
         found.append(
             (
@@ -181,131 +188,110 @@ def _residuals(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
         found.append(
             (
                 grade,
-                f"only {100.0 * e.coverage:.0f} % of the lines' borders in view met an edge, expected "
-                f"{100.0 * s.min_coverage:.0f} %",
+                f"{_percent(e.coverage)} of the lines' borders in view met an edge, expected "
+                f"{_percent(s.min_coverage)} at least",
             )
         )
     return found
 
 
-def _line(side: str, line: LineEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
-    """Judge one line by itself; how much of it met an edge says little, as dashes and worn lines meet few."""
+def _line(side: str, line: LineEvidence, s: VerdictSettings) -> list[_Finding]:
+    """Judge one line by its residuals; its coverage says little, since dashes and worn lines lower it."""
     if line.samples < s.min_samples:
         return [
             (
                 "usable",
-                f"held-out frames show {line.samples} places of the {side} line, expected {s.min_samples}: "
-                "too few to check it",
+                f"held-out frames show {line.samples} places of the {side} line, expected {s.min_samples} at "
+                "least to check it",
             )
         ]
     if not line.coverage > 0.0:
         return [("reject", f"no edge was found where the map expects the borders of its {side} line")]
-    found: list[tuple[Grade, str]] = []
+    found: list[_Finding] = []
+    what = f"residual of the {side} line on held-out frames"
     grade = _bounded(line.robust_sd_px, s.max_sd_px, s)
     if grade != "good":
         found.append(
-            (
-                grade,
-                f"residual of the {side} line on held-out frames: robust sd {line.robust_sd_px:.2f} px, "
-                f"expected {s.max_sd_px:g} at most",
-            )
+            (grade, f"{what}: robust sd {line.robust_sd_px:.2f} px, expected {s.max_sd_px:g} at most")
         )
     if line.p95_px > s.usable * s.max_p95_px:
-        found.append(
-            (
-                "usable",
-                f"residual of the {side} line on held-out frames: p95 {line.p95_px:.2f} px, expected "
-                f"{s.usable * s.max_p95_px:g} at most of one line",
-            )
-        )
+        bound = s.usable * s.max_p95_px
+        found.append(("usable", f"{what}: p95 {line.p95_px:.2f} px, expected {bound:g} at most for one line"))
     return found
 
 
-def _labelled(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
-    found: list[tuple[Grade, str]] = []
+def _labelled(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
+    found: list[_Finding] = []
     causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
     grade = _bounded(1.0 - e.labelled_share, 1.0 - s.min_labelled, s)
     if grade != "good":
-        found.append(
-            (
-                grade,
-                f"{100.0 * e.labelled_share:.0f} % of the frames have labels, expected "
-                f"{100.0 * s.min_labelled:.0f} % ({causes})",
-            )
-        )
+        labelled = f"{_percent(e.labelled_share)} of the frames have labels"
+        found.append((grade, f"{labelled}, expected {_percent(s.min_labelled)} ({causes})"))
     return found + [
         (
             "usable",
-            f"{100.0 * share:.0f} % of the {side} line's points in the window have labels, expected "
-            f"{100.0 * s.min_labelled:.0f} % (frames: {100.0 * e.labelled_share:.0f} %)",
+            f"{_percent(share)} of the {side} line's points in the window have labels, expected "
+            f"{_percent(s.min_labelled)} at least (frames: {_percent(e.labelled_share)})",
         )
         for side, share in e.point_shares.items()
         if share < s.min_labelled
     ]
 
 
-def _contradicted(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+def _contradicted(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
     grade = _bounded(e.contradicted_share, s.max_contradicted, s)
     if grade == "good":
         return []
     return [
         (
             grade,
-            f"the pictures disagree with {100.0 * e.contradicted_share:.0f} % of the frames' lines on the "
-            f"map, expected {100.0 * s.max_contradicted:.0f} % at most",
+            f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map, "
+            f"expected {_percent(s.max_contradicted)} at most",
         )
     ]
 
 
-def _camera(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
-    found: list[tuple[Grade, str]] = []
+def _camera(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
+    found: list[_Finding] = []
     if e.closure_across_heights is not None and e.closure_across_heights > s.max_closure_heights:
-        grade = _bounded(e.closure_across_heights, s.max_closure_heights, s)
         found.append(
-            (grade, f"revisits miss {e.closure_across_heights:.2f} camera heights across the road (median)")
+            (
+                _bounded(e.closure_across_heights, s.max_closure_heights, s),
+                f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights, "
+                f"expected {s.max_closure_heights:g} at most",
+            )
         )
     if e.camera_known:
         return found
-    bounds = {"focal": ("focal length", s.max_focal_sigma), "pitch": ("pitch", s.max_pitch_sigma_rad)}
     if not e.revisits:
-        _, bound = bounds.pop("focal")
         sigma = e.sigma["focal"]
         found.append(
             (
-                max("usable", _bounded(sigma, bound, s), key=_ORDER.index),
-                "the camera was found from the drive, but no place was seen twice, without which its focal "
-                f"length is a guess, here to {100.0 * sigma:.0f} %: drive two laps of a closed road, so that "
-                "the second one passes where the first did, or calibrate the camera and give it",
+                max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
+                "the camera was found from the drive, but no place was seen twice, so its focal length is "
+                f"only a guess, here within {_percent(sigma)}: drive two laps of a closed road, the second "
+                "along the same path, or calibrate the camera and give it",
             )
         )
-    for name, (what, bound) in bounds.items():
-        sigma = e.sigma.get(name, 0.0)
-        if sigma > bound:
-            unit = f"{100.0 * sigma:.1f} %" if name == "focal" else f"{sigma:.3f} rad"
-            found.append((_bounded(sigma, bound, s), f"the drive leaves the camera's {what} open by {unit}"))
+    elif (sigma := e.sigma.get("focal", 0.0)) > s.max_focal_sigma:
+        grade = _bounded(sigma, s.max_focal_sigma, s)
+        found.append((grade, f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %"))
+    if (sigma := e.sigma.get("pitch", 0.0)) > s.max_pitch_sigma_rad:
+        grade = _bounded(sigma, s.max_pitch_sigma_rad, s)
+        found.append((grade, f"the drive leaves the camera's pitch open by {sigma:.3f} rad"))
     return found
 
 
-def _lane_width(e: MapEvidence, s: VerdictSettings) -> list[tuple[Grade, str]]:
+def _lane_width(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
     if e.found_lane_cm is None:
         return []
     ratio = max(e.found_lane_cm / e.given_lane_cm, e.given_lane_cm / e.found_lane_cm)
     if ratio <= 1.0 + s.lane_mismatch:
         return []
-    grade: Grade = "usable" if ratio <= 1.0 + s.lane_reject else "reject"
     return [
         (
-            grade,
+            "usable" if ratio <= 1.0 + s.lane_reject else "reject",
             f"the lane measures {e.found_lane_cm:.0f} cm with this camera, but {e.given_lane_cm:g} cm was "
-            "given: one of lane width and camera height is wrong",
+            "given: either the lane width or the camera's height is wrong",
         )
     ]
-
-
-def _remarks(e: MapEvidence) -> list[str]:
-    if e.found_lane_cm is None:
-        return [
-            f"the lane width of {e.given_lane_cm:g} cm is the one thing that sets the scale: nothing here "
-            "tells if it is wrong, and every length is wrong by the same share"
-        ]
-    return []

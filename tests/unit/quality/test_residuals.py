@@ -94,7 +94,7 @@ def test_edges_beyond_the_gate_or_of_the_other_direction_are_not_found():
     for wrong in (EdgePixels(edges.uv_px, -edges.normals), edges_of(lane(), 6.0)):
         found = measure(wrong, lane())
         # Further away the marking is narrower than the gate, and its other border is within it.
-        near = found.part(found.ahead_cm < 12.0)
+        near = found.select(found.ahead_cm < 12.0)
         assert len(near.right) > 20 and not near.found.any()
     nothing = summarise(measure(EdgePixels(np.empty((0, 2)), np.empty((0, 2))), lane()))
     assert nothing.coverage == 0.0 and np.isnan(nothing.p95_px) and nothing.samples > 100
@@ -104,7 +104,7 @@ def test_a_line_in_the_empty_middle_of_the_lane_meets_nothing():
     alone = replace(lane(), right_cm=np.full((60, 2), np.nan))
     assert summarise(measure(edges_of(lane()), alone)).coverage > 0.98
     aside = measure(edges_of(lane()), alone, aside_cm=20.0)
-    near = aside.part(aside.ahead_cm < 45.0)
+    near = aside.select(aside.ahead_cm < 45.0)
     assert len(near.right) > 50 and not near.found.any()
 
 
@@ -140,5 +140,5 @@ def test_a_line_that_knows_its_marking_is_compared_with_that():
     wide = replace(lane(), markings_cm=(TAPE_CM + 1.5, float("nan")))
     assert abs(summarise(measure(edges_of(lane()), lane())).median_px) < 0.05
     found = measure(edges_of(lane()), wide)
-    assert summarise(found.part(~found.right)).median_px > 0.3
-    assert abs(summarise(found.part(found.right)).median_px) < 0.05
+    assert summarise(found.select(~found.right)).median_px > 0.3
+    assert abs(summarise(found.select(found.right)).median_px) < 0.05

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from datagen.labels.quality import frame_residual_cm, label_report
+from datagen.labels.label_map import frame_residual_cm, label_report
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.birdseye import BirdseyeWindow
