@@ -109,7 +109,8 @@ def lanenet(*words: object) -> str:
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, "-m", "lanenet", *map(str, words)]
     environment = {**os.environ, **threads, "PYTHONPATH": path}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    # `python -m` looks into the current folder first, which may be that of another checkout.
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command[2:])}: code {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
