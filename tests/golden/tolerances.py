@@ -1,15 +1,19 @@
-"""How far results may be from the expected ones, from what another processor was measured to do.
+"""How far results may be from the expected ones, from what code for other processors was measured to do.
 
 Measured on an x86-64 with AVX-512 against (a) numba's code for any x86-64 without SVML
 (NUMBA_CPU_NAME=generic, NUMBA_DISABLE_INTEL_SVML=1), OpenBLAS for Nehalem (OPENBLAS_CORETYPE), NumPy without
-AVX2 and FMA (NPY_DISABLE_CPU_FEATURES), OpenCV without AVX and IPP (OPENCV_CPU_DISABLE, OPENCV_IPP), all at
+AVX2 and above (NPY_DISABLE_CPU_FEATURES), OpenCV without AVX and IPP (OPENCV_CPU_DISABLE, OPENCV_IPP), all at
 once; (b) numba's generic code alone; (c) OpenBLAS for Haswell alone.
 
-The synthetic drive and what detectors see in it were the same to 1e-6 each time, and with (b) and (c) so were
-the maps. With (a) they are not: a difference in the last digit of NumPy's functions decides which particles
-live on, and the map adjusted from there comes to rest elsewhere within the doubt of its loop closure. Limits
-are two to three times what was measured; the comment before each says what it was, ``rms / largest``. On the
-processor of the manifest, with its versions, nothing of this is needed: EXACT holds for all fields.
+The synthetic drive and all detectors but the painter were the same to 1e-6 each time, and with (b) and (c) so
+were the maps. With (a) they are not, probably by the sums of OpenBLAS for Nehalem: with NumPy's AVX2 left in,
+the maps were those of (a) again. A last digit decides which particles live on, and the map adjusted
+from there comes to rest elsewhere within the doubt of its loop closure. That is one throw of the dice, and
+limits are two to three times of it; the comment before each says what was measured, ``rms / largest``.
+Nothing was run on an Arm.
+
+On the processor of the manifest, with its versions, none of this is needed: EXACT holds for all fields. Only
+there are small changes noticed in what mapping does, such as a prior by 7 %.
 """
 
 from comparison import Tolerance
@@ -59,6 +63,8 @@ TOLERANCES = {
         "camera.*": Tolerance(1e-6, 1e-6),
     },
     "recorded": {
+        # 0.063 / 0.64; 2 of 740
+        "detect.painter.points_cm": Tolerance(0.16, 1.6, 0.01),
         "detect.small.*": _NETWORK,
         "detect.general.*": _NETWORK,
         "detect.*": _FROM_ONE_IMAGE,
