@@ -43,7 +43,7 @@ from lanenet.data.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.drive_settings import DriveDetectorSettings
+from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.draw import draw_estimate

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from lanenet.errors import HardwareError
-from lanenet.onboard.hardware import Actuator
+from lanenet.onboard.actuators.actuator import Actuator
 
 log = logging.getLogger(__name__)
 

@@ -26,8 +26,8 @@ from pydantic import TypeAdapter
 
 from lanenet.errors import LanenetError
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator
+from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT, raise_priority
-from lanenet.onboard.hardware import Actuator
 
 log = logging.getLogger("lanenet.onboard.guard")
 

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
-from lanenet.onboard.hardware import Frame
+from lanenet.onboard.cameras.source import Frame
 
 #: A frame that is this far ahead of the clock is not timed by that clock.
 _MAX_AHEAD_S = 0.05

@@ -203,7 +203,7 @@ class SerialBoard:
         )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.hardware.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
             HardwareError: If it is not open, a value is not a number, or the board is gone, silent or has

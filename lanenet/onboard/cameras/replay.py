@@ -14,7 +14,7 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import DriveFormatError, HardwareError
-from lanenet.onboard.hardware import Frame, SourceEnded
+from lanenet.onboard.cameras.source import Frame, SourceEnded
 
 _DEFAULT_STEP_S = 0.05
 _log = logging.getLogger(__name__)

@@ -16,10 +16,9 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
+from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
-from lanenet.onboard.drive import build_drive_detector
-from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
+from lanenet.onboard.drive import DriveSettings, build_drive_detector
 
 #: The camera is watched for so long.
 _WATCH_S = 2.0

@@ -12,7 +12,7 @@ from lanenet.errors import ConfigError, LanenetError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
 from lanenet.onboard.actuators.pulses import PulseSettings
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings
 from lanenet.onboard.guard import CommandSink
 
 _log = logging.getLogger(__name__)

@@ -17,8 +17,7 @@ from lanenet.data.detections import read_detections
 from lanenet.data.sources import Source, find_mask, read_mask
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.drive import build_drive_detector
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings, build_drive_detector
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.lane_filter.detector import LaneFilter, lane_filter_settings
 from lanenet.perception.network.detector import NetworkDetector

@@ -25,7 +25,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.trajectory import read_tum
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
-from lanenet.onboard.hardware import Frame, SourceEnded
+from lanenet.onboard.cameras.source import Frame, SourceEnded
 
 SETTINGS = MapSettings(filter=FilterSettings(particles=60))
 KNOWN = StartSettings(factor=1.0)

@@ -14,11 +14,11 @@ from lanenet.config import check_settings
 from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import HardwareError
 from lanenet.onboard.bench import example_camera
+from lanenet.onboard.cameras.source import Frame
 from lanenet.onboard.doctor import car as doctor_car
 from lanenet.onboard.doctor import installation as doctor
 from lanenet.onboard.doctor.car import check_car, check_source, check_temperature, check_throttling
-from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.hardware import Frame
+from lanenet.onboard.drive import DriveSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 CHECKPOINT = ROOT / "checkpoints" / "small"

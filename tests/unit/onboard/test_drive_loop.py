@@ -9,10 +9,10 @@ import pytest
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
+from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
 from lanenet.onboard.drive_report import LatencyHistogram, Step
-from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
-from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings, State
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.safety import LimitSettings, SafetySettings, State
 from lanenet.perception.estimate import LaneEstimate
 
 RATE_HZ = 30.0
@@ -108,16 +108,13 @@ class Car:
         self.steps: list[Step] = []
         control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
-            self.camera,
-            Eye(answer),
-            LaneController(control),
-            self.wire,
+            CarParts(self.camera, Eye(answer), LaneController(control), self.wire),
             SafetySettings(countdown_s=0.0),
-            CommandLimiter(LimitSettings()),
+            LimitSettings(),
             control.speed,
-            watch=self.steps.append,
-            clock=self.clock,
-            **options,
+            DriveMode(**options),
+            self.steps.append,
+            self.clock,
         )
 
 

@@ -9,7 +9,7 @@ from lanenet.config import check_settings
 from lanenet.errors import ConfigError, HardwareError
 from lanenet.onboard.actuators.pulses import PulseSettings, command_pulses
 from lanenet.onboard.doctor.wheel_trial import try_wheels
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings
 
 PULSES = {
     "max_steering_rad": 0.4,

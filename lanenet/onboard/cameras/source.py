@@ -1,10 +1,4 @@
-"""What the drive loop asks of a camera and of an actuator; every driver answers to one of these protocols.
-
-Each driver has a strict settings class with ``kind``. :mod:`lanenet.onboard.cameras` unites those of the
-sources as ``SourceSettings`` and builds one with ``open_source(settings)``;
-:mod:`lanenet.onboard.actuators` has ``ActuatorSettings`` and ``make_actuator(settings)``. Neither function
-touches the device: :meth:`FrameSource.open` and :meth:`Actuator.open` do.
-"""
+"""What the drive loop needs of a camera: frames with their times."""
 
 from __future__ import annotations
 
@@ -65,38 +59,4 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Release the device; harmless when it is not open."""
-        ...
-
-
-@runtime_checkable
-class Actuator(Protocol):
-    """Steering servo and motor controller."""
-
-    def open(self) -> None:
-        """Connect, and put the motor into neutral before anything else.
-
-        Raises:
-            HardwareError: If the device is not there or does not answer; names it and what to check.
-            MissingExtraError: If its driver is not installed.
-        """
-        ...
-
-    def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs.
-
-        Args:
-            steering_rad: Angle of the front wheels, positive left; more than the car's lock is cut off.
-            throttle: -1 (full reverse) to 1 (full ahead).
-
-        Raises:
-            HardwareError: If the device did not take it.
-        """
-        ...
-
-    def neutral(self) -> None:
-        """Put the motor into neutral and the wheels straight; may be called at any time, never raises."""
-        ...
-
-    def close(self) -> None:
-        """Go to neutral, then release the device; harmless when it is not open, never raises."""
         ...
