@@ -1,4 +1,4 @@
-"""Actuators: what turns the wheels and drives the motor, chosen by ``kind``."""
+"""Actuators, chosen by ``kind``: steering servo and motor."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ class Actuator(Protocol):
         """Connect, and put the motor into neutral before anything else.
 
         Raises:
-            HardwareError: If the device is not there or does not answer; names it and what to check.
+            HardwareError: If the device is missing or does not answer; names it and what to check.
             MissingExtraError: If its driver is not installed.
         """
         ...
@@ -22,7 +22,7 @@ class Actuator(Protocol):
         """Set both outputs.
 
         Args:
-            steering_rad: Angle of the front wheels, positive left; more than the car's lock is cut off.
+            steering_rad: Angle of the front wheels, positive left; clipped to the car's largest.
             throttle: -1 (full reverse) to 1 (full ahead).
 
         Raises:
@@ -31,9 +31,9 @@ class Actuator(Protocol):
         ...
 
     def neutral(self) -> None:
-        """Put the motor into neutral and the wheels straight; may be called at any time, never raises."""
+        """Put the motor into neutral and the wheels straight, at any time; never raises."""
         ...
 
     def close(self) -> None:
-        """Go to neutral, then release the device; harmless when it is not open, never raises."""
+        """Go to neutral, then release the device; harmless if it is not open, never raises."""
         ...

@@ -1,4 +1,4 @@
-"""Sources of frames: cameras and what stands in for one, chosen by ``kind``."""
+"""Sources of frames, chosen by ``kind``: cameras, and a recording in place of one."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 
 class SourceEnded(Exception):  # noqa: N818 (an end, like StopIteration, and not an error)
-    """A recording has come to its end: there will never be another frame."""
+    """A recording has ended: there will be no more frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +18,10 @@ class Frame:
     """One image of a camera.
 
     Attributes:
-        image_bgr: The image. The source does not write to the array once it is handed out.
-        t_s: When it was exposed, on the clock of :func:`time.monotonic`: the sensor's own time where the
-            driver tells it, else when it arrived.
-        number: Counts the frames of the source, those that nobody read included.
+        image_bgr: The image; the source does not change it any more.
+        t_s: Time of exposure on the clock of :func:`time.monotonic`: the sensor's if the driver gives it,
+            else the time of arrival.
+        number: Counts all frames of the source, also those that were not read.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] = field(repr=False)
@@ -31,25 +31,25 @@ class Frame:
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A camera, or a recording that plays one; used by one thread."""
+    """A camera, or a recording in its place; used by one thread."""
 
     def open(self) -> None:
         """Start the device.
 
         Raises:
-            HardwareError: If it is not there or does not answer; the message names it and what to check.
+            HardwareError: If it is missing or does not answer; the message names it and what to check.
             MissingExtraError: If its driver is not installed.
         """
         ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the newest frame that was not returned before, waiting for it if need be.
+        """Return the newest frame that was not returned before; waits for one if there is none.
 
         Args:
             timeout_s: The longest wait, [s]; the call may not last noticeably longer.
 
         Returns:
-            The frame, or None if there was nothing new: the device is late, or gone and being looked for.
+            The frame, or None if there is no new one: the device is late, or lost and being restarted.
 
         Raises:
             SourceEnded: If a recording is over.
@@ -58,5 +58,5 @@ class FrameSource(Protocol):
         ...
 
     def close(self) -> None:
-        """Release the device; harmless when it is not open."""
+        """Release the device; harmless if it is not open."""
         ...

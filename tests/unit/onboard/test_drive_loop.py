@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -164,7 +165,7 @@ FAULTS: dict[str, tuple[str, Callable[[int], LaneEstimate] | None, str]] = {
         "confidence 0.10",
     ),
     "no frame": ("camera", None, "no frame from the camera"),
-    "frozen": ("camera", None, "the one before once more"),
+    "frozen": ("camera", None, "repeats the one before"),
     "late": ("camera", None, "300 ms old"),
     "ahead": ("camera", None, "ahead of the clock"),
 }
@@ -226,11 +227,12 @@ def test_an_exception_is_neutral_first_and_goes_on_up(where: str, caplog: pytest
     if where == "camera":
         car.camera._faults = {30: fail}  # type: ignore[dict-item]
     elif where == "detector":
-        car.loop._detector = Eye(lambda k: LANE if k < 30 else fail())
+        failing = Eye(lambda k: LANE if k < 30 else fail())
+        car.loop._parts = replace(car.loop._parts, detector=failing)
     elif where == "controller":
         calls = iter(range(31))
-        whole = car.loop._controller.wish
-        car.loop._controller.wish = lambda *words: (  # type: ignore[method-assign]
+        whole = car.loop._parts.controller.wish
+        car.loop._parts.controller.wish = lambda *words: (  # type: ignore[method-assign]
             whole(*words) if next(calls) < 30 else fail()
         )
     elif where == "actuator":

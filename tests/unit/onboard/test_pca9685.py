@@ -114,7 +114,7 @@ def test_glitch_is_tried_again(bus, actuator):
 def test_chip_that_lost_its_supply_is_noticed(bus, actuator):
     actuator.send(0.0, 0.1)
     bus.chip.power_on()
-    with pytest.raises(HardwareError, match="started again by itself, and gives no pulses"):
+    with pytest.raises(HardwareError, match="restarted and sends no pulses"):
         actuator.send(0.0, 0.1)
     assert bus.chip.asleep and bus.chip.pulse_us(0) == 0.0
 
