@@ -24,7 +24,7 @@ class PulseSettings(Settings):
     counts at the true rate of its PCA9685.
 
     Attributes:
-        max_steering_rad: Angle of the front wheels at the ends of the servo's travel; larger ones are clipped.
+        max_steering_rad: Angle of the front wheels at the ends of the servo's travel; others are clipped.
         steering_trim_rad: Added to every angle, so that the car runs straight at 0; positive left.
         steering_left_us: Pulse at the left end.
         steering_right_us: Pulse at the right end.
@@ -103,7 +103,7 @@ def _clip(share: float) -> float:
     return min(max(share, -1.0), 1.0)
 
 
-#: The longest that neutral waits for a command in progress, which takes a few milliseconds.
+#: Longest wait of neutral for a command in progress, which takes a few milliseconds.
 _LONGEST_WAIT_S = 0.02
 
 

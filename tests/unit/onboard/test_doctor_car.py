@@ -69,7 +69,7 @@ def test_good_camera():
     ("source", "name", "state", "text"),
     [
         (Camera(missing=True), "camera", "problem", "cannot be started"),
-        (Camera(rate_hz=10.0), "camera", "problem", "40 were asked for"),
+        (Camera(rate_hz=10.0), "camera", "problem", "40 were requested"),
         (Camera(size=(120, 160)), "image size", "problem", "160x120 px, but the camera file is for 320x240"),
         (Camera(late_s=0.2), "delay", "note", "200 ms"),
         (Camera(value=3), "image", "note", "is the lens covered"),
