@@ -95,10 +95,10 @@ def test_temperature(tmp_path, milli, state):
 @pytest.mark.parametrize(
     ("said", "state", "text"),
     [
-        ("throttled=0x0", "ok", "held"),
+        ("throttled=0x0", "ok", "no throttling"),
         ("throttled=0x50005", "problem", "voltage is too low and the processor is throttled; use a supply"),
         ("throttled=0x80008", "problem", "limit of temperature"),
-        ("throttled=0x20000", "note", "since the start it happened that the processor's clock is capped"),
+        ("throttled=0x20000", "note", "since boot it happened that the processor's clock is capped"),
         ("VCHI initialization failed", "note", "VCHI"),
     ],
 )

@@ -215,7 +215,7 @@ def test_sketch_of_another_version(silent_port):
     pytest.importorskip("serial", reason="pyserial is not installed")
     port, master = silent_port
     threading.Timer(0.05, os.write, (master, encode("V", 2))).start()
-    with pytest.raises(HardwareError, match="speaks version 2 of the protocol, expected 1"):
+    with pytest.raises(HardwareError, match="version 2 of the protocol, expected 1"):
         make_actuator(SerialBoardSettings(port=port, start_s=1.0)).open()
 
 
