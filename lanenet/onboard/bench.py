@@ -288,11 +288,8 @@ def _detectors(camera: Camera, models: Sequence[Path], threads: int) -> dict[str
         for model in models
     }
     inputs = DetectorInputs(camera=camera, lane_width_cm=LANE_WIDTH_CM)
-    return networks | {name: build_detector(name, inputs) for name in _without_model()}
-
-
-def _without_model() -> list[str]:
-    return detector_names(lambda kind: not kind.needs_model)
+    without_model = detector_names(lambda kind: not kind.needs_model)
+    return networks | {name: build_detector(name, inputs) for name in without_model}
 
 
 class _Path:
