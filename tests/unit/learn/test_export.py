@@ -39,7 +39,7 @@ def make_network():
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     folder = tmp_path_factory.mktemp("checkpoint")
-    (folder / "config.yaml").write_text(dump_settings(LearnSettings()))
+    (folder / "config.yaml").write_text(dump_settings(LearnSettings(network=NetworkSettings(bins=0))))
     write_weights(folder / "weights.safetensors", make_network(), META)
     write_rasters(folder / "check_rasters.png", RASTERS)
     export_checkpoint(folder)
