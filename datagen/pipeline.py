@@ -27,7 +27,6 @@ from datagen.quality.mappable import check_edges, check_lines_seen, check_moving
 from datagen.quality.measure import held_out_frames, measure_map, quality_figures
 from datagen.quality.page import PAGE_NAME, report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
-from datagen.quality.residuals import ResidualSettings
 from datagen.quality.verdict import judge
 from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.camera.coarse import with_known_scale
@@ -157,9 +156,9 @@ def _map_drive(
     mapped = MappedDrive(drive_map, drive, rows_of_map, settings.perception)
     drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
     mapped = replace(mapped, drive_map=drive_map)
-    quality = measure_map(mapped, ResidualSettings())
+    quality = measure_map(mapped)
     check_lines_seen(quality, drive, lane_width_cm, free_cm)
-    figures |= quality_figures(quality, drive.width, ResidualSettings())
+    figures |= quality_figures(quality, drive.width)
     frames = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
     notes.append(f"{frames}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, figures, drive.deleted[rows_of_map], free_cm)
