@@ -97,7 +97,7 @@ def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypa
     held: list[tuple[int, int]] = []
 
     def adjust(*args: object, **_: object) -> None:
-        held.extend(args[6])
+        held.extend(args[5])
         raise _StopError
 
     monkeypatch.setattr("datagen.slam.segment.adjust", adjust)

@@ -10,7 +10,7 @@ from picture_road import Pictures, loop_drive, made_up_drive
 from pixel_road import fisheye
 
 from datagen.settings import MapSettings
-from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
+from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, BundleSettings, Observations
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.join import Stretch, _agreeing, frames_text, join_stretches
 from datagen.slam.keyframes import key_pairs
@@ -101,8 +101,9 @@ def test_recorded_speeds_of_both_stretches_are_told_in_one_unit(same_road, monke
     drive, _, stretches = same_road
     told: list[np.ndarray] = []
 
-    def adjust(*_: object, expected: np.ndarray, **__: object) -> None:
-        told.append(expected)
+    def adjust(observed: Observations, *_: object) -> None:
+        assert observed.relative_steps is not None
+        told.append(observed.relative_steps)
         raise _StopError
 
     monkeypatch.setattr("datagen.slam.join.adjust", adjust)
@@ -128,9 +129,9 @@ def test_key_frames_of_a_crawl_are_those_of_the_joined_stretch(same_road, monkey
         cleaned.append(args[-1])
         return road_edges(*args)
 
-    def adjust(_edges: object, poses: np.ndarray, *args: object, **_: object) -> BundleResult:
-        pairs[:] = args[4]
-        return replace(long.solved.bundle, poses=poses, tilt=args[5])
+    def adjust(_: Observations, start: BundleEstimate, *args: object) -> BundleResult:
+        pairs[:] = args[3]
+        return replace(long.solved.bundle, poses=start.poses, tilt=start.tilt)
 
     monkeypatch.setattr("datagen.slam.join.road_edges", see)
     monkeypatch.setattr("datagen.slam.join.adjust", adjust)
