@@ -324,7 +324,7 @@ class LiveLocaliser:
         if self._filter is None:
             self._filter = ParticleFilter(motion, self.settings.filter, height, wheelbase_cm, self._rng)
         edges = seen.edges
-        estimate = self._filter.step(edges.points_cm, edges.normals, edges.weights, motion, 0)
+        estimate = self._filter.step(edges.scan(0), motion, 0)
         if self.steering is None and self._turns:
             self._learn_steering(seen.commands.speed_known)
         self._last = LivePose(seen.frame, seen.t_s, self.segment, estimate, edges.points_cm)

@@ -32,8 +32,8 @@ __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "
 #: Share of the diagonal that is added to it. A bend of the whole drive hardly changes any one frame's
 #: residuals: with 1e-4, an error that all turns have in common was still there after all rounds.
 _DAMPING = 1e-8
-#: Relative fall of the cost at which a round ends early. Chosen: a tenth of what moves a pose visibly; only
-#: time depends on it.
+#: Relative fall of the cost at which a round ends early. Chosen: it only saves
+#: steps that change little.
 _CONVERGED = 1e-5
 
 

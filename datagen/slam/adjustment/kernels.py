@@ -26,8 +26,8 @@ N_VIEW = 8
 #: Newton steps that undo a lens, and the step, [rad], at which they end. Four or five are enough for lenses
 #: up to 170 degrees; the rest is margin.
 _NEWTON_STEPS, _CONVERGED = 8, 1e-13
-#: Points whose edge would be wider than this in the other image, relative to their own, are not compared: the
-#: road is seen too obliquely there. Chosen: a sigma of 3 px, wider than any gate.
+#: Points whose edge would be wider than this in the other image, relative to their own, are not compared.
+#: Chosen: the sigma of their residual would be 2.9 times that of an edge.
 _MAX_STRETCH = 4.0
 
 

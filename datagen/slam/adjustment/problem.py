@@ -20,10 +20,10 @@ from datagen.slam.adjustment.kernels import N_CAMERA, N_FRAME, accumulate, assoc
 from datagen.slam.adjustment.state import CAMERA_NAMES, BundleSettings, BundleState, Observations
 from lanenet.geometry.camera import Camera
 
-#: A point that meets an edge in at most this share of its frames does so by chance; from the second share on
-#: it is taken for a mark on the road. Below the first its weight is the third number: not zero, so that the
-#: system stays determined. Chosen: noise at fixed pixels is met by chance in up to 0.4 of the frames
-#: (tests/unit/slam/test_bundle.py).
+#: Shares of its frames in which a point meets an edge by chance, and in which it is taken for a mark on the
+#: road; weight of a point below the first. Chosen between noise, which meets an edge now and then, and marks,
+#: which meet one in nearly every image (tests/unit/slam/test_bundle.py); not zero, so that the system stays
+#: determined.
 _CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
 #: Trust in a point that is in view of fewer than two frames, whose share says little. Chosen between the two.
 _TRUST_ONCE = 0.3

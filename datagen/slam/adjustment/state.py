@@ -32,10 +32,10 @@ class BundleSettings(Settings):
         lags: Frames between the two frames of a pair. With these, a closed ``donkey_circuit`` gave focal
             lengths within 1 px from starts of 50 to 76 px.
         points: Edge points per frame that are compared.
-        gates_px: Search radius for the nearest edge, [px], one per round of association. It shrinks as the
-            poses improve; 5 px is about the error of the open loop.
+        gates_px: Search radius for the nearest edge, [px], one per round of association. Chosen: it
+            shrinks as the poses improve.
         iterations: Levenberg-Marquardt steps per round.
-        cauchy_px: Scale of the Cauchy loss, [px]: three times the residuals of a good map, 0.25 px.
+        cauchy_px: Scale of the Cauchy loss, [px]: about three times the robust sd of ``donkey_circuit``.
         pixel_sigma: Standard deviation of a residual, [px]. Larger than the residuals seen, since
             neighbouring edge points share their errors and count for fewer.
         focal: Relative sigma of the focal length's prior; wide, for a guessed lens.

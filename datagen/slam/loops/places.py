@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from datagen.slam.filter.field import DirectionField
-from datagen.slam.odometry.scans import Scans, thin_scan
+from datagen.slam.odometry.scans import Scan, Scans, thin_scan
 from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
@@ -234,8 +234,7 @@ def match_places(
     query = _submap(
         scans, poses, range(max(0, later - 4), min(len(scans), later + 5)), later, wheelbase_cm, rng
     )
-    points, normals, trust = query
-    if len(points) < 20:
+    if len(query.weights) < 20:
         return None
     step = 0.15 * camera_height_cm
     reach = np.array([settings.along_heights, settings.sideways_heights]) * camera_height_cm
@@ -247,17 +246,16 @@ def match_places(
     for cell_heights in (0.12, 0.06, 0.04):
         field = DirectionField.empty(cell_heights * camera_height_cm, 512, 1e9)
         for k in near:
-            frame = scans.frame(k)
-            pose = relative_pose(origin, poses[k])
+            scan, pose = scans.scan(k), relative_pose(origin, poses[k])
             field.insert(
-                map_from_car(scans.points_cm[frame], pose, wheelbase_cm),
-                map_from_car_directions(scans.normals[frame], pose[2]),
-                scans.weights[frame] / len(near),
+                map_from_car(scan.points_cm, pose, wheelbase_cm),
+                map_from_car_directions(scan.normals, pose[2]),
+                scan.weights / len(near),
                 0,
             )
         # Cells were filled by many frames: bring the field to about one where all agree.
         field.vectors[...] *= 8.0
-        scores = field.score(grid, wheelbase_cm, points, normals, trust, 0) / trust.sum()
+        scores = field.score(grid, wheelbase_cm, query, 0) / query.weights.sum()
         # Alike pictures were taken at about the same place: a weak prior settles ties between dashes.
         chosen = int(np.argmax(scores - 0.1 * np.sum((grid[:, :2] / reach) ** 2, axis=1)))
         best, share = grid[chosen], float(scores[chosen])
@@ -274,15 +272,15 @@ def _submap(
     reference: int,
     wheelbase_cm: float,
     rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+) -> Scan:
     """Edges of several frames as points of the reference frame's car frame."""
     parts = []
     for k in frames:
-        points, normals, trust = thin_scan(scans, k, 60, rng)
+        points, normals, trust = thin_scan(scans.scan(k), 60, rng)
         pose = relative_pose(poses[reference], poses[k])
         ahead_left = map_from_car(points, pose, wheelbase_cm)
         directions = map_from_car_directions(normals, pose[2])
         # Back to x right, y ahead of the front axle.
         car = np.stack([-ahead_left[:, 1], ahead_left[:, 0] - wheelbase_cm], axis=1)
         parts.append((car, np.stack([-directions[:, 1], directions[:, 0]], axis=1), trust))
-    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))  # type: ignore[return-value]
+    return Scan(*(np.concatenate(column) for column in zip(*parts, strict=True)))

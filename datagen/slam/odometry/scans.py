@@ -1,13 +1,10 @@
-"""What the mapper sees of a drive: the edge points of every frame, packed for the numba kernels.
-
-Fewer edge points that say the same: those of one small patch and one direction become one.
-"""
+"""Scans: the edge points of every frame on the road, packed for the numba kernels, and reduced to fewer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +16,23 @@ from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, find_edges
 from lanenet.perception.edges.road import RangeSettings, RoadEdges, RoadTable
 
 Progress = Callable[[int, int], None]
+
+#: Directions that :func:`condense` keeps apart: enough for the two edges of a tape.
+_SECTORS = 4
+
+
+class Scan(NamedTuple):
+    """Edge points of one frame.
+
+    Attributes:
+        points_cm: Edge points, frame car.
+        normals: Unit vectors across the edges, towards the brighter side, frame car.
+        weights: Trust in each point.
+    """
+
+    points_cm: Float[np.ndarray, "m 2"]
+    normals: Float[np.ndarray, "m 2"]
+    weights: Float[np.ndarray, "m"]
 
 
 @dataclass(frozen=True)
@@ -43,6 +57,11 @@ class Scans:
     def frame(self, k: int) -> slice:
         """Return the slice of frame k's points."""
         return slice(int(self.starts[k]), int(self.starts[k + 1]))
+
+    def scan(self, k: int) -> Scan:
+        """Return frame k's edge points."""
+        rows = self.frame(k)
+        return Scan(self.points_cm[rows], self.normals[rows], self.weights[rows])
 
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:
@@ -117,37 +136,23 @@ def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
     return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
 
 
-def thin_scan(
-    scans: Scans, k: int, max_points: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
-    frame = scans.frame(k)
-    size = frame.stop - frame.start
+def thin_scan(scan: Scan, max_points: int, rng: np.random.Generator) -> Scan:
+    """Return at most ``max_points`` of a frame's edge points, drawn evenly."""
+    size = len(scan.weights)
     if size <= max_points:
-        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
-    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
-    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]
+        return scan
+    chosen = np.sort(rng.choice(size, max_points, replace=False))
+    return Scan(*(column[chosen] for column in scan))
 
 
-_SECTORS = 4  # directions that are kept apart, so that both edges of a tape are
+def condense(scan: Scan, patch_cm: float, most: int) -> Scan:
+    """Average the edge points of each patch and direction, and keep the heaviest averages.
 
-
-def condense(
-    points_cm: Float[np.ndarray, "m 2"],
-    normals: Float[np.ndarray, "m 2"],
-    weights: Float[np.ndarray, "m"],
-    patch_cm: float,
-    most: int,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-    """Take the points of each patch together, and of the patches the heaviest.
-
-    Near the car many pixels see one patch of road; a random choice of them would say as little of the rest as
-    it says of that patch.
+    Near the car many pixels see one patch of road. A random choice of points would crowd there and leave
+    little for the rest of the road.
 
     Args:
-        points_cm: Edge points, frame car.
-        normals: Their unit normals.
-        weights: Trust in each.
+        scan: Edge points of a frame.
         patch_cm: Side of a patch.
         most: How many patches to keep.
 
@@ -155,16 +160,17 @@ def condense(
         Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
         that normals that disagree weigh less.
     """
-    # At most half of the slots are taken, so that a search for a free one is short.
+    weights = scan.weights
+    # At most half of the slots of the hash table are taken, so that a search for a free one is short.
     slots = np.full(2 << max(len(weights), 1).bit_length(), -1, np.int64)
     sums, keys = np.zeros((len(weights), 5)), np.empty((len(weights), 2), np.int64)
-    count = _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums)
+    count = _add_up(*scan, patch_cm, slots, keys, sums)
     weight, length = sums[:count, 0], np.hypot(sums[:count, 3], sums[:count, 4])
     kept = np.flatnonzero(length > 1e-9 * weight)
     if len(kept) > most:
         kept = np.sort(kept[np.argpartition(-length[kept], most)[:most]])
     mean, length = sums[kept], length[kept]
-    return mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length
+    return Scan(mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -71,11 +71,7 @@ def test_poses_are_those_that_the_filter_has_when_it_has_seen_each_frame(road):
     scans, motion = scans_and_motion(drive)
     settings = (SETTINGS.filter, CAMERA.mounting.height_cm, CAMERA.wheelbase_cm)
     plain = ParticleFilter(motion, *settings, np.random.default_rng(SETTINGS.seed))
-    frames = [scans.frame(k) for k in range(len(drive))]
-    known = [
-        plain.step(scans.points_cm[f], scans.normals[f], scans.weights[f], motion, k)
-        for k, f in enumerate(frames)
-    ]
+    known = [plain.step(scans.scan(k), motion, k) for k in range(len(drive))]
     _, poses = ran(moments_of(drive))
     np.testing.assert_allclose(stacked(poses), [estimate.pose for estimate in known], rtol=0, atol=1e-9)
     # The whole drive in one go gives the same matches; its poses are smoothed by what came later.
