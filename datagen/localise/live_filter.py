@@ -22,10 +22,10 @@ from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Estimate, ParticleFilter, Survivors, smooth_lineages
 from datagen.slam.filter.motion import OFFSET, MotionModel
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import usual_way
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import typical_step
 from datagen.slam.odometry.scans import Scans, pack_scans, seen_edges
-from datagen.slam.odometry.stillness import StandingWatch, shrink_picture
+from datagen.slam.odometry.stillness import StandstillDetector, shrink_image
 from datagen.slam.track import CommandedMotion, SteeringFit, commanded_motion, fit_steering
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
@@ -58,7 +58,7 @@ def live_motion(
     Args:
         commands: What was commanded.
         curvature_per_cm: Curvature that the steering predicts; None where it predicts nothing.
-        factor: Usual way per unit of the commands, see :class:`datagen.slam.odometry.odometry.UsualWay`.
+        factor: Usual way per unit of the commands, see :class:`datagen.slam.odometry.odometry.TypicalStep`.
         height_cm: Of the camera.
     """
     predicted = curvature_per_cm is not None
@@ -220,7 +220,7 @@ class LiveLocaliser:
             # Over a gap the motion is predicted, as long as that can be believed.
             return poses if paused else [*poses, *self._follow(self._seen(moment, None))]
         self._t_seen_s = moment.t_s
-        stands = self._watch.stands(shrink_picture(self._checked(moment)))
+        stands = self._watch.stands(shrink_image(self._checked(moment)))
         if stands and (self._filter is not None or self._waiting):
             self.standing += 1
             return poses if self._last is None else [*poses, self._stay(moment)]
@@ -249,7 +249,7 @@ class LiveLocaliser:
 
     def _begin(self) -> None:
         """Forget where the car was; what was learned of the car itself stays."""
-        self._watch = StandingWatch()
+        self._watch = StandstillDetector()
         self._filter: ParticleFilter | None = None
         self._waiting = []
         self._last: LivePose | None = None
@@ -312,10 +312,10 @@ class LiveLocaliser:
 
     def _set_out(self, waiting: list[_Seen]) -> list[LivePose]:
         """Find the usual speed in the frames so far, and run the filter over them."""
-        odometry, height = self.settings.odometry, self.camera.mounting.height_cm
-        pictures = Pictures([seen.pixels for seen in waiting], self.camera, odometry, self._rng)
+        odometry = self.settings.odometry
+        pictures = ImagePairs([seen.pixels for seen in waiting], self.camera, odometry, self._rng)
         ways = np.concatenate([seen.commands.distance_cm for seen in waiting])
-        self.factor = usual_way(pictures, ways, waiting[0].commands.speed_known, height).factor
+        self.factor = typical_step(pictures, ways, waiting[0].commands.speed_known).factor
         return [self._step(seen) for seen in waiting]
 
     def _step(self, seen: _Seen) -> LivePose:

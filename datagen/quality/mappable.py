@@ -8,7 +8,7 @@ from jaxtyping import Float
 from datagen.lanes.trace import other_lane
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import REFERENCE_WIDTH, summarise
-from datagen.slam.odometry.stillness import small_picture
+from datagen.slam.odometry.stillness import shrink_image
 from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.lane import SIDES
@@ -73,7 +73,7 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
 
 def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:
     """Block means of a frame relative to its brightness: suppresses noise and flicker."""
-    small = small_picture(drive, k).astype(np.float64)
+    small = shrink_image(drive.image(k)).astype(np.float64)
     return (small - small.mean()).ravel()
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Int, UInt8
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.keyframes import alongside
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import UsualWay, usual_way
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import TypicalStep, typical_step
 from datagen.slam.odometry.reflections import without_reflections
 from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
 from datagen.slam.track import CommandedMotion
@@ -79,8 +79,8 @@ class SeenDrive:
     commands: CommandedMotion
     road: SeenRoad
     scans: Scans
-    pictures: Pictures
-    usual: UsualWay
+    pictures: ImagePairs
+    usual: TypicalStep
 
 
 def see_drive(
@@ -104,6 +104,6 @@ def see_drive(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
             "road; mapping needs 20"
         )
-    pictures = Pictures(road.edges, camera, settings.odometry, rng)
-    usual = usual_way(pictures, commands.distance_cm, commands.speed_known, height)
+    pictures = ImagePairs(road.edges, camera, settings.odometry, rng)
+    usual = typical_step(pictures, commands.distance_cm, commands.speed_known)
     return SeenDrive(drive, camera, commands, road, scans, pictures, usual)

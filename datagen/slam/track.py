@@ -10,8 +10,8 @@ from pydantic import Field
 
 from datagen.slam.filter.dp_slam import FilterSettings, Trajectory, run_filter
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import Evidence, Odometry, UsualWay
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import Evidence, Odometry, TypicalStep
 from datagen.slam.odometry.scans import Progress, Scans
 from lanenet.config import Settings
 from lanenet.data.drives import Commands, Drive
@@ -131,10 +131,10 @@ def _held(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def track(
-    pictures: Pictures,
+    pictures: ImagePairs,
     scans: Scans,
     commands: CommandedMotion,
-    usual: UsualWay,
+    usual: TypicalStep,
     camera: Camera,
     filter_settings: FilterSettings,
     motion_settings: MotionSettings,
@@ -162,9 +162,7 @@ def track(
     """
     height, n = camera.mounting.height_cm, len(scans)
     compared = None if progress is None else lambda k, _: progress(k, 2 * n)
-    evidence = Evidence(
-        pictures, commands.distance_cm, commands.speed_known, height, compared, far_rad, usual
-    )
+    evidence = Evidence(pictures, usual, compared, far_rad)
     odometry = evidence.motion()
     fit = fit_steering(odometry.poses, commands, height)
     if fit is not None and commands.turn is not None:
@@ -176,7 +174,7 @@ def track(
 
 def motion_about(odometry: Odometry, settings: MotionSettings, camera_height_cm: float) -> MotionModel:
     """Return the motion of a car that does about what the odometry says."""
-    m, ways = settings, odometry.ways_cm
+    m, ways = settings, odometry.steps_cm
     moving = ways > 0.0
     return MotionModel(
         distance_cm=ways,

@@ -24,8 +24,8 @@ from datagen.pipeline import map_drive
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory, run_filter
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import Evidence
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import Evidence, typical_step
 from datagen.slam.odometry.scans import scans_of
 from datagen.slam.seen import road_edges
 from datagen.slam.track import commands_of, delayed, fit_steering
@@ -91,13 +91,14 @@ def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tu
     scans = scans_of(edges, camera, limits)
     commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)
-    pictures = Pictures(edges, camera, settings.odometry, rng)
-    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height)
+    pictures = ImagePairs(edges, camera, settings.odometry, rng)
+    typical = typical_step(pictures, commands.distance_cm, commands.speed_known)
+    evidence = Evidence(pictures, typical)
     fit = fit_steering(evidence.motion().poses, commands, height)
     predicted = None
     if fit is not None and commands.turn is not None:
         predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    motion = live_motion(commands, predicted, evidence.usual.factor, height)
+    motion = live_motion(commands, predicted, typical.factor, height)
     begun = time.process_time()
     trajectory = run_filter(scans, motion, settings.filter, height, camera.wheelbase_cm, rng)
     return trajectory, 1e3 * (time.process_time() - begun) / len(drive)

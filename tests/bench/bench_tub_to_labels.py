@@ -36,7 +36,7 @@ STAGES: list[tuple[ModuleType, str]] = [
     (self_calibration, "solve_segment"),
     (seen, "edges_of_drive"),
     (seen, "without_reflections"),
-    (seen, "usual_way"),
+    (seen, "typical_step"),
     (segment, "scans_of"),
     (mapper, "Evidence"),
     (mapper, "run_filter"),

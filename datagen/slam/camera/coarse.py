@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_rim, standing_out, usual_step
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence
 from datagen.slam.odometry.scans import Progress, seen_edges
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
@@ -131,10 +131,10 @@ def coarse_camera(
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
                 pictures = _pictures(pixels, camera, perception, seed)
                 steps = usual * _AROUND
-                _, fits = usual_step(pictures, relative, steps, _PAIRS)
+                _, fits = best_step(pictures, relative, steps, _PAIRS)
                 # How well a step fits says little: with a camera that looks too far down, standing still
                 # fits better than the truth with the right one.
-                clear = standing_out(fits, steps)[_INNER] / pictures.points_per_frame
+                clear = prominence(fits, steps)[_INNER] / pictures.points_per_frame
                 fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2)
                 step = float(steps[_INNER][np.argmax(clear)])
                 tried[focal, pitch] = Candidate(focal, pitch, step, fit)
@@ -150,7 +150,7 @@ def coarse_camera(
     return camera, list(tried.values())
 
 
-def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"]) -> float:
+def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"]) -> float:
     """The way per frame, in camera heights, with the camera in which one stands out most.
 
     A camera that is far off has no step that the pictures meet at. What it likes best then lies at either
@@ -163,9 +163,9 @@ def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"])
     steps = np.array(STEPS_HEIGHTS)
     best, most = float(np.sqrt(steps[0] * steps[-1])), 0.0
     for pictures in cameras:
-        step, fit = usual_step(pictures, relative, steps, _FIRST_PAIRS)
-        clear = float(standing_out(fit, steps).max()) / pictures.points_per_frame
-        if clear > most and not at_rim(step, steps):
+        step, fit = best_step(pictures, relative, steps, _FIRST_PAIRS)
+        clear = float(prominence(fit, steps).max()) / pictures.points_per_frame
+        if clear > most and not at_limit(step, steps):
             best, most = step, clear
     return best
 
@@ -176,11 +176,11 @@ def _spacing(values: tuple[float, ...]) -> float:
 
 def _pictures(
     pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, seed: int
-) -> Pictures:
+) -> ImagePairs:
     """The edges that see the road with a camera, the same draw of points for every camera."""
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
     edges = [seen_edges(frame, table) for frame in pixels]
-    return Pictures(edges, camera, OdometrySettings(), np.random.default_rng(seed))
+    return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(seed))
 
 
 def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Camera:

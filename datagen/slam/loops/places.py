@@ -11,7 +11,7 @@ from pydantic import Field
 
 from datagen.slam.filter.field import DirectionField
 from datagen.slam.odometry.scans import Scan, Scans, thin_scan
-from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_pictures
+from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_images
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
@@ -81,7 +81,7 @@ def thumbnails(drive: Drive) -> Float[np.ndarray, "n d"]:
     same markings.
     """
     rows = np.empty((len(drive), SMALL_HEIGHT * SMALL_WIDTH), np.float32)
-    for k, small in enumerate(small_pictures(drive)):
+    for k, small in enumerate(small_images(drive)):
         flat = small - cv2.GaussianBlur(small, (0, 0), 6.0)
         # Less than a tenth of a gray level is rounding: blank pictures would be alike by it.
         rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), 2.0)

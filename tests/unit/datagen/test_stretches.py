@@ -77,7 +77,7 @@ def test_each_stretch_keeps_its_own_poses_where_the_longest_gave_the_camera(monk
         return SimpleNamespace(solved=longest, camera=CAMERA, how="found", figures={}, note="found")
 
     monkeypatch.setattr(pipeline, "open_drive", lambda path: drive)
-    monkeypatch.setattr(pipeline, "following_frames", lambda drive, notes: drive)
+    monkeypatch.setattr(pipeline, "following_frames", lambda drive: (drive, []))
     monkeypatch.setattr(pipeline, "keep_images", lambda drive: drive)
     for check in ("check_moving", "check_edges"):
         monkeypatch.setattr(pipeline, check, lambda *_: None)

@@ -19,8 +19,8 @@ from datagen.slam.camera.coarse import (
     mapping_range,
     with_known_scale,
 )
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, best_step
 from datagen.slam.odometry.scans import seen_edges
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadTable
@@ -124,9 +124,9 @@ def test_the_step_is_that_of_the_camera_in_which_one_stands_out():
     for name, camera in (("true", true), ("far off", far_off)):
         table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
         edges = [seen_edges(frame, table) for frame in pixels]
-        pictures[name] = Pictures(edges, camera, OdometrySettings(), np.random.default_rng(0))
+        pictures[name] = ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(0))
     relative = np.ones(60)
-    wrong, _ = usual_step(pictures["far off"], relative, np.array(STEPS_HEIGHTS))
+    wrong, _ = best_step(pictures["far off"], relative, np.array(STEPS_HEIGHTS))
     step_heights = 4.0 / true.mounting.height_cm
     assert abs(wrong / step_heights - 1.0) > 0.3
     for order in (("true", "far off"), ("far off", "true")):

@@ -106,7 +106,7 @@ def test_how_the_car_answers_to_the_steering_is_learned_on_the_way(road):
     check_turned(poses, truth)
 
 
-def test_the_usual_way_per_frame_is_found_where_no_speed_was_recorded(road):
+def test_the_typical_step_is_found_where_no_speed_was_recorded(road):
     unknown = replace(road[0], commands=Commands()).subset(slice(0, 80))
     localiser = LiveLocaliser(CAMERA, SETTINGS, StartSettings(frames=60))
     counts = [len(localiser.take(moment)) for moment in moments_of(unknown)]

@@ -10,8 +10,8 @@ from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import Odometry, usual_way
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import Odometry, typical_step
 from datagen.slam.odometry.scans import scans_of
 from datagen.slam.track import (
     CommandedMotion,
@@ -179,12 +179,12 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     camera = fisheye()
     edges = pixels(road, camera)
     rng = np.random.default_rng(0)
-    pictures = Pictures(edges, camera, OdometrySettings(), rng)
+    pictures = ImagePairs(edges, camera, OdometrySettings(), rng)
     trajectory, fit = track(
         pictures,
         scans_of(edges, camera, RangeSettings()),
         commands,
-        usual_way(pictures, commands.distance_cm, speed_known, HEIGHT_CM),
+        typical_step(pictures, commands.distance_cm, speed_known),
         camera,
         FilterSettings(particles=200),
         MotionSettings(),
