@@ -248,7 +248,7 @@ def test_points_are_drawn_from_every_direction_alike():
     uv = np.concatenate([lines, across])
     normals = np.concatenate([np.tile([1.0, 0.0], (len(lines), 1)), np.tile([0.0, 1.0], (24, 1))])
     pictures = _pictures([EdgePixels(uv, normals)])
-    sector = pictures._pictures[0].sector
+    sector = pictures._images[0].sector
     assert (sector == SECTORS // 4).sum() >= SETTINGS.points // 4
 
 
