@@ -12,7 +12,7 @@ from datagen.quality.verdict import VerdictSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.coarse import GuessSettings
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.places import RevisitSettings
+from datagen.slam.loops.revisits import RevisitSettings
 from datagen.slam.odometry.image_pairs import OdometrySettings
 from datagen.slam.track import MotionSettings
 from lanenet.config import Settings

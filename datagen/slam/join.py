@@ -18,9 +18,9 @@ from datagen.slam.adjustment.adjust import BundleEstimate, Observations, adjust
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, separate_places
-from datagen.slam.loops.places import Revisit, alike, diagonal_mean, match_places, thumbnails
-from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
+from datagen.slam.loops.consistency import AGREE_HEIGHTS, AGREE_RAD, AGREE_SHARE, count_places
+from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
+from datagen.slam.loops.revisits import Revisit, diagonal_mean, match_places, similarities, thumbnails
 from datagen.slam.odometry.scans import Scans, scans_of
 from datagen.slam.seen import road_edges
 from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment
@@ -106,7 +106,7 @@ def _join(
             found.append(match)
     cross, moved = _agreeing(apart, first, found, height)
     ways = path_lengths(apart[first:])[[r.later - first for r in cross]]
-    if separate_places(ways, height) < s.min_revisits:
+    if count_places(ways, height) < s.min_revisits:
         return None
     # Of both maps what they know of themselves already, beside what they share.
     later = [replace(r, earlier=r.earlier + first, later=r.later + first) for r in other.solved.revisits]
@@ -135,8 +135,8 @@ def _join(
         start = BundleEstimate(poses, tilt, camera)
         bundle = adjust(observed, start, settings.bundle, rng, (), held + loops)
         poses, tilt = bundle.poses, bundle.tilt
-        true = borne_out(poses, revisits, height)
-        loops = loop_pairs(true, len(poses), breaks) + side_by_side(poses, height, s)
+        true = inlier_revisits(poses, revisits, height)
+        loops = loop_pairs(true, len(poses), breaks) + neighbouring_laps(poses, height, s)
     alone = base.solved.bundle, other.solved.bundle
     before = np.average([b.misfit for b in alone], weights=[b.pairs for b in alone])
     if bundle.misfit > MAX_MISFIT * before:
@@ -173,13 +173,13 @@ def _shared_places(
     """Pairs of frames, one of either stretch, that look alike, each the other's most similar one.
 
     Args:
-        base: A picture per frame of the first stretch, see :func:`datagen.slam.loops.places.thumbnails`.
+        base: A picture per frame of the first stretch, see :func:`datagen.slam.loops.revisits.thumbnails`.
         other: Likewise of the second, whose frames count on from those of the first.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
         max_pairs: Pairs at most, spread over the second stretch.
     """
     first = len(base)
-    similarity = diagonal_mean(alike(base, other))
+    similarity = diagonal_mean(similarities(base, other))
     # What surrounds the last frames of one stretch must not be taken from the other one.
     inner = similarity[: max(first - _EDGE, 0)]
     if not inner.size:
@@ -220,7 +220,7 @@ def _agreeing(
         for r in found:
             seen = relative_pose(poses[r.earlier], carried[r.later - first]) - r.relative
             between = abs(way[r.later - first] - way[one.later - first])
-            near = float(np.hypot(seen[0], seen[1])) < AGREE_HEIGHTS * height_cm + AGREE_WAY * between
+            near = float(np.hypot(seen[0], seen[1])) < AGREE_HEIGHTS * height_cm + AGREE_SHARE * between
             if near and abs(float(wrap_angle(seen[2:])[0])) < AGREE_RAD:
                 turns = carried[r.later - first, 2] - poses[r.earlier, 2] - r.relative[2]
                 kept.append(replace(r, turns=round(turns / (2.0 * np.pi))))

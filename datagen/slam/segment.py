@@ -16,15 +16,9 @@ from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, Observa
 from datagen.slam.camera.coarse import mapping_range
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import commands_between, key_frames, key_pairs, poses_between, values_between
-from datagen.slam.loops.mutual import with_supported, without_contradicted
-from datagen.slam.loops.places import (
-    Revisit,
-    consistent_revisits,
-    match_places,
-    propose_revisits,
-    thumbnails,
-)
-from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
+from datagen.slam.loops.consistency import consistent_revisits, with_supported, without_contradicted
+from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
+from datagen.slam.loops.revisits import Revisit, match_places, propose_revisits, thumbnails
 from datagen.slam.odometry.far_view import far_turns
 from datagen.slam.odometry.scans import Progress, Scans, scans_of
 from datagen.slam.seen import SeenDrive, road_edges, see_drive
@@ -134,7 +128,7 @@ def solve_frames(
     closure = _close(observed, opened, matched, settings, rng, free, believed)
     if closure is not None and not find_camera:
         # Pictures that outvote a revisit are still pulled by it.
-        true = borne_out(closure.bundle.poses, closure.revisits, height)
+        true = inlier_revisits(closure.bundle.poses, closure.revisits, height)
         if settings.revisits.min_revisits <= len(true) < len(closure.revisits):
             drift = closure.drift_rad_per_cm
             again = _closed_by(true, drift, observed, opened, settings, rng, free, believed)
@@ -146,8 +140,8 @@ def solve_frames(
             road = road_edges(drive, bundle.camera, limits, settings)
             observed = replace(observed, edges=road.edges, keep=road.keep)
             before = bundle.camera.K[0, 0]
-            true = borne_out(bundle.poses, closure.revisits, height)
-            loops = loop_pairs(true, len(drive)) + side_by_side(bundle.poses, height, settings.revisits)
+            true = inlier_revisits(bundle.poses, closure.revisits, height)
+            loops = loop_pairs(true, len(drive)) + neighbouring_laps(bundle.poses, height, settings.revisits)
             bundle = adjust(observed, bundle, settings.bundle, rng, loops=loops, prior_camera=believed)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
@@ -311,8 +305,8 @@ def _with_frames_between(
     pairs = key_pairs(keys, settings.bundle.lags)
     if revisits:
         # Those that the key frames' map contradicts would pull again.
-        true = borne_out(poses, revisits, height)
-        pairs += loop_pairs(true, len(drive)) + side_by_side(poses, height, settings.revisits)
+        true = inlier_revisits(poses, revisits, height)
+        pairs += loop_pairs(true, len(drive)) + neighbouring_laps(poses, height, settings.revisits)
     observed = Observations(road.edges, road.keep, commands.relative_ways, commands.speed_known)
     start = BundleEstimate(poses, values_between(solved.bundle.tilt, keys, ways), camera)
     bundle = adjust(observed, start, settings.bundle, rng, (), pairs)

@@ -10,7 +10,7 @@ import pytest
 from datagen.pipeline import _check_size, hide_bumper, split_segments
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import GuessSettings, guessed_camera
-from datagen.slam.loops.places import Revisit
+from datagen.slam.loops.revisits import Revisit
 from datagen.slam.segment import count_laps
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.recording import Commands, Drive

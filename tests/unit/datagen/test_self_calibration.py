@@ -27,7 +27,7 @@ from datagen.slam.camera.self_calibration import (
     refining,
 )
 from datagen.slam.filter.dp_slam import Trajectory
-from datagen.slam.loops.places import Revisit
+from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.camera_file import write_camera

@@ -13,7 +13,7 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings, Trajectory
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.places import Revisit
+from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment, _with_frames_between, solve_segment
 from datagen.slam.track import commands_of

@@ -14,8 +14,8 @@ from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, BundleS
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.join import Stretch, _agreeing, frames_text, join_stretches
 from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.seen import SeenRoad, road_edges
 from datagen.slam.segment import solve_segment
 from lanenet.data.drives.recording import Commands, Drive
