@@ -242,8 +242,8 @@ class LiveLocaliser:
         """
         if self.factor is None:
             raise TrackingLostError(
-                f"{self.dropped} frames of a moving car: the typical step length needs {LEAST_START} that follow "
-                "each other, or has to be given"
+                f"{self.dropped} frames of a moving car: the typical step length needs {LEAST_START} that "
+                "follow each other, or has to be given"
             )
 
     def _begin(self) -> None:

@@ -175,7 +175,7 @@ def frames_at(*rows: tuple[int, float]) -> list[Frame | None]:
     return [Frame(np.full((4, 6, 3), number, np.uint8), t_s, number) for number, t_s in rows]
 
 
-def test_a_running_camera_gives_moments_at_the_speed_that_is_meant():
+def test_a_running_camera_gives_frames_at_the_speed_that_is_meant():
     rows = frames_at((0, 5.0), (1, 5.1), (4, 5.4))
     source = Replayed([rows[0], None, *rows[1:]])
     frames = CameraFrames(source, 50.0)

@@ -87,7 +87,7 @@ def test_one_wrong_revisit_among_ten_is_left_unsatisfied(wrong):
 
 
 @pytest.mark.parametrize("dashes", [2.0, -2.0])
-def test_a_revisit_that_shows_the_next_dash_is_not_borne_out(dashes):
+def test_a_revisit_that_shows_the_next_dash_is_no_inlier(dashes):
     true, drifted = _laps(np.deg2rad(20.0))
     revisits = _revisits(true, range(5, 96, 10))
     revisits[4] = replace(revisits[4], relative=revisits[4].relative + [dashes * HEIGHT_CM, 0.0, 0.0])
