@@ -119,8 +119,8 @@ def _map_drive(
     rng = np.random.default_rng(settings.seed)
     recorded = keep_images(open_drive(drive_path))
     check_moving(recorded)
-    drive, found = following_frames(recorded)
-    notes = [*recorded.problems, *found]
+    drive, seen = following_frames(recorded)
+    notes = [*recorded.problems, *seen]
     segments = split_segments(drive)
     # What the driver deleted gets no labels, and where the car leaves the road it tells nothing of them.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
