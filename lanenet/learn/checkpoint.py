@@ -33,8 +33,7 @@ from lanenet.learn.export import (
 from lanenet.learn.network import LaneNet
 from lanenet.learn.predict import Answers
 from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, STATE_NAME, EpochRecord, best_record
-from lanenet.perception.network.detector import ModelMeta
-from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME
+from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
 from lanenet.samples.dataset import LaneSamples
 
 CURVE_NAME = "curve"

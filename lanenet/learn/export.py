@@ -25,13 +25,16 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
-from lanenet.perception.network.detector import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
+    INPUT_NAME,
     MARKER_NAME,
     MODEL_NAME,
+    OUTPUT_NAMES,
     WIDTH_NAME,
+    ModelMeta,
     is_model,
+    open_model,
     without_model,
 )
 

@@ -14,10 +14,8 @@ from jaxtyping import UInt8
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from lanenet.data.files import atomic_file, write_json
-from lanenet.errors import CheckpointError
 from lanenet.learn.export import CALIBRATION_NAME, RASTERS_NAME, quiet, read_rasters
-from lanenet.perception.network.detector import INPUT_NAME, open_model
-from lanenet.perception.network.model_file import MODEL_NAME
+from lanenet.perception.network.model_file import INPUT_NAME, MODEL_NAME, open_model
 
 INT8_NAME = "model-int8.onnx"
 #: Largest RMS change of the points by quantisation. Chosen: a tenth of a good network's RMSE.
@@ -84,8 +82,6 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
     source = checkpoint / MODEL_NAME
     path = checkpoint / INT8_NAME if out is None else out
     session, meta = open_model(source)
-    if not meta.tells_sigma:
-        raise CheckpointError(f"{source}: the model has an older format; train it again")
     rasters = read_rasters(checkpoint / CALIBRATION_NAME, meta)
     checks = read_rasters(checkpoint / RASTERS_NAME, meta)
     path.parent.mkdir(parents=True, exist_ok=True)

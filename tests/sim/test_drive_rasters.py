@@ -18,7 +18,8 @@ from lanenet.onboard.cameras.replay import ReplaySettings, ReplaySource
 from lanenet.onboard.guard import NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
 from lanenet.onboard.safety import LimitSettings, SafetySettings
-from lanenet.perception.network.detector import INPUT_NAME, NetworkDetector
+from lanenet.perception.network.detector import NetworkDetector
+from lanenet.perception.network.model_file import INPUT_NAME
 
 MODEL = Path(__file__).resolve().parents[2] / "checkpoints" / "small" / "model.onnx"
 

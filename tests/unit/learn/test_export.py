@@ -20,7 +20,7 @@ from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
-from lanenet.perception.network.detector import ModelMeta, read_model_meta
+from lanenet.perception.network.model_file import ModelMeta, read_model_meta
 
 torch.set_num_threads(1)
 
