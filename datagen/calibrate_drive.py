@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from datagen.lanes.scale import LaneScale, measure_lane
-from datagen.pipeline import hide_bumper, split_segments
-from datagen.quality.mappable import check_moving
+from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
 from datagen.quality.pictures import straight_frames
 from datagen.settings import MapSettings
-from datagen.slam.camera.coarse import Candidate, with_known_scale
+from datagen.slam.camera.changes import with_known_scale
+from datagen.slam.camera.coarse import Candidate
 from datagen.slam.camera.self_calibration import (
     DRIVE_INSTEAD,
     MIN_FRAMES,
@@ -21,9 +21,9 @@ from datagen.slam.camera.self_calibration import (
     check_observable,
     find_camera,
 )
-from datagen.slam.kept_images import keep_images
 from datagen.slam.odometry.scans import Progress
 from datagen.slam.odometry.stillness import following_frames
+from datagen.slam.segment import SegmentSolver
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import CalibrationError, TrackingLostError
@@ -150,20 +150,16 @@ def calibrate_drive(
             "pictures do not tell lengths: expected the lane's width or the camera's height, found neither"
         )
     drive, notes = _moving_part(keep_images(open_drive(drive_path)), start)
-    settings = hide_bumper(drive, settings, notes)
+    settings, hidden = hide_bumper(drive, settings)
+    notes += hidden
     if start is not None:
         guess = settings.guess.model_copy(update={"wheelbase_cm": start.wheelbase_cm})
         settings = settings.model_copy(update={"guess": guess})
     rng = np.random.default_rng(settings.seed)
+    solver = SegmentSolver(settings, rng, _track_progress(progress))
+    search = None if progress is None else lambda done, total: progress("try cameras", done, total)
     try:
-        found = find_camera(
-            drive,
-            start,
-            settings,
-            rng,
-            _follow_progress(progress),
-            None if progress is None else lambda done, total: progress("try cameras", done, total),
-        )
+        found = find_camera(drive, start, solver, search)
     except TrackingLostError as error:
         raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
     if progress is not None:
@@ -174,7 +170,7 @@ def calibrate_drive(
     )
     factor, height_sigma, scale_from = _scale(found.camera, lane, lane_width_cm, camera_height_cm)
     height = found.camera.mounting.height_cm
-    camera = with_known_scale(found.camera, factor, settings.guess)
+    camera = with_known_scale(found.camera, factor, settings.guess.wheelbase_cm)
     lane_cm = None if lane is None else factor * lane.width_cm
     if lane_width_cm and lane_cm and abs(lane_cm / lane_width_cm - 1.0) > _OTHER_LANE:
         notes.append(
@@ -200,7 +196,7 @@ def calibrate_drive(
 _ADJUST = "adjust poses and camera"
 
 
-def _follow_progress(progress: StageProgress | None) -> Progress | None:
+def _track_progress(progress: StageProgress | None) -> Progress | None:
     """Report the filter's progress, and after it the stage of the adjustment, which has no steps."""
     if progress is None:
         return None
@@ -224,8 +220,7 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
     _check_count(recorded, len(recorded), "frames")
     try:
         check_moving(recorded)
-        moving, found = following_frames(recorded)
-        notes += found
+        moving = following_frames(recorded, notes)
         _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
         segments = split_segments(moving)
     except TrackingLostError as error:
@@ -245,7 +240,7 @@ def _check_count(drive: Drive, count: int, what: str) -> None:
 
 def _lane_of(found: FoundCamera, settings: MapSettings, where: Path, needed: bool) -> LaneScale | None:
     try:
-        return measure_lane(found.solved, settings, found.sigma)
+        return measure_lane(found.solved, found.sigma, settings.trace, settings.fit)
     except TrackingLostError as error:
         if needed:
             raise CalibrationError(

@@ -16,7 +16,7 @@ from datagen.datasets.done import Output, fingerprint, key_of
 from datagen.datasets.settings import DataSettings, RecordedSettings
 from datagen.datasets.splits import split_recording
 from datagen.labels.truth import truth_labels
-from datagen.pipeline import MapSettings, label_map, map_drive
+from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from datagen.world.variety import first_world, vary_simulation
 from lanenet.data.files import write_text
@@ -150,7 +150,7 @@ class SyntheticJob:
             return
         pictures, lane_cm = self.number < _PICTURED, track.lane_width_cm
         Output(self.frames / "map.yaml", key_of(self.simulation, mapping)).make(
-            lambda: map_drive(self.drive, lane_cm, None, mapping, self.frames, pictures=pictures)
+            lambda: map_drive(MapRequest(self.drive, lane_cm), mapping, self.frames, pictures=pictures)
         )
         label_map(
             self.frames, self.labels, window=data.window, colour_weight=data.colour_weight, pictures=pictures
@@ -219,11 +219,11 @@ class RecordedJob:
             for role in ROLES
         )
 
+        request = MapRequest(settings.path, settings.lane_width_cm, settings.camera)
+
         def make() -> None:
             Output(self.frames / "map.yaml", key_of(mapped, *recording)).make(
-                lambda: map_drive(
-                    settings.path, settings.lane_width_cm, settings.camera, settings.map, self.frames
-                )
+                lambda: map_drive(request, settings.map, self.frames)
             )
             label_map(self.frames, whole.path, window=data.window, colour_weight=data.colour_weight)
             for part, labels in zip(parts, split_recording(read_labels(whole.path), settings), strict=True):

@@ -24,7 +24,6 @@ class MappedSegment:
     """A segment with its lane, in the scale of its camera.
 
     Attributes:
-        rows: Its frames, as positions in the drive.
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
         lane: The traced lane.
@@ -32,12 +31,16 @@ class MappedSegment:
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
     """
 
-    rows: Int[np.ndarray, "n"]
     solved: SolvedSegment
     s_frames_cm: Float[np.ndarray, "n"]
     lane: TracedLane
     lines: list[LaneLine]
     free_lane_cm: float | None = None
+
+    @property
+    def rows(self) -> Int[np.ndarray, "n"]:
+        """Its frames, as positions in the drive."""
+        return self.solved.rows
 
 
 def check_lane(parts: list[MappedSegment], drive: Drive) -> None:

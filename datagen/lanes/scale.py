@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.lanes.fit import fit_lines
+from datagen.lanes.fit import FitSettings, fit_lines
+from datagen.lanes.follow import TraceSettings
 from datagen.lanes.path import Path, PathEdges, edges_along_path, path_of_poses
 from datagen.lanes.trace import TracedLane, trace_lane
-from datagen.settings import MapSettings
-from datagen.slam.camera.coarse import nudged
+from datagen.slam.camera.changes import nudged
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.line import LaneLine
@@ -71,22 +71,25 @@ def edges_beside(
     return path, edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach_cm)
 
 
-def measure_lane(solved: SolvedSegment, settings: MapSettings, sigma: dict[str, float]) -> LaneScale:
+def measure_lane(
+    solved: SolvedSegment, sigma: dict[str, float], trace: TraceSettings, fit: FitSettings
+) -> LaneScale:
     """Find the driven lane of a segment and measure how wide it is.
 
     Args:
         solved: The segment, with its camera.
-        settings: How lines are looked for and fitted.
         sigma: Standard deviations of the camera's numbers, see
             :class:`datagen.slam.adjustment.adjust.BundleResult`.
+        trace: How lane lines are looked for.
+        fit: Cubics through them.
 
     Raises:
         TrackingLostError: If no two lines run along the drive.
     """
     height = solved.camera.mounting.height_cm
     path, edges = edges_beside(solved, solved.scans)
-    lane = trace_lane(path, edges, height, None, settings.trace)
-    lines = fit_lines(path, edges, lane, height, settings.fit)
+    lane = trace_lane(path, edges, height, None, trace)
+    lines = fit_lines(path, edges, lane, height, fit)
     width_cm = fitted_width_cm(lines, lane, path.s_frames_cm)
     both = spacing_cm(lines, path.s_cm)
     spread = 1.4826 * float(np.median(np.abs(both - width_cm))) if both.size else 0.1 * width_cm

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.quality.residuals import REFERENCE_WIDTH, BorderSamples, border_samples
-from datagen.slam.camera.coarse import mapping_range
+from datagen.quality.residuals import REFERENCE_WIDTH, BorderSamples, ResidualSettings, border_samples
+from datagen.slam.view import mapping_range
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.geometry.poses import path_lengths
 from lanenet.perception.edges.canny import find_edges
@@ -55,6 +55,7 @@ def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
             drive_map.meta.tape_cm,
             drive_map.camera_at(k),
             table.keep,
+            ResidualSettings(),
         )
         samples = samples.select(samples.ahead_cm < _REACH_CM)
         counts[i] = len(samples.residual_px) >= _MIN_VIEW

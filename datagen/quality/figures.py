@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 
 from datagen.lanes.mapped import MappedSegment
 from datagen.quality.verdict import LineEvidence, MapEvidence
-from datagen.slam.loops.pose_graph import revisit_residuals
+from datagen.slam.loops.pose_graph import missed_by
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import known_lines
 from lanenet.geometry.camera import Camera
@@ -65,7 +65,7 @@ def map_figures(
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
-        residual = np.abs(revisit_residuals(solved.poses, solved.revisits))
+        residual = np.abs(missed_by(solved.poses, solved.revisits))
         segments.append(
             {
                 "first_frame": int(numbers[part.rows[0]]),
@@ -188,13 +188,14 @@ def map_evidence(
 
 
 def map_notes(
-    drive_map: DriveMap, figures: dict[str, Any], camera_known: bool, free_cm: float | None
+    drive_map: DriveMap, figures: dict[str, Any], frames: int, camera_known: bool, free_cm: float | None
 ) -> list[str]:
     """Say in sentences what was mapped.
 
     Args:
         drive_map: The map.
         figures: Its figures.
+        frames: Number of frames of the drive.
         camera_known: Whether the camera was given.
         free_cm: See :func:`free_lane_cm`; if there is one, the mapped lane is not the road's.
     """
@@ -203,7 +204,7 @@ def map_notes(
     path = sum(segment["path_cm"] for segment in figures["segments_mapped"])
     lane = "lane" if free_cm is None else "distance of the mapped lines"
     notes = [
-        f"{len(drive_map.frames)} of {figures['frames']} frames mapped, {path / 100.0:.1f} m of road, "
+        f"{len(drive_map.frames)} of {frames} frames mapped, {path / 100.0:.1f} m of road, "
         f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, so no loop was closed"),
         f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
         f"scale from the {meta.scale_from}",

@@ -18,7 +18,7 @@ from datagen.quality.measure import MapQuality
 from datagen.quality.pictures import contact_sheets
 from datagen.quality.residuals import REFERENCE_WIDTH
 from datagen.quality.verdict import Verdict, VerdictSettings
-from datagen.slam.track import SteeringFit
+from datagen.slam.commands import SteeringFit
 from lanenet.data.maps.folder import MapMeta
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.camera import Camera

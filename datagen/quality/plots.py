@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
 from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
-from datagen.slam.track import SteeringFit, commands_of, delayed
+from datagen.slam.commands import SteeringFit, commands_of, delayed
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import DELETED, MappedDrive

@@ -31,12 +31,13 @@ def map_drive(
     wheelbase: WheelbaseOption = None,
 ) -> None:
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
-    from datagen.pipeline import MapSettings
+    from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
+    request = MapRequest(drive, lane_width, camera, refine_camera, wheelbase)
     with console.progress_bar("map") as progress:
-        report = run(drive, lane_width, camera, settings, out, progress, refine_camera, wheelbase)
+        report = run(request, settings, out, progress)
     console.show_lines(report.lines)
     console.wrote(out, out / "report.html")
     if report.figures["verdict"]["grade"] == "reject":

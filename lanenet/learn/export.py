@@ -25,16 +25,13 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.perception.network.detector import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
-    INPUT_NAME,
     MARKER_NAME,
     MODEL_NAME,
-    OUTPUT_NAMES,
     WIDTH_NAME,
-    ModelMeta,
     is_model,
-    open_model,
     without_model,
 )
 
@@ -42,11 +39,10 @@ from lanenet.perception.network.model_file import (
 OPSET = 18
 IR_VERSION = 9
 #: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
-#: Chosen: far below any error that matters, and 30 times what is found.
 TOLERANCE = 1e-3
-#: Lane widths that a network is given in the check, beside none at all: unknown, narrow and wide.
+#: Widths of the lane that the check tells a network that can be told, after a run without any.
 _CHECKED_WIDTHS_CM = (0.0, 30.0, 60.0)
-#: Rasters of the check at a time; bounds the memory.
+#: Rasters that the check takes at a time.
 _BATCH = 256
 
 CHECKPOINT_FORMAT = "lanenet-checkpoint/1"
@@ -61,11 +57,11 @@ def export_onnx(
 ) -> float:
     """Write a network as ONNX, after a check against PyTorch.
 
-    The file appears at ``path`` only if onnxruntime answers as PyTorch does.
+    The file appears at ``path`` only when onnxruntime answers as PyTorch does.
 
     Args:
         network: Trained network.
-        meta: Its description, kept in the file.
+        meta: Its description, stored in the file.
         rasters: Real rasters for the check.
         path: File to write.
 
@@ -73,7 +69,7 @@ def export_onnx(
         The largest difference of any output on the rasters, [cm] or smaller units.
 
     Raises:
-        CheckpointError: If there is no raster, or the answers differ by more than ``TOLERANCE``.
+        CheckpointError: If there is no raster, or the file's answers differ from PyTorch's.
     """
     if not len(rasters):
         raise CheckpointError(f"{path}: no raster to check the export with, expected at least one")
@@ -116,7 +112,10 @@ def export_checkpoint(checkpoint: Path, out: Path | None = None, labels: Sequenc
     Args:
         checkpoint: Folder that :func:`lanenet.learn.train.train` wrote.
         out: File to write; None replaces the folder's ``model.onnx``.
-        labels: Label sets whose rasters are checked beside those in the folder.
+        labels: Label sets on whose rasters the file is checked, beside those that the folder holds.
+
+    Returns:
+        The file that was written, and how well it agrees with PyTorch.
 
     Raises:
         CheckpointError: If a file of the folder is missing or does not fit, a label set has another window,
@@ -151,7 +150,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     if not checkpoint.is_dir():
         found = "is a file" if checkpoint.exists() else "no such folder"
         raise CheckpointError(f"{checkpoint}: {found}, expected a checkpoint folder")
-    # A checkpoint without its config or without its weights is named below.
+    # Without its config or its weights alone it is a broken one, which is told below.
     if not is_model(checkpoint) and not any((checkpoint / n).is_file() for n in (CONFIG_NAME, WEIGHTS_NAME)):
         raise CheckpointError(f"{checkpoint}: expected a checkpoint: {without_model(checkpoint)}")
     check_marker(checkpoint)
@@ -172,7 +171,9 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         meta = ModelMeta.from_properties(properties, str(path))
     except ModelMismatchError as error:
         raise CheckpointError(str(error)) from None
-    network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
+    # Checkpoints from before there were bins do not say that they have none.
+    older = {} if "bins_cm" in state else {"bins": 0}
+    network = LaneNet(settings.network.model_copy(update=older), meta.window.rows, meta.window.columns)
     try:
         network.load_state_dict(state)
     except RuntimeError as error:
@@ -199,11 +200,11 @@ def check_marker(checkpoint: Path) -> None:
 
 
 def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
-    """Write rasters as one tall image, so that a later export can be checked without the data."""
+    """Keep rasters as one tall picture, so that a later export can be checked without the data."""
     tall = rasters.reshape(-1, rasters.shape[-1])
     done, png = cv2.imencode(".png", tall)
     if not done:
-        raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as an image")
+        raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as a picture")
     with atomic_file(path) as temporary:
         temporary.write_bytes(png.tobytes())
 
@@ -212,14 +213,14 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
     """Read what :func:`write_rasters` wrote.
 
     Raises:
-        CheckpointError: If the image is missing or does not fit the window.
+        CheckpointError: If the picture is missing or does not fit the window.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; an export needs its rasters")
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
     rows, columns = meta.window.rows, meta.window.columns
     if image is None or image.shape[1] != columns or image.shape[0] % rows:
-        found = "no image" if image is None else f"{image.shape[0]} x {image.shape[1]}"
+        found = "no picture" if image is None else f"{image.shape[0]} x {image.shape[1]}"
         raise CheckpointError(f"{path}: found {found}, expected rasters of {rows} x {columns}")
     return np.asarray(image).reshape(-1, 1, rows, columns)
 
@@ -228,7 +229,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
     example = [torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)]
     inputs, shapes = [INPUT_NAME], [{0: torch.export.Dim(BATCH_NAME, min=1)}]
     if meta.takes_width:
-        # Two, not one: the exporter takes a dimension of one for a constant.
+        # Not one wide: the exporter would take a dimension of one for a constant.
         example.append(torch.zeros(2))
         inputs.append(WIDTH_NAME)
         shapes.append(shapes[0])
@@ -245,9 +246,9 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
             dynamic_shapes=tuple(shapes),
         )
     if program is None:
-        raise CheckpointError("torch.onnx.export returned None, expected a program")
+        raise CheckpointError("torch.onnx.export answered nothing, expected a program")
     model: onnx.ModelProto = program.model_proto
-    # The exporter writes source lines and folders of this machine on every node; IR 9 does not know them.
+    # The exporter notes source lines and folders of this machine on every node; IR 9 does not know them.
     for node in model.graph.node:
         node.ClearField("doc_string")
         if "metadata_props" in node.DESCRIPTOR.fields_by_name:
@@ -267,7 +268,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
 
 
 def _make_optional(graph: onnx.GraphProto) -> None:
-    """Make the lane width optional; left out, it is unknown: 0."""
+    """Let the lane's width be left out of a run, which is to say that it is unknown: 0."""
     width = next(value for value in graph.input if value.name == WIDTH_NAME)
     # One for all rasters, or one for each.
     width.type.tensor_type.shape.dim[0].dim_param = "w"
@@ -282,18 +283,18 @@ def _largest_difference(
     feeds: list[dict[str, np.ndarray]] = [{}, *({WIDTH_NAME: np.array([w], np.float32)} for w in widths_cm)]
     for begin in range(0, len(rasters), _BATCH):
         some = rasters[begin : begin + _BATCH]
-        for given in feeds:
+        for told in feeds:
             with torch.inference_mode():
-                expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in given.values()))
-            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | given)
+                expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in told.values()))
+            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | told)
             off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
-    # Not Python's max(), which ignores NaN.
+    # Not Python's max(), which passes over what is no number.
     return float(np.max(off))
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Silence the exporters: prints, log lines, warnings."""
+    """Keep the exporters' chatter (prints, log lines, warnings) to itself."""
     previous = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -1,4 +1,7 @@
-"""What a training run keeps on disk and starts from: its state, its end, and weights for fine-tuning."""
+"""What a training run keeps on disk: the state to go on from, and the sign that it is finished.
+
+Weights to start from: fine-tuning a network that has been trained before.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from lanenet.samples.dataset import hash_files
 def check_start(
     settings: LearnSettings, window: BirdseyeWindow, perceptions: Sequence[PerceptionSettings]
 ) -> None:
-    """Refuse starting weights that the training would refuse, before its data is made.
+    """Refuse weights to begin with that the training would refuse, before its data is made.
 
     Args:
         settings: Of the training.
@@ -46,7 +49,7 @@ def check_start(
 def load_start_weights(
     network: LaneNet, folder: Path, window: BirdseyeWindow, perception: PerceptionSettings
 ) -> None:
-    """Load the weights of a checkpoint, with the mean and the scale of the labels that belong to them.
+    """Take over the weights of a checkpoint, with the mean and the spread of the labels that they belong to.
 
     Args:
         network: Network to change.
@@ -67,7 +70,7 @@ def load_start_weights(
     unlike = perception.unlike(meta.perception)
     if unlike:
         raise CheckpointError(
-            f"learn.start_from {folder}: was trained on edges with other settings than those of the labels "
+            f"learn.start_from {folder}: was trained on edges found in another way than those of the labels "
             f"({unlike}); set data.colour_weight to the checkpoint's"
         )
     weights = start.state_dict()
@@ -83,16 +86,16 @@ def load_start_weights(
 
 
 def hash_of_start(folder: Path | None) -> str:
-    """Return a hash of the weights that a run starts from; empty for random weights.
+    """Return a hash of the weights that a run starts from; empty where it starts anew.
 
     Raises:
-        CheckpointError: If the folder has none.
+        CheckpointError: If there are none.
     """
     if folder is None:
         return ""
     path = folder / WEIGHTS_NAME
     if not path.is_file():
-        raise CheckpointError(f"learn.start_from {folder}: no {WEIGHTS_NAME}, expected a checkpoint")
+        raise CheckpointError(f"learn.start_from {folder}: no {WEIGHTS_NAME} in it, expected a checkpoint")
     return hash_files([path])
 
 
@@ -115,7 +118,8 @@ class EpochRecord:
         learning_rate: At the end of the epoch.
         samples_per_s: Speed of the training part.
         val_trimmed_cm: As ``val_rmse_cm``, without the largest hundredth of the errors: some labels from maps
-            are wrong by a lane, and the network that agrees with them is not the best one.
+            are wrong by a lane, and the network that agrees with them is not the best one. NaN in what older
+            versions left.
     """
 
     epoch: int
@@ -123,12 +127,12 @@ class EpochRecord:
     val_rmse_cm: float
     learning_rate: float
     samples_per_s: float
-    val_trimmed_cm: float
+    val_trimmed_cm: float = math.nan
 
 
 @dataclass
 class RunState:
-    """All that a stopped run needs to resume as if it had not stopped.
+    """All that a stopped run needs to go on as if it had not stopped.
 
     Random numbers follow from the seed and the epoch, so no generator is kept.
 
@@ -155,7 +159,7 @@ def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
 
 
 def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
-    """Return a hash of all that decides a run: version, settings, contents of the files, starting weights.
+    """Return a hash of all that decides a run: how it learns, settings, files' contents, first weights.
 
     Raises:
         LabelFormatError: If a file cannot be read.
@@ -170,7 +174,7 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
 
 
 def write_state(path: Path, state: RunState, run_hash: str) -> None:
-    """Write the state; a kill while writing leaves the previous one."""
+    """Write the state; a kill while writing leaves the one before."""
     data = {
         "run_hash": run_hash,
         "network": state.network,

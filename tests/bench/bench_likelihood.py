@@ -20,15 +20,13 @@ from typing import Any
 import numpy as np
 
 from datagen.localise.live_filter import live_motion
-from datagen.pipeline import map_drive
+from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
-from datagen.slam.camera.coarse import mapping_range
+from datagen.slam.commands import commands_of, fit_steering
 from datagen.slam.filter.dp_slam import Trajectory, run_filter
-from datagen.slam.odometry.image_pairs import ImagePairs
-from datagen.slam.odometry.odometry import Evidence, typical_step
-from datagen.slam.odometry.scans import scans_of
-from datagen.slam.seen import road_edges
-from datagen.slam.track import commands_of, delayed, fit_steering
+from datagen.slam.odometry.image_pairs import Pictures
+from datagen.slam.odometry.odometry import Evidence
+from datagen.slam.view import view_road
 from lanenet.config import load_settings
 from lanenet.data.drives import read_truth
 from lanenet.data.maps.folder import SETTINGS_NAME
@@ -86,19 +84,17 @@ def between(poses: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
 def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tuple[Trajectory, float]:
     """Run the filter alone over the frames of the map; its trajectory, and processor time per frame, [ms]."""
     drive, camera = mapped.drive.subset(mapped.rows[rows]), mapped.drive_map.camera
-    limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
-    edges = road_edges(drive, camera, limits, settings).edges
-    scans = scans_of(edges, camera, limits)
+    road = view_road(drive, camera, settings)
+    scans = road.scans(camera)
     commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)
-    pictures = ImagePairs(edges, camera, settings.odometry, rng)
-    typical = typical_step(pictures, commands.distance_cm, commands.speed_known)
-    evidence = Evidence(pictures, typical)
+    pictures = Pictures(road.edges, camera, settings.odometry, rng)
+    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height)
     fit = fit_steering(evidence.motion().poses, commands, height)
     predicted = None
     if fit is not None and commands.turn is not None:
-        predicted = fit.gain * delayed(commands.turn, fit.lag_frames) + fit.trim_per_cm
-    motion = live_motion(commands, predicted, typical.factor, height)
+        predicted = fit.curvature_per_cm(commands.turn)
+    motion = live_motion(commands, predicted, evidence.usual.factor, height)
     begun = time.process_time()
     trajectory = run_filter(scans, motion, settings.filter, height, camera.wheelbase_cm, rng)
     return trajectory, 1e3 * (time.process_time() - begun) / len(drive)
@@ -132,7 +128,9 @@ def remapped(mapped: MappedDrive, folder: Path, settings: MapSettings, out: Path
     """Run the whole mapping, with the map's camera as known."""
     width_cm = mapped.drive_map.meta.mapped_lane_cm
     try:
-        figures = map_drive(mapped.drive.path, width_cm, folder / "camera.yaml", settings, out).figures
+        figures = map_drive(
+            MapRequest(mapped.drive.path, width_cm, folder / "camera.yaml"), settings, out
+        ).figures
     except LanenetError as error:
         return {"refused": str(error)}
     both = figures["held_out"]["both_lines"]

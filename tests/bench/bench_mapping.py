@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from datagen.labels.truth import true_lines
-from datagen.pipeline import map_drive
+from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
 from datagen.slam.odometry.stillness import following_frames
 from datagen.world.road.track_settings import preset_names
@@ -31,6 +31,7 @@ from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.maps.folder import read_map
 from lanenet.data.maps.labelled_frames import read_map_frames
+from lanenet.data.trajectory import read_tum
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
@@ -136,7 +137,7 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     shutil.rmtree(out, ignore_errors=True)
     map_settings = MapSettings.model_validate({"guess": {"wheelbase_cm": settings.car.wheelbase_cm}})
     try:
-        report = map_drive(drive if known else blind, lane_width_cm, None, map_settings, out)
+        report = map_drive(MapRequest(drive if known else blind, lane_width_cm), map_settings, out)
     except LanenetError as error:
         return row | {"refused": str(error)}
     row["cpu_s"] = round(time.process_time() - start, 1)
@@ -148,7 +149,7 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     true_points[true_lines(drive, truth, settings.car.wheelbase_cm)[1]] = np.nan
     miss_cm = frames.points_cm - true_points[index]
     # A frame that counts and was not mapped is one without labels; repeated ones and pauses do not count.
-    counted = np.unique(np.concatenate([following_frames(open_drive(drive))[0].frames, index]))
+    counted = np.unique(np.concatenate([following_frames(open_drive(drive), []).frames, index]))
     labelable = np.isfinite(true_points[counted]).sum()
     row["labelled"] = round(float(np.isfinite(miss_cm).sum() / max(labelable, 1)), 4)
     for k, y_cm in enumerate(ROWS_CM):
@@ -163,7 +164,7 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     miss = np.linalg.norm(aligned(drive_map.poses[:, :2], xy) - xy, axis=1)
     lap_cm = settings.track.length_cm or 0.0
     row["ate_cm_per_10_m"] = round(float(np.sqrt(np.mean(miss**2))) * 1000.0 / lap_cm, 3)
-    row["open_drift_percent"] = round(drift_percent(100.0 * np.loadtxt(out / "open_loop.tum")[:, 1:3], xy), 3)
+    row["open_drift_percent"] = round(drift_percent(read_tum(out / "open_loop.tum")[1], xy), 3)
     row["revisits"] = report.figures["segments_mapped"][0]["revisits"]
     row["laps"] = drive_map.meta.laps
     row["focal_error_percent"] = round(

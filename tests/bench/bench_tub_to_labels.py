@@ -21,29 +21,27 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from datagen import pipeline
-from datagen.lanes import find as stretches
+from datagen import check, pipeline, prepare, segments
 from datagen.settings import MapSettings
-from datagen.slam import seen, segment
-from datagen.slam import track as mapper
+from datagen.slam import segment, track, view
 from datagen.slam.camera import self_calibration
 
 #: Outermost first.
-STAGES: list[tuple[ModuleType, str]] = [
-    (pipeline, "following_frames"),
+STAGES: list[tuple[ModuleType | type, str]] = [
+    (prepare, "following_frames"),
     (pipeline, "find_camera"),
     (self_calibration, "coarse_camera"),
-    (self_calibration, "solve_segment"),
-    (seen, "edges_of_drive"),
-    (seen, "without_reflections"),
-    (seen, "typical_step"),
-    (segment, "scans_of"),
-    (mapper, "Evidence"),
-    (mapper, "run_filter"),
+    (segment.SegmentSolver, "solve"),
+    (view, "edges_of_drive"),
+    (view, "without_reflections"),
+    (view, "usual_way"),
+    (view, "scans_of"),
+    (track, "Evidence"),
+    (track, "run_filter"),
     (segment, "match_places"),
     (segment, "adjust"),
-    (stretches, "_find_lane"),
-    (pipeline, "measure_map"),
+    (segments, "find_lane"),
+    (check, "measure_map"),
     (pipeline, "report_page"),
     (pipeline, "label_map"),
 ]
@@ -58,7 +56,7 @@ def cpu_s() -> float:
 class Stage:
     """Calls of one function, and what they cost."""
 
-    def __init__(self, module: ModuleType, name: str) -> None:
+    def __init__(self, module: ModuleType | type, name: str) -> None:
         self.name, self.calls, self.cpu_s = name.lstrip("_"), 0, 0.0
         inner: Callable[..., Any] = getattr(module, name)
 
@@ -90,7 +88,9 @@ def main() -> None:
     begun, begun_cpu = time.perf_counter(), cpu_s()
     with tempfile.TemporaryDirectory() as folder:
         drive_map = Path(folder) / "map"
-        report = pipeline.map_drive(args.drive, args.lane_width, None, MapSettings(), drive_map)
+        report = pipeline.map_drive(
+            pipeline.MapRequest(args.drive, args.lane_width), MapSettings(), drive_map
+        )
         labels = pipeline.label_map(drive_map, Path(folder) / "labels.parquet")
     total = {"cpu_s": round(cpu_s() - begun_cpu, 1), "wall_s": round(time.perf_counter() - begun, 1)}
     for stage in stages:

@@ -53,7 +53,7 @@ def read_donkeycar_pilot(path: Path) -> Any:
 
 
 def read_car(path: Path) -> Any:
-    from lanenet.onboard.drive import load_drive_settings
+    from lanenet.onboard.drive_settings import load_drive_settings
 
     return load_drive_settings(path)
 
@@ -137,15 +137,8 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
     from lanenet.learn.checkpoint import publish
     from lanenet.learn.train import train
 
-    def map_drive(
-        drive: Path,
-        lane_width_cm: float,
-        camera: Path | None,
-        settings: Any,
-        out: Path,
-        pictures: bool = True,
-    ) -> None:
-        assert lane_width_cm > 20.0
+    def map_drive(request: Any, settings: Any, out: Path, pictures: bool = True) -> None:
+        assert request.lane_width_cm > 20.0
 
     def label_map(
         drive_map: Path, out: Path, *, window: Any, colour_weight: float, pictures: bool = True

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.pipeline import MapSettings, map_drive
+from datagen.pipeline import MapRequest, MapSettings, map_drive
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
@@ -50,7 +50,7 @@ def test_labels_before_during_and_after_changes_of_lane(tmp_path, seed, directio
     track = {"lanes": 2, "lane_width_cm": LANE_CM, "interruptions_per_m": 0.0}
     driver = {"change_lanes_every_cm": 300.0, "direction": direction}
     drive = simulated(tmp_path / "drive", seed, 300, track, driver)
-    map_drive(drive, LANE_CM, None, MapSettings(), tmp_path / "map")
+    map_drive(MapRequest(drive, LANE_CM), MapSettings(), tmp_path / "map")
     found = read_map_frames(tmp_path / "map")
     exact = true_points(drive)[found.frames]
     truth = labelled(exact)
@@ -84,7 +84,7 @@ def test_an_edge_of_the_road_without_paint_is_masked(tmp_path, seed, direction):
     track = {"lanes": 2, "lane_width_cm": LANE_CM, "interruptions_per_m": 0.0, "far": {"kind": "none"}}
     driver = {"change_lanes_every_cm": 300.0, "direction": direction}
     drive = simulated(tmp_path / "drive", seed, 300, track, driver)
-    map_drive(drive, LANE_CM, None, MapSettings(), tmp_path / "map")
+    map_drive(MapRequest(drive, LANE_CM), MapSettings(), tmp_path / "map")
     found = read_map_frames(tmp_path / "map")
     exact = true_points(drive)[found.frames]
     error = found.points_cm - labelled(exact)
@@ -121,7 +121,7 @@ def test_labels_of_a_road_driven_both_ways(tmp_path):
                     truth={name: float(values[i]) for name, values in truth.items() if name != "frame"},
                     speed_cm_s=float(drive.commands.speed_cm_s[i]),
                 )
-    report = map_drive(both, LANE_CM, None, MapSettings(), tmp_path / "map")
+    report = map_drive(MapRequest(both, LANE_CM), MapSettings(), tmp_path / "map")
     assert report.figures["segments"] == 2
     found = read_map_frames(tmp_path / "map")
     truth = labelled(true_points(both)[found.frames])

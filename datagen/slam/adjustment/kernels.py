@@ -1,11 +1,13 @@
-"""Inner loops of the bundle adjustment: points on the road, nearest edges, residuals and Jacobians.
+"""Inner loops of the bundle adjustment: points on the road, nearest edges, normal equations.
 
-Lengths are in camera heights. A camera is two vectors here: ``lens`` = fx, fy, cx, cy, D (five numbers), and
-``mount`` = pitch, roll, yaw, camera ahead of the rear axle, camera left of the middle. Per frame, with its
-tilt, the mount becomes a ``view`` (see :func:`set_view`).
+Lengths are in camera heights. A camera over a flat road is a pair of arrays, ``lens`` and ``mount``.
 
-numba's cache notices a change of the file that a function is in, but not of one that it calls into: after a
-change here delete ``datagen/slam/adjustment/__pycache__``.
+Lengths are in camera heights. A camera is two vectors here: ``lens`` = fx, fy, cx, cy, D (five numbers) and
+``mount`` = pitch, roll, yaw, camera ahead of the rear axle, camera left of the middle; the kernels take the
+mount as a ``view`` (see :func:`set_view`).
+
+numba's cache notices a change of the file that a function stands in, and not of one that it calls into: after
+a change here delete ``datagen/slam/__pycache__``.
 """
 
 from __future__ import annotations
@@ -15,26 +17,18 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-#: Adjustable numbers of the camera: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
+#: Numbers of the camera that can be adjusted: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
 N_CAMERA = 8
-#: Where pitch and roll stand among the camera's numbers; each frame adds its own.
-_PITCH, _ROLL = 4, 5
-#: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
-N_FRAME = 5
 #: Length of a view.
 N_VIEW = 8
-#: Newton steps that undo a lens, and the step, [rad], at which they end. Four or five are enough for lenses
-#: up to 170 degrees; the rest is margin.
-_NEWTON_STEPS, _CONVERGED = 8, 1e-13
-#: Points whose edge would be wider than this in the other image, relative to their own, are not compared.
-#: Chosen: the sigma of their residual would be 2.9 times that of an edge.
-_MAX_STRETCH = 4.0
+_NEWTON_STEPS = 8
+_CONVERGED = 1e-13
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def set_view(mount, pitch_more, roll_more, view):
-    """Fill a view: cosine and sine of one frame's pitch, roll and yaw, then the camera ahead and left."""
+    """Fill a view: cosine and sine of pitch, roll and yaw in one frame, then lever and left."""
     pitch, roll = mount[0] + pitch_more, mount[1] + roll_more
     view[0], view[1] = np.cos(pitch), np.sin(pitch)
     view[2], view[3] = np.cos(roll), np.sin(roll)
@@ -45,7 +39,7 @@ def set_view(mount, pitch_more, roll_more, view):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def lift_pixel(fisheye, lens, view, u, v):
-    """Road point of a pixel (ahead of the rear axle, left); NaN where its ray does not meet the road."""
+    """Road point (ahead of the rear axle, left) of a pixel; the ray must meet the road, or both are NaN."""
     mx, my = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
     k1, k2, k3, k4, k5 = lens[4], lens[5], lens[6], lens[7], lens[8]
     if fisheye:
@@ -70,7 +64,7 @@ def lift_pixel(fisheye, lens, view, u, v):
             dy = k3 * (r2 + 2.0 * y * y) + 2.0 * k4 * x * y
             x, y = (mx - dx) / radial, (my - dy) / radial
         z = 1.0
-    # Undo roll, then pitch (camera y and z become down and ahead), then yaw.
+    # Undo roll, then pitch; camera y down and z ahead become up and ahead; then yaw.
     x, y = view[2] * x - view[3] * y, view[3] * x + view[2] * y
     down, ahead = view[0] * y + view[1] * z, view[0] * z - view[1] * y
     if down <= 1e-6:
@@ -82,10 +76,10 @@ def lift_pixel(fisheye, lens, view, u, v):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _distorted(fisheye, lens, x, y, z):
-    """Project a point of the camera's frame, before focal length and centre; NaN behind a pinhole.
+    """A point of the camera's frame in the image, before focal length and centre; NaN behind a pinhole.
 
     Returns:
-        Both image coordinates; derivatives of the first by x, y and z; those of the second; both by k1.
+        The two numbers; the slopes of the first by x, y and z; those of the second; both slopes by k1.
     """
     k1, k2, k3, k4, k5 = lens[4], lens[5], lens[6], lens[7], lens[8]
     if fisheye:
@@ -94,7 +88,7 @@ def _distorted(fisheye, lens, x, y, z):
         theta = np.arctan2(r, z)
         t2 = theta * theta
         slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-        # Image radius per radius in the camera's frame, and its derivatives; 1 / z on the axis.
+        # Radius in the image per radius in the camera's frame, and how that changes; on the axis 1 / z.
         s, bend, by_k1 = 1.0 / z, 0.0, 0.0
         if r > 1e-9:
             s = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
@@ -130,7 +124,7 @@ def _distorted(fisheye, lens, x, y, z):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _in_camera(view, forward, left):
-    """A road point in the camera's frame, and before pitch and roll; it lies one camera height below."""
+    """A road point in the camera's frame, turned by yaw, pitch and roll; one camera height below it."""
     a, b = forward - view[6], left - view[7]
     ahead, right = a * view[4] + b * view[5], a * view[5] - b * view[4]
     down, z = view[0] - view[1] * ahead, view[1] + view[0] * ahead
@@ -149,8 +143,8 @@ def project_point(fisheye, lens, view, forward, left):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def project_with_jacobian(fisheye, lens, view, forward, left, by):
-    """Pixel of a road point, and its Jacobian.
+def project_with_slopes(fisheye, lens, view, forward, left, by):
+    """Pixel of a road point, and its slopes.
 
     Args:
         fisheye: Lens model.
@@ -158,7 +152,7 @@ def project_with_jacobian(fisheye, lens, view, forward, left, by):
         view: See :func:`set_view`.
         forward: Ahead of the rear axle.
         left: Of the middle.
-        by: Filled, 2 x (2 + ``N_CAMERA``): derivatives of u and v by forward and left, then by the camera's
+        by: 2 x (2 + ``N_CAMERA``), filled: slopes of u and of v by forward and left, then by the camera's
             numbers.
     """
     cp, sp, cr, sr, cy, sy = view[0], view[1], view[2], view[3], view[4], view[5]
@@ -167,7 +161,7 @@ def project_with_jacobian(fisheye, lens, view, forward, left, by):
     for k in range(2):
         scale = lens[k]
         g_x, g_y, g_z = scale * seen[2 + 3 * k], scale * seen[3 + 3 * k], scale * seen[4 + 3 * k]
-        # By the point ahead and to the right of the lens; pitch and roll also move what is below it.
+        # By a point ahead and to the right of the lens; both tilts move what is below the lens.
         g_down = sr * g_x + cr * g_y
         g_ahead, g_right = cp * g_z - sp * g_down, cr * g_x - sr * g_y
         by[k, 0] = g_ahead * cy + g_right * sy
@@ -183,10 +177,18 @@ def project_with_jacobian(fisheye, lens, view, forward, left, by):
     return lens[2] + lens[0] * seen[0], lens[3] + lens[1] * seen[1]
 
 
+#: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
+N_FRAME = 5
+#: Where pitch and roll stand among the camera's numbers: a frame has its own.
+_PITCH, _ROLL = 4, 5
+#: Points that would be drawn out more than this, across their edge, are not moved.
+_MAX_STRETCH = 4.0
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_by, out_normal):
-    """Lift pixels to the road, with Jacobians.
+    """Lift pixels to the road, with derivatives.
 
     Args:
         fisheye: Lens model.
@@ -196,9 +198,9 @@ def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_
         point_starts: First pixel of each frame, and one behind the last.
         uv: Pixels.
         normals: Unit gradients in the image.
-        out: Filled: road point of each pixel (ahead, left).
-        out_by: Filled: derivatives by the camera's numbers.
-        out_normal: Filled: road point half a pixel further along the gradient.
+        out: (ahead, left) of each pixel.
+        out_by: Their derivatives by the camera's numbers.
+        out_normal: A point of the road half a pixel further along the gradient.
     """
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     for k in range(point_starts.shape[0] - 1):
@@ -208,8 +210,8 @@ def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_
             out[p, 0], out[p, 1] = a, b
             u, v = uv[p, 0] + 0.5 * normals[p, 0], uv[p, 1] + 0.5 * normals[p, 1]
             out_normal[p, 0], out_normal[p, 1] = lift_pixel(fisheye, lens, view, u, v)
-            # Implicit differentiation: the road point moves so that its pixel stays.
-            project_with_jacobian(fisheye, lens, view, a, b, by)
+            # The point moves so that its pixel stays.
+            project_with_slopes(fisheye, lens, view, a, b, by)
             per_area = 1.0 / (by[0, 0] * by[1, 1] - by[0, 1] * by[1, 0])
             for c in range(N_CAMERA):
                 du, dv = by[0, 2 + c], by[1, 2 + c]
@@ -220,7 +222,7 @@ def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _first_row(edge_uv, start, stop, v):
-    """First edge of a frame at or below row v; the edges are sorted by row."""
+    """First edge of a frame, whose edges stand in the order of their rows, at or below row v."""
     while start < stop:
         middle = (start + stop) // 2
         if edge_uv[middle, 1] < v:
@@ -255,38 +257,17 @@ def associate(
     out_pair,
     out_sigma,
 ):
-    """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
+    """Find for every point of frame i the nearest edge of frame j that brightens the same way.
 
-    The edges of each frame are sorted by row. Only points that fall into ``inner`` get an edge: beyond the
-    rim of the visible road, a point would be matched to another edge on this side of it, all along the rim,
-    and the road would seem to stand still.
-
-    Args:
-        fisheye: Lens model.
-        lens: See the module.
-        mount: See the module.
-        tilt: Pitch and roll of each frame beyond the camera's.
-        poses: Of the frames.
-        pairs: Pairs of frames, i and j.
-        point_starts: First point of each frame, and one behind the last.
-        lifted: Road point of each compared point, see :func:`lift_points`.
-        lifted_normal: The same half a pixel further along the gradient.
-        edge_starts: First edge of each frame, and one behind the last.
-        edge_uv: Pixels of the edges.
-        edge_normals: Their unit gradients.
-        gate_px: Search radius.
-        min_dot: Least cosine between the gradients of point and edge.
-        inner: Pixels in which points get an edge.
-        in_view: Counts in how many frames each point fell into ``inner``.
-        matched: Counts in how many of them it met an edge.
-        out_point: Filled: point of each link.
-        out_edge: Filled: its edge.
-        out_pair: Filled: its pair of frames.
-        out_sigma: Filled: sigma of the residual, relative to that of an edge in its own image. A far edge is
-            a wide band where the road is near.
+    The edges of each frame stand in the order of their rows. Only what falls into ``inner`` looks for an
+    edge: at the rim of what is seen, a point whose edge lies beyond would take one on this side for it, all
+    along the rim, and what is seen would seem to stay. ``out_sigma`` is the standard deviation of the
+    residual to come, in that of an edge's place in its own picture: an edge seen far ahead is a wide band
+    where the road is near. ``in_view`` and ``matched`` count how often each point fell into ``inner`` of the
+    other picture, and met an edge there.
 
     Returns:
-        Number of links.
+        Number of associations written.
     """
     view = np.empty(N_VIEW)
     height, width = inner.shape
@@ -310,7 +291,7 @@ def associate(
                 else:
                     nu, nv = u1 - u, v1 - v
             length = np.sqrt(nu * nu + nv * nv)
-            # Half a pixel became this long: so uncertain is the place of the point in the other image.
+            # The moved point is half a pixel long: how uncertain its place in the other picture is.
             stretch = 2.0 * length
             if not 1e-9 < stretch < _MAX_STRETCH:
                 continue
@@ -359,32 +340,9 @@ def accumulate(
     rhs,
     residual,
 ):
-    """Add up the normal equations of all point-to-line residuals, a block per pair of frames.
+    """Sum the normal equations of all point-to-line residuals, a block per pair of frames.
 
-    The residual e of a link is the distance of the moved point from its edge, along the edge's gradient, with
-    the Cauchy loss: weight w = 1 / (1 + (e / (sigma c))^2). The unknowns of a block are frame i (x, y,
-    heading, pitch, roll), frame j, and the camera.
-
-    Args:
-        fisheye: Lens model.
-        lens: See the module.
-        mount: See the module.
-        tilt: Pitch and roll of each frame beyond the camera's.
-        poses: Of the frames.
-        pairs: Pairs of frames, i and j.
-        pair_starts: First link of each pair, and one behind the last.
-        points: Point of each link.
-        edges: Its edge.
-        lifted: Road point of each compared point.
-        lifted_by: Its Jacobian by the camera's numbers.
-        edge_uv: Pixels of the edges.
-        edge_normals: Their unit gradients.
-        link_sigma: Sigma of each link, see :func:`associate`.
-        point_weight: Inverse variance of each compared point.
-        cauchy_px: Scale c of the loss.
-        blocks: Filled: J^T W J of each pair.
-        rhs: Filled: -J^T W e of each pair.
-        residual: Filled: e of each link; NaN where the point is behind the camera.
+    The unknowns of a block are frame i (x, y, heading, pitch, roll), frame j, and the camera.
 
     Returns:
         Robust cost.
@@ -404,7 +362,7 @@ def accumulate(
             dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
             dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
             forward, left = cj * dx + sj * dy, cj * dy - sj * dx
-            u, v = project_with_jacobian(fisheye, lens, view, forward, left, by)
+            u, v = project_with_slopes(fisheye, lens, view, forward, left, by)
             nu, nv = edge_normals[q, 0], edge_normals[q, 1]
             e = (u - edge_uv[q, 0]) * nu + (v - edge_uv[q, 1]) * nv
             if not np.isfinite(e):
@@ -415,7 +373,7 @@ def accumulate(
             cost += 0.5 * point_weight[p] * cauchy_px * cauchy_px * np.log1p(s * s)
             w = point_weight[p] / ((1.0 + s * s) * link_sigma[r] * link_sigma[r])
             g_f, g_l = nu * by[0, 0] + nv * by[1, 0], nu * by[0, 1] + nv * by[1, 1]
-            # By the point in the map, and by the point in frame i.
+            # By a point of the map, and by the point in the frame i.
             g_x, g_y = g_f * cj - g_l * sj, g_f * sj + g_l * cj
             g_a, g_b = g_x * ci + g_y * si, g_y * ci - g_x * si
             jac[0], jac[1] = g_x, g_y

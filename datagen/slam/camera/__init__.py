@@ -1,1 +1,1 @@
-"""Self-calibration: a coarse camera from the images, then camera and poses refined together."""
+"""Self-calibration: a coarse camera from the images, then camera and poses adjusted together."""

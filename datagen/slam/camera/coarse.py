@@ -1,62 +1,43 @@
-"""A coarse camera from the drive alone: focal length and pitch by how clearly pictures tell the motion.
+"""A coarse camera from the drive alone: the focal length and pitch with which the motion is clearest.
 
-This is a start for the bundle adjustment. Seen with the right camera, the edges of a picture meet those of
-the next one at the true motion and nowhere else. That tells the pitch to a few degrees and the focal length
-to a fifth or so before a loop is closed, so that what lenses usually have counts, too. The lens is taken as
-an equidistant fisheye with its axis in the image's middle. Scale is not observable: the camera's height is
-nominal until the lane width sets it.
+It is the start of the bundle adjustment. With the right camera, the edges of an image meet those of the next
+one at the true motion and nowhere else. Before a loop is closed, this gives the pitch to a few degrees and
+the focal length to about a fifth, so a prior on the focal length is needed. The lens is taken as an
+equidistant fisheye with its axis in the image centre. Scale is not observable: the camera's height is nominal
+until the lane width sets it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
 
-from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence
+from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_rim, standing_out, usual_step
 from datagen.slam.odometry.scans import Progress, seen_edges
-from lanenet.config import Settings
+from datagen.slam.settings import GuessSettings
+from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.canny import EdgePixels, find_edges
-from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadTable
+from lanenet.perception.edges.road import PerceptionSettings, RoadTable
 
-
-class GuessSettings(Settings):
-    """First guess of an unknown camera; lengths in camera heights where the name says so.
-
-    Attributes:
-        focal_px: Focal lengths to try for images of 160 px width; wider images scale them. Their geometric
-            mean is what lenses are expected to have where pictures leave it open.
-        pitch_deg: Downward tilts to try.
-        k1: First coefficient of the fisheye.
-        lever_heights: Camera ahead of the rear axle.
-        wheelbase_cm: Distance between the axles, which sets where y = 0 lies under the car.
-        frames: Frames that the search looks at.
-    """
-
-    focal_px: tuple[float, ...] = (65.0, 80.0, 95.0, 110.0)
-    pitch_deg: tuple[float, ...] = (7.0, 11.0, 15.0, 19.0, 23.0)
-    k1: float = -0.03
-    lever_heights: float = Field(default=0.9, gt=0.0)
-    wheelbase_cm: float = Field(default=17.0, gt=0.0)
-    frames: int = Field(default=250, ge=50)
-
-
-#: Steps tried with each camera, relative to the one that suits the best camera so far, and the part of them
-#: that may be the best: those beyond are what it is compared with.
+#: Step lengths to try with each camera, relative to that of the best camera so far, and those among them that
+#: may be the best; the others are what it is compared with. Chosen: half to twice, in steps of a tenth.
 _AROUND, _INNER = np.exp(np.linspace(-0.6, 0.6, 13)), slice(2, -2)
-#: Frames that are compared with those before them: while nothing is known of the camera, and then.
+#: Frames that are compared with those before them: while nothing is known of the camera, and later. Chosen:
+#: the time of the search is proportional to them.
 _FIRST_PAIRS, _PAIRS = 20, 40
-#: What a squared logarithm between the focal length and the middle of those to try costs, in log likelihood
-#: per point: for half or twice the usual one a tenth to a third of what a clear step is worth.
+#: Cost of a squared log ratio between a focal length and the typical one, in log likelihood per point: half
+#: or twice the typical length costs 0.024, a tenth to a third of the prominence of a clear step.
 _FOCAL_PRIOR = 0.05
-#: Height of the camera before the scale is known.
+#: Height of the camera before the scale is known, [cm]; any would do, this is near those of 1:10 cars.
 NOMINAL_HEIGHT_CM = 15.0
+#: Width of the images for which focal lengths are given, [px]: that of a Donkeycar.
+_REFERENCE_WIDTH = 160.0
 
 
 def guessed_camera(
@@ -73,19 +54,16 @@ def guessed_camera(
     )
 
 
-def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings:
-    """Range for mapping, in proportion to the camera's height; rows stay as configured."""
-    reach = 6.0 * camera_height_cm
-    coarse = 0.3 * camera_height_cm
-    return base.model_copy(update={"far_cm": reach, "side_cm": reach, "max_cm_per_px": coarse})
-
-
 @dataclass(frozen=True)
 class Candidate:
-    """One camera of the search, with its best step, in camera heights, and how well it does.
+    """One camera of the search.
 
-    ``fit`` is how much likelier an edge point of a pair of pictures is with this step than with clearly
-    shorter and longer ones, as a logarithm, less the prior's.
+    Attributes:
+        focal_px: Focal length.
+        pitch_deg: Downward pitch.
+        step_heights: Its best step length.
+        fit: Log likelihood per edge point of this step relative to clearly shorter and longer ones, less the
+            prior of the focal length.
     """
 
     focal_px: float
@@ -101,7 +79,7 @@ def coarse_camera(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Camera, list[Candidate]]:
-    """Search focal length and pitch for the camera with which the motion between pictures is clearest.
+    """Search focal length and pitch for the camera with which the motion from image to image is clearest.
 
     Returns:
         The camera, and all candidates for the report.
@@ -109,13 +87,13 @@ def coarse_camera(
     count = min(guess.frames, len(drive))
     start = max(0, (len(drive) - count) // 3)
     pixels = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
-    scale = drive.width / 160.0
+    scale = drive.width / _REFERENCE_WIDTH
     seed = int(rng.integers(2**31))
     tried: dict[tuple[float, float], Candidate] = {}
     grid = [(f * scale, p) for f in guess.focal_px for p in guess.pitch_deg]
     total = len(grid) + 9
     relative = np.ones(count)
-    # Every second camera of the grid, as on a chessboard.
+    # Every second camera of the grid, like the black squares of a chessboard.
     spread = [
         guessed_camera(drive.width, drive.height, f * scale, p, guess)
         for i, f in enumerate(guess.focal_px)
@@ -131,10 +109,10 @@ def coarse_camera(
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
                 pictures = _pictures(pixels, camera, perception, seed)
                 steps = usual * _AROUND
-                _, fits = best_step(pictures, relative, steps, _PAIRS)
-                # How well a step fits says little: with a camera that looks too far down, standing still
-                # fits better than the truth with the right one.
-                clear = prominence(fits, steps)[_INNER] / pictures.points_per_frame
+                _, fits = usual_step(pictures, relative, steps, _PAIRS)
+                # The fit itself decides nothing: with too much pitch, standing still fits better than the
+                # true motion with the right camera.
+                clear = standing_out(fits, steps)[_INNER] / pictures.points_per_frame
                 fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2)
                 step = float(steps[_INNER][np.argmax(clear)])
                 tried[focal, pitch] = Candidate(focal, pitch, step, fit)
@@ -150,22 +128,22 @@ def coarse_camera(
     return camera, list(tried.values())
 
 
-def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"]) -> float:
-    """The way per frame, in camera heights, with the camera in which one stands out most.
+def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"]) -> float:
+    """Typical step length, in camera heights, with the camera in which one is most prominent.
 
-    A camera that is far off has no step that the pictures meet at. What it likes best then lies at either
-    end: next to nothing, which leaves all edges where they are, or more than a picture shows.
+    With a camera that is far off, images agree at no step. The best fit then lies at either end: almost no
+    motion, which leaves all edges where they are, or more than an image shows.
 
     Args:
-        cameras: The same pictures, seen with each camera.
-        relative: Way of each frame relative to the usual one.
+        cameras: The same images, seen with each camera.
+        relative: Step length of each frame relative to the typical one.
     """
     steps = np.array(STEPS_HEIGHTS)
     best, most = float(np.sqrt(steps[0] * steps[-1])), 0.0
     for pictures in cameras:
-        step, fit = best_step(pictures, relative, steps, _FIRST_PAIRS)
-        clear = float(prominence(fit, steps).max()) / pictures.points_per_frame
-        if clear > most and not at_limit(step, steps):
+        step, fit = usual_step(pictures, relative, steps, _FIRST_PAIRS)
+        clear = float(standing_out(fit, steps).max()) / pictures.points_per_frame
+        if clear > most and not at_rim(step, steps):
             best, most = step, clear
     return best
 
@@ -176,52 +154,8 @@ def _spacing(values: tuple[float, ...]) -> float:
 
 def _pictures(
     pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, seed: int
-) -> ImagePairs:
-    """The edges that see the road with a camera, the same draw of points for every camera."""
+) -> Pictures:
+    """The edges that see the road with a camera; the same points are drawn for every camera."""
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
     edges = [seen_edges(frame, table) for frame in pixels]
-    return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(seed))
-
-
-def with_known_scale(camera: Camera, factor: float, guess: GuessSettings) -> Camera:
-    """Scale a guessed camera; the wheelbase is the car's own and stays, so that the lever arm scales."""
-    scaled = camera.scaled_lengths(factor)
-    lever = scaled.wheelbase_cm + scaled.mounting.ahead_of_front_axle_cm
-    kept = replace(scaled, wheelbase_cm=guess.wheelbase_cm)
-    return kept.with_mounting(ahead_of_front_axle_cm=lever - guess.wheelbase_cm)
-
-
-def looking_alike(camera: Camera, like: Camera) -> Camera:
-    """Turn a camera so that the middle of its picture shows the place that it shows with another one.
-
-    Pitch and yaw were found together with a principal point, and with another one they are others: a few
-    pixels make up for degrees.
-    """
-    m = like.mounting
-    middle = np.array([[0.5 * (like.width - 1), 0.5 * (like.height - 1)]])
-    x_cm, y_cm = like.intersect_ground(middle)[0] - [m.right_of_centre_cm, m.ahead_of_front_axle_cm]
-    if not np.isfinite(x_cm):
-        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad, yaw_rad=m.yaw_rad)
-    pitch = float(np.arctan2(m.height_cm, np.hypot(x_cm, y_cm)))
-    return camera.with_mounting(pitch_down_rad=pitch, yaw_rad=float(np.arctan2(-x_cm, y_cm)))
-
-
-def nudged(camera: Camera, name: str, by: float) -> Camera:
-    """Return the camera with one of its adjustable numbers changed, in the adjustment's units."""
-    m = camera.mounting
-    if name == "pitch":
-        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad + by)
-    if name == "roll":
-        return camera.with_mounting(roll_rad=m.roll_rad + by)
-    if name == "yaw":
-        return camera.with_mounting(yaw_rad=m.yaw_rad + by)
-    if name == "lever":
-        return camera.with_mounting(ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + by * m.height_cm)
-    K, D = np.array(camera.K, dtype=np.float64), np.array(camera.D, dtype=np.float64)
-    if name == "focal":
-        K[:2, :2] *= np.exp(by)
-    elif name == "k1":
-        D[0] += by
-    else:
-        K[("cx", "cy").index(name), 2] += by
-    return replace(camera, K=K, D=D)
+    return Pictures(edges, camera, OdometrySettings(), np.random.default_rng(seed))

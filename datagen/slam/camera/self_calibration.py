@@ -1,23 +1,23 @@
-"""The camera from the drive itself: found or refined together with the poses, with honest uncertainties.
+"""Self-calibration: the camera is found or refined together with the poses, with realistic uncertainties.
 
-The numbers of lens and mounting are unknowns of the bundle adjustment. What the pictures leave open is
-decided by priors, and what they leave open depends on the drive: only a place that is seen twice ties the
-heading down, and with it the focal length.
+The numbers of lens and mounting are unknowns of the bundle adjustment. What the images leave open is decided
+by priors, and that depends on the drive: only a loop closure ties down the heading, and with it the focal
+length.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
-from datagen.slam.camera.coarse import Candidate, coarse_camera, looking_alike, nudged
+from datagen.slam.camera.changes import looking_alike, nudged
+from datagen.slam.camera.coarse import Candidate, coarse_camera
 from datagen.slam.odometry.scans import Progress
-from datagen.slam.segment import SolvedSegment, solve_segment
+from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
@@ -27,36 +27,45 @@ DRIVE_INSTEAD = (
     "drive two laps of a closed track, or of a figure of eight, without a pause, between two lines that the "
     "camera sees"
 )
-#: Moving frames that the adjustment needs, at least.
+#: Moving frames that the adjustment needs. Chosen: ten seconds at 20 frames a second, less than any lap.
 MIN_FRAMES = 200
-#: Range of the heading below which nothing but a prior tells the focal length from the pitch.
+#: Range of the heading below which focal length and pitch can only be told apart by a prior. Chosen: half a
+#: turn; a closed lap has twice as much.
 MIN_TURNING_RAD = np.pi
-#: Places that have to be seen twice: fewer may be chance.
+#: Revisits needed: fewer may agree by chance. Chosen: twice as many as a map needs
+#: (``RevisitSettings.min_revisits``), for a wrong camera does more harm than a wrong map.
 MIN_REVISITS = 6
-#: Relative standard deviation of the focal length beyond which a camera is no result.
+#: Relative sigma of the focal length beyond which a camera is refused. Chosen: it changes lengths ahead by
+#: about as much, 1 cm at a lane's half width of 20 cm.
 MAX_FOCAL_SIGMA = 0.05
-#: Numbers that stay as they start until a place is seen twice.
+#: Numbers that stay as they start until a loop is closed.
 _LENS = ("focal", "cx", "cy", "k1")
-#: Numbers whose priors every usual camera meets: far from them, the pictures do not show a flat road alone.
-_USUAL = ("cx", "cy", "roll")
-#: How far principal points usually are from the middle, for images of 160 px, and cameras from level, [rad]:
-#: real ones differ by more than the adjustment's priors, which are close to keep what is nearly degenerate.
+#: Numbers whose priors every ordinary camera meets: far from them, the images show more than a flat road.
+_ORDINARY = ("cx", "cy", "roll")
+#: Standard deviations of the principal point from the image centre, for images 160 px wide, and of the roll,
+#: [rad], among real cameras. Wider than the adjustment's priors, which are close because these numbers are
+#: nearly degenerate with the yaw; a real drive had a roll of 3 degrees.
 _CENTRE_PX, _LEVEL_RAD = 2.0, 0.04
-#: Strain beyond which a camera is no result, and strain that is worth a word.
+#: Width of the images for which priors in pixels are given, [px].
+_REFERENCE_WIDTH = 160.0
+#: Strain beyond which a camera is refused, and strain that is worth a note, in standard deviations.
 MAX_STRAIN, _STRAINED = 2.0, 1.5
-#: Range of the heading from which a drive may turn: with a wrong camera the filter creeps and sees few bends.
-_WORTH_ANEW_RAD = 0.25 * np.pi
-#: A start whose focal length is this close to what was found from it is good enough.
+#: Range of the heading from which a drive without a closed loop is worth a restart: with a wrong camera the
+#: filter creeps and sees few bends. Chosen: a quarter of ``MIN_TURNING_RAD``.
+_WORTH_RESTART_RAD = 0.25 * np.pi
+#: Relative difference of the focal lengths of start and result below which no restart is needed: about the
+#: sigma of a good drive.
 _CLOSE_START = 0.03
-#: Focal lengths to start from anew, relative to the first, where that closes no loop.
-_ANEW = (1.0, 1.2)
-#: What the adjustment's own standard deviations are multiplied by, as measured on simulated drives with known
-#: cameras (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
+#: Focal lengths of restarts, relative to the first start, where no loop was closed: once with the pitch that
+#: was found, and once longer by about what the search may be off.
+_RESTARTS = (1.0, 1.2)
+#: Factor on the adjustment's own sigmas, measured on simulated drives with known cameras
+#: (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
 SIGMA_FACTOR = 2.0
 
 
 def refining(settings: BundleSettings) -> BundleSettings:
-    """Return the settings with priors about a camera that is known, which are closer than about a guess."""
+    """Return the settings with closer priors, as for a known camera."""
     close = {
         "focal": 0.05,
         "centre_px": 1.0,
@@ -74,13 +83,12 @@ class FoundCamera:
     """A camera that was adjusted together with the poses of a drive, in the scale that it started with.
 
     Attributes:
-        solved: The drive's longest stretch, with the camera.
+        solved: The segment, with the camera.
         candidates: Cameras of the coarse search; none where one was given.
         sigma: Standard deviation of each number of the camera, in the units of
-            :attr:`datagen.slam.adjustment.adjust.BundleResult.sigma`, after :data:`SIGMA_FACTOR`.
+            :attr:`datagen.slam.adjustment.adjust.BundleResult.sigma`, after :func:`honest_sigma`.
         refined: Whether a known camera was the start.
-        strain: How far principal point and roll had to go from their priors, in usual standard
-            deviations; by so much, if it is more than one, the standard deviations are larger.
+        strain: Distance of principal point and roll from their priors, see :func:`prior_strain`.
     """
 
     solved: SolvedSegment
@@ -96,7 +104,7 @@ class FoundCamera:
 
     @property
     def closed(self) -> bool:
-        """Whether a place was seen twice."""
+        """Whether a loop was closed."""
         return bool(self.solved.revisits)
 
     @property
@@ -126,22 +134,15 @@ class FoundCamera:
 
 
 def find_camera(
-    drive: Drive,
-    start: Camera | None,
-    settings: MapSettings,
-    rng: np.random.Generator,
-    progress: Progress | None = None,
-    search_progress: Progress | None = None,
+    drive: Drive, start: Camera | None, solver: SegmentSolver, search_progress: Progress | None = None
 ) -> FoundCamera:
     """Find a drive's camera, or refine a known one, together with the drive's poses.
 
     Args:
-        drive: One uninterrupted stretch.
+        drive: One segment.
         start: Camera to refine, with close priors about it; None looks for one, with wide priors.
-        settings: Settings of all mapping stages.
-        rng: Source of randomness.
-        progress: Called with (done, total) while the drive is followed.
-        search_progress: The same for the coarse search.
+        solver: Solves the segment.
+        search_progress: Called with (done, total) during the coarse search.
 
     Returns:
         The camera, in the scale of the start or of a nominal height.
@@ -150,85 +151,82 @@ def find_camera(
         TrackingLostError: If too few edge points of the road are seen.
     """
     candidates: list[Candidate] = []
+    settings = solver.settings
     if start is None:
-        camera, candidates = coarse_camera(drive, settings.perception, settings.guess, rng, search_progress)
+        camera, candidates = coarse_camera(
+            drive, settings.perception, settings.guess, solver.rng, search_progress
+        )
     else:
         camera = start
         settings = settings.model_copy(update={"bundle": refining(settings.bundle)})
-    solved = solve_segment(drive, camera, settings, rng, progress, find_camera=True)
+        solver = replace(solver, settings=settings)
+    solved = solver.solve(drive, camera, find_camera=True)
     if start is None:
-        solved = _started_anew(drive, camera, solved, settings, rng, progress)
+        solved = _restarted(drive, camera, solved, solver)
     closed = bool(solved.revisits)
     strain = prior_strain(solved.camera, camera, settings.bundle)
     sigma = honest_sigma(solved.bundle.sigma, closed, strain, settings.bundle, camera.width)
     return FoundCamera(solved, candidates, sigma, start is not None, strain)
 
 
-def _started_anew(
-    drive: Drive,
-    searched: Camera,
-    first: SolvedSegment,
-    settings: MapSettings,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> SolvedSegment:
-    """Solve a drive again with what was learned of its camera, where the search was off.
+def _restarted(drive: Drive, searched: Camera, first: SolvedSegment, solver: SegmentSolver) -> SolvedSegment:
+    """Solve a drive again from the camera that was found, where the search was off.
 
-    The filter follows the drive, and loops are found, with the camera of the start: poses that a wrong camera
-    has bent hold the adjustment back.
+    The filter tracks the drive, and loops are found, with the camera of the start: poses that are bent by a
+    wrong camera hold the adjustment back.
     """
     start, found = searched, first
-    for factor in _ANEW:
+    for factor in _RESTARTS:
         if found.revisits:
             if abs(found.camera.K[0, 0] / start.K[0, 0] - 1.0) < _CLOSE_START:
                 return found
             focal_px = float(found.camera.K[0, 0])
-        elif len(drive) < MIN_FRAMES or turning_rad(first.poses) < _WORTH_ANEW_RAD:
+        elif len(drive) < MIN_FRAMES or turning_rad(first.poses) < _WORTH_RESTART_RAD:
             return first
         else:
             focal_px = float(searched.K[0, 0]) * factor
-        # A closed loop knows best where to begin, also with the lever, without which every bend is off. But
-        # what is believed of principal point, roll and k1 must not walk along with what was found of them.
+        # The camera of a closed loop is the best start, also for the lever, which every bend depends on. But
+        # the priors of principal point, roll and k1 must not move along with what was found of them.
         turned = looking_alike(searched, found.camera if found.revisits else first.camera)
-        believed = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
-        start = found.camera if found.revisits else believed
-        again = solve_segment(drive, start, settings, rng, progress, find_camera=True, believed=believed)
+        prior = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
+        start = found.camera if found.revisits else prior
+        again = solver.solve(drive, start, find_camera=True, prior_camera=prior)
         if len(again.revisits) < 0.5 * len(found.revisits):
-            # The map that more places agree on.
+            # Keep the map with more revisits.
             return found
         found = again
     return found if found.revisits else first
 
 
-def prior_strain(camera: Camera, believed: Camera, priors: BundleSettings) -> float:
-    """How far a camera's principal point and roll are from where they were believed, in usual deviations."""
-    centre = max(priors.centre_px, _CENTRE_PX) * camera.width / 160.0
+def prior_strain(camera: Camera, prior: Camera, priors: BundleSettings) -> float:
+    """Distance of a camera's principal point and roll from their priors, in sigmas of ordinary cameras."""
+    centre = max(priors.centre_px, _CENTRE_PX) * camera.width / _REFERENCE_WIDTH
     spread = {"cx": centre, "cy": centre, "roll": max(priors.roll, _LEVEL_RAD)}
     off = {
-        "cx": camera.K[0, 2] - believed.K[0, 2],
-        "cy": camera.K[1, 2] - believed.K[1, 2],
-        "roll": camera.mounting.roll_rad - believed.mounting.roll_rad,
+        "cx": camera.K[0, 2] - prior.K[0, 2],
+        "cy": camera.K[1, 2] - prior.K[1, 2],
+        "roll": camera.mounting.roll_rad - prior.mounting.roll_rad,
     }
-    return max(abs(float(off[name])) / spread[name] for name in _USUAL)
+    return max(abs(float(off[name])) / spread[name] for name in _ORDINARY)
 
 
 def honest_sigma(
     sigma: dict[str, float], closed: bool, strain: float, priors: BundleSettings, width: int
 ) -> dict[str, float]:
-    """Widen the standard deviations of an adjustment to what they are worth.
+    """Widen the standard deviations of an adjustment to realistic ones.
 
     Args:
         sigma: As the adjustment gives them.
-        closed: Whether a place was seen twice; if not, the lens was held, and is known as well as its prior.
-        strain: See :func:`prior_strain`. What bends the principal point bends the other numbers, too.
+        closed: Whether a loop was closed; if not, the lens was held, and is known as well as its prior.
+        strain: See :func:`prior_strain`; what bends the principal point bends the other numbers too.
         priors: Of the adjustment.
         width: Image width, [px].
 
     Source:
         The strain widens as Birge's ratio does (Birge 1932, "The calculation of errors by the method of least
-        squares", Physical Review 40): data that contradict what is known are worse than they say.
+        squares", Physical Review 40): data that contradict the priors are worse than their scatter shows.
     """
-    centre = priors.centre_px * width / 160.0
+    centre = priors.centre_px * width / _REFERENCE_WIDTH
     prior = {"focal": priors.focal, "cx": centre, "cy": centre, "k1": priors.k1}
     return {
         name: prior[name] if name in _LENS and not closed else SIGMA_FACTOR * max(1.0, strain) * sigma[name]
@@ -237,7 +235,7 @@ def honest_sigma(
 
 
 def turning_rad(poses: Float[np.ndarray, "n 3"]) -> float:
-    """Range of the heading along a path; swinging about one direction adds nothing to it."""
+    """Range of the heading along a path; swaying about one direction adds nothing to it."""
     return float(np.ptp(poses[:, 2]))
 
 
@@ -247,7 +245,7 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
     Args:
         found: The camera.
         where: Names the drive in messages.
-        accept_open_loop: Take the focal length's prior where no place was seen twice.
+        accept_open_loop: Accept the focal length's prior where no loop was closed.
 
     Returns:
         Notes on what had to be accepted.

@@ -1,15 +1,18 @@
-"""Arrays and inner loops of the shared map: growing the ancestry, entering, pruning, collapsing, scoring.
+"""The loops of the shared map: following the ancestry, writing, pruning.
 
-Resampling keeps the order of the particles (systematic resampling draws ascending indices). The living
-descendants of a node are therefore neighbours: one interval of particles. Whether a particle descends from a
-node is two comparisons, and what a cell holds for each particle is a sum over intervals.
+Resampling keeps the order of the particles (systematic resampling draws ascending indices), so that the
+living descendants of a node are always neighbours: one interval of particles. Whether a particle descends
+from a node is two comparisons, and what a cell holds for each particle is a sum over intervals.
 
-An entry whose interval is empty is dead. One whose interval holds everybody is the same for all particles and
-moves into the root of its cell. Both are dealt with when a cell is visited, and at the latest when the
-frame's row leaves the tree.
+An entry whose interval is empty is dead; one whose interval holds everybody is the same for all particles and
+moves into the root. Both happen where a cell is visited, and at the latest when its frame leaves the tree.
 
-The entries of a cell are stored in pages, each of which is contiguous, and the loops over points are
-outermost: following entries one by one through memory would take longer than all the arithmetic.
+The entries of a cell stand in pages, each of which is one run of memory, and the loops over points are
+outermost: chasing entries one by one through memory would take longer than all the arithmetic.
+
+The arrays of the shared map, as the numba kernels take them.
+
+Scoring: what each particle sees of a frame, against what its own lineage saw before.
 """
 
 from __future__ import annotations
@@ -20,18 +23,18 @@ import numpy as np
 from jaxtyping import Float, Int32, Int64
 from numba import njit
 
-#: Entries per page. Chosen: a page of vectors is four cache lines.
+#: Entries per page.
 PAGE_SIZE = 16
-#: A node's number in an entry: its row in the bits above these, its place in the row below.
+#: A node's number in an entry: its row above this many bits, its place in the row below.
 PLACE_BITS = 16
 PLACE = (1 << PLACE_BITS) - 1
-#: Type of an index: unsigned, so that numba need not check for indices from the end.
+#: Type of an index: without a sign, numba need not look whether it counts from the end.
 U = np.uint32
 #: Columns of a cell's state.
 OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
 
 
-class AncestryTree(NamedTuple):
+class Tree(NamedTuple):
     """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
 
     Attributes:
@@ -80,7 +83,7 @@ class Pages(NamedTuple):
         following: Next page of the cell, or of the free ones; -1 at the end.
         used: Entries in each page.
         node: Who saw it: row << PLACE_BITS | place in the row.
-        vector: What was seen: weighted normal, or weight.
+        vector: What was seen.
         free: First free page, and how many are free.
     """
 
@@ -91,9 +94,7 @@ class Pages(NamedTuple):
     free: Int32[np.ndarray, "2"]
 
 
-#: Cells along each side of the square in which a node's last entries are remembered. Chosen: neighbouring
-#: points are at most a patch apart, which is a cell.
-_RECENT = 4
+_RECENT = 4  # cells along each side of the square that a node's last entries are known of
 _NOWHERE = -(1 << 31)  # no cell has this number
 
 
@@ -135,9 +136,9 @@ def grow(tree, row, frame, states, chosen):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def prune(tree, cells, pages, a, b, memory):
-    """Prune a cell: drop dead entries, and move those that all particles share into its root.
+    """Take the dead entries out of a cell, and move those that all particles share into its root.
 
-    Entries with the same descendants keep the same descendants: they are merged.
+    Entries with the same descendants will have the same for ever: they become one.
     """
     state, root = cells.state, cells.root
     following, used = pages.following, pages.used
@@ -147,7 +148,7 @@ def prune(tree, cells, pages, a, b, memory):
     state[a, b, PRUNED] = tree.version[0]
     tree.version[1] += 1
     serial = tree.version[1]
-    # Entries that stay move to the front; ``into`` is the page that is being filled, ``out`` the place.
+    # Entries that stay move up to the front; ``into`` is the page that is being filled, ``out`` the place.
     page = into = state[a, b, PAGE]
     out = into * PAGE_SIZE
     while page >= 0:
@@ -197,7 +198,7 @@ def prune(tree, cells, pages, a, b, memory):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _free(pages, page):
-    """Return a chain of pages to the free ones."""
+    """Give a chain of pages back."""
     while page >= 0:
         following = pages.following[page]
         pages.following[page] = pages.free[0]
@@ -231,7 +232,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
-    # Neighbouring points share cells: the last entry of a node in each of a few cells takes both.
+    # Neighbouring points share cells: the entry that a node made last in each of a few cells takes both.
     recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
@@ -258,7 +259,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                     a, b = U(iy & mask), U(ix & mask)
                     slot = U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
                     if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
-                        # The cell is taken over by another patch of road; what it held is dropped.
+                        # Another patch of road takes the cell over; what it held is forgotten.
                         if state[a, b, PAGE] >= 0:
                             _free(pages, state[a, b, PAGE])
                             recent[:] = _NOWHERE
@@ -289,11 +290,11 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def collapse(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
-    """Collapse a row of the tree: its entries move into the roots or are dropped.
+def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
+    """Free a row of the tree: its entries move into the roots or are dropped.
 
-    Where lineages still differ, one node at their ancestors' mean pose is left in the row, to be entered and
-    collapsed in turn.
+    Where particles still disagree on the frame, a node at their ancestors' mean pose is left in the row, to
+    be entered and forgotten in its turn.
 
     Args:
         tree: The tree.
@@ -306,7 +307,7 @@ def collapse(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
         plain: As in :func:`write`.
 
     Returns:
-        Whether lineages still differed.
+        Whether they disagreed.
     """
     span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
     particles, nodes, mask = span.shape[1], tree.nodes[row], state.shape[0] - 1
@@ -333,7 +334,7 @@ def collapse(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
                     if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
                         prune(tree, cells, pages, a, b, memory)
     if forced:
-        # No entry of single lineages is left; one node that everybody descends from takes their place.
+        # All lineages are gone from the cells; one node that everybody descends from takes their place.
         pose[row, 0] = mean
         span[row, 0, 1] = particles
         tree.nodes[row] = 1
@@ -344,11 +345,8 @@ def collapse(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     return forced
 
 
-#: Cells that the particles' views of one point may spread over to be looked up together. Chosen: 64 x 64
-#: cells, far more than particles spread over while they track.
-_BOX = 4096
-#: Particles with the same cell up to which each is looked up singly. Chosen: it only changes the time.
-_FEW = 4
+_BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
+_FEW = 4  # particles that ask for the same cell and are yet looked up singly
 
 
 @njit(cache=True, error_model="numpy")
@@ -361,7 +359,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
         cells: The grid.
         pages: The pages.
         poses: Predicted poses, frame map.
-        points: Edge points as in :class:`AncestryTree`.
+        points: Edge points as in :class:`Tree`.
         frame: Number of the frame, one more than the newest in the tree.
         wheelbase: Distance between the axles, [cm].
         cell_cm: Side of a cell.
@@ -399,7 +397,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             x, y = 0.0, 0.0
             box = (iy[p] - low_y) * wide + ix[p] - low_x if boxed else 0
             if boxed and asked[box] == 0:
-                # Looked up before for all particles.
+                # Looked up before, for all particles.
                 x, y = values[rows[box], p, 0], values[rows[box], p, 1]
             else:
                 a, b = U(iy[p] & mask), U(ix[p] & mask)
@@ -448,7 +446,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             for p in range(particles):
                 scores[p] += weight * (seen_x[p] >= occupied)
             continue
-        # A loop of its own, so that it is vectorised.
+        # A loop of its own, which the processor takes several particles at a time through.
         for p in range(particles):
             x, y = seen_x[p], seen_y[p]
             nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]

@@ -1,8 +1,8 @@
-"""A likelihood field: blurred unit gradients of the mapped edges, scored by dot product.
+"""The likelihood field: blurred unit gradients of the mapped edges, scored by dot product.
 
-A count of matched points prefers standing still; with directions, an edge only matches an edge that brightens
-in the same direction. The grid wraps around: a cell holds the patch of road that was mapped there last.
-Memory and cost per frame stay constant however long the drive is.
+A plain count of matched points prefers standing still; with directions, an edge only matches an edge that
+brightens the same way. The grid wraps around (a cell holds whichever patch of road was mapped there last),
+so that memory and cost per frame stay constant however long the drive is.
 """
 
 from __future__ import annotations
@@ -14,10 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numba import njit
 
-from datagen.slam.odometry.scans import Scan
-
-#: Cells on each side of a point that it blurs into: two standard deviations of the blur, which is one cell.
-_REACH = 2
+_REACH = 2  # cells on each side of a point that it blurs into
 
 
 @dataclass(frozen=True)
@@ -26,7 +23,7 @@ class DirectionField:
 
     Attributes:
         cell_cm: Side of a cell.
-        memory_frames: Frames after which a cell has faded to 1/e.
+        memory_frames: Frames after which what was mapped has faded to 1/e.
         vectors: Sum of unit normals per cell, size x size x 2.
         owner: Which cell of the unbounded plane (ix, iy) each grid cell holds.
         seen: Frame at which the cell was last written; -1 where never.
@@ -40,7 +37,7 @@ class DirectionField:
 
     @staticmethod
     def empty(cell_cm: float, size: int, memory_frames: float) -> DirectionField:
-        """Return an empty field; ``size`` must be a power of two."""
+        """Return a field with nothing mapped; ``size`` must be a power of two."""
         return DirectionField(
             cell_cm,
             memory_frames,
@@ -58,15 +55,24 @@ class DirectionField:
     ) -> None:
         """Map the edge points of a frame, [cm], frame map."""
         _insert(
-            self.vectors, self.owner, self.seen, self.cell_cm, self.memory_frames,
-            points_map_cm, normals_map, weights, frame,
-        )  # fmt: skip
+            self.vectors,
+            self.owner,
+            self.seen,
+            self.cell_cm,
+            self.memory_frames,
+            points_map_cm,
+            normals_map,
+            weights,
+            frame,
+        )
 
     def score(
         self,
         poses: Float[np.ndarray, "p 3"],
         wheelbase_cm: float,
-        scan: Scan,
+        points_car_cm: Float[np.ndarray, "n 2"],
+        normals_car: Float[np.ndarray, "n 2"],
+        weights: Float[np.ndarray, "n"],
         frame: int,
     ) -> Float[np.ndarray, "p"]:
         """Score how well a frame's edges fit the map from each pose.
@@ -76,9 +82,18 @@ class DirectionField:
             of matched points.
         """
         return _score(
-            self.vectors, self.owner, self.seen, self.cell_cm, self.memory_frames,
-            poses, wheelbase_cm, *scan, frame,
-        )  # fmt: skip
+            self.vectors,
+            self.owner,
+            self.seen,
+            self.cell_cm,
+            self.memory_frames,
+            poses,
+            wheelbase_cm,
+            points_car_cm,
+            normals_car,
+            weights,
+            frame,
+        )
 
 
 @njit(cache=True, fastmath=True)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from datagen.prepare import MapRequest
 from lanenet.cli import app as cli
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
@@ -178,27 +179,22 @@ class FakeSettings(Settings):
 
 def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
     map_drive = asked.function("map", Report(("7 frames mapped",)))
-    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=map_drive)
+    asked.module("datagen.pipeline", MapRequest=MapRequest, MapSettings=FakeSettings, map_drive=map_drive)
     config = tmp_path / "map.yaml"
     config.write_text("frames: 9\n")
     result = run(
         *("map", "tub", "--lane-width", "38.5", "--camera", "c.yaml", "--config", config, "--out", "m/one")
     )
     assert result.exit_code == 0, result.output
-    assert asked.calls["map"][:5] == (
-        Path("tub"),
-        38.5,
-        Path("c.yaml"),
-        FakeSettings(frames=9),
-        Path("m/one"),
-    )
+    request = MapRequest(Path("tub"), 38.5, Path("c.yaml"))
+    assert asked.calls["map"][:3] == (request, FakeSettings(frames=9), Path("m/one"))
     for text in ("7 frames mapped", "wrote m/one", "lanenet label m/one --out m/one.parquet"):
         assert text in result.stdout
 
 
 def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
     map_drive = asked.function("map", Report(("verdict: reject",), "reject"))
-    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=map_drive)
+    asked.module("datagen.pipeline", MapRequest=MapRequest, MapSettings=FakeSettings, map_drive=map_drive)
     result = run("map", "tub", "--lane-width", "40", "--out", "m")
     assert "the map was rejected" in error_of(result)
     assert "verdict: reject" in result.stdout and "wrote m/report.html" in result.stdout
@@ -207,7 +203,7 @@ def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
 
 def test_map_that_is_lost_says_so(asked: Asked) -> None:
     lost = asked.function("map", TrackingLostError("tub: lost at frame 12"))
-    asked.module("datagen.pipeline", MapSettings=FakeSettings, map_drive=lost)
+    asked.module("datagen.pipeline", MapRequest=MapRequest, MapSettings=FakeSettings, map_drive=lost)
     assert error_of(run("map", "tub", "--lane-width", "40", "--out", "m")) == "error: tub: lost at frame 12"
 
 

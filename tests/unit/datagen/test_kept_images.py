@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.slam.kept_images import KeptImages
+from datagen.prepare import KeptImages
 from lanenet.errors import DriveFormatError
 
 

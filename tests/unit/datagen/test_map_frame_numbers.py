@@ -11,10 +11,11 @@ from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.trace import TracedLane
 from datagen.quality.figures import map_edges
 from datagen.slam.adjustment.adjust import BundleResult
-from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SolvedSegment
+from datagen.slam.settings import GuessSettings
 from lanenet.geometry.frames import car_from_map
 from lanenet.perception.edges.road import RoadEdges
 
@@ -24,7 +25,7 @@ NUMBERS = np.array([0, 1, 5, 6, 7, 9, 10])
 
 
 def segment(rows: list[int], seed: int) -> MappedSegment:
-    """A stretch whose frame at row r shows r + 1 edge points."""
+    """A segment whose frame at row r shows r + 1 edge points."""
     rng = np.random.default_rng(seed)
     n = len(rows)
     poses = rng.normal(0.0, 1.0, (n, 3))
@@ -36,6 +37,7 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
         )
     zeros = np.zeros(n)
     solved = SolvedSegment(
+        rows=np.array(rows),
         camera=CAMERA,
         scans=pack_scans(roads, 15.0),
         trajectory=Trajectory(poses, zeros, zeros, zeros),
@@ -47,7 +49,7 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
         bundle=BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(1), 0.0, 1),
     )
     lane = TracedLane(zeros, zeros, zeros, 30.0, 2.0)
-    return MappedSegment(np.array(rows), solved, zeros, lane, [])
+    return MappedSegment(solved, zeros, lane, [])
 
 
 def test_edges_name_the_drives_own_frames():
@@ -74,6 +76,7 @@ def test_each_edge_lies_where_its_frame_saw_it():
 
 def test_the_edges_do_not_depend_on_where_the_frames_that_count_lie():
     part = segment([2, 3, 4], 2)
-    moved = map_edges([replace(part, rows=part.rows - 2)], NUMBERS[2:], CAMERA, 1.0)
+    shifted = replace(part, solved=replace(part.solved, rows=part.rows - 2))
+    moved = map_edges([shifted], NUMBERS[2:], CAMERA, 1.0)
     for name, values in map_edges([part], NUMBERS, CAMERA, 1.0).items():
         np.testing.assert_array_equal(moved[name], values)

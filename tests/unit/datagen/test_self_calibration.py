@@ -16,7 +16,8 @@ from datagen.lanes.trace import TracedLane
 from datagen.quality.pictures import straight_frames
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult, BundleSettings
-from datagen.slam.camera.coarse import GuessSettings, guessed_camera, nudged
+from datagen.slam.camera.changes import nudged
+from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.camera.self_calibration import (
     SIGMA_FACTOR,
     FoundCamera,
@@ -27,9 +28,10 @@ from datagen.slam.camera.self_calibration import (
     refining,
 )
 from datagen.slam.filter.dp_slam import Trajectory
-from datagen.slam.loops.revisits import Revisit
+from datagen.slam.loops.places import Revisit
 from datagen.slam.odometry.scans import pack_scans
-from datagen.slam.segment import SolvedSegment
+from datagen.slam.segment import SegmentSolver, SolvedSegment
+from datagen.slam.settings import GuessSettings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.drives.writer import DriveWriter
@@ -51,7 +53,9 @@ def found(heading: np.ndarray, revisits: int = 8, focal_sigma: float = 0.02) -> 
     bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, SIGMA, np.zeros(5), 1.0, 10)
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
     places = [REVISIT] * revisits
-    solved = SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, places, None, bundle)
+    solved = SolvedSegment(
+        np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, places, None, bundle
+    )
     return FoundCamera(solved, [], {**SIGMA, "focal": focal_sigma}, False, 0.5)
 
 
@@ -87,7 +91,7 @@ def test_a_car_that_only_reverses_is_refused(tmp_path):
         for k in range(220):
             image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
             writer.add(image, 0.05 * k, speed_cm_s=-20.0, truth=None)
-    with pytest.raises(CalibrationError, match=r"reverse in frames .*Drive two laps"):
+    with pytest.raises(CalibrationError, match=r"told to reverse in frames .*Drive two laps"):
         calibrate_drive(tmp_path / "d", 40.0, None, None, MapSettings())
 
 
@@ -196,11 +200,11 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
     asked: list[float] = []
     lap = np.linspace(0.0, 4.0 * np.pi, 400)
 
-    def solve(drive, camera, settings, rng, progress, find_camera, believed=None):
+    def solve(self, drive, camera, find_camera, prior_camera=None):
         asked.append(float(camera.K[0, 0]))
         # Roll and principal point are believed to be as usual, whatever came out before; the drive is
         # followed with what a closed loop has found.
-        usual = camera if believed is None else believed
+        usual = camera if prior_camera is None else prior_camera
         assert usual.mounting.roll_rad == 0.0 and usual.K[0, 2] == 79.5 and find_camera
         once_closed = any(was_closed for _, was_closed in answers[: len(asked) - 1])
         assert camera.mounting.roll_rad == pytest.approx(0.04 if once_closed else 0.0)
@@ -210,9 +214,10 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
         bundle = replace(solved.bundle, camera=adjusted)
         return replace(solved, camera=adjusted, bundle=bundle)
 
-    monkeypatch.setattr(datagen.slam.camera.self_calibration, "solve_segment", solve)
+    monkeypatch.setattr(SegmentSolver, "solve", solve)
     monkeypatch.setattr(datagen.slam.camera.self_calibration, "coarse_camera", lambda *_: (CAMERA, []))
-    result = find_camera(made_up_drive(400), None, MapSettings(), np.random.default_rng(0))
+    solver = SegmentSolver(MapSettings(), np.random.default_rng(0))
+    result = find_camera(made_up_drive(400), None, solver)
     assert asked == pytest.approx(starts)
     closed = [focal_px for focal_px, was_closed in answers if was_closed]
     assert result.closed and result.camera.K[0, 0] == pytest.approx(closed[-1])

@@ -22,7 +22,7 @@ NOMINAL = (
 def test_a_wheelbase_that_nobody_gave_is_nominal_and_said_so():
     settings, camera, notes = with_wheelbase(MapSettings(), None, None)
     assert settings == MapSettings() and camera is None
-    assert notes == [NOMINAL]
+    assert notes == (NOMINAL,)
 
 
 def test_settings_that_were_saved_in_full_do_not_make_a_nominal_wheelbase_known(tmp_path):
@@ -31,20 +31,20 @@ def test_settings_that_were_saved_in_full_do_not_make_a_nominal_wheelbase_known(
     saved = load_settings(MapSettings, path)
     assert "wheelbase_cm" in saved.guess.model_fields_set
     _, _, notes = with_wheelbase(saved, None, None)
-    assert notes == [NOMINAL]
-    assert with_wheelbase(saved, None, 17.0)[2] == []
+    assert notes == (NOMINAL,)
+    assert with_wheelbase(saved, None, 17.0)[2] == ()
 
 
 def test_a_wheelbase_of_the_settings_or_the_camera_is_not_nominal():
     told = MapSettings.model_validate({"guess": {"wheelbase_cm": 26.0}})
-    assert with_wheelbase(told, None, None) == (told, None, [])
-    assert with_wheelbase(MapSettings(), CAMERA, None) == (MapSettings(), CAMERA, [])
+    assert with_wheelbase(told, None, None) == (told, None, ())
+    assert with_wheelbase(MapSettings(), CAMERA, None) == (MapSettings(), CAMERA, ())
 
 
 @pytest.mark.parametrize("wheelbase_cm", [17.0, 26.0])
 def test_a_given_wheelbase_goes_before_all_others(wheelbase_cm):
     settings, camera, notes = with_wheelbase(MapSettings(), CAMERA, wheelbase_cm)
-    assert settings.guess.wheelbase_cm == wheelbase_cm and notes == []
+    assert settings.guess.wheelbase_cm == wheelbase_cm and notes == ()
     assert camera is not None and camera.wheelbase_cm == wheelbase_cm
     # The lens stays where it is over the front axle.
     assert camera.mounting == CAMERA.mounting

@@ -16,6 +16,7 @@ from datagen.datasets.build import prepare, shared_camera
 from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
 from datagen.datasets.settings import DataSettings, RecordedSettings, SyntheticSettings
 from datagen.datasets.splits import split_along_time
+from datagen.prepare import MapRequest
 from datagen.world.simulate import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.errors import ConfigError, TrackingLostError
@@ -148,7 +149,8 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
 
     pictured: list[str] = []
 
-    def map_drive(path: Path, *_: object, pictures: bool) -> None:
+    def map_drive(request: MapRequest, *_: object, pictures: bool) -> None:
+        path = request.drive_path
         mapped.append(path.name)
         pictured.extend([path.name] if pictures else [])
         if path.name in ("train_01", "train_02"):
@@ -241,9 +243,7 @@ def test_drives_have_names_for_people(tmp_path):
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):
     made: list[str] = []
 
-    def map_drive(
-        path: Path, lane_width_cm: float, camera: Path | None, map_settings: object, out: Path
-    ) -> None:
+    def map_drive(request: MapRequest, map_settings: object, out: Path) -> None:
         made.append("map")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)

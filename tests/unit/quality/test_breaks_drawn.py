@@ -11,9 +11,10 @@ import pytest
 
 from datagen.quality import plots
 from datagen.quality.pictures import draw_map
-from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.camera.coarse import guessed_camera
+from datagen.slam.commands import SteeringFit
 from datagen.slam.odometry.scans import pack_scans
-from datagen.slam.track import SteeringFit
+from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.data.maps.mapped_drive import MappedDrive

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from datagen.labels.label_map import label_map, refuse_rejected
-from datagen.pipeline import map_drive
+from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -44,7 +44,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def mapped(drive: Path) -> tuple[Path, tuple[str, ...]]:
     out = drive.parent / "map"
-    return out, map_drive(drive, 40.0, None, SETTINGS, out).lines
+    return out, map_drive(MapRequest(drive, 40.0), SETTINGS, out).lines
 
 
 def test_a_clean_drive_is_good_and_says_so_first(mapped):
@@ -56,7 +56,7 @@ def test_a_clean_drive_is_good_and_says_so_first(mapped):
 def test_without_pictures_the_map_is_the_same(drive, mapped, tmp_path):
     folder, lines = mapped
     bare = tmp_path / "bare"
-    assert map_drive(drive, 40.0, None, SETTINGS, bare, pictures=False).lines == lines
+    assert map_drive(MapRequest(drive, 40.0), SETTINGS, bare, pictures=False).lines == lines
     drawn = {"map.png", "frames.png", "report.html"}
     assert {p.name for p in folder.iterdir()} - {p.name for p in bare.iterdir()} == drawn
     for name in ("poses.csv", "lanes.json", "report.json"):
@@ -132,7 +132,7 @@ def test_held_out_frames_have_no_say_in_the_lines(drive, tmp_path):
     """With other frames held out the lines move a little; the poses do not move at all."""
     folders = [tmp_path / name for name in ("a", "b")]
     for folder, every in zip(folders, (0, 2), strict=True):
-        map_drive(drive, 40.0, None, SETTINGS.model_copy(update={"held_out_every": every}), folder)
+        map_drive(MapRequest(drive, 40.0), SETTINGS.model_copy(update={"held_out_every": every}), folder)
     first, second = (read_map(folder) for folder in folders)
     np.testing.assert_array_equal(first.poses, second.poses)
     s = np.linspace(20.0, 150.0, 30)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from datagen.calibrate_drive import calibrate_drive
-from datagen.pipeline import map_drive
-from datagen.quality.mappable import check_edges, check_lines_seen, check_moving
+from datagen.check import check_lines_seen
+from datagen.pipeline import MapRequest, map_drive
+from datagen.prepare import check_edges, check_moving
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import BorderSamples, join_samples
 from datagen.settings import MapSettings
@@ -43,7 +44,7 @@ def written(folder: Path, frames: list[np.ndarray]) -> Path:
 def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0) -> str:
     """Message of a drive that is not mapped; nothing may be left behind."""
     with pytest.raises(TrackingLostError) as caught:
-        map_drive(drive, lane_width_cm, None, SETTINGS, out)
+        map_drive(MapRequest(drive, lane_width_cm), SETTINGS, out)
     assert not out.exists() and not list(out.parent.glob(".*"))
     message = str(caught.value)
     assert str(drive) in message and INSTEAD in message
@@ -97,7 +98,7 @@ def test_an_older_map_is_kept_and_named_where_the_new_one_is_refused(tmp_path):
     frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
     drive, out = written(tmp_path / "drive", frames), older_map(tmp_path / "map", "usable")
     with pytest.raises(TrackingLostError, match=rf"20 frames.*map at {out} is an older one.*verdict: usable"):
-        map_drive(drive, 40.0, None, SETTINGS, out)
+        map_drive(MapRequest(drive, 40.0), SETTINGS, out)
     assert "usable" in (out / "map.yaml").read_text()
 
 
@@ -107,15 +108,15 @@ def test_where_no_map_can_be_written_none_is_made(tmp_path):
     foreign.mkdir()
     (foreign / "x.txt").write_text("x")
     with pytest.raises(LanenetError, match=r"notes: the folder is not empty and holds no map.yaml"):
-        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, foreign)
+        map_drive(MapRequest(tmp_path / "nowhere", 40.0), SETTINGS, foreign)
     with pytest.raises(LanenetError, match=r"x.txt: is a file, expected a folder"):
-        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, foreign / "x.txt")
+        map_drive(MapRequest(tmp_path / "nowhere", 40.0), SETTINGS, foreign / "x.txt")
 
 
 def test_what_a_killed_run_left_goes_also_where_the_new_one_fails(tmp_path):
     left, other = older_map(tmp_path / ".map.0123abcd.tmp", "good"), older_map(tmp_path / "other", "good")
     with pytest.raises(DriveFormatError, match="nowhere"):
-        map_drive(tmp_path / "nowhere", 40.0, None, SETTINGS, tmp_path / "map")
+        map_drive(MapRequest(tmp_path / "nowhere", 40.0), SETTINGS, tmp_path / "map")
     assert not left.exists() and other.exists()
 
 
@@ -200,5 +201,5 @@ def test_a_lane_width_wrong_by_two_is_found_where_the_camera_is_known(tmp_path, 
     with pytest.raises(
         CalibrationError, match=rf"{given_cm:g} cm apart .* (39|40|41) cm apart .*camera's height"
     ):
-        map_drive(both_lines, given_cm, None, SETTINGS, tmp_path / "map")
+        map_drive(MapRequest(both_lines, given_cm), SETTINGS, tmp_path / "map")
     assert not (tmp_path / "map").exists()

@@ -10,7 +10,7 @@ import pytest
 from picture_road import loop_drive
 from pixel_road import fisheye
 
-from datagen.pipeline import map_drive
+from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings
@@ -33,7 +33,7 @@ def test_repeated_frames_are_not_mapped_and_do_not_cut_the_drive(tmp_path: Path)
     settings = MapSettings(
         filter=FilterSettings(particles=80, max_points=80), bundle=BundleSettings(points=40)
     )
-    report = map_drive(tmp_path / "drive", 36.0, None, settings, tmp_path / "map")
+    report = map_drive(MapRequest(tmp_path / "drive", 36.0), settings, tmp_path / "map")
     assert (
         f"{len(repeats)} frames show the same as the one before, and are left out" in report.figures["notes"]
     )

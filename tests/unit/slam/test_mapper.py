@@ -6,22 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from picture_road import made_up_drive
 from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
+from datagen.slam.commands import CommandedMotion, commands_of, delayed, fit_steering
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
-from datagen.slam.odometry.odometry import Odometry, typical_step
-from datagen.slam.odometry.scans import scans_of
-from datagen.slam.track import (
-    CommandedMotion,
-    MotionSettings,
-    commands_of,
-    delayed,
-    fit_steering,
-    motion_about,
-    track,
-)
+from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
+from datagen.slam.odometry.odometry import Odometry, usual_way
+from datagen.slam.settings import MotionSettings, SlamSettings
+from datagen.slam.track import motion_about, track
+from datagen.slam.view import RoadView, SegmentView
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.perception.edges.road import RangeSettings
 
@@ -179,18 +174,15 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     camera = fisheye()
     edges = pixels(road, camera)
     rng = np.random.default_rng(0)
-    pictures = ImagePairs(edges, camera, OdometrySettings(), rng)
-    trajectory, fit = track(
-        pictures,
-        scans_of(edges, camera, RangeSettings()),
-        commands,
-        typical_step(pictures, commands.distance_cm, speed_known),
-        camera,
-        FilterSettings(particles=200),
-        MotionSettings(),
-        rng,
-        lambda done, total: calls.append((done, total)),
-    )
+    pictures = Pictures(edges, camera, OdometrySettings(), rng)
+    blank = made_up_drive([np.zeros((camera.height, camera.width, 3), np.uint8)] * n)
+    everywhere = np.ones((camera.height, camera.width), np.uint8)
+    road_view = RoadView(edges, everywhere, RangeSettings())
+    usual = usual_way(pictures, commands.distance_cm, speed_known, HEIGHT_CM)
+    seen = SegmentView(blank, camera, commands, road_view, road_view.scans(camera), pictures, usual)
+    settings = SlamSettings(filter=FilterSettings(particles=200))
+    tracked = track(seen, settings, rng, lambda done, total: calls.append((done, total)))
+    trajectory, fit = tracked.trajectory, tracked.steering
     assert calls == [(k, 2 * n) for k in range(1, 2 * n + 1)]
     assert fit is not None
     assert abs(fit.lag_frames - 2) <= 1

@@ -13,11 +13,11 @@ from pixel_road import camera_numbers, fisheye
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.self_calibration import SIGMA_FACTOR
+from datagen.slam.commands import CommandedMotion
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.pose_graph import loop_pairs, neighbouring_laps, revisit_residuals
-from datagen.slam.loops.revisits import Revisit, RevisitSettings
-from datagen.slam.segment import SolvedSegment, solve_segment
-from datagen.slam.track import CommandedMotion
+from datagen.slam.loops.places import Revisit, RevisitSettings
+from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
+from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.recording import Commands, Drive
@@ -56,7 +56,7 @@ def _errors_cm(poses: np.ndarray, true: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def solved() -> tuple[SolvedSegment, np.ndarray]:
     drive, poses = _drive(125)
-    return solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None), poses
+    return SegmentSolver(SMALL, np.random.default_rng(0)).solve(drive, _camera()), poses
 
 
 def test_laps_side_by_side_are_paired_once_each():
@@ -64,7 +64,7 @@ def test_laps_side_by_side_are_paired_once_each():
     angle = 2.0 * np.pi * np.arange(270) / 90
     radius = 64.0 + np.repeat([0.0, 5.0, 30.0], 90)
     poses = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), angle])
-    pairs = neighbouring_laps(poses, 15.0, RevisitSettings())
+    pairs = side_by_side(poses, 15.0, RevisitSettings())
     lap_apart = {(later - 90, later) for later in range(90, 180, 3)}
     assert lap_apart <= set(pairs)
     # The third lap is too far away. Where one lap goes over into the next, both are near.
@@ -72,14 +72,14 @@ def test_laps_side_by_side_are_paired_once_each():
     # Driven the other way round, no picture shows the same.
     back = poses.copy()
     back[90:, 2] += np.pi
-    turned = neighbouring_laps(back[:180], 15.0, RevisitSettings())
+    turned = side_by_side(back[:180], 15.0, RevisitSettings())
     assert all((earlier < 90) == (later < 90) for earlier, later in turned)
 
 
 def test_a_lap_is_held_on_each_of_the_three_before_it():
     angle = 2.0 * np.pi * np.arange(450) / 90
     poses = np.column_stack([64.0 * np.sin(angle), -64.0 * np.cos(angle), angle])
-    pairs = neighbouring_laps(poses, 15.0, RevisitSettings())
+    pairs = side_by_side(poses, 15.0, RevisitSettings())
     for later, laps in ((60, 0), (150, 1), (240, 2), (330, 3), (420, 3)):
         expected = [later - 90 * back for back in range(1, laps + 1)]
         assert [earlier for earlier, frame in pairs if frame == later] == expected
@@ -103,7 +103,7 @@ def test_revisits_are_a_lap_apart_and_meet(solved):
     for revisit in segment.revisits:
         assert abs(revisit.later - revisit.earlier - LAP_FRAMES) <= 2
         assert revisit.turns == 1
-    missed = np.median(np.abs(revisit_residuals(segment.poses, segment.revisits)), axis=0)
+    missed = np.median(np.abs(missed_by(segment.poses, segment.revisits)), axis=0)
     assert missed[:2].max() < 1.0 and missed[2] < np.deg2rad(1.0)
     assert segment.drift_rad_per_cm is not None
     missed_rad = [
@@ -128,7 +128,7 @@ def test_a_known_camera_stays_and_the_frames_agree(solved):
 
 def test_one_lap_stays_open():
     drive, true = _drive(60)
-    segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
+    segment = SegmentSolver(SMALL, np.random.default_rng(0)).solve(drive, _camera())
     assert segment.revisits == [] and segment.drift_rad_per_cm is None
     assert not segment.laps.any()
     np.testing.assert_array_equal(segment.poses, segment.open_poses)
@@ -139,7 +139,7 @@ def test_one_lap_stays_open():
 def test_pictures_without_edges_cannot_be_mapped():
     gray = [np.full((120, 160, 3), 90, np.uint8)] * 60
     with pytest.raises(TrackingLostError, match=r"0 edge points per frame.*needs 20"):
-        solve_segment(made_up_drive(gray), _camera(), SMALL, np.random.default_rng(0), None)
+        SegmentSolver(SMALL, np.random.default_rng(0)).solve(made_up_drive(gray), _camera())
 
 
 def test_pairs_around_a_revisit_stay_within_the_drive():
@@ -150,8 +150,8 @@ def test_pairs_around_a_revisit_stay_within_the_drive():
 
 def test_ways_are_relative_to_the_usual_one():
     commands = CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
-    np.testing.assert_allclose(commands.relative_ways, [0.0, 1.0, 1.0, 2.0, 0.0])
-    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_ways, np.zeros(3))
+    np.testing.assert_allclose(commands.relative_steps, [0.0, 1.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_steps, np.zeros(3))
 
 
 @pytest.mark.slow
@@ -164,7 +164,7 @@ def test_a_camera_that_is_off_is_found_once_the_loop_is_closed(seed):
     for factor, pitch_rad in ((1.06, 0.44), (0.94, 0.40)):
         start = replace(true, K=true.K * np.array([[factor, 0.0, 1.0], [0.0, factor, 1.0], [0.0, 0.0, 1.0]]))
         start = start.with_mounting(pitch_down_rad=pitch_rad, yaw_rad=0.0)
-        segment = solve_segment(drive, start, SMALL, np.random.default_rng(seed), None, find_camera=True)
+        segment = SegmentSolver(SMALL, np.random.default_rng(seed)).solve(drive, start, find_camera=True)
         # The uncertainty it tells is that of a number that was seen, not of the prior; and so short a drive
         # with so few dashes trades focal length for pitch and k1 within what it tells.
         focal_sigma = segment.bundle.sigma["focal"]
@@ -191,7 +191,7 @@ def test_a_simulated_drive_is_mapped_to_millimetres(tmp_path: Path, seed):
     )
     drive = open_drive(simulate_drive(settings, tmp_path / "drive"))
     assert drive.camera is not None
-    segment = solve_segment(drive, drive.camera, MapSettings(), np.random.default_rng(seed), None)
+    segment = SegmentSolver(MapSettings(), np.random.default_rng(seed)).solve(drive, drive.camera)
     truth = read_truth(tmp_path / "drive")
     error = _errors_cm(segment.poses, np.stack([truth["x_cm"], truth["y_cm"]], axis=1))
     assert segment.revisits

@@ -1,4 +1,4 @@
-"""Stretches of a drive: each keeps its own poses, and one that cannot be mapped leaves the others."""
+"""Segments of a drive: each keeps its own poses, and one that cannot be mapped leaves the others."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datagen import pipeline
-from datagen.lanes import find as stretches
+from datagen import pipeline, prepare
+from datagen import segments as drive_segments
 from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.trace import TracedLane
+from datagen.segments import MappedDriveSegments
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult
-from datagen.slam.camera.coarse import GuessSettings, guessed_camera
+from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.filter.dp_slam import Trajectory
-from datagen.slam.join import Stretch
 from datagen.slam.odometry.scans import pack_scans
-from datagen.slam.segment import SolvedSegment
+from datagen.slam.segment import SegmentSolver, SolvedSegment
+from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
@@ -59,16 +61,16 @@ def _solved(n: int) -> SolvedSegment:
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
     bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), 1.0, 10)
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
-    return SolvedSegment(CAMERA, nothing, trajectory, poses, poses, None, [], None, bundle)
+    return SolvedSegment(np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, [], None, bundle)
 
 
 @pytest.mark.parametrize("at", [70, 130])
-def test_each_stretch_keeps_its_own_poses_where_the_longest_gave_the_camera(monkeypatch, at):
+def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monkeypatch, at):
     drive = _drive(200, [at])
     longest = _solved(130)
-    seen: list[Stretch] = []
+    seen: list[SolvedSegment] = []
 
-    def join(found: list[Stretch], *_: object) -> None:
+    def join(found: tuple[SolvedSegment, ...], *_: object) -> None:
         seen.extend(found)
         raise _StopError
 
@@ -76,19 +78,19 @@ def test_each_stretch_keeps_its_own_poses_where_the_longest_gave_the_camera(monk
         assert len(part) == 130
         return SimpleNamespace(solved=longest, camera=CAMERA, how="found", figures={}, note="found")
 
-    monkeypatch.setattr(pipeline, "open_drive", lambda path: drive)
-    monkeypatch.setattr(pipeline, "following_frames", lambda drive: (drive, []))
-    monkeypatch.setattr(pipeline, "keep_images", lambda drive: drive)
-    for check in ("check_moving", "check_edges"):
-        monkeypatch.setattr(pipeline, check, lambda *_: None)
+    monkeypatch.setattr(prepare, "open_drive", lambda path: drive)
+    monkeypatch.setattr(prepare, "following_frames", lambda drive, notes: drive)
+    monkeypatch.setattr(prepare, "keep_images", lambda drive: drive)
+    monkeypatch.setattr(prepare, "check_moving", lambda *_: None)
+    monkeypatch.setattr(pipeline, "check_edges", lambda *_: None)
     monkeypatch.setattr(pipeline, "find_camera", find)
-    monkeypatch.setattr(stretches, "solve_segment", lambda part, *_: _solved(len(part)))
-    monkeypatch.setattr(stretches, "join_stretches", join)
+    monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: _solved(len(part)))
+    monkeypatch.setattr(pipeline, "join_segments", join)
     with pytest.raises(_StopError):
-        pipeline.map_drive(Path("made-up"), 40.0, None, SETTINGS, Path("nowhere"))
-    assert [len(s.rows) for s in seen] == [at, 200 - at]
-    assert [len(s.solved.poses) for s in seen] == [at, 200 - at]
-    assert next(s for s in seen if len(s.rows) == 130).solved is longest
+        pipeline.map_drive(pipeline.MapRequest(Path("made-up"), 40.0), SETTINGS, Path("nowhere"))
+    assert [(int(s.rows[0]), int(s.rows[-1])) for s in seen] == [(0, at - 1), (at, 199)]
+    assert [len(s.poses) for s in seen] == [at, 200 - at]
+    assert next(s for s in seen if len(s.rows) == 130).poses is longest.poses
 
 
 def _line(side: Side, until_cm: float) -> LaneLine:
@@ -99,21 +101,20 @@ def _line(side: Side, until_cm: float) -> LaneLine:
 def _map(
     monkeypatch: pytest.MonkeyPatch,
     drive: Drive,
-    notes: list[str],
     no_edges: tuple[int, ...] = (),
     no_lane: tuple[int, ...] = (),
     one_line: tuple[int, ...] = (),
     other_lane: tuple[int, ...] = (),
-) -> list[MappedSegment]:
-    """Map a drive whose stretches of some lengths show no edges, no lane, one line only, or another lane."""
+) -> MappedDriveSegments:
+    """Map a drive whose segments of some lengths show no edges, no lane, one line only, or another lane."""
 
-    def solve(part: Drive, *_: object) -> SolvedSegment:
+    def solve(self: SegmentSolver, part: Drive, camera: Camera) -> SolvedSegment:
         if len(part) in no_edges:
             raise TrackingLostError(f"{part.path}: {len(part)} frames, 3 edge points per frame")
         return _solved(len(part))
 
-    def find_lane(stretch: Stretch, *_: object) -> MappedSegment:
-        n = len(stretch.rows)
+    def find_lane(segment: SolvedSegment, *_: object) -> MappedSegment:
+        n = len(segment.rows)
         if n in no_lane:
             raise TrackingLostError(f"no pair of lines in {n} frames")
         if n in other_lane:
@@ -121,13 +122,14 @@ def _map(
         lane = TracedLane(np.zeros(2), np.zeros(2), np.zeros(2), 40.0, 2.0)
         # The right line ends early where there is one line only.
         lines = [_line("left", 3.0 * n), _line("right", 0.3 * n if n in one_line else 3.0 * n)]
-        return MappedSegment(stretch.rows, stretch.solved, 3.0 * np.arange(n), lane, lines)
+        return MappedSegment(segment, 3.0 * np.arange(n), lane, lines)
 
-    monkeypatch.setattr(stretches, "solve_segment", solve)
-    monkeypatch.setattr(stretches, "_find_lane", find_lane)
-    segments, held_out = pipeline.split_segments(drive), np.zeros(len(drive), dtype=bool)
-    rng = np.random.default_rng(0)
-    return stretches.map_stretches(drive, segments, CAMERA, {}, 40.0, held_out, SETTINGS, rng, notes, None)
+    monkeypatch.setattr(SegmentSolver, "solve", solve)
+    monkeypatch.setattr(drive_segments, "find_lane", find_lane)
+    solver = SegmentSolver(SETTINGS, np.random.default_rng(0))
+    solved = drive_segments.solve_segments(drive, prepare.split_segments(drive), CAMERA, solver, {})
+    held_out = np.zeros(len(drive), dtype=bool)
+    return drive_segments.fit_lanes(solved.segments, solved.refused, drive, 40.0, held_out, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -139,25 +141,22 @@ def _map(
         ({"other_lane": (70,)}, "a lane of 30 cm in 70 frames, expected 40 cm"),
     ],
 )
-def test_a_stretch_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, why):
-    notes: list[str] = []
-    parts = _map(monkeypatch, _drive(1000, [300, 370]), notes, **bad)
-    assert [(int(p.rows[0]), int(p.rows[-1])) for p in parts] == [(0, 299), (370, 999)]
-    assert len(notes) == 1
-    assert notes[0].startswith(f"frames 1300-1369 left out: {why}")
+def test_a_segment_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, why):
+    mapped = _map(monkeypatch, _drive(1000, [300, 370]), **bad)
+    assert [(int(s.rows[0]), int(s.rows[-1])) for s in mapped.segments] == [(0, 299), (370, 999)]
+    (note,) = mapped.notes
+    assert note.startswith(f"frames 1300-1369 left out: {why}")
 
 
-def test_the_longest_stretch_says_why_nothing_could_be_mapped(monkeypatch):
-    notes: list[str] = []
+def test_the_longest_segment_says_why_nothing_could_be_mapped(monkeypatch):
     with pytest.raises(TrackingLostError, match="no pair of lines in 130 frames"):
-        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(70,), no_lane=(130,))
+        _map(monkeypatch, _drive(200, [70]), no_edges=(70,), no_lane=(130,))
     with pytest.raises(TrackingLostError, match="130 frames, 3 edge points"):
-        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(130,), no_lane=(70,))
+        _map(monkeypatch, _drive(200, [70]), no_edges=(130,), no_lane=(70,))
     with pytest.raises(CalibrationError, match="a lane of 30 cm in 130 frames"):
-        _map(monkeypatch, _drive(200, [70]), notes, no_edges=(70,), other_lane=(130,))
+        _map(monkeypatch, _drive(200, [70]), no_edges=(70,), other_lane=(130,))
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):
-    notes: list[str] = []
-    assert len(_map(monkeypatch, _drive(200, [70]), notes)) == 2
-    assert not notes
+    mapped = _map(monkeypatch, _drive(200, [70]))
+    assert len(mapped.segments) == 2 and not mapped.notes

@@ -1,4 +1,4 @@
-"""A car that crawls for a part of its drive: followed by key frames, every frame on the map."""
+"""A car that is slow for a part of its drive: tracked by keyframes, every frame on the map."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pixel_road import fisheye
 
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
+from datagen.slam.commands import commands_of
 from datagen.slam.filter.dp_slam import FilterSettings, Trajectory
-from datagen.slam.keyframes import key_pairs
-from datagen.slam.loops.revisits import Revisit
+from datagen.slam.keyframes import keyframe_pairs
+from datagen.slam.loops.places import Revisit
 from datagen.slam.odometry.scans import pack_scans
-from datagen.slam.segment import SolvedSegment, _with_frames_between, solve_segment
-from datagen.slam.track import commands_of
+from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
 
 SMALL = MapSettings(filter=FilterSettings(particles=80, max_points=80), bundle=BundleSettings(points=40))
-STEP_CM, CRAWLED = 0.6, 180
+STEP_CM, SLOW_FRAMES = 0.6, 180
 
 
 def _camera() -> Camera:
@@ -34,8 +34,8 @@ def _camera() -> Camera:
 def _drive() -> tuple[Drive, np.ndarray]:
     """Frames 6 mm apart, then 3 cm, on a loop of 360 cm, most of it driven."""
     drive, poses = loop_drive(_camera(), 480, 600, 600 * STEP_CM, seed=1)
-    rows = np.r_[0:CRAWLED, CRAWLED:480:5]
-    step_cm = np.where(rows < CRAWLED, STEP_CM, 5.0 * STEP_CM)
+    rows = np.r_[0:SLOW_FRAMES, SLOW_FRAMES:480:5]
+    step_cm = np.where(rows < SLOW_FRAMES, STEP_CM, 5.0 * STEP_CM)
     thinned = replace(drive.subset(rows), t_s=0.05 * np.arange(len(rows)))
     return replace(thinned, commands=Commands(speed_cm_s=step_cm / 0.05)), poses[rows]
 
@@ -43,34 +43,34 @@ def _drive() -> tuple[Drive, np.ndarray]:
 @pytest.fixture(scope="module")
 def solved() -> tuple[SolvedSegment, np.ndarray]:
     drive, true = _drive()
-    return solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None), true
+    return SegmentSolver(SMALL, np.random.default_rng(0)).solve(drive, _camera()), true
 
 
-def test_the_way_is_that_of_the_car_crawling_or_not(solved):
+def test_the_distance_is_that_of_the_car_slow_or_not(solved):
     segment, true = solved
     assert len(segment.poses) == len(segment.scans) == len(true)
     found, driven = path_lengths(segment.poses), path_lengths(true)
-    for start, stop in ((0, CRAWLED), (CRAWLED, len(true) - 1)):
-        way = driven[stop] - driven[start]
-        assert found[stop] - found[start] == pytest.approx(way, rel=0.04)
+    for start, stop in ((0, SLOW_FRAMES), (SLOW_FRAMES, len(true) - 1)):
+        distance = driven[stop] - driven[start]
+        assert found[stop] - found[start] == pytest.approx(distance, rel=0.04)
     assert found[-1] == pytest.approx(driven[-1], rel=0.02)
     turn = segment.poses[-1, 2] - segment.poses[0, 2]
     assert turn == pytest.approx(true[-1, 2] - true[0, 2], abs=np.deg2rad(3.0))
 
 
-def test_every_frame_of_the_crawl_moves_on(solved):
+def test_every_frame_of_the_slow_part_moves_on(solved):
     segment, _ = solved
-    steps_cm = np.diff(path_lengths(segment.poses))[: CRAWLED - 1]
+    steps_cm = np.diff(path_lengths(segment.poses))[: SLOW_FRAMES - 1]
     assert steps_cm.min() > 0.3 * STEP_CM and steps_cm.max() < 1.8 * STEP_CM
     assert segment.bundle.robust_sd_px < 0.3
-    # Ways from key frame to key frame are those of a drive.
+    # Steps from keyframe to keyframe are those of a drive.
     matches = len(np.unique(segment.trajectory.match[1:]))
-    assert matches == pytest.approx(CRAWLED / 4 + 60, abs=8)
+    assert matches == pytest.approx(SLOW_FRAMES / 4 + 60, abs=8)
 
 
-def test_where_no_speed_was_recorded_a_crawl_shows_by_its_step():
+def test_where_no_speed_was_recorded_a_slow_car_shows_by_its_step():
     drive, poses = loop_drive(_camera(), 130, 600, 600 * STEP_CM, seed=1)
-    segment = solve_segment(drive, _camera(), SMALL, np.random.default_rng(0), None)
+    segment = SegmentSolver(SMALL, np.random.default_rng(0)).solve(drive, _camera())
     assert len(np.unique(segment.trajectory.match[1:])) < 50
     assert path_lengths(segment.poses)[-1] == pytest.approx(path_lengths(poses)[-1], rel=0.1)
 
@@ -79,7 +79,7 @@ class _StopError(Exception):
     """The rest is another test's."""
 
 
-def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypatch):
+def test_revisits_that_the_map_of_keyframes_contradicts_hold_no_frames(monkeypatch):
     lap, keys = 150, np.arange(0, 301, 3)
     angle = 2.0 * np.pi * np.arange(301) / lap
     poses = np.column_stack([60.0 * np.sin(angle), -60.0 * np.cos(angle), angle])
@@ -90,8 +90,8 @@ def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypa
     still = np.zeros(len(keys))
     bundle = BundleResult(on_keys, np.zeros((len(keys), 2)), _camera(), {}, np.zeros(1), 1.0, 1)
     solved = SolvedSegment(
-        _camera(), pack_scans([], 15.0), Trajectory(on_keys, still, still, still), on_keys, on_keys, None,
-        [true, false], None, bundle,
+        keys, _camera(), pack_scans([], 15.0), Trajectory(on_keys, still, still, still), on_keys, on_keys,
+        None, [true, false], None, bundle,
     )  # fmt: skip
     drive = made_up_drive([np.zeros((120, 160, 3), np.uint8)] * 301)
     held: list[tuple[int, int]] = []
@@ -102,9 +102,8 @@ def test_revisits_that_the_map_of_key_frames_contradicts_hold_no_frames(monkeypa
 
     monkeypatch.setattr("datagen.slam.segment.adjust", adjust)
     with pytest.raises(_StopError):
-        _with_frames_between(
-            solved, keys, np.full(301, 0.05), drive, commands_of(drive, 17.0), SMALL, np.random.default_rng(0)
-        )
+        solver = SegmentSolver(SMALL, np.random.default_rng(0))
+        solver.place_between(solved, keys, np.full(301, 0.05), drive, commands_of(drive, 17.0))
     assert {(15 + d, 15 + lap + d) for d in range(-12, 13, 4)} <= set(held)
     assert not {(30 + d, 30 + 3 * lap // 2 + d) for d in range(-12, 13, 4)} & set(held)
-    assert set(key_pairs(keys, SMALL.bundle.lags)) <= set(held)
+    assert set(keyframe_pairs(keys, SMALL.bundle.lags)) <= set(held)

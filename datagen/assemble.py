@@ -1,0 +1,104 @@
+"""Segments with their lanes -> one map in centimetres, with its frames in the order of the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datagen.lanes.mapped import MappedSegment
+from datagen.lanes.scale import fitted_width_cm
+from datagen.prepare import MapRequest, PreparedDrive
+from datagen.slam.camera.changes import with_known_scale
+from datagen.slam.odometry.scans import Scans
+from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class AssembledMap:
+    """A map, and the segments that it was assembled from.
+
+    Attributes:
+        drive_map: The map, [cm].
+        segments: Its segments, in the scale of the camera that they were solved with.
+        rows: Its frames, as positions in the drive.
+        factor: Turns the segments' lengths into centimetres.
+    """
+
+    drive_map: DriveMap
+    segments: list[MappedSegment]
+    rows: Int[np.ndarray, "n"]
+    factor: float
+
+    @property
+    def open_poses(self) -> Float[np.ndarray, "n 3"]:
+        """Poses before loops were closed, [cm]."""
+        return _in_order(self.segments, [s.solved.open_poses for s in self.segments]) * _pose_scale(
+            self.factor
+        )
+
+    @property
+    def scaled_scans(self) -> list[tuple[Scans, Float[np.ndarray, "n 3"], float]]:
+        """Of each segment the scans, the poses in centimetres, and the factor of the scans."""
+        scale = _pose_scale(self.factor)
+        return [(s.solved.scans, s.solved.poses * scale, self.factor) for s in self.segments]
+
+
+def assemble(
+    request: MapRequest, prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]
+) -> AssembledMap:
+    """Join the segments in one map, in centimetres.
+
+    Args:
+        request: What was given; its lane width sets the scale where the camera was not known.
+        prepared: The drive.
+        camera: The camera, known or found.
+        mapped: Segments in its scale.
+    """
+    segments = list(mapped)
+    lane_cm = float(np.median([fitted_width_cm(s.lines, s.lane, s.s_frames_cm) for s in segments]))
+    factor = 1.0
+    if prepared.camera is None:
+        factor = request.lane_width_cm / lane_cm
+        camera = with_known_scale(camera, factor, prepared.settings.guess.wheelbase_cm)
+    drive, rows = prepared.drive, np.sort(np.concatenate([s.rows for s in segments]))
+    markings_cm = [line.marking_cm for s in segments for line in s.lines[:2]]
+    meta = MapMeta(
+        format=FORMAT,
+        drive=str(request.drive_path),
+        lane_width_cm=request.lane_width_cm,
+        mapped_lane_cm=factor * lane_cm,
+        tape_cm=factor * float(np.median(markings_cm)),
+        scale_from="lane width" if prepared.camera is None else "camera",
+        laps=max(int(s.solved.laps.max()) for s in segments),
+    )
+    numbers = [np.full(len(s.rows), i) for i, s in enumerate(segments)]
+    drive_map = DriveMap(
+        meta=meta,
+        camera=camera,
+        frames=drive.frames[rows],
+        t_s=drive.t_s[rows],
+        poses=_in_order(segments, [s.solved.poses for s in segments]) * _pose_scale(factor),
+        lap=_in_order(segments, [s.solved.laps for s in segments]),
+        segment=_in_order(segments, numbers),
+        s_cm=_in_order(segments, [s.s_frames_cm for s in segments]) * factor,
+        match=_in_order(segments, [s.solved.trajectory.match for s in segments]),
+        lines={i: [line.scaled(factor) for line in s.lines] for i, s in enumerate(segments)},
+        tilt_rad=_in_order(segments, [s.solved.bundle.tilt for s in segments]),
+        held_out=prepared.held_out[rows],
+        # Found by the check.
+        contradicted=np.zeros((len(rows), 2), dtype=bool),
+    )
+    return AssembledMap(drive_map, segments, rows, factor)
+
+
+def _pose_scale(factor: float) -> Float[np.ndarray, "3"]:
+    return np.array([factor, factor, 1.0])
+
+
+def _in_order(segments: list[MappedSegment], values: list[np.ndarray]) -> np.ndarray:
+    """Values per frame of each segment, in the order of the drive: a segment may lie within another one."""
+    return np.concatenate(values)[np.argsort(np.concatenate([s.rows for s in segments]))]

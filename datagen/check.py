@@ -1,0 +1,117 @@
+"""Check of an assembled map before it is written: held-out frames, local checks, figures, verdict."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from datagen.assemble import AssembledMap
+from datagen.lanes.trace import other_lane
+from datagen.prepare import PreparedDrive
+from datagen.quality.agreement import contradicted_lines
+from datagen.quality.figures import free_lane_cm, map_evidence, map_figures, map_notes
+from datagen.quality.measure import MapQuality, measure_map, quality_figures
+from datagen.quality.residuals import REFERENCE_WIDTH, ResidualSettings, summarise
+from datagen.quality.verdict import Verdict, judge
+from lanenet.data.drives import Drive
+from lanenet.data.maps.mapped_drive import MappedDrive, points_text
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.lane import SIDES
+
+#: Least coverage of both lines. Chosen: dashes and worn lines have more.
+_LEAST_COVERAGE = 0.2
+#: A line is clutter if its robust sd exceeds the first, in pixels of an image 160 px wide, and its coverage
+#: is below the second; with more coverage it is a line that the map has bent. Measured: edges met by chance
+#: have 3 px, real lines 0.5 px at most (:class:`datagen.quality.verdict.VerdictSettings`).
+_CLUTTER_PX, _CLUTTER_COVERAGE = 1.5, 0.4
+
+
+@dataclass(frozen=True)
+class CheckedMap:
+    """A map with its verdict.
+
+    Attributes:
+        mapped: The map with its drive; lines that frames contradict are marked.
+        quality: What the held-out frames show of it.
+        verdict: How far it can be trusted.
+        figures: For machines.
+        notes: For people, a sentence each.
+    """
+
+    mapped: MappedDrive
+    quality: MapQuality
+    verdict: Verdict
+    figures: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+def check_map(assembled: AssembledMap, prepared: PreparedDrive, camera_figures: dict[str, Any]) -> CheckedMap:
+    """Compare a map with its frames and judge it.
+
+    Args:
+        assembled: The map.
+        prepared: The drive.
+        camera_figures: Those of the camera, where it was found or refined on this drive.
+
+    Raises:
+        TrackingLostError: If held-out frames do not show the lines.
+        CalibrationError: If they show one line only, but there is a lane of another width.
+    """
+    drive, drive_map, segments = prepared.drive, assembled.drive_map, assembled.segments
+    free_cm = free_lane_cm(segments)
+    figures = map_figures(drive_map, segments, drive.frames, assembled.factor)
+    notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
+    mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
+    drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
+    quality = measure_map(replace(mapped, drive_map=drive_map), ResidualSettings())
+    check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
+    figures |= quality_figures(quality, drive.width, ResidualSettings())
+    labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
+    notes.append(f"{labelled}; {points_text(quality.point_shares)}")
+    evidence = map_evidence(drive_map, camera_figures | figures, drive.deleted[assembled.rows], free_cm)
+    verdict = judge(evidence, prepared.settings.verdict)
+    meta = drive_map.meta.model_copy(update={"verdict": verdict.grade})
+    mapped = replace(mapped, drive_map=replace(drive_map, meta=meta))
+    return CheckedMap(mapped, quality, verdict, figures | {"verdict": asdict(verdict)}, tuple(notes))
+
+
+def check_lines_seen(
+    quality: MapQuality, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
+) -> None:
+    """Refuse lines that held-out frames do not show: clutter along the path.
+
+    Args:
+        quality: The map compared with its held-out frames.
+        drive: The drive.
+        lane_width_cm: The given lane width.
+        free_lane_cm: Lane width found without the given one, if it fits better; else None.
+
+    Raises:
+        TrackingLostError: If the frames show at most one of the lines; names the coverage.
+        CalibrationError: If they show at most one, but there is a lane of another width.
+    """
+    near = quality.near
+    coverage = summarise(near).coverage
+    if coverage < _LEAST_COVERAGE:
+        raise TrackingLostError(
+            f"{drive.path}: no lane: held-out frames show an edge along {100.0 * coverage:.0f} % of the "
+            f"borders of its lines, expected {100.0 * _LEAST_COVERAGE:.0f} % at least"
+        )
+    lines = {side: summarise(near.select(near.right == (side == "right"))) for side in SIDES}
+    sd_px = {side: line.robust_sd_px * REFERENCE_WIDTH / drive.width for side, line in lines.items()}
+    clutter = [
+        side for side in SIDES if lines[side].coverage < _CLUTTER_COVERAGE and sd_px[side] > _CLUTTER_PX
+    ]
+    if not clutter:
+        return
+    if free_lane_cm is not None:
+        raise other_lane(lane_width_cm, free_lane_cm)
+    found = ", ".join(
+        f"of the {side} one {100.0 * line.coverage:.0f} % to {sd_px[side]:.1f} px"
+        for side, line in lines.items()
+    )
+    raise TrackingLostError(
+        f"{drive.path}: {'one line only bounds the driven lane' if len(clutter) == 1 else 'no lane'}: "
+        f"held-out frames show {found} (robust sd); for the {' and the '.join(clutter)} one these are edges "
+        "met by chance"
+    )

@@ -1,0 +1,237 @@
+"""First stage of mapping: from a recording to the segments that can be tracked, or a refusal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from datagen.quality.measure import held_out_frames
+from datagen.settings import MapSettings, with_wheelbase
+from datagen.slam.odometry.stillness import following_frames, small_picture
+from lanenet.data.camera_file import read_camera
+from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives.recording import ImageSource
+from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.static import find_static, spread_frames
+
+#: Frames of a segment at least. Chosen: three seconds at 20 frames a second; the steering is fitted to 50.
+MIN_SEGMENT = 60
+#: Memory for the images of a drive; the rest is read again. About 1100 frames of 320 x 240 px.
+_MOST_BYTES = 250_000_000
+#: Frames looked at, evenly over the drive. Chosen: enough for a median, and quick.
+_CHECKED = 40
+#: Mean difference below which frames from all over a drive are the same, [gray levels] of block means.
+#: Chosen: sensor noise of block means is a few tenths.
+_SAME = 1.0
+#: The same, for noisy images: below the first they are the same if distant frames differ less than the second
+#: times as much as neighbours. Chosen: noise and flicker change both alike, motion changes distant frames
+#: more.
+_NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
+#: Least median number of edge points in the lower half of a frame. Chosen: one border of one line, 20 px
+#: long.
+_LEAST_EDGES = 20
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """What is to be mapped, and what is known about it.
+
+    Attributes:
+        drive_path: Drive folder, Donkeycar tub or video.
+        lane_width_cm: Distance between the middles of the two lines of the driven lane. It sets the scale
+            where the camera is not known.
+        camera_path: Camera file; None takes the drive's own, or calibrates from the drive.
+        refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
+        wheelbase_cm: Distance between the axles; None takes the camera's own, or a nominal one.
+    """
+
+    drive_path: Path
+    lane_width_cm: float
+    camera_path: Path | None = None
+    refine_camera: bool = False
+    wheelbase_cm: float | None = None
+
+
+@dataclass(frozen=True)
+class PreparedDrive:
+    """A drive that can be tracked.
+
+    Attributes:
+        drive: The frames in which the car drives forward.
+        segments: Its segments, as positions in it.
+        held_out: Frames whose edge points are held out from the lines.
+        settings: Settings, with the drive's wheelbase and without the rows in which the car sees itself.
+        camera: The camera, where it is known.
+        notes: What was left out or assumed, a sentence each.
+    """
+
+    drive: Drive
+    segments: list[slice]
+    held_out: Bool[np.ndarray, "n"]
+    settings: MapSettings
+    camera: Camera | None
+    notes: tuple[str, ...]
+
+    @property
+    def longest(self) -> int:
+        """Index of the longest segment."""
+        return max(range(len(self.segments)), key=lambda i: self.segments[i].stop - self.segments[i].start)
+
+
+def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
+    """Open a recording, and keep the frames in which the car drives forward.
+
+    Raises:
+        TrackingLostError: If the car stands still, or no segment is long enough.
+        CalibrationError: If the known camera is for images of another size.
+    """
+    recorded = keep_images(open_drive(request.drive_path))
+    check_moving(recorded)
+    notes = list(recorded.problems)
+    drive = following_frames(recorded, notes)
+    segments = split_segments(drive)
+    # Deleted frames get no labels; where the car leaves the road, they show nothing of the lines.
+    held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
+    known = read_camera(request.camera_path) if request.camera_path is not None else drive.camera
+    settings, known, nominal = with_wheelbase(settings, known, request.wheelbase_cm)
+    settings, hidden = hide_bumper(drive, settings)
+    if known is not None:
+        check_size(known, drive, request.camera_path)
+    return PreparedDrive(drive, segments, held_out, settings, known, (*notes, *nominal, *hidden))
+
+
+class KeptImages:
+    """Images that stay in memory once they were read, for mapping looks at every frame a dozen times.
+
+    The first ones are kept until they take up too much.
+    """
+
+    def __init__(self, source: ImageSource, most_bytes: int = _MOST_BYTES) -> None:
+        self._source, self._free = source, most_bytes
+        self._kept: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
+
+    def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Read one image, which must not be drawn on."""
+        kept = self._kept.get(row)
+        if kept is not None:
+            return kept
+        image = self._source.read(row)
+        if image.nbytes <= self._free:
+            self._free -= image.nbytes
+            image.flags.writeable = False
+            self._kept[row] = image
+        return image
+
+
+def keep_images(drive: Drive) -> Drive:
+    """Return the drive with images that are read once, as far as they fit into memory."""
+    return replace(drive, images=KeptImages(drive.images))
+
+
+def split_segments(drive: Drive) -> list[slice]:
+    """Cut a drive where the recording is interrupted; segments too short to map are left out.
+
+    Raises:
+        TrackingLostError: If no segment is long enough.
+    """
+    starts = [0, *(int(k) for k in np.flatnonzero(drive.breaks) if k > 0), len(drive)]
+    segments = [slice(a, b) for a, b in pairwise(starts) if b - a >= MIN_SEGMENT]
+    if not segments:
+        raise TrackingLostError(
+            f"{drive.path}: {len(drive)} frames, longest segment without a gap "
+            f"{max(b - a for a, b in pairwise(starts))}; mapping needs {MIN_SEGMENT}"
+        )
+    return segments
+
+
+def hide_bumper(drive: Drive, settings: MapSettings) -> tuple[MapSettings, tuple[str, ...]]:
+    """Leave out the lowest rows in which the car sees itself.
+
+    The rows become part of the perception settings, so that labels, model and car leave out the same ones.
+    They are whole rows: masks of two drives of one car differ in some pixels, and label sets whose edge
+    points were found differently are not trained on together.
+
+    Returns:
+        The settings, and a note where something was found.
+    """
+    if not settings.find_bumper or settings.perception.range.bottom_rows:
+        return settings, ()
+    try:
+        static = find_static(drive.image(k) for k in spread_frames(len(drive)))
+    except DriveFormatError:  # too few frames of a moving car to tell it from the road
+        return settings, ()
+    if not static.rows:
+        return settings, ()
+    if static.is_too_high:
+        note = f"something in the lowest {static.rows} rows never moves; set bottom_rows if it is the car"
+        return settings, (note,)
+    limits = settings.perception.range.model_copy(update={"bottom_rows": static.rows})
+    perception = settings.perception.model_copy(update={"range": limits})
+    note = f"the car sees itself in the lowest {static.rows} rows, which are left out"
+    return settings.model_copy(update={"perception": perception}), (note,)
+
+
+def check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
+    """Refuse a camera for images of another size.
+
+    Raises:
+        CalibrationError: Names both sizes.
+    """
+    if (camera.width, camera.height) != (drive.width, drive.height):
+        raise CalibrationError(
+            f"{camera_path or drive.path}: the camera is for {camera.width}x{camera.height} px, "
+            f"the images of {drive.path} have {drive.width}x{drive.height}"
+        )
+
+
+def check_moving(drive: Drive) -> None:
+    """Refuse a drive whose images do not change.
+
+    Raises:
+        TrackingLostError: If the car stands still; names the changes.
+    """
+    at = np.unique(np.linspace(0, len(drive) - 2, _CHECKED).astype(int))
+    blocks = np.array([[_blocks(drive, int(k) + d) for d in (0, 1)] for k in at])
+    neighbours = float(np.median(_difference(blocks[:, 0], blocks[:, 1])))
+    # A third of the drive apart, so that a lap driven twice is not compared with itself.
+    spread = float(np.median(_difference(blocks[:, 0], np.roll(blocks[:, 0], len(at) // 3, axis=0))))
+    if spread < _SAME or (spread < _NOISY_SAME and spread < _NOISY_RATIO * neighbours):
+        raise TrackingLostError(
+            f"{drive.path}: the car stands still: {len(drive)} frames, which differ by {spread:.1f} gray "
+            f"levels from distant ones and by {neighbours:.1f} from their neighbours; mapping needs a "
+            "moving car"
+        )
+
+
+def check_edges(drive: Drive, settings: EdgeSettings) -> None:
+    """Refuse a drive with hardly any edges on the road, before the camera is searched for.
+
+    Raises:
+        TrackingLostError: Names the number of edge points.
+    """
+    counts = []
+    for k in np.unique(np.linspace(0, len(drive) - 1, _CHECKED).astype(int)).tolist():
+        # The horizon is unknown without a camera; most cameras show road in the lower half.
+        image = drive.image(k)
+        counts.append(len(find_edges(image[image.shape[0] // 2 :], settings).uv_px))
+    if np.median(counts) < _LEAST_EDGES:
+        raise TrackingLostError(
+            f"{drive.path}: {np.median(counts):.0f} edge points in the lower half of a frame, expected "
+            f"{_LEAST_EDGES} at least: no line is visible"
+        )
+
+
+def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:
+    """Block means of a frame relative to its brightness: suppresses noise and flicker."""
+    small = small_picture(drive, k).astype(np.float64)
+    return (small - small.mean()).ravel()
+
+
+def _difference(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
+    return np.asarray(np.abs(a - b).mean(axis=1))

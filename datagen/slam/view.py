@@ -1,0 +1,136 @@
+"""What the images of a segment show before its motion is known: edges of the road, and the typical step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from datagen.slam.adjustment.adjust import Observations
+from datagen.slam.commands import CommandedMotion
+from datagen.slam.keyframes import interleaved_rows
+from datagen.slam.odometry.image_pairs import Pictures
+from datagen.slam.odometry.odometry import UsualWay, usual_way
+from datagen.slam.odometry.reflections import without_reflections
+from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
+from datagen.slam.settings import SlamSettings
+from lanenet.data.drives import Drive
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.road import RangeSettings, RoadTable
+
+#: Road that one pixel may span, in camera heights: about the width of a tape, 5 cm for a camera 17 cm high.
+_COARSEST_HEIGHTS = 0.3
+#: Range of the mapping, in camera heights. Far edges place a line badly, but hold the heading. With a focal
+#: length of 120 px a pixel spans as much as the limit above there; with 80 px it does at 4.9 heights.
+_REACH_HEIGHTS = 6.0
+#: Edge points per frame, on average, below which a segment cannot be tracked. Chosen: road without lines, but
+#: with seams and stains, has more; a blank floor has hardly any.
+_LEAST_POINTS = 20
+
+
+def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings:
+    """Range of the road for mapping, in proportion to the camera's height; rows stay as configured."""
+    reach = _REACH_HEIGHTS * camera_height_cm
+    coarsest = _COARSEST_HEIGHTS * camera_height_cm
+    return base.model_copy(update={"far_cm": reach, "side_cm": reach, "max_cm_per_px": coarsest})
+
+
+@dataclass(frozen=True)
+class RoadView:
+    """Edges of the road in every frame.
+
+    Attributes:
+        edges: Edge pixels per frame.
+        keep: Pixels in which they were looked for, 0 elsewhere.
+        limits: Range of the road that counts.
+    """
+
+    edges: list[EdgePixels]
+    keep: UInt8[np.ndarray, "h w"]
+    limits: RangeSettings
+
+    def scans(self, camera: Camera, tilt_rad: Float[np.ndarray, "n 2"] | None = None) -> Scans:
+        """Move the edges to the road, with the camera tilted in each frame beyond its mounting."""
+        return scans_of(self.edges, camera, self.limits, tilt_rad)
+
+    def observed(
+        self, commands: CommandedMotion, breaks: Bool[np.ndarray, "n"] | None = None
+    ) -> Observations:
+        """For the bundle adjustment: the edges, with what was commanded and where the drive breaks."""
+        return Observations(self.edges, self.keep, commands.relative_steps, commands.speed_known, breaks)
+
+
+def view_road(
+    drive: Drive, camera: Camera, settings: SlamSettings, keys: Int[np.ndarray, "k"] | None = None
+) -> RoadView:
+    """Find the edges of the road in every frame, without those of lamps that are mirrored in it.
+
+    Args:
+        drive: The drive.
+        camera: Its camera.
+        settings: How edges are found.
+        keys: Keyframes of a slow car: what stands still is recognised over as much road as between them.
+    """
+    limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
+    table = RoadTable(camera, limits)
+    found = edges_of_drive(drive, settings.perception.edges, table)
+    kept = list(found)
+    for rows in [np.arange(len(found))] if keys is None else interleaved_rows(keys, len(found)):
+        for k, pixels in zip(rows, without_reflections([found[k] for k in rows], camera, table), strict=True):
+            kept[k] = pixels
+    return RoadView(kept, table.keep, limits)
+
+
+@dataclass(frozen=True)
+class SegmentView:
+    """What the images of a segment show, before its motion is known.
+
+    Attributes:
+        drive: The segment.
+        camera: Its camera, or a coarse guess of it.
+        commands: What was commanded.
+        road: Edges of the road.
+        scans: The same on the road.
+        pictures: The same, ready to be compared from image to image.
+        usual: The typical step length, and what the commands mean in centimetres.
+    """
+
+    drive: Drive
+    camera: Camera
+    commands: CommandedMotion
+    road: RoadView
+    scans: Scans
+    pictures: Pictures
+    usual: UsualWay
+
+    @property
+    def steps_heights(self) -> Float[np.ndarray, "n"]:
+        """Rough step length of each frame, in camera heights."""
+        return self.usual.step_heights * self.usual.relative
+
+
+def view_segment(
+    drive: Drive,
+    camera: Camera,
+    commands: CommandedMotion,
+    settings: SlamSettings,
+    rng: np.random.Generator,
+) -> SegmentView:
+    """Find the edges of the road in a segment, and the typical step length.
+
+    Raises:
+        TrackingLostError: If there are too few edges.
+    """
+    road = view_road(drive, camera, settings)
+    scans = road.scans(camera)
+    if len(scans.points_cm) < _LEAST_POINTS * len(scans):
+        raise TrackingLostError(
+            f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
+            f"road; mapping needs {_LEAST_POINTS}"
+        )
+    pictures = Pictures(road.edges, camera, settings.odometry, rng)
+    usual = usual_way(pictures, commands.distance_cm, commands.speed_known, camera.mounting.height_cm)
+    return SegmentView(drive, camera, commands, road, scans, pictures, usual)
