@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
-from datagen.prepare import MapRequest, PreparedDrive
+from datagen.prepare import PreparedDrive
 from datagen.slam.camera.changes import with_known_scale
 from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
@@ -47,18 +47,15 @@ class AssembledMap:
         return [(s.solved.scans, s.solved.poses * scale, self.factor) for s in self.segments]
 
 
-def assemble(
-    request: MapRequest, prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]
-) -> AssembledMap:
-    """Join the segments in one map, in centimetres.
+def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]) -> AssembledMap:
+    """Put the segments in one map, in centimetres; the lane width sets the scale of an unknown camera.
 
     Args:
-        request: What was given; its lane width sets the scale where the camera was not known.
-        prepared: The drive.
+        prepared: The drive, with the lane width that was given.
         camera: The camera, known or found.
         mapped: Segments in its scale.
     """
-    segments = list(mapped)
+    request, segments = prepared.request, list(mapped)
     lane_cm = float(np.median([fitted_width_cm(s.lines, s.lane, s.s_frames_cm) for s in segments]))
     factor = 1.0
     if prepared.camera is None:

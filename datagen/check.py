@@ -45,12 +45,12 @@ class CheckedMap:
     notes: tuple[str, ...]
 
 
-def check_map(assembled: AssembledMap, prepared: PreparedDrive, camera_figures: dict[str, Any]) -> CheckedMap:
+def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: dict[str, Any]) -> CheckedMap:
     """Compare a map with its frames and judge it.
 
     Args:
-        assembled: The map.
         prepared: The drive.
+        assembled: The map.
         camera_figures: Those of the camera, where it was found or refined on this drive.
 
     Raises:

@@ -63,6 +63,7 @@ class PreparedDrive:
     """A drive that can be tracked.
 
     Attributes:
+        request: What was asked for.
         drive: The frames in which the car drives forward.
         segments: Its segments, as positions in it.
         held_out: Frames whose edge points are held out from the lines.
@@ -71,6 +72,7 @@ class PreparedDrive:
         notes: What was left out or assumed, a sentence each.
     """
 
+    request: MapRequest
     drive: Drive
     segments: list[slice]
     held_out: Bool[np.ndarray, "n"]
@@ -79,9 +81,9 @@ class PreparedDrive:
     notes: tuple[str, ...]
 
     @property
-    def longest(self) -> int:
-        """Index of the longest segment."""
-        return max(range(len(self.segments)), key=lambda i: self.segments[i].stop - self.segments[i].start)
+    def known_lane_cm(self) -> float | None:
+        """Lane width in the scale of the camera; None where it still sets the scale."""
+        return None if self.camera is None else self.request.lane_width_cm
 
 
 def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
@@ -103,7 +105,8 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     settings, hidden = hide_bumper(drive, settings)
     if known is not None:
         check_size(known, drive, request.camera_path)
-    return PreparedDrive(drive, segments, held_out, settings, known, (*notes, *nominal, *hidden))
+    notes += [*nominal, *hidden]
+    return PreparedDrive(request, drive, segments, held_out, settings, known, tuple(notes))
 
 
 class KeptImages:

@@ -1,21 +1,45 @@
-"""All segments of a drive, solved and given lanes; one that cannot be mapped does not spoil the others."""
+"""Stages over the segments of a drive: the camera from one of them, then poses and lanes of each.
+
+A segment that cannot be mapped does not spoil the others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from datagen.lanes.find import find_lane
 from datagen.lanes.mapped import MappedSegment, check_lane
-from datagen.settings import MapSettings
+from datagen.prepare import PreparedDrive, check_edges
+from datagen.slam.camera.self_calibration import find_camera
 from datagen.slam.join import frames_text
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class CameraOfDrive:
+    """The camera to map with.
+
+    Attributes:
+        camera: In centimetres where it was known, else of nominal height.
+        how: How it was found, for the files.
+        solved: Segments that were solved on the way, by their place among the segments.
+        figures: For the report.
+        notes: A sentence each.
+    """
+
+    camera: Camera
+    how: str = "given"
+    solved: dict[int, SolvedSegment] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -30,6 +54,10 @@ class Refused:
     rows: Int[np.ndarray, "n"]
     reason: TrackingLostError | CalibrationError
 
+    def note(self, drive: Drive) -> str:
+        """Name the frames that were left out, and why."""
+        return f"{frames_text(drive, self.rows)} left out: {str(self.reason).removeprefix(f'{drive.path}: ')}"
+
 
 @dataclass(frozen=True)
 class SolvedDrive:
@@ -40,39 +68,37 @@ class SolvedDrive:
 
 
 @dataclass(frozen=True)
-class MappedDriveSegments:
-    """Segments of a drive with their lanes, in its order.
-
-    Attributes:
-        segments: At least one.
-        notes: Which segments were left out, and why, a sentence each.
-    """
+class LanesOfDrive:
+    """Segments of a drive with their lanes, at least one, in its order; and notes on those left out."""
 
     segments: tuple[MappedSegment, ...]
     notes: tuple[str, ...]
 
 
-def solve_segments(
-    drive: Drive,
-    segments: Sequence[slice],
-    camera: Camera,
-    solver: SegmentSolver,
-    solved: Mapping[int, SolvedSegment],
-) -> SolvedDrive:
-    """Track each segment, close its loops and adjust it.
+def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfDrive:
+    """Take the known camera, or find it on the longest segment; refine it there if that was asked for.
 
-    Args:
-        drive: The drive.
-        segments: Its segments, as positions in it.
-        camera: Camera of all of them.
-        solver: Solves them.
-        solved: Segments that are solved already, by their place in ``segments``.
+    Raises:
+        TrackingLostError: If that segment shows too few edges of the road.
     """
+    segments = prepared.segments
+    if prepared.camera is not None and not prepared.request.refine_camera:
+        return CameraOfDrive(prepared.camera)
+    longest = max(range(len(segments)), key=lambda i: segments[i].stop - segments[i].start)
+    drive = prepared.drive.subset(segments[longest])
+    check_edges(drive, prepared.settings.perception.edges)
+    found = find_camera(drive, prepared.camera, solver, solver.progress)
+    figures = {"calibration": found.figures}
+    return CameraOfDrive(found.camera, found.how, {longest: found.solved}, figures, (found.note,))
+
+
+def solve_segments(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentSolver) -> SolvedDrive:
+    """Track each segment, close its loops and adjust it."""
     found, refused = [], []
-    for i, segment in enumerate(segments):
+    for i, segment in enumerate(prepared.segments):
         rows = np.arange(segment.start, segment.stop)
         try:
-            one = solved.get(i) or solver.solve(drive.subset(segment), camera)
+            one = camera.solved.get(i) or solver.solve(prepared.drive.subset(segment), camera.camera)
         except (TrackingLostError, CalibrationError) as error:
             refused.append(Refused(rows, error))
         else:
@@ -81,40 +107,30 @@ def solve_segments(
 
 
 def fit_lanes(
-    segments: Sequence[SolvedSegment],
-    refused: Sequence[Refused],
-    drive: Drive,
-    lane_width_cm: float | None,
-    held_out: Bool[np.ndarray, "n"],
-    settings: MapSettings,
-) -> MappedDriveSegments:
+    prepared: PreparedDrive, segments: Sequence[SolvedSegment], refused: Sequence[Refused]
+) -> LanesOfDrive:
     """Find the lane of each segment.
 
     Args:
+        prepared: The drive.
         segments: Segments with their poses.
         refused: Those that could not be tracked.
-        drive: The drive.
-        lane_width_cm: Width of the driven lane in the scale of the camera; None where that is not known.
-        held_out: Frames whose edge points are held out from the lines.
-        settings: Settings of all stages.
 
     Raises:
         TrackingLostError: If no segment can be mapped; says why the longest one cannot.
         CalibrationError: The same, where the longest one shows a lane of another width.
     """
+    drive, settings, held_out = prepared.drive, prepared.settings, prepared.held_out
     mapped, left_out = [], list(refused)
     for segment in segments:
+        rows, lane_cm = segment.rows, prepared.known_lane_cm
         try:
-            one = find_lane(segment, lane_width_cm, held_out[segment.rows], settings.trace, settings.fit)
+            one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit)
             check_lane([one], drive)
         except (TrackingLostError, CalibrationError) as error:
-            left_out.append(Refused(segment.rows, error))
+            left_out.append(Refused(rows, error))
         else:
             mapped.append(one)
     if not mapped:
         raise max(left_out, key=lambda one: len(one.rows)).reason
-    notes = (
-        f"{frames_text(drive, one.rows)} left out: {str(one.reason).removeprefix(f'{drive.path}: ')}"
-        for one in left_out
-    )
-    return MappedDriveSegments(tuple(mapped), tuple(notes))
+    return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in left_out))

@@ -12,7 +12,7 @@ from datagen import pipeline, prepare
 from datagen import segments as drive_segments
 from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.trace import TracedLane
-from datagen.segments import MappedDriveSegments
+from datagen.segments import LanesOfDrive
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult
 from datagen.slam.camera.coarse import guessed_camera
@@ -82,8 +82,8 @@ def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monk
     monkeypatch.setattr(prepare, "following_frames", lambda drive, notes: drive)
     monkeypatch.setattr(prepare, "keep_images", lambda drive: drive)
     monkeypatch.setattr(prepare, "check_moving", lambda *_: None)
-    monkeypatch.setattr(pipeline, "check_edges", lambda *_: None)
-    monkeypatch.setattr(pipeline, "find_camera", find)
+    monkeypatch.setattr(drive_segments, "check_edges", lambda *_: None)
+    monkeypatch.setattr(drive_segments, "find_camera", find)
     monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: _solved(len(part)))
     monkeypatch.setattr(pipeline, "join_segments", join)
     with pytest.raises(_StopError):
@@ -105,7 +105,7 @@ def _map(
     no_lane: tuple[int, ...] = (),
     one_line: tuple[int, ...] = (),
     other_lane: tuple[int, ...] = (),
-) -> MappedDriveSegments:
+) -> LanesOfDrive:
     """Map a drive whose segments of some lengths show no edges, no lane, one line only, or another lane."""
 
     def solve(self: SegmentSolver, part: Drive, camera: Camera) -> SolvedSegment:
@@ -126,10 +126,19 @@ def _map(
 
     monkeypatch.setattr(SegmentSolver, "solve", solve)
     monkeypatch.setattr(drive_segments, "find_lane", find_lane)
+    prepared = prepare.PreparedDrive(
+        request=prepare.MapRequest(drive.path, 40.0),
+        drive=drive,
+        segments=prepare.split_segments(drive),
+        held_out=np.zeros(len(drive), dtype=bool),
+        settings=SETTINGS,
+        camera=CAMERA,
+        notes=(),
+    )
     solver = SegmentSolver(SETTINGS, np.random.default_rng(0))
-    solved = drive_segments.solve_segments(drive, prepare.split_segments(drive), CAMERA, solver, {})
-    held_out = np.zeros(len(drive), dtype=bool)
-    return drive_segments.fit_lanes(solved.segments, solved.refused, drive, 40.0, held_out, SETTINGS)
+    camera = drive_segments.camera_of_drive(prepared, solver)
+    solved = drive_segments.solve_segments(prepared, camera, solver)
+    return drive_segments.fit_lanes(prepared, solved.segments, solved.refused)
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,0 @@
-"""How good a map is: residuals on frames held out from it, a verdict, and a page for people."""
