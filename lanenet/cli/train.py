@@ -75,7 +75,7 @@ def train(
     from lanenet.learn.checkpoint import publish
     from lanenet.learn.run_state import METRICS_NAME, check_start, hash_run
     from lanenet.learn.train import train as train_network
-    from lanenet.perception.network.detector import read_model_meta
+    from lanenet.perception.network.model_file import read_model_meta
     from lanenet.samples.dataset import compile_kernels
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)

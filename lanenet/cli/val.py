@@ -80,7 +80,7 @@ def val(
     from lanenet.data.files import write_bytes, write_json, write_text
     from lanenet.data.label_set import read_labels
     from lanenet.geometry.birdseye import BirdseyeWindow
-    from lanenet.perception.network.detector import read_model_meta
+    from lanenet.perception.network.model_file import read_model_meta
 
     model, source_paths = _split_paths(paths)
     more = _more_models(also or [])

@@ -18,14 +18,14 @@ from lanenet.perception.estimate import LaneEstimate
 
 FORMAT_VERSION = 1
 FORMAT = f"lanenet-detections/{FORMAT_VERSION}"
-#: In a CSV, which has no other place for it; tables without it are older ones.
+#: Column of a CSV, which has no other place for it.
 VERSION_NAME = "format_version"
 
 SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
-#: Written if a detector measures the lane at all; tables of other detectors, and older ones, do without.
+#: Written only by detectors that measure them.
 LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm")
-#: Columns that may be empty.
+#: Columns with empty cells where a detector does not know the value.
 _OPEN_COLUMNS = ("t_s", *POINT_NAMES, *SIGMA_NAMES, *PARABOLA_NAMES, "steering_rad")
 #: A straight lane has an infinite radius.
 _INFINITE_COLUMNS = ("radius_cm",)
@@ -45,7 +45,7 @@ class Detections:
         confidence: 0 to 1.
         radius_cm: Radius of curvature of the lane's middle, infinite where straight; all NaN if the table
             has no such column.
-        offset_cm: The car's place right of the lane's middle; as above.
+        offset_cm: Distance of the car right of the lane's middle; as above.
     """
 
     frame: Int[np.ndarray, "n"]
@@ -73,7 +73,7 @@ class DetectionTable:
         return len(self._frames)
 
     def add(self, frame: int, t_s: float, estimate: LaneEstimate) -> None:
-        """Append what one frame showed; ``t_s`` is NaN where there is no time."""
+        """Append the estimate of one frame; ``t_s`` is NaN if there is no time."""
         self._frames.append(int(frame))
         self._rows.append(
             np.concatenate(
@@ -101,7 +101,7 @@ class DetectionTable:
         for name, values in columns.items():
             bad = np.isinf(values) & (name not in _INFINITE_COLUMNS)
             bad |= np.isnan(values) & (name == "confidence")
-            # "-inf" is no radius either.
+            # Not even a radius is minus infinity.
             bad |= np.isneginf(values)
             if bad.any():
                 row = int(np.flatnonzero(bad)[0])
@@ -142,17 +142,14 @@ def read_detections(path: Path) -> Detections:
     """
     if _ending(path) == ".csv":
         specs = {"frame": ColumnSpec("int"), "confidence": ColumnSpec()}
-        # A detector that does not know its doubt may leave the columns of it out.
-        specs |= {
-            name: ColumnSpec(required=name not in SIGMA_NAMES, allow_empty=True) for name in _OPEN_COLUMNS
-        }
+        specs |= {name: ColumnSpec(allow_empty=True) for name in _OPEN_COLUMNS}
         specs |= {
             name: ColumnSpec(required=False, allow_empty=True, allow_infinite=name in _INFINITE_COLUMNS)
             for name in LANE_NAMES
         }
-        specs[VERSION_NAME] = ColumnSpec("int", required=False)
+        specs[VERSION_NAME] = ColumnSpec("int")
         columns = read_csv(path, specs, LabelFormatError)
-        others = set(columns.pop(VERSION_NAME, np.empty(0)).tolist()) - {FORMAT_VERSION}
+        others = set(columns.pop(VERSION_NAME).tolist()) - {FORMAT_VERSION}
         if others:
             raise LabelFormatError(
                 f"{path}: column {VERSION_NAME!r}: found {min(others)}, expected {FORMAT_VERSION}"
@@ -169,7 +166,7 @@ def read_detections(path: Path) -> Detections:
             if name in table.column_names
         }
     unknown = np.full(len(columns["frame"]), np.nan)
-    columns |= {name: unknown for name in (*SIGMA_NAMES, *LANE_NAMES) if name not in columns}
+    columns |= {name: unknown for name in LANE_NAMES if name not in columns}
 
     def together(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([columns[name] for name in names], axis=1)

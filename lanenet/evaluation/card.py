@@ -14,7 +14,7 @@ from lanenet.evaluation.errors import ErrorStats
 from lanenet.evaluation.robustness import RobustRow, robust_table
 from lanenet.evaluation.tables import show_cm, show_share
 from lanenet.geometry.lane import POINT_NAMES
-from lanenet.perception.network.detector import ModelMeta
+from lanenet.perception.network.model_file import ModelMeta
 
 CARD_NAME = "MODEL_CARD.md"
 #: What is so much worse than the whole is told as a weakness.

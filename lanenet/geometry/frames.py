@@ -81,21 +81,6 @@ def ros_from_car(points_car_cm: Float[np.ndarray, "n 2"], wheelbase_cm: float) -
     return np.stack([0.01 * ahead, -0.01 * points_car_cm[:, 0]], axis=1)
 
 
-def car_from_ros(points_ros_m: Float[np.ndarray, "n 2"], wheelbase_cm: float) -> Float[np.ndarray, "n 2"]:
-    """Express points of ROS's ``base_link`` in the car frame; inverse of :func:`ros_from_car`."""
-    return np.stack([-100.0 * points_ros_m[:, 1], 100.0 * points_ros_m[:, 0] - wheelbase_cm], axis=1)
-
-
 def left_from_donkey(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Turn Donkeycar's sign (-1 = left) into this project's (positive = left); the gain stays unknown."""
     return -np.asarray(angle)
-
-
-def donkey_angle_from_steering(steering_rad: float, max_steering_rad: float) -> float:
-    """Convert a steering angle (positive left) to Donkeycar's -1 (left) .. 1 (right), clipped."""
-    return float(np.clip(-steering_rad / max_steering_rad, -1.0, 1.0))
-
-
-def steering_from_donkey_angle(angle: float, max_steering_rad: float) -> float:
-    """Convert Donkeycar's -1 (left) .. 1 (right) to a steering angle, [rad], positive left."""
-    return -float(angle) * max_steering_rad

@@ -1,1 +1,1 @@
-"""Learning: network, loader, training, evaluation, export; the only package with torch."""
+"""Learning: network, training, quality on held-out frames, export; the only room with torch."""

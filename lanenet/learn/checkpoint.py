@@ -1,7 +1,4 @@
-"""What a finished training run leaves: weights, model, config, metrics and curve.
-
-From a finished run to the folder that people use: ``checkpoints/<name>/``.
-"""
+"""The checkpoint folder: what a finished run writes, and how it is published as ``checkpoints/<name>/``."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import importlib.metadata
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,77 +33,83 @@ from lanenet.learn.export import (
 from lanenet.learn.network import LaneNet
 from lanenet.learn.predict import Answers
 from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, STATE_NAME, EpochRecord, best_record
-from lanenet.perception.network.detector import ModelMeta
-from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME
+from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
 from lanenet.samples.dataset import LaneSamples
 
 CURVE_NAME = "curve"
 
-_N_CHECK_RASTERS = 48
-_N_CALIBRATION_RASTERS = 96
+#: Rasters that are kept: to check later exports, and to find the value ranges of an INT8 model. Chosen:
+#: enough of both in files below 100 kB.
+_N_CHECK_RASTERS, _N_CALIBRATION_RASTERS = 48, 96
+#: Whose versions the metrics name.
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
 
 
-def write_checkpoint(
-    folder: Path,
-    settings: LearnSettings,
-    network: LaneNet,
-    samples: LaneSamples,
-    val: LaneSamples,
-    answers: Answers,
-    history: Sequence[EpochRecord],
-    run_hash: str,
-) -> None:
-    """Write the results of a run; the metrics come last and mark it as finished.
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a checkpoint is written from.
 
-    Args:
-        folder: Checkpoint folder.
-        settings: Of the run.
+    Attributes:
+        settings: Of the training.
         network: Weights of the best epoch.
         samples: Training frames.
         val: Validation frames.
         answers: Of the network on ``val``.
         history: Training curve.
         run_hash: Of settings and data.
+    """
+
+    settings: LearnSettings
+    network: LaneNet
+    samples: LaneSamples
+    val: LaneSamples
+    answers: Answers
+    history: Sequence[EpochRecord]
+    run_hash: str
+
+
+def write_checkpoint(folder: Path, run: FinishedRun) -> None:
+    """Write the results of a run; the metrics come last and mark it as finished.
 
     Raises:
         CheckpointError: If the exported model does not answer as PyTorch does.
     """
+    settings, network, samples, answers = run.settings, run.network, run.samples, run.answers
     errors = answers.errors
     meta = ModelMeta(
         window=samples.window,
         camera_hashes=tuple(samples.camera_hashes),
         wheelbase_cm=samples.wheelbase_cm,
         lane_width_cm=samples.lane_width_cm,
-        training_hash=run_hash,
+        training_hash=run.run_hash,
         rmse_cm=errors.point_rmse_cm,
         reference=errors.reference,
         perception=samples.perception,
         lane_width_range_cm=samples.lane_widths_cm,
         takes_width=settings.network.takes_width,
     )
-    rasters = _spread_rasters(val, _N_CHECK_RASTERS)
+    rasters = _spread_rasters(run.val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)
     write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
-    write_curve(folder, history)
+    write_curve(folder, run.history)
     presence = presence_of(answers.presence, answers.present)
     metrics: dict[str, Any] = {
         "format": METRICS_FORMAT,
-        "run_hash": run_hash,
+        "run_hash": run.run_hash,
         "units": {"*_cm": "centimetres", "samples_per_s": "training samples per second"},
         "val_rmse_cm": errors.all.rmse_cm,
-        "best_epoch": best_record(history).epoch,
-        "epochs": len(history),
+        "best_epoch": best_record(run.history).epoch,
+        "epochs": len(run.history),
         "train_frames": len(samples),
-        "val_frames": len(val),
+        "val_frames": len(run.val),
         "parameters": network.n_parameters,
         "sigma_factors": network.sigma_factor.tolist(),
         "val_presence": None if presence is None else presence.as_dict(),
         "onnx_difference_cm": difference,
-        "median_samples_per_s": float(np.median([record.samples_per_s for record in history])),
+        "median_samples_per_s": float(np.median([record.samples_per_s for record in run.history])),
         "seed": settings.seed,
         "versions": {name: _version(name) for name in _PACKAGES},
         "val": errors.as_dict(),
@@ -114,7 +118,7 @@ def write_checkpoint(
 
 
 def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:
-    """Return rasters of frames that are spread evenly over all."""
+    """Return rasters of frames spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
     return samples.plain_batch(chosen).rasters
 
@@ -123,12 +127,12 @@ def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 
 def tensorboard_curve(
     folder: Path, first_epoch: int, wanted: bool
 ) -> Iterator[Callable[[EpochRecord], None]]:
-    """Yield what writes each epoch's record for TensorBoard, or does nothing.
+    """Yield a function that writes each epoch's record for TensorBoard.
 
     Args:
         folder: Checkpoint folder; the events go into its ``tensorboard``.
-        first_epoch: What an earlier run wrote from this epoch on is left out.
-        wanted: False does nothing, and does not need the package.
+        first_epoch: Events of an earlier run from this epoch on are dropped.
+        wanted: False yields a function that does nothing, and does not need the package.
     """
     if not wanted:
         yield lambda record: None
@@ -184,22 +188,22 @@ def publish(
     files: Mapping[str, str | bytes],
     results: Mapping[str, object] | None = None,
 ) -> None:
-    """Copy a finished run, without the state of its optimiser, and what was measured on it.
+    """Copy a finished run, without the state of its optimiser, together with what was measured on it.
 
-    An earlier checkpoint of the name is replaced as a whole, once the new one is complete.
+    An earlier checkpoint of that name is replaced as a whole, once the new one is complete.
 
     Args:
         run_folder: Folder of a finished training run.
         out: Checkpoint folder to write.
         name: Of the checkpoint.
-        files: More files by name: config, results, camera.
+        files: Other files by name: config, results, camera.
         results: Figures for ``results.json``.
 
     Raises:
         CheckpointError: If the run is not finished.
     """
     if not (run_folder / METRICS_NAME).is_file():
-        raise CheckpointError(f"{run_folder}: no {METRICS_NAME} in it, the run is not finished")
+        raise CheckpointError(f"{run_folder}: no {METRICS_NAME}, the run is not finished")
     with atomic_folder(out, "checkpoint") as folder:
         for path in sorted(run_folder.iterdir()):
             if path.is_file() and path.name != STATE_NAME:

@@ -25,13 +25,16 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
-from lanenet.perception.network.detector import INPUT_NAME, OUTPUT_NAMES, ModelMeta, open_model
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
+    INPUT_NAME,
     MARKER_NAME,
     MODEL_NAME,
+    OUTPUT_NAMES,
     WIDTH_NAME,
+    ModelMeta,
     is_model,
+    open_model,
     without_model,
 )
 
@@ -39,10 +42,11 @@ from lanenet.perception.network.model_file import (
 OPSET = 18
 IR_VERSION = 9
 #: Largest difference between PyTorch and onnxruntime, [cm]; parabolas and angles are much smaller numbers.
+#: Chosen: far below any error that matters, and 30 times what is found.
 TOLERANCE = 1e-3
-#: Widths of the lane that the check tells a network that can be told, after a run without any.
+#: Lane widths that a network is given in the check, beside none at all: unknown, narrow and wide.
 _CHECKED_WIDTHS_CM = (0.0, 30.0, 60.0)
-#: Rasters that the check takes at a time.
+#: Rasters of the check at a time; bounds the memory.
 _BATCH = 256
 
 CHECKPOINT_FORMAT = "lanenet-checkpoint/1"
@@ -57,11 +61,11 @@ def export_onnx(
 ) -> float:
     """Write a network as ONNX, after a check against PyTorch.
 
-    The file appears at ``path`` only when onnxruntime answers as PyTorch does.
+    The file appears at ``path`` only if onnxruntime answers as PyTorch does.
 
     Args:
         network: Trained network.
-        meta: Its description, stored in the file.
+        meta: Its description, kept in the file.
         rasters: Real rasters for the check.
         path: File to write.
 
@@ -69,7 +73,7 @@ def export_onnx(
         The largest difference of any output on the rasters, [cm] or smaller units.
 
     Raises:
-        CheckpointError: If there is no raster, or the file's answers differ from PyTorch's.
+        CheckpointError: If there is no raster, or the answers differ by more than ``TOLERANCE``.
     """
     if not len(rasters):
         raise CheckpointError(f"{path}: no raster to check the export with, expected at least one")
@@ -112,10 +116,7 @@ def export_checkpoint(checkpoint: Path, out: Path | None = None, labels: Sequenc
     Args:
         checkpoint: Folder that :func:`lanenet.learn.train.train` wrote.
         out: File to write; None replaces the folder's ``model.onnx``.
-        labels: Label sets on whose rasters the file is checked, beside those that the folder holds.
-
-    Returns:
-        The file that was written, and how well it agrees with PyTorch.
+        labels: Label sets whose rasters are checked beside those in the folder.
 
     Raises:
         CheckpointError: If a file of the folder is missing or does not fit, a label set has another window,
@@ -150,7 +151,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     if not checkpoint.is_dir():
         found = "is a file" if checkpoint.exists() else "no such folder"
         raise CheckpointError(f"{checkpoint}: {found}, expected a checkpoint folder")
-    # Without its config or its weights alone it is a broken one, which is told below.
+    # A checkpoint without its config or without its weights is named below.
     if not is_model(checkpoint) and not any((checkpoint / n).is_file() for n in (CONFIG_NAME, WEIGHTS_NAME)):
         raise CheckpointError(f"{checkpoint}: expected a checkpoint: {without_model(checkpoint)}")
     check_marker(checkpoint)
@@ -171,9 +172,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         meta = ModelMeta.from_properties(properties, str(path))
     except ModelMismatchError as error:
         raise CheckpointError(str(error)) from None
-    # Checkpoints from before there were bins do not say that they have none.
-    older = {} if "bins_cm" in state else {"bins": 0}
-    network = LaneNet(settings.network.model_copy(update=older), meta.window.rows, meta.window.columns)
+    network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
     try:
         network.load_state_dict(state)
     except RuntimeError as error:
@@ -200,11 +199,11 @@ def check_marker(checkpoint: Path) -> None:
 
 
 def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
-    """Keep rasters as one tall picture, so that a later export can be checked without the data."""
+    """Write rasters as one tall image, so that a later export can be checked without the data."""
     tall = rasters.reshape(-1, rasters.shape[-1])
     done, png = cv2.imencode(".png", tall)
     if not done:
-        raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as a picture")
+        raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as an image")
     with atomic_file(path) as temporary:
         temporary.write_bytes(png.tobytes())
 
@@ -213,14 +212,14 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
     """Read what :func:`write_rasters` wrote.
 
     Raises:
-        CheckpointError: If the picture is missing or does not fit the window.
+        CheckpointError: If the image is missing or does not fit the window.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; an export needs its rasters")
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
     rows, columns = meta.window.rows, meta.window.columns
     if image is None or image.shape[1] != columns or image.shape[0] % rows:
-        found = "no picture" if image is None else f"{image.shape[0]} x {image.shape[1]}"
+        found = "no image" if image is None else f"{image.shape[0]} x {image.shape[1]}"
         raise CheckpointError(f"{path}: found {found}, expected rasters of {rows} x {columns}")
     return np.asarray(image).reshape(-1, 1, rows, columns)
 
@@ -229,7 +228,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
     example = [torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)]
     inputs, shapes = [INPUT_NAME], [{0: torch.export.Dim(BATCH_NAME, min=1)}]
     if meta.takes_width:
-        # Not one wide: the exporter would take a dimension of one for a constant.
+        # Two, not one: the exporter takes a dimension of one for a constant.
         example.append(torch.zeros(2))
         inputs.append(WIDTH_NAME)
         shapes.append(shapes[0])
@@ -246,9 +245,9 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
             dynamic_shapes=tuple(shapes),
         )
     if program is None:
-        raise CheckpointError("torch.onnx.export answered nothing, expected a program")
+        raise CheckpointError("torch.onnx.export returned None, expected a program")
     model: onnx.ModelProto = program.model_proto
-    # The exporter notes source lines and folders of this machine on every node; IR 9 does not know them.
+    # The exporter writes source lines and folders of this machine on every node; IR 9 does not know them.
     for node in model.graph.node:
         node.ClearField("doc_string")
         if "metadata_props" in node.DESCRIPTOR.fields_by_name:
@@ -268,7 +267,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
 
 
 def _make_optional(graph: onnx.GraphProto) -> None:
-    """Let the lane's width be left out of a run, which is to say that it is unknown: 0."""
+    """Make the lane width optional; left out, it is unknown: 0."""
     width = next(value for value in graph.input if value.name == WIDTH_NAME)
     # One for all rasters, or one for each.
     width.type.tensor_type.shape.dim[0].dim_param = "w"
@@ -283,18 +282,18 @@ def _largest_difference(
     feeds: list[dict[str, np.ndarray]] = [{}, *({WIDTH_NAME: np.array([w], np.float32)} for w in widths_cm)]
     for begin in range(0, len(rasters), _BATCH):
         some = rasters[begin : begin + _BATCH]
-        for told in feeds:
+        for given in feeds:
             with torch.inference_mode():
-                expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in told.values()))
-            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | told)
+                expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in given.values()))
+            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | given)
             off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
-    # Not Python's max(), which passes over what is no number.
+    # Not Python's max(), which ignores NaN.
     return float(np.max(off))
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep the exporters' chatter (prints, log lines, warnings) to itself."""
+    """Silence the exporters: prints, log lines, warnings."""
     previous = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

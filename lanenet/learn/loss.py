@@ -1,4 +1,4 @@
-"""What the training makes small: a robust likelihood of the points, and the presence of the lines."""
+"""What the training minimises: a robust likelihood of the points, and the presence of the lines."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from lanenet.learn.network import LaneOutput
 
 #: Share of a normal distribution within one standard deviation.
 ONE_SIGMA = 0.6827
-#: Tails of Student's distribution: its degrees of freedom.
+#: Degrees of freedom of Student's distribution. Chosen: heavy tails, of finite variance.
 _FREEDOM = 4.0
-#: Half the width that holds 68.27 % over the scale: of Student's distribution, and of Laplace's.
+#: Half the width of the interval that holds 68.27 %, over the scale: of Student's distribution with four
+#: degrees of freedom, and of Laplace's. Derived from their quantiles.
 _STUDENT_SIGMA, _LAPLACE_SIGMA = 1.1417, 1.1479
-#: Up to this distance of a mean, errors count as their squares, beyond it as they are, [cm].
+#: Up to this distance of the mean, errors count by their squares, beyond it by their size, [cm]. Chosen: a
+#: tape.
 _NEAR_CM = 2.0
-#: Fewer points than this do not tell a share of 68 %.
+#: Fewer points do not give a share of 68 %. Chosen: the standard error of the share is 7 % at 50 points.
 _ENOUGH_POINTS = 50
 
 
@@ -31,14 +33,14 @@ def lane_loss(
 ) -> Float[Tensor, ""]:
     """Return the mean negative log likelihood of the known labels, and the cross-entropy of the presence.
 
-    A network with bins answers distributions of x: a label between two bins is as likely as their shares say,
-    by its distance to each; the distance of the mean is added, since likelihood alone knows no near miss.
-    Without bins the points themselves are judged. The spread that a network predicts is half the width of the
-    interval that holds 68.27 % of the errors, for each kind of distribution: the scale follows from it.
+    With bins a label belongs to the two bins beside it, by its distance to each. The distance of the mean is
+    added, since the cross-entropy knows no near miss. Without bins the points themselves are judged. The
+    predicted sigma is half the width of the interval that holds 68.27 % of the errors, for each kind of
+    distribution; the scale follows from it.
 
     Args:
         output: Answers of the network.
-        labels_cm: NaN where masked; such points have no part in the loss and give no gradient.
+        labels_cm: NaN where masked; such points add nothing to the loss and give no gradient.
         present: 1 for a line that can be seen, 0 for one that cannot, NaN where that is unknown.
         settings: Kind and weights.
 
@@ -46,7 +48,7 @@ def lane_loss(
         The loss; zero, with a gradient of zero, if nothing is known.
 
     Source:
-        The weighting by the predicted spread: Seitzer et al. 2022, "On the pitfalls of heteroscedastic
+        The weighting by the predicted sigma: Seitzer et al. 2022, "On the pitfalls of heteroscedastic
         uncertainty estimation with probabilistic neural networks", eq. 5. Bins: Li et al. 2020, "Generalized
         focal loss", eq. 6.
     """
@@ -54,23 +56,23 @@ def lane_loss(
     known = torch.isfinite(labels_cm)
     error = output.points_cm[known] - labels_cm[known]
     if output.log_share is not None and output.bins_cm is not None:
-        terms = _surprise(output.log_share[known], labels_cm[known], output.bins_cm)
+        terms = _cross_entropy(output.log_share[known], labels_cm[known], output.bins_cm)
         terms = terms + settings.distance * nn.functional.smooth_l1_loss(
             error, torch.zeros_like(error), beta=_NEAR_CM, reduction="none"
         )
         points = terms.sum() / max(terms.numel(), 1)
-        # The spread is learned from the errors; the points are not moved by it.
-        points = points + settings.distance * _doubt(error.detach(), output.sigma_cm[known], settings)
+        # Sigma is learned from the errors, without moving the points.
+        points = points + settings.distance * _likelihood(error.detach(), output.sigma_cm[known], settings)
     else:
-        points = _doubt(error, output.sigma_cm[known], settings)
-    told = torch.isfinite(present)
+        points = _likelihood(error, output.sigma_cm[known], settings)
+    known_lines = torch.isfinite(present)
     entropy = nn.functional.binary_cross_entropy_with_logits(
-        output.presence_logit[told], present[told], reduction="sum"
+        output.presence_logit[known_lines], present[known_lines], reduction="sum"
     )
-    return points + settings.presence * entropy / max(int(told.sum()), 1)
+    return points + settings.presence * entropy / max(int(known_lines.sum()), 1)
 
 
-def _surprise(
+def _cross_entropy(
     log_share: Float[Tensor, "k b"], labels_cm: Float[Tensor, "k"], bins_cm: Float[Tensor, "b"]
 ) -> Float[Tensor, "k"]:
     """Cross-entropy between labels, each between two bins, and distributions over the bins."""
@@ -83,8 +85,10 @@ def _surprise(
     return -shares[:, 0]
 
 
-def _doubt(error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossSettings) -> Float[Tensor, ""]:
-    """Mean negative log likelihood of errors, weighted by their spread."""
+def _likelihood(
+    error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossSettings
+) -> Float[Tensor, ""]:
+    """Mean negative log likelihood of errors, weighted by a power of their sigma."""
     if settings.kind == "student":
         z = error * _STUDENT_SIGMA / sigma
         terms = 0.5 * (_FREEDOM + 1.0) * torch.log1p(z * z / _FREEDOM) + torch.log(sigma)
@@ -100,13 +104,13 @@ def _doubt(error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossS
 def sigma_factors(
     error_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]
 ) -> Float[np.ndarray, "6"]:
-    """Find what predicted spreads have to be multiplied with so that 68.27 % of the errors lie within them.
+    """Return the factors on the predicted sigmas that make 68.27 % of the errors lie within one sigma.
 
     Both sides share the factor of a row: a network that is trained with mirrored samples knows no side.
 
     Args:
-        error_cm: Errors on frames that the network did not learn from; NaN where there is no label.
-        sigma_cm: The predicted standard deviations.
+        error_cm: Errors on held-out frames; NaN where there is no label.
+        sigma_cm: The predicted sigmas.
 
     Returns:
         A factor per point; 1 for the points of a row with too few errors.

@@ -1,4 +1,4 @@
-"""The exported network in whole numbers of eight bits: smaller, and on some processors faster."""
+"""The exported network, INT8-quantised: smaller, and on some processors faster."""
 
 from __future__ import annotations
 
@@ -14,29 +14,27 @@ from jaxtyping import UInt8
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from lanenet.data.files import atomic_file, write_json
-from lanenet.errors import CheckpointError
 from lanenet.learn.export import CALIBRATION_NAME, RASTERS_NAME, quiet, read_rasters
-from lanenet.perception.network.detector import INPUT_NAME, open_model
-from lanenet.perception.network.model_file import MODEL_NAME
+from lanenet.perception.network.model_file import INPUT_NAME, MODEL_NAME, open_model
 
 INT8_NAME = "model-int8.onnx"
-#: Largest change of the points, root of the mean square, that the smaller numbers may cost.
+#: Largest RMS change of the points by quantisation. Chosen: a tenth of a good network's RMSE.
 TOLERANCE_CM = 0.05
-
+#: Timed runs of each model, and untimed ones before them. Chosen: well below a second in all.
 _ROUNDS, _WARM_UP = 200, 20
 
 
 @dataclass(frozen=True)
 class Int8Report:
-    """What the smaller numbers cost and bring on this machine.
+    """What quantisation costs and brings on this machine.
 
     Attributes:
-        rms_difference_cm: Root of the mean square difference of the points, on validation rasters.
+        rms_difference_cm: RMS difference of the points, on validation rasters.
         largest_difference_cm: Largest difference of a point.
         median_ms: Time of one raster, one thread.
-        float_median_ms: The same for the model that it was made of, measured in turns with it.
+        float_median_ms: The same for the original model, timed alternately with it.
         size_bytes: Of the file.
-        float_size_bytes: Of the model that it was made of.
+        float_size_bytes: Of the original model.
     """
 
     rms_difference_cm: float
@@ -67,15 +65,15 @@ class Int8Report:
 def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Report]:
     """Quantise the exported model of a checkpoint; the figures are written beside it as JSON.
 
-    The convolutions are computed in whole numbers, their ranges taken from training rasters. The fully
-    connected layers are not: a point of a line is a matter of 0.1 %, which eight bits do not hold.
+    Only the convolutions are quantised, with value ranges from training rasters. The fully connected layers
+    are not: a point has to be right to 0.1 %, which eight bits cannot hold.
 
     Args:
         checkpoint: Folder with an exported model and its rasters.
         out: File to write; None writes ``model-int8.onnx`` into the folder.
 
     Returns:
-        The file, and what it costs and brings.
+        The file and its report.
 
     Raises:
         CheckpointError: If a file of the folder is missing or does not fit.
@@ -84,8 +82,6 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
     source = checkpoint / MODEL_NAME
     path = checkpoint / INT8_NAME if out is None else out
     session, meta = open_model(source)
-    if not meta.tells_sigma:
-        raise CheckpointError(f"{source}: a model of the older format, expected a new one; train it again")
     rasters = read_rasters(checkpoint / CALIBRATION_NAME, meta)
     checks = read_rasters(checkpoint / RASTERS_NAME, meta)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +97,7 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
             per_channel=True,
         )
         model = onnx.load(temporary)
-        # The description is that of the source, which the quantiser drops.
+        # The quantiser drops the description.
         onnx.helper.set_model_props(model, meta.to_properties())
         onnx.save(model, temporary)
         small, _ = open_model(temporary)
@@ -111,7 +107,7 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
 
 
 class _Rasters(CalibrationDataReader):  # type: ignore[misc]
-    """Hands the quantiser one raster after the other."""
+    """Feeds the quantiser one raster after the other."""
 
     def __init__(self, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
         self._rest: Iterator[np.ndarray] = iter(rasters)
@@ -132,7 +128,7 @@ def _compare(
     names = ["points_cm"]
     off = small.run(names, {INPUT_NAME: rasters})[0] - source.run(names, {INPUT_NAME: rasters})[0]
     times_ms: dict[int, list[float]] = {0: [], 1: []}
-    # In turns, so that whatever else the machine does falls on both.
+    # Alternately, so that other load on the machine slows both.
     for i in range(_WARM_UP + _ROUNDS):
         raster = rasters[i % len(rasters)][None]
         for which, session in enumerate((source, small)):

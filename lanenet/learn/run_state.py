@@ -1,7 +1,4 @@
-"""What a training run keeps on disk: the state to go on from, and the sign that it is finished.
-
-Weights to start from: fine-tuning a network that has been trained before.
-"""
+"""What a training run keeps on disk and starts from: its state, its end, and weights for fine-tuning."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from lanenet.samples.dataset import hash_files
 def check_start(
     settings: LearnSettings, window: BirdseyeWindow, perceptions: Sequence[PerceptionSettings]
 ) -> None:
-    """Refuse weights to begin with that the training would refuse, before its data is made.
+    """Refuse starting weights that the training would refuse, before its data is made.
 
     Args:
         settings: Of the training.
@@ -49,7 +46,7 @@ def check_start(
 def load_start_weights(
     network: LaneNet, folder: Path, window: BirdseyeWindow, perception: PerceptionSettings
 ) -> None:
-    """Take over the weights of a checkpoint, with the mean and the spread of the labels that they belong to.
+    """Load the weights of a checkpoint, with the mean and the scale of the labels that belong to them.
 
     Args:
         network: Network to change.
@@ -70,7 +67,7 @@ def load_start_weights(
     unlike = perception.unlike(meta.perception)
     if unlike:
         raise CheckpointError(
-            f"learn.start_from {folder}: was trained on edges found in another way than those of the labels "
+            f"learn.start_from {folder}: was trained on edges with other settings than those of the labels "
             f"({unlike}); set data.colour_weight to the checkpoint's"
         )
     weights = start.state_dict()
@@ -86,16 +83,16 @@ def load_start_weights(
 
 
 def hash_of_start(folder: Path | None) -> str:
-    """Return a hash of the weights that a run starts from; empty where it starts anew.
+    """Return a hash of the weights that a run starts from; empty for random weights.
 
     Raises:
-        CheckpointError: If there are none.
+        CheckpointError: If the folder has none.
     """
     if folder is None:
         return ""
     path = folder / WEIGHTS_NAME
     if not path.is_file():
-        raise CheckpointError(f"learn.start_from {folder}: no {WEIGHTS_NAME} in it, expected a checkpoint")
+        raise CheckpointError(f"learn.start_from {folder}: no {WEIGHTS_NAME}, expected a checkpoint")
     return hash_files([path])
 
 
@@ -118,8 +115,7 @@ class EpochRecord:
         learning_rate: At the end of the epoch.
         samples_per_s: Speed of the training part.
         val_trimmed_cm: As ``val_rmse_cm``, without the largest hundredth of the errors: some labels from maps
-            are wrong by a lane, and the network that agrees with them is not the best one. NaN in what older
-            versions left.
+            are wrong by a lane, and the network that agrees with them is not the best one.
     """
 
     epoch: int
@@ -127,12 +123,12 @@ class EpochRecord:
     val_rmse_cm: float
     learning_rate: float
     samples_per_s: float
-    val_trimmed_cm: float = math.nan
+    val_trimmed_cm: float
 
 
 @dataclass
 class RunState:
-    """All that a stopped run needs to go on as if it had not stopped.
+    """All that a stopped run needs to resume as if it had not stopped.
 
     Random numbers follow from the seed and the epoch, so no generator is kept.
 
@@ -159,7 +155,7 @@ def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
 
 
 def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
-    """Return a hash of all that decides a run: how it learns, settings, files' contents, first weights.
+    """Return a hash of all that decides a run: version, settings, contents of the files, starting weights.
 
     Raises:
         LabelFormatError: If a file cannot be read.
@@ -174,7 +170,7 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
 
 
 def write_state(path: Path, state: RunState, run_hash: str) -> None:
-    """Write the state; a kill while writing leaves the one before."""
+    """Write the state; a kill while writing leaves the previous one."""
     data = {
         "run_hash": run_hash,
         "network": state.network,

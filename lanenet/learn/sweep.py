@@ -1,7 +1,4 @@
-"""A recorded search for the window, the size, the loss and the learning rate, judged on validation drives.
-
-The trials of a sweep as tables: all as CSV, the best and what each choice was worth as Markdown.
-"""
+"""A recorded search for the window, the size, the loss and the learning rate, judged on validation drives."""
 
 from __future__ import annotations
 
@@ -24,6 +21,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.run_state import best_record, hash_run
 from lanenet.learn.train import TrainingRun, torch_threads
+from lanenet.learn.trunks import TRUNKS
 from lanenet.samples.dataset import LaneSamples, check_same
 
 _BEST = 10
@@ -57,13 +55,13 @@ def trials_table(rows: Sequence[Mapping[str, Any]], choices: Sequence[str]) -> s
     """Return the best trials, and for each choice the errors of the trials that made it, as Markdown.
 
     Args:
-        rows: Trials by the names of the CSV; ``state`` is ``complete``, or ``pruned`` for those that were
-            given up early, which do not count.
-        choices: Names of what was chosen from a few values.
+        rows: Trials by the names of the CSV; ``state`` is ``complete``, or ``pruned`` for trials that were
+            stopped early, which do not count.
+        choices: Names of what takes one of a few values.
     """
     whole = sorted((row for row in rows if row["state"] == "complete"), key=lambda row: row["val_rmse_cm"])
     lines = [
-        f"{len(whole)} trials to the end, {len(rows) - len(whole)} given up early. RMSE over the six points "
+        f"{len(whole)} complete trials, {len(rows) - len(whole)} stopped early. RMSE over the six points "
         "of the validation drives.",
         "",
         "| " + " | ".join(_NAMES.values()) + " |",
@@ -90,7 +88,8 @@ Progress = Callable[[int, int], None]
 
 DATABASE_NAME = "sweep.db"
 
-#: What is tried; the first value of each is tried first, together: the small network as it is.
+#: What is tried. The first trial takes the first value of each: the small network as it is. The others are
+#: about half and twice that value.
 CHOICES: dict[str, tuple[Any, ...]] = {
     "cell_cm": (0.75, 0.5, 1.0, 1.5),
     "far_cm": (72.0, 48.0, 96.0),
@@ -98,14 +97,14 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "first_channels": (16, 8, 12, 24),
     "layers": (5, 4, 3),
     "hidden": (64, 32, 128),
-    # What points are: distributions, or numbers whose errors are spread in one of these ways.
+    # Points as distributions, or as numbers with one of these distributions of their errors.
     "loss": ("bins", "student", "laplace", "gaussian"),
     "evenness": (0.5, 0.0, 1.0, 2.0),
 }
-#: From and to.
+#: Lowest and highest that is tried, about the default's factor of 5 and 3.
 LEARNING_RATE = (5e-4, 1e-2)
 
-#: Trials that all run to their end before others are measured against them, and epochs that each gets.
+#: Trials that run to their end before others are compared with them, and epochs that each trial gets. Chosen.
 _UNPRUNED, _LEAST_EPOCHS = 5, 3
 _OUT_OF_TIME = math.inf
 
@@ -119,31 +118,31 @@ def sweep(
     trials: int,
     progress: Progress | None = None,
 ) -> str:
-    """Try networks until the time is up, and write the table of all that were tried.
+    """Try networks until the time is up, and write the table of all trials.
 
-    The trials lie in an SQLite file. A later call with the same data and settings goes on with them; a trial
-    that was interrupted is tried again from its start.
+    The trials are kept in an SQLite file. A later call with the same data and settings continues them; an
+    interrupted trial starts again.
 
     Args:
-        settings: Of each training, but for what is tried.
+        settings: Of each training, apart from what is tried.
         train_paths: Label sets to learn from.
         val_paths: Label sets that judge.
         out: Folder for ``sweep.db``, ``trials.csv`` and ``sweep.md``.
-        seconds: No trial goes on for longer than this after the start.
-        trials: No more finished trials than this, those of earlier calls included.
+        seconds: No trial runs longer than this after the start.
+        trials: Finished trials at most, those of earlier calls included.
         progress: Called after each trial.
 
     Returns:
         The table, as Markdown.
 
     Raises:
-        ConfigError: If the network is AlexNet.
+        ConfigError: If the network's size cannot be set (AlexNet).
         MissingExtraError: If optuna is not installed.
         LabelFormatError: If the label sets cannot be read or learned together.
     """
-    if settings.network.kind == "alexnet":
+    if "channels" not in TRUNKS[settings.network.kind].uses:
         raise ConfigError(
-            "learn.network.kind: found alexnet, expected a compact network: its size is what is tried"
+            f"learn.network.kind: found {settings.network.kind}, expected a network whose size can be set"
         )
     optuna: Any = require("optuna", "sweep")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -176,7 +175,7 @@ def sweep(
 
 
 def _open_study(optuna: Any, path: Path, key: str, seed: int) -> Any:
-    """Open the trials of the same data and settings; those that a kill has left open are put in the queue."""
+    """Open the trials of the same data and settings; those that a kill left open are queued again."""
     name = hashlib.sha256(f"{key} {CHOICES} {LEARNING_RATE}".encode()).hexdigest()[:16]
     # Each call draws other trials, and the first call always the same.
     study = optuna.create_study(
@@ -207,7 +206,7 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
         rows=round(drawn["far_cm"] / cell_cm),
         columns=round(2.0 * half_cm / cell_cm),
     )
-    # As in the family: each layer has as many channels more as the first one has.
+    # As in the compact trunks: layer k has k times the channels of the first.
     channels = tuple(drawn["first_channels"] * k for k in range(1, drawn["layers"] + 1))
     bins = (settings.network.bins or NetworkSettings().bins) if drawn["loss"] == "bins" else 0
     network = {"channels": channels, "hidden": drawn["hidden"], "bins": bins}
@@ -221,19 +220,19 @@ def _draw(trial: Any, settings: LearnSettings) -> tuple[BirdseyeWindow, LearnSet
 
 
 def _seen_in(labels: LabelSet, window: BirdseyeWindow) -> LabelSet:
-    """Return labels with another window; they stay as they are, so that every trial is asked the same."""
+    """Return labels with another window; all trials are judged on the same labels."""
     return replace(labels, meta=replace(labels.meta, window=window))
 
 
 def _try(trial: Any, run: TrainingRun, val: LaneSamples, deadline: float) -> float | None:
-    """Train; answers the best validation error, [cm], None if given up early, or ``_OUT_OF_TIME``."""
+    """Train; returns the best validation error, [cm], None if stopped early, or ``_OUT_OF_TIME``."""
     trial.set_user_attr("parameters", run.network.n_parameters)
     began = time.process_time()
     while not run.ended:
         try:
             record = run.run_epoch(val)
         except LanenetError:
-            # A learning rate that makes the training diverge is an answer, too.
+            # The learning rate made the training diverge.
             return None
         trial.report(record.val_rmse_cm, record.epoch)
         trial.set_user_attr("epochs", record.epoch)

@@ -1,7 +1,4 @@
-"""Train a network on label sets: one call from Parquet files to a checkpoint folder.
-
-What is set right after the training, on frames that the network did not learn from: doubt and presence.
-"""
+"""Train a network on label sets: one call from Parquet files to a checkpoint folder."""
 
 from __future__ import annotations
 
@@ -15,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 
 from lanenet.data.label_set import read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
-from lanenet.learn.checkpoint import tensorboard_curve, write_checkpoint
+from lanenet.learn.checkpoint import FinishedRun, tensorboard_curve, write_checkpoint
 from lanenet.learn.config import LearnSettings
-from lanenet.learn.loss import lane_loss, sigma_factors
+from lanenet.learn.loss import lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
-from lanenet.learn.optimiser import RunningMean, learning_rate_at, new_optimizer, set_learning_rate
-from lanenet.learn.predict import answer_rasters, predict, trimmed_rmse_cm
+from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
 from lanenet.learn.run_state import (
     STATE_NAME,
     EpochRecord,
@@ -38,38 +35,12 @@ from lanenet.learn.run_state import (
 from lanenet.perception.network.model_file import MODEL_NAME
 from lanenet.samples.augment import Batch
 from lanenet.samples.dataset import LaneSamples, check_same
-from lanenet.samples.settings import AugmentSettings
-
-#: Share of the missing lines that are to be called absent, with a margin to the 95 % that are asked for.
-_ABSENT_FOUND = 0.96
-#: A network that needs more has not learned to tell lines, and would call most of them absent.
-_MOST_SHIFT = 2.0
-
-
-def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
-    """Scale a network's spread so that 68 % of its errors on frames it did not learn from lie within it."""
-    answers = predict(network, val)
-    factors = sigma_factors(answers.points_cm - answers.truth_cm, answers.sigma_cm)
-    network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
-
-
-def calibrate_presence(network: LaneNet, val: LaneSamples) -> None:
-    """Shift what a network says of lines so that it calls those absent that are.
-
-    How often lines are missing in the training is no more than a setting, and with it where a probability of
-    one half lies. It is put where 96 % of the lines that are taken out of frames it did not learn from are
-    called absent, if it does not lie there already.
-    """
-    gone = AugmentSettings.only(missing_line=0.8, missing_both=0.2)
-    batch = val.augmented_batch(np.arange(len(val)), gone, seed=0, epoch=0)
-    odds = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.double().cpu().numpy()
-    absent = odds[batch.present == 0.0]
-    if absent.size:
-        network.lower_presence(min(max(float(np.quantile(absent, _ABSENT_FOUND)), 0.0), _MOST_SHIFT))
-
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]
+
+#: Key of a parameter group: its learning rate is this many times that of the others.
+_FACTOR = "rate_factor"
 
 
 @dataclass(frozen=True)
@@ -81,7 +52,7 @@ class TrainResult:
         model_path: Its ONNX file.
         best_epoch: Epoch of the exported weights, from 1.
         val_rmse_cm: Their RMSE over all labelled points of the validation frames.
-        computed: False if the folder already held this run and nothing had to be done.
+        computed: False if the folder already held this run.
     """
 
     folder: Path
@@ -100,7 +71,7 @@ def train(
 ) -> TrainResult:
     """Train, evaluate and export a network.
 
-    A run that was stopped goes on from its last written epoch and ends with the same weights, bit for bit on
+    A run that was stopped resumes after its last written epoch and ends with the same weights, bit for bit on
     the same machine and number of threads. A finished run with the same settings and data is not repeated.
 
     Args:
@@ -111,13 +82,13 @@ def train(
         progress: Called after each epoch.
 
     Returns:
-        Where the model is and how good it is.
+        The checkpoint folder and the error of its model.
 
     Raises:
         LabelFormatError: If the label sets cannot be read or learned together.
         CheckpointError: If the folder holds a run with other settings or data, or pretrained weights cannot
             be read.
-        ConfigError: If a GPU is asked for and there is none.
+        ConfigError: If a GPU is set and there is none.
         LanenetError: If the training diverges.
     """
     run_hash = hash_run(settings, train_paths, val_paths)
@@ -147,13 +118,14 @@ def train(
         calibrate_sigma(network, val)
         calibrate_presence(network, val)
         answers = predict(network, val)
-        best = best_record(run.history)
-        write_checkpoint(out, settings, network, samples, val, answers, run.history, run_hash)
+        finished = FinishedRun(settings, network, samples, val, answers, run.history, run_hash)
+        write_checkpoint(out, finished)
+    best = best_record(run.history)
     return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
 
 
 class TrainingRun:
-    """Weights, optimiser and curve of a run in memory.
+    """Weights, optimiser and curve of a run.
 
     Attributes:
         network: What is trained.
@@ -162,33 +134,38 @@ class TrainingRun:
 
     def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None = None) -> None:
         self.settings, self.samples = settings, samples
-        self.device = _device(settings)
-        self.network = self._new_network()
+        self.device, window = _device(settings), samples.window
+        self.network = new_network(settings.network, window.rows, window.columns, settings.seed)
+        self.network.to(self.device)
         mean, scale = samples.normalisation(settings.augment.mirror > 0.0)
         self.network.mean_cm.copy_(torch.from_numpy(mean))
         self.network.scale_cm.copy_(torch.from_numpy(scale))
-        self.network.spread_bins(samples.window.left_cm, samples.window.right_cm)
+        self.network.spread_bins(window.left_cm, window.right_cm)
         if settings.start_from is not None:
-            load_start_weights(self.network, settings.start_from, samples.window, samples.perception)
+            load_start_weights(self.network, settings.start_from, window, samples.perception)
         self.optimizer = new_optimizer(self.network, settings)
         self.step = 0
         self.history: list[EpochRecord] = []
         self.best: dict[str, Tensor] | None = None
         self.total = max(1, settings.epochs * samples.steps_per_epoch(settings.batch_size))
-        self.mean = RunningMean(self._new_network(), self.network, settings.ema_decay)
+        self.mean = running_mean(self.network, settings.ema_decay)
         if saved is not None:
             self.network.load_state_dict(saved.network)
-            self.mean.network.load_state_dict(saved.ema)
+            self.averaged.load_state_dict(saved.ema)
+            self.mean.n_averaged.fill_(saved.step + 1)
             self.optimizer.load_state_dict(saved.optimizer)
             self.step, self.history, self.best = saved.step, list(saved.history), saved.best
 
-    def _new_network(self) -> LaneNet:
-        window, settings = self.samples.window, self.settings
-        return new_network(settings.network, window.rows, window.columns, settings.seed).to(self.device)
+    @property
+    def averaged(self) -> LaneNet:
+        """The running mean of the weights."""
+        network = self.mean.module
+        assert isinstance(network, LaneNet)
+        return network
 
     @property
     def ended(self) -> bool:
-        """True after the last epoch, and once the validation error has long not sunk."""
+        """True after the last epoch, and when the validation error has not fallen for too long."""
         done, patience = len(self.history), self.settings.patience
         if done >= self.settings.epochs:
             return True
@@ -218,7 +195,7 @@ class TrainingRun:
                         f"learning_rate (now {settings.learning_rate:g})"
                     )
         seconds = time.perf_counter() - started
-        answers = predict(self.mean.network, val)
+        answers = predict(self.averaged, val)
         record = EpochRecord(
             epoch=epoch + 1,
             train_rmse_cm=math.sqrt(squares / max(count, 1)),
@@ -229,11 +206,11 @@ class TrainingRun:
         )
         self.history.append(record)
         if best_record(self.history) is record:
-            self.best = {name: value.clone() for name, value in self.mean.network.state_dict().items()}
+            self.best = {name: value.clone() for name, value in self.averaged.state_dict().items()}
         return record
 
     def learn_from(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:
-        """Take one step at a learning rate; answers the points that it started from."""
+        """Take one step at a learning rate; returns the points as they were before it."""
         set_learning_rate(self.optimizer, rate)
         rasters, present, lane_cm = (
             torch.from_numpy(part).to(self.device) for part in (batch.rasters, batch.present, batch.lane_cm)
@@ -244,7 +221,7 @@ class TrainingRun:
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.step += 1
-        self.mean.update(self.step)
+        self.mean.update_parameters(self.network)
         points: Tensor = output.points_cm.detach()
         return points
 
@@ -252,7 +229,7 @@ class TrainingRun:
         """Return what :class:`RunState` keeps of this run."""
         return RunState(
             network=self.network.state_dict(),
-            ema=self.mean.network.state_dict(),
+            ema=self.averaged.state_dict(),
             optimizer=self.optimizer.state_dict(),
             step=self.step,
             history=self.history,
@@ -268,6 +245,58 @@ class TrainingRun:
         return network.eval()
 
 
+def new_optimizer(network: LaneNet, settings: LearnSettings) -> torch.optim.Optimizer:
+    """Return AdamW over a network's weights; biases and norms do not decay.
+
+    A new head on a pretrained trunk learns ``head_rate`` times as fast as the rest, as in the paper.
+    """
+    head_factor = settings.head_rate if network.trunk.head_learns_faster else 1.0
+    groups = []
+    # All children, so that every part of a network learns.
+    for part in network.children():
+        factor = head_factor if part is network.head else 1.0
+        for decays in (True, False):
+            chosen = [p for p in part.parameters() if (p.ndim > 1) == decays]
+            decay = settings.weight_decay if decays else 0.0
+            if chosen:
+                groups.append({"params": chosen, "weight_decay": decay, _FACTOR: factor})
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
+
+
+def learning_rate_at(step: int, total: int, settings: LearnSettings) -> float:
+    """Return the learning rate of a step (from 0): a straight rise, then a cosine down to zero."""
+    rise = settings.warmup * total
+    if step < rise:
+        return settings.learning_rate * (step + 1) / (rise + 1)
+    share = (step - rise) / max(total - rise, 1.0)
+    return settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate; a group of parameters may have a multiple of it."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate * group[_FACTOR]
+
+
+def running_mean(network: LaneNet, decay: float) -> AveragedModel:
+    """Return a copy of a network at the running mean of its weights; a step keeps ``decay`` of the mean.
+
+    Less is kept at first, so that the first epochs are not judged by their random beginning.
+    """
+
+    def move(means: Sequence[Tensor], values: Sequence[Tensor], step: Tensor | int) -> None:
+        if means[0].is_floating_point():
+            now = min(decay, (1.0 + int(step)) / (10.0 + int(step)))
+            torch._foreach_lerp_(list(means), list(values), 1.0 - now)
+        else:
+            torch._foreach_copy_(list(means), list(values))
+
+    mean = AveragedModel(network, multi_avg_fn=move, use_buffers=True)
+    # The first step counts as 1: otherwise it would replace the mean.
+    mean.n_averaged.fill_(1)
+    return mean
+
+
 def _read_both(
     settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]
 ) -> tuple[LaneSamples, LaneSamples]:
@@ -276,8 +305,8 @@ def _read_both(
     for path, labels in zip(train_paths, train_sets, strict=True):
         if labels.meta.source != "map":
             raise LabelFormatError(
-                f"{path}: labels from the {labels.meta.source}; a network learns from maps, "
-                "the truth only scores it"
+                f"{path}: labels from the {labels.meta.source}; a network learns from maps, the truth only "
+                "scores it"
             )
     samples = LaneSamples(train_sets, [str(p) for p in train_paths], settings.min_quality)
     val = LaneSamples(val_sets, [str(p) for p in val_paths])
@@ -288,13 +317,13 @@ def _read_both(
 def _device(settings: LearnSettings) -> torch.device:
     found = torch.cuda.is_available()
     if settings.device == "cuda" and not found:
-        raise ConfigError("device: cuda, but PyTorch finds no GPU here; expected cpu or auto")
+        raise ConfigError("device: cuda, but PyTorch finds no GPU; expected cpu or auto")
     return torch.device("cuda" if found and settings.device != "cpu" else "cpu")
 
 
 @contextmanager
 def _random_numbers(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
-    """Let torch's own draws (dropout) follow from the seed and the epoch, and leave its generators alone."""
+    """Make torch's own draws (dropout) follow from seed and epoch; its global generators stay untouched."""
     with torch.random.fork_rng(devices=[torch.cuda.current_device()] if device.type == "cuda" else []):
         torch.manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
         yield
@@ -302,7 +331,7 @@ def _random_numbers(seed: int, epoch: int, device: torch.device) -> Iterator[Non
 
 @contextmanager
 def torch_threads(threads: int) -> Iterator[None]:
-    """Set torch's threads for a while; the setting belongs to the whole process."""
+    """Set torch's number of threads for a while; the setting belongs to the whole process."""
     before = torch.get_num_threads()
     if threads:
         torch.set_num_threads(threads)

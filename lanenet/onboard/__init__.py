@@ -1,1 +1,1 @@
-"""What runs a detector: over recorded sources, and on the car."""
+"""What runs on the car: the drive loop with its safety, guard, cameras and actuators, and the doctor."""

@@ -43,7 +43,7 @@ from lanenet.data.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.drive_settings import DriveDetectorSettings
+from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.draw import draw_estimate
@@ -51,24 +51,25 @@ from lanenet.perception.edges.views import birdseye_view, undistorting_view
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.registry import build_detector
 
-#: Donkeycar asks its pilot in every turn of its loop, unless a person drives.
+#: Donkeycar calls its pilot in every turn of its loop (20 Hz by default) unless a person drives: after a
+#: longer silence a person drove.
 _PAUSE_S = 0.5
 
 
 class DonkeySettings(Settings):
-    """Settings of the pilot; files are relative to the settings' own.
+    """Settings of the pilot; paths are relative to the settings file.
 
     Attributes:
-        camera: Camera file; ``hough`` and ``painter`` do without.
-        detector: What finds the lane.
+        camera: Camera file; ``hough`` and ``painter`` need none.
+        detector: Finds the lane.
         control: Steering and speed.
-        limits: What no command exceeds; Donkeycar's angle of 1 is ``max_steering_rad``.
-        min_confidence: A frame of less confidence counts as one without a lane.
-        hold_s: Without a lane, or without a new image, the car goes on as before for this long, then it
-            stops. Longer than the time between two images of the camera.
-        allow_repeated_frames: Take an image that equals the one before, pixel for pixel, for a new one.
-            Donkeycar hands out the last image of a camera that hangs for ever; a simulator without noise
-            gives equal ones while the car stands.
+        limits: Limits of every command; Donkeycar's angle of 1 is ``max_steering_rad``.
+        min_confidence: A frame with less confidence counts as one without a lane.
+        hold_s: Without a lane, or without a new image, the car keeps its last command for this long, then
+            stops. Must be longer than the time between two images.
+        allow_repeated_frames: Treat an image that equals the one before in every pixel as a new one.
+            Donkeycar repeats the last image of a camera that hangs; a simulator without noise gives equal
+            images while the car stands.
     """
 
     camera: Path | None = None
@@ -85,7 +86,7 @@ class LanePilot:
 
     Attributes:
         estimate: The lane of the last image.
-        camera: The camera; None where the detector does without.
+        camera: The camera; None if the detector needs none.
     """
 
     def __init__(
@@ -94,12 +95,12 @@ class LanePilot:
         """Build detector and controller.
 
         Args:
-            settings: Of the pilot.
-            folder: Where the settings' relative paths start.
+            settings: The pilot's settings.
+            folder: Start of the settings' relative paths.
             clock: Time, [s].
 
         Raises:
-            LanenetError: If the model does not fit the camera, or something that is needed is missing.
+            LanenetError: If the model does not fit the camera, or something required is missing.
         """
 
         def found(path: Path | None) -> Path | None:
@@ -127,7 +128,7 @@ class LanePilot:
 
     @staticmethod
     def from_file(path: str | Path) -> LanePilot:
-        """Build the pilot of a YAML file.
+        """Build the pilot that a YAML file describes.
 
         Raises:
             LanenetError: If the file or what it names cannot be used.
@@ -136,24 +137,24 @@ class LanePilot:
         return LanePilot(load_settings(DonkeySettings, path), path.parent)
 
     def run(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
-        """Answer to an image.
+        """Return the command for an image.
 
         Args:
-            image_rgb: Donkeycar's image, also of a camera with ``IMAGE_DEPTH = 1``; None until there is one.
+            image_rgb: Donkeycar's image, colour or gray (``IMAGE_DEPTH = 1``); None before the first.
 
         Returns:
             Angle, -1 (left) to 1 (right), and throttle; a throttle of 0 when the lane is lost.
         """
         now_s = self._clock()
         if now_s - self._run_s > _PAUSE_S:
-            # A person drove meanwhile: the throttle rises from 0, and nothing is known of the lane.
+            # A person drove meanwhile: the throttle starts from 0, and the lane memory is out of date.
             self._limiter.neutral(now_s)
             self._controller.reset()
         self._run_s = now_s
         if image_rgb is None:
             self.estimate = LaneEstimate()
         else:
-            # A copy: some of Donkeycar's cameras fill the same array again and again.
+            # A copy, since some of Donkeycar's cameras reuse one array.
             bgr = _bgr_of(image_rgb)
             if self._is_new(bgr):
                 self.estimate = self._detector.detect(bgr)
@@ -178,27 +179,27 @@ class LanePilot:
             self._wish = (wish.steering_rad, wish.speed_cm_s)
 
     def run_threaded(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
-        """Do the same as :meth:`run`: the pilot is faster than a camera and needs no thread."""
+        """Same as :meth:`run`: the pilot is faster than the camera and needs no thread."""
         return self.run(image_rgb)
 
     def shutdown(self) -> None:
-        """Forget the lane; Donkeycar calls it at the end."""
+        """Forget the lane; called by Donkeycar at the end."""
         self._detector.reset()
         self._controller.reset()
 
 
 def _bgr_of(image: Num[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Copy Donkeycar's image into one of OpenCV's."""
+    """Copy Donkeycar's image in OpenCV's order."""
     if image.ndim == 2 or image.shape[2:] == (1,):
-        # Its gray images are floats, some with a third axis of one.
+        # Donkeycar's gray images are floats, some with a third axis of length 1.
         gray = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
         return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
-    # It hands out views that OpenCV does not take.
+    # Donkeycar gives views that OpenCV does not accept.
     return np.ascontiguousarray(image[..., ::-1])
 
 
 class CvLaneController:
-    """The pilot as a controller of the ``cv_control`` template, which gives it a PID controller and ``cfg``.
+    """The pilot as a controller for the ``cv_control`` template, which passes a PID controller and ``cfg``.
 
     The PID controller is not used: steering follows from the geometry of the lane.
     """
@@ -207,7 +208,7 @@ class CvLaneController:
         """Build the pilot that ``cfg.LANENET_CONFIG`` names.
 
         Raises:
-            LanenetError: If it is missing or cannot be used.
+            LanenetError: If the file is missing or cannot be used.
         """
         path = getattr(cfg, "LANENET_CONFIG", None)
         if path is None:
@@ -218,7 +219,7 @@ class CvLaneController:
     def run(
         self, cam_img: Num[np.ndarray, "h w *c"] | None
     ) -> tuple[float, float, Num[np.ndarray, "h w *d"] | None]:
-        """Return angle, throttle, and the image with what was found drawn into it."""
+        """Return angle, throttle, and the image with the detected lane drawn into it."""
         angle, throttle = self.pilot.run(cam_img)
         if cam_img is None or not self._overlay:
             return angle, throttle, cam_img
@@ -231,7 +232,7 @@ class CvLaneController:
 
 
 class BirdseyeTransformer:
-    """The road from above, for Donkeycar's image transformations.
+    """The bird's-eye view, for Donkeycar's image transformations.
 
     ``cfg.LANENET_CAMERA`` is the camera file; ``cfg.LANENET_WINDOW`` may be a dictionary with some of
     ``left_cm, near_cm, cell_cm, rows, columns``.
@@ -255,7 +256,7 @@ class BirdseyeTransformer:
 
 
 class UndistortTransformer:
-    """The image of a lens without distortion, for Donkeycar's image transformations.
+    """The undistorted image, for Donkeycar's image transformations.
 
     ``cfg.LANENET_CAMERA`` is the camera file.
     """

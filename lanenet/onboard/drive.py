@@ -1,33 +1,110 @@
-"""Puts a car together from its settings."""
+"""Puts a car together from its settings: what is on the car, how it drives, and when it stops."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
-from lanenet.control.controller import LaneController
+from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
+from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drives.recorder import DriveRecorder, new_drive_folder
+from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_drive_folder
 from lanenet.data.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators import ActuatorSettings, make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
-from lanenet.onboard.cameras import open_source
+from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.drive_report import Step
-from lanenet.onboard.drive_settings import DriveSettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
-from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.safety import CommandLimiter
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.estimate import Detector
-from lanenet.perception.registry import build_detector
+from lanenet.perception.registry import KINDS, build_detector
 
-#: Longer than any rehearsal: a dry run stops for a fault, and does not end for it.
+#: In a dry run a fault stops the car but does not end the drive: this is longer than any dry run.
 _NEVER_S = 1e9
+
+
+def _known_detector(name: str) -> str:
+    if name not in KINDS:
+        raise PydanticCustomError("detector", f"expected one of {', '.join(KINDS)}")
+    return name
+
+
+class DriveDetectorSettings(Settings):
+    """The detector of a car.
+
+    Attributes:
+        kind: As in ``lanenet detect --detector``.
+        model: ONNX file or checkpoint folder of the network.
+        config: Settings file of the other detectors.
+        mask: PNG that is black except on the car itself, which is ignored.
+        any_camera: Use a network with another camera than it was trained with.
+        lane_width_cm: Between the middles of the two lines, for the lane filter.
+    """
+
+    kind: Annotated[str, AfterValidator(_known_detector)] = "network"
+    model: Path | None = None
+    config: Path | None = None
+    mask: Path | None = None
+    any_camera: bool = False
+    lane_width_cm: float | None = Field(default=None, gt=0.0)
+
+
+class DriveSettings(Settings):
+    """Everything that ``lanenet drive`` needs.
+
+    Attributes:
+        source: Camera, or a recording in its place.
+        camera: Camera file; without one only detectors that work in pixels can be used.
+        detector: Finds the lane.
+        control: Steering and speed; the wheelbase defaults to the camera file's.
+        limits: Limits of every command.
+        safety: When the car slows down, stops and gives up.
+        actuator: Servo and motor; None for a dry run.
+        recording: Record the drive; None for no recording.
+        threads: Threads of OpenCV; the network uses one.
+    """
+
+    source: SourceSettings
+    camera: Path | None = None
+    detector: DriveDetectorSettings = DriveDetectorSettings()
+    control: ControlSettings
+    limits: LimitSettings = Field(default_factory=LimitSettings)
+    safety: SafetySettings = Field(default_factory=SafetySettings)
+    actuator: ActuatorSettings | None = None
+    recording: RecordingSettings | None = None
+    threads: int = Field(default=1, ge=1)
+
+
+def load_drive_settings(path: Path, overrides: list[str] | None = None) -> DriveSettings:
+    """Read a car's settings; the wheelbase defaults to the camera file's.
+
+    Raises:
+        ConfigError: Naming the file, the key, what was found and what was expected.
+        CalibrationError: If the camera file is needed and cannot be used.
+    """
+    data = apply_overrides(read_yaml(path), overrides or [])
+    return check_settings(DriveSettings, _with_wheelbase(data), str(path))
+
+
+def _with_wheelbase(data: dict[str, Any]) -> dict[str, Any]:
+    control, camera = data.get("control", {}), data.get("camera")
+    steering = control.get("steering", {}) if isinstance(control, dict) else None
+    # Wrong types are left to check_settings, which names them.
+    if not isinstance(steering, dict) or not isinstance(camera, str) or "wheelbase_cm" in steering:
+        return data
+    wheelbase_cm = read_camera(Path(camera)).wheelbase_cm
+    return {**data, "control": {**control, "steering": {**steering, "wheelbase_cm": wheelbase_cm}}}
 
 
 def build_loop(
@@ -38,13 +115,13 @@ def build_loop(
     dry_run: bool = False,
     watch: Callable[[Step], None] | None = None,
 ) -> DriveLoop:
-    """Put a car together; devices are opened when the loop runs, a recording's folder is made here.
+    """Put a car together; a recording's folder is made here, devices are opened when the loop runs.
 
     Args:
-        settings: Of the car.
+        settings: The car's settings.
         arm: Let the motor turn, after the countdown.
         steering_only: Move the wheels and not the motor.
-        dry_run: Nothing is sent to any actuator; what would be sent is that of an armed car.
+        dry_run: Send nothing; the loop behaves as that of an armed car.
         watch: Called after every turn of the loop.
 
     Raises:
@@ -63,21 +140,15 @@ def build_loop(
     safety = settings.safety
     if dry_run:
         safety = safety.model_copy(update={"countdown_s": 0.0, "end_after_s": _NEVER_S})
-    return DriveLoop(
+    parts = CarParts(
         open_source(settings.source),
         build_drive_detector(settings, camera),
         LaneController(settings.control),
         NoActuator() if dry_run else build_sink(settings),
-        safety,
-        CommandLimiter(settings.limits),
-        settings.control.speed,
-        armed=arm or dry_run,
-        steering_only=steering_only,
-        recorder=_recorder(settings, camera),
-        # Whoever drives the car during a dry run, it is not these commands.
-        record_commands=not dry_run,
-        watch=watch,
+        _recorder(settings, camera),
     )
+    mode = DriveMode(arm or dry_run, steering_only, record_commands=not dry_run)
+    return DriveLoop(parts, safety, settings.limits, settings.control.speed, mode, watch)
 
 
 def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Detector:
@@ -88,7 +159,7 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
         model=chosen.model,
         any_camera=chosen.any_camera,
         lane_width_cm=chosen.lane_width_cm,
-        # The controller's lane width counts for the detector as well.
+        # The controller's lane width is the detector's, too.
         drive_lane_width_cm=settings.control.steering.lane_width_cm,
         mask=None if chosen.mask is None else read_mask(chosen.mask),
         config=chosen.config,
@@ -97,17 +168,17 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
 
 
 def build_sink(settings: DriveSettings) -> CommandSink:
-    """Return the car's actuator behind its guard, not open yet; one that does nothing where there is none."""
+    """Return the car's actuator behind its guard, not open yet; one that does nothing if there is none."""
     if settings.actuator is None:
         return NoActuator()
     actuator, safety = settings.actuator, settings.safety
-    # What was left out has to stay so: there a Donkeycar's myconfig.py may have a say.
+    # Unset values stay unset, since a Donkeycar's myconfig.py may set them.
     text = actuator.model_dump_json(exclude_unset=True)
     return GuardedActuator(text, lambda: make_actuator(actuator), safety.watchdog_s, safety.end_after_s)
 
 
 def _refuse_blind_drive(settings: DriveSettings) -> None:
-    """Keep a car with a motor from driving by what another drive saw."""
+    """Keep a car with a motor from driving by a recording."""
     source, has_motor = settings.source, isinstance(settings.actuator, PulseSettings)
     if has_motor and isinstance(source, ReplaySettings) and not source.may_drive:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""What a drive was like: rate, latencies and states, kept in constant memory."""
+"""Figures of a drive: rate, latencies and states, in constant memory."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from jaxtyping import Int
 
 from lanenet.onboard.safety import State
 
+#: Fine beside a frame's work of a few milliseconds; the bins reach to 500 ms, five times the largest age.
 _BIN_MS = 0.05
 _BINS = 10_000
 
 
 class LatencyHistogram:
-    """Counts durations in bins of 0.05 ms, so that a day of driving takes no more memory than a minute."""
+    """Counts durations in bins of 0.05 ms; its memory does not grow with the drive."""
 
     def __init__(self) -> None:
         """Start empty."""
@@ -25,7 +26,7 @@ class LatencyHistogram:
         self.longest_ms = 0.0
 
     def add(self, duration_s: float) -> None:
-        """Count one duration; those of more than half a second share the last bin."""
+        """Count one duration; all above half a second share the last bin."""
         duration_ms = max(0.0, 1e3 * duration_s)
         self._counts[min(int(duration_ms / _BIN_MS), _BINS - 1)] += 1
         self.longest_ms = max(self.longest_ms, duration_ms)
@@ -34,7 +35,7 @@ class LatencyHistogram:
         return int(self._counts.sum())
 
     def above(self, duration_s: float) -> int:
-        """Return how many durations were longer, to the width of a bin."""
+        """Return how many durations were longer, to within one bin."""
         return int(self._counts[math.ceil(1e3 * duration_s / _BIN_MS) :].sum())
 
     def percentile_ms(self, percent: float) -> float:
@@ -49,14 +50,14 @@ class LatencyHistogram:
 
 @dataclass(frozen=True)
 class Step:
-    """One turn of the drive loop, for whoever watches.
+    """One turn of the drive loop.
 
     Attributes:
         frame: Number of the frame; -1 when there was none.
         state: What the car may do.
-        reason: Why it is slow or stands; empty when it drives.
-        steering_rad: What was sent, positive left.
-        throttle: What was sent; 0 is neutral.
+        reason: Why it is slow or stopped; empty when it drives.
+        steering_rad: Steering that was sent, positive left.
+        throttle: Throttle that was sent; 0 is neutral.
         confidence: Of the estimate; NaN when there was none.
     """
 
@@ -69,7 +70,7 @@ class Step:
 
     @property
     def text(self) -> str:
-        """The step as people read it."""
+        """The turn in one line."""
         command = f"steering {np.rad2deg(self.steering_rad):+5.1f} deg, throttle {self.throttle:.2f}"
         seen = f", confidence {self.confidence:.2f}" if np.isfinite(self.confidence) else ""
         return f"{self.state}: {command}{seen}{f' ({self.reason})' if self.reason else ''}"
@@ -77,20 +78,20 @@ class Step:
 
 @dataclass
 class DriveReport:
-    """Figures of a drive; grows only in its numbers.
+    """Figures of a drive.
 
     Attributes:
-        frames: Frames that were looked at.
-        skipped: Frames of the source that nobody read, because the loop was late.
+        frames: Frames that were processed.
+        skipped: Frames of the source that were not read because the loop was late.
         latency: From the exposure of a frame to its command.
         work: From having the frame to its command.
         states: Turns of the loop in each state.
         seconds: Time from the first turn to the last.
         ended: Why the drive ended.
         by_fault: Whether it ended because the car had to stop.
-        recording: Folder of the recording, if it holds a frame.
+        recording: Folder of the recording; None if it holds no frame.
         recorded: Frames in the recording.
-        unrecorded: Frames that the card was too slow for, or that came after the recording had stopped.
+        unrecorded: Frames left out because the card was slow or the recording had stopped.
     """
 
     frames: int = 0
@@ -112,11 +113,11 @@ class DriveReport:
 
     @property
     def text(self) -> str:
-        """The figures that matter while driving."""
+        """Rate and p99 of the work, for the live line."""
         return f"{self.rate_hz:5.1f}/s  p99 {self.work.percentile_ms(99.0):.1f} ms"
 
     def lines(self) -> list[str]:
-        """Return the summary that is shown at the end."""
+        """Return the summary of the drive."""
         turns = max(1, self.states.total())
         shares = ", ".join(f"{state} {100.0 * n / turns:.0f} %" for state, n in self.states.most_common())
         lines = [

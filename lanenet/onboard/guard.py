@@ -1,16 +1,15 @@
-"""The watchdog: a process of its own that owns the actuator, and the loop's end of the line to it.
+"""The loop's side of the guard, a watchdog process that owns the actuator.
 
-The loop sends commands that carry the time at which they run out. The guard goes to neutral when the last
-one has run out, when the loop's process is gone, and when the actuator fails. It is a process and not a
-thread, so that it outlives whatever holds the loop: a hung driver, a hung network, SIGKILL. And should the
-guard itself die, the loop opens the actuator once more and puts it into neutral.
+The loop sends commands with the time at which they expire. The guard (:mod:`lanenet.onboard.guard_process`)
+goes to neutral when the last one has expired, when the loop's process is gone, and when the actuator fails.
+It is a process, not a thread, so that it survives whatever stops the loop: a driver that hangs, a network
+that hangs, SIGKILL. If the guard itself dies, the loop opens the actuator again and puts it into neutral.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import select
 import socket
 import struct
@@ -21,54 +20,56 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from lanenet.errors import HardwareError
-from lanenet.onboard.hardware import Actuator
+from lanenet.onboard.actuators.actuator import Actuator
 
 log = logging.getLogger(__name__)
 
 #: What runs in the guard's process.
 PROGRAM = (sys.executable, "-m", "lanenet.onboard.guard_process")
-#: Kind of message, its number, steering, throttle, and the time at which it runs out.
+#: Kind of message, its number, steering, throttle, and the time at which it expires.
 MESSAGE = struct.Struct("<cxxxIddd")
 DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
-#: Time for the interpreter, the driver and the device; an Arduino restarts when its port is opened.
+#: For the interpreter, the driver and the device; chosen ample: imports are slow on a small board,
+#: and an Arduino restarts when its port is opened.
 _START_S = 30.0
-#: Commands without an answer for this long: the guard hangs in the actuator's driver.
+#: If commands stay unanswered for this long, the guard hangs in the actuator's driver. Chosen: three
+#: watchdog times.
 _STUCK_S = 0.25
-#: Closing takes no longer than this.
+#: Closing takes no longer than this; chosen, as a driver needs a few milliseconds.
 _CLOSE_S = 2.0
-#: A process that is killed is gone within this time, if ever.
+#: A killed process is gone within this time, unless it hangs in the kernel.
 _DIE_S = 0.1
-#: Lines that the guard may leave behind, each of which may be an error.
+#: At most so many lines of the guard are read at the end; each may be an error.
 _LAST_WORDS = 8
 
 
 @runtime_checkable
 class CommandSink(Protocol):
-    """Where the loop's commands go."""
+    """Receiver of the loop's commands."""
 
     def open(self) -> None:
         """Get ready, in neutral."""
         ...
 
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
-        """Hand over a command that is good until a time of the monotonic clock."""
+        """Send a command that is valid until a time of the monotonic clock."""
         ...
 
     def idle(self) -> None:
-        """Stay in neutral; raises HardwareError if whoever holds the actuator has failed."""
+        """Stay in neutral; raises HardwareError if the actuator or its guard has failed."""
         ...
 
     def neutral(self) -> None:
-        """Go to neutral at once, from a signal handler as well; never raises."""
+        """Go to neutral at once; safe in a signal handler, never raises."""
         ...
 
     def close(self) -> None:
-        """Go to neutral and let go; never raises."""
+        """Go to neutral and release the actuator; never raises."""
         ...
 
 
 class NoActuator:
-    """Takes commands and does nothing with them: a dry run."""
+    """Ignores commands: a dry run."""
 
     def open(self) -> None:
         """Do nothing."""
@@ -87,7 +88,7 @@ class NoActuator:
 
 
 class GuardedActuator:
-    """The loop's end: starts the guard, hands commands to it and hears what became of them."""
+    """Starts the guard, sends it commands and reads its answers; a ``CommandSink``."""
 
     def __init__(
         self,
@@ -101,10 +102,10 @@ class GuardedActuator:
 
         Args:
             settings_json: Settings of the actuator, for the guard.
-            make_actuator: Makes the same actuator in this process, should the guard die.
-            watchdog_s: The longest time that a command is good.
-            give_up_s: The guard takes no more commands after a silence this long.
-            program: Starts the guard; the line and these values follow as arguments.
+            make_actuator: Makes the same actuator in this process, in case the guard dies.
+            watchdog_s: The longest time that a command is valid.
+            give_up_s: After a silence this long the guard accepts no more commands.
+            program: Command that starts the guard; the socket and these values follow as arguments.
         """
         self._settings_json, self._make_actuator, self._program = settings_json, make_actuator, program
         self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
@@ -117,19 +118,19 @@ class GuardedActuator:
 
     @property
     def pid(self) -> int:
-        """Process number of the guard; 0 before it is started."""
+        """Process id of the guard; 0 before it is started."""
         return 0 if self._process is None else self._process.pid
 
     def open(self) -> None:
         """Start the guard and wait until it holds the actuator, in neutral.
 
         Raises:
-            HardwareError: If the actuator does not answer; the guard's own words.
+            HardwareError: If the actuator does not answer; the message is the guard's.
         """
         ours, theirs = socket.socketpair()
         try:
             values = (theirs.fileno(), self._settings_json, self._watchdog_s, self._give_up_s)
-            # A session of its own: Ctrl-C at the terminal is for the loop, which then says goodbye.
+            # Its own session: Ctrl-C at the terminal is for the loop, which then ends the guard.
             self._process = subprocess.Popen(
                 [*self._program, *(str(value) for value in values)],
                 pass_fds=[theirs.fileno()],
@@ -153,11 +154,11 @@ class GuardedActuator:
             raise
 
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
-        """Hand over a command; see :class:`CommandSink`.
+        """Send a command; see :class:`CommandSink`.
 
         Raises:
-            HardwareError: If the actuator failed, takes no more commands, or the guard is gone; in the last
-                case the actuator has been put into neutral from here.
+            HardwareError: If the actuator failed or takes no more commands, or the guard is gone; in the last
+                case the actuator has been put into neutral from this process.
         """
         self._order(DRIVE, steering_rad, throttle, until_s)
 
@@ -172,12 +173,12 @@ class GuardedActuator:
     def _order(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         self._listen()
         if self._closed:
-            # It has said goodbye; that its process takes a while to end is no hanging driver.
+            # It has closed the actuator: its process may still be ending, which is not a hanging driver.
             self._lost()
         self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:
-            # The guard cannot go to neutral any more, and meanwhile the motor runs on.
+            # The guard cannot go to neutral any more, and the motor runs on.
             self._kill()
             self._rescue()
             raise HardwareError(
@@ -188,7 +189,7 @@ class GuardedActuator:
     def _kill(self) -> None:
         if self._process is not None:
             self._process.kill()
-            # What hangs in the kernel does not even die.
+            # A process that hangs in the kernel cannot be killed.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_DIE_S)
         if self._line is not None:
@@ -209,10 +210,10 @@ class GuardedActuator:
         try:
             self._process.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
-            log.error("the guard does not end, its driver hangs: it is killed")
+            log.error("the guard does not end, its driver hangs: killing it")
             self._kill()
             self._rescue()
-        # What it had to say at the end decides whether it left the actuator in order.
+        # Its last lines say whether it left the actuator in neutral.
         for _ in range(_LAST_WORDS):
             with contextlib.suppress(HardwareError):
                 self._listen()
@@ -234,7 +235,7 @@ class GuardedActuator:
             self._lost()
 
     def _listen(self) -> None:
-        """Take in what the guard has to say."""
+        """Read the guard's answers."""
         if self._line is None:
             return
         while True:
@@ -266,7 +267,7 @@ class GuardedActuator:
             raise HardwareError(text)
 
     def _lost(self) -> None:
-        """The guard is gone: if it did not say goodbye, do its work from here."""
+        """Handle a guard that is gone: unless it closed the actuator, put it into neutral from here."""
         if self._line is not None:
             self._line.close()
             self._line = None
@@ -285,10 +286,4 @@ class GuardedActuator:
             actuator.open()
             actuator.close()
         except Exception as error:
-            log.critical("the actuator could not be put into neutral: %s; take the battery out", error)
-
-
-def raise_priority() -> None:
-    """Run before others where the system allows it: the guard has little to do, but that in time."""
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, -10)
+            log.critical("the actuator could not be put into neutral: %s; disconnect the battery", error)

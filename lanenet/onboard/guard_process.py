@@ -1,9 +1,9 @@
-"""What runs in the guard's process, which :mod:`lanenet.onboard.guard` starts with these arguments.
+"""The guard's process: owns the actuator and goes to neutral when commands stay away.
 
-    LINE SETTINGS WATCHDOG_S GIVE_UP_S
-
-SETTINGS is JSON. LINE is the number of an open socket. Down it come messages of fixed size; up go lines of
-text: ``ready``, ``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``, ``closed``.
+:mod:`lanenet.onboard.guard` starts it with the arguments ``LINE SETTINGS WATCHDOG_S GIVE_UP_S``: the number
+of an open socket and the actuator's settings as JSON. The loop sends messages of fixed size; the guard
+answers with lines of text: ``ready``, ``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``
+and ``closed``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import gc
 import logging
 import math
+import os
 import select
 import signal
 import socket
@@ -26,19 +27,20 @@ from pydantic import TypeAdapter
 
 from lanenet.errors import LanenetError
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator
-from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT, raise_priority
-from lanenet.onboard.hardware import Actuator
+from lanenet.onboard.actuators.actuator import Actuator
+from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT
 
 log = logging.getLogger("lanenet.onboard.guard")
 
-#: Neutral is written again and again: a write that was lost on the wire is made good.
+#: Neutral is sent again this often, in case it was lost on the wire; chosen: within the 100 ms watchdog of
+#: the Arduino board.
 _REFRESH_S = 0.05
-#: A driver needs a few milliseconds; after this long it hangs. Looked at this often.
+#: A driver needs a few milliseconds; after the first time it counts as hanging, checked at the second.
 _SLOW_S, _LOOK_S = 0.05, 0.02
 
 
 class Guard:
-    """Owns the actuator; nothing but neutral unless a command that still holds says otherwise."""
+    """Owns the actuator: neutral, unless there is a valid command."""
 
     def __init__(self, line: socket.socket, actuator: Actuator, watchdog_s: float, give_up_s: float) -> None:
         self._line, self._actuator = line, actuator
@@ -47,14 +49,14 @@ class Guard:
         self._heard_s = time.monotonic()
         self._logged_s = -math.inf
         self._driving = False
-        #: Once set, no command is taken any more.
+        #: Why no command is accepted any more; empty while they are.
         self._over = ""
-        #: Since when the actuator's driver has been at work; it is not now where this is infinite.
+        #: When the present call of the driver began; infinite if there is none.
         self._busy_s = math.inf
         self.asked_to_end = False
 
     def run(self) -> str:
-        """Serve until the loop is gone or says goodbye; returns why it ended."""
+        """Serve until the loop is gone or ends; returns why it ended."""
         ended = threading.Event()
         threading.Thread(target=self._oversee, args=(ended,), name="driver hangs", daemon=True).start()
         try:
@@ -63,15 +65,15 @@ class Guard:
             ended.set()
 
     def _oversee(self, ended: threading.Event) -> None:
-        """Say neutral past a driver that hangs in a command, again and again until it goes on."""
-        told_s = math.inf
+        """Send neutral while a driver hangs in a command, until it continues."""
+        logged_s = math.inf
         while not ended.wait(_LOOK_S):
             begun_s = self._busy_s
             if time.monotonic() - begun_s <= _SLOW_S:
                 continue
             self._actuator.neutral()
-            if begun_s != told_s:
-                told_s = begun_s
+            if begun_s != logged_s:
+                logged_s = begun_s
                 log.warning("neutral: the actuator's driver hangs in a command")
 
     @contextmanager
@@ -104,14 +106,14 @@ class Guard:
                 if any(kind == QUIT for kind, *_ in messages):
                     return "the drive loop has ended"
                 if messages:
-                    # Of several that waited, only the newest says what is wanted now.
+                    # Of several waiting messages only the newest counts.
                     self._obey(*messages[-1])
             self._expire(readable=bool(readable))
 
     def _obey(self, kind: bytes, number: int, steering_rad: float, throttle: float, until_s: float) -> None:
         now_s = time.monotonic()
         self._heard_s = now_s
-        # No command is good for longer than the watchdog, whatever it says.
+        # No command is valid for longer than the watchdog, whatever it says.
         until_s = min(until_s, now_s + self._watchdog_s)
         sane = math.isfinite(steering_rad) and math.isfinite(throttle) and abs(throttle) <= 1.0
         if kind == DRIVE and sane and until_s > now_s and not self._over:
@@ -127,7 +129,7 @@ class Guard:
         else:
             self._neutral()
             if kind == DRIVE and not sane:
-                self._say(f"neutral the command is no number: steering {steering_rad}, throttle {throttle}")
+                self._say(f"neutral the command is not finite: steering {steering_rad}, throttle {throttle}")
             if self._over:
                 self._say(f"failed {self._over}")
                 return
@@ -139,7 +141,7 @@ class Guard:
             self._neutral()
             reason = f"no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms"
             self._say(f"neutral {reason}")
-            # A loop that hangs cannot tell it. Each second once: a slow camera lets every command run out.
+            # A loop that hangs cannot log it. Once a second at most: a slow camera lets every command expire.
             if now_s - self._logged_s > 1.0:
                 self._logged_s = now_s
                 log.warning("neutral: %s", reason)
@@ -154,13 +156,13 @@ class Guard:
         self._driving = False
 
     def _say(self, text: str) -> None:
-        # A loop that does not listen must not hold the guard.
+        # A loop that does not read must not block the guard.
         with contextlib.suppress(OSError):
             self._line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
 
 
 def actuator_from_json(text: str) -> Actuator:
-    """Build an actuator of its settings as JSON; the device is not touched.
+    """Build an actuator from its settings as JSON; the device is not touched.
 
     Raises:
         ConfigError: If the settings name a file that cannot be used.
@@ -173,8 +175,8 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
     """Open the actuator, serve, close it.
 
     Args:
-        arguments: As above.
-        build: Makes the actuator of its settings.
+        arguments: As above, four texts.
+        build: Makes the actuator from its settings.
 
     Returns:
         The exit code.
@@ -200,8 +202,10 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
         signal.signal(signal.SIGTERM, end)
         actuator.open()
         actuator.neutral()
-        raise_priority()
-        # What exists now stays; a collection would be a pause.
+        # The guard has little to do, but has to do it in time.
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, -10)
+        # A garbage collection would be a pause.
         gc.collect()
         gc.disable()
         say("ready")
@@ -217,7 +221,7 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
             actuator.neutral()
             actuator.close()
         say("closed")
-    # Said after the motor stands: a terminal that is gone may hold a writer for ever.
+    # Logged after the motor has stopped: a terminal that is gone may block a writer for ever.
     log.info("neutral: %s", reason)
     return 0
 

@@ -1,7 +1,7 @@
 """When the car may drive: arming, faults, slowing down, and the limits of every command.
 
-A command is good until its frame is ``max_age_s`` old. Whatever goes wrong, no new command appears, the last
-one runs out, and the guard (:mod:`lanenet.onboard.guard`) puts the motor into neutral; nothing has to notice
+A command is valid until its frame is ``max_age_s`` old. Whatever goes wrong, no new command appears, the last
+one expires, and the guard (:mod:`lanenet.onboard.guard`) puts the motor into neutral. Nothing has to detect
 the fault for that.
 """
 
@@ -16,21 +16,24 @@ from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
-from lanenet.onboard.hardware import Frame
+from lanenet.onboard.cameras.source import Frame
 
-#: A frame that is this far ahead of the clock is not timed by that clock.
+#: A frame time further ahead than this comes from another clock; chosen: more than rounding, less than two
+#: frames.
 _MAX_AHEAD_S = 0.05
-#: Every how many-th pixel tells most frames apart.
+#: Frames are compared in every 16th pixel first; of a 320 x 240 image these are 300 pixels with noise.
 _SAMPLE = 16
 
 
 class LimitSettings(Settings):
-    """What no command exceeds.
+    """Limits of every command.
 
     Attributes:
-        max_steering_rad: Steering stays within plus and minus this.
-        steering_rate_rad_s: Fastest change of the steering.
-        max_throttle: Throttle stays between 0 and this; the car does not reverse.
+        max_steering_rad: Largest steering angle to either side; the default is a common 1:10 car's.
+        steering_rate_rad_s: Fastest change of the steering; the default is about a standard servo's, which
+            needs 0.15 s for 60 degrees of its horn.
+        max_throttle: The throttle stays between 0 and this: the car does not reverse. The default is chosen
+            low, for a first drive.
         throttle_rate_s: Fastest rise of the throttle, per second; it may fall at once.
     """
 
@@ -44,17 +47,18 @@ class SafetySettings(Settings):
     """When the car slows down, stops and gives up.
 
     Attributes:
-        watchdog_s: Without a new command for this long the motor goes to neutral. The default leaves a fifth
-            of 100 ms to the system, which has to wake the guard, and to the wire.
-        max_age_s: A command is good until its frame is this old.
-        countdown_s: An armed car starts after it has seen the lane this long without a break.
+        watchdog_s: Without a new command for this long the motor goes to neutral. The default is 100 ms less
+            a fifth, for waking the guard and for the wire.
+        max_age_s: A command is valid until its frame is this old; at the default and 1 m/s the car has moved
+            10 cm.
+        countdown_s: An armed car starts after it has seen the lane for this long without interruption.
         slow_below: Below this confidence the car slows down.
-        slow_share: Share of the speed that is left at ``stop_below``.
-        stop_below: Below this confidence it stops.
+        slow_share: Share of the speed that remains at ``stop_below``.
+        stop_below: Below this confidence the car stops.
         slow_for_s: A car that has been slow for this long stops.
-        end_after_s: An armed car that had to stop for this long does not start again: the drive ends.
-        allow_repeated_frames: Accept frames that equal the one before, pixel for pixel. A camera gives them
-            only when it hangs; a simulator without noise always, while the car stands.
+        end_after_s: If an armed car had to stop for this long, the drive ends: it does not start again.
+        allow_repeated_frames: Accept a frame that equals the one before in every pixel. A camera sends such
+            frames only when it hangs; a simulator without noise sends them while the car stands.
     """
 
     watchdog_s: float = Field(default=0.08, gt=0.0, le=0.5)
@@ -78,7 +82,7 @@ class SafetySettings(Settings):
 
 
 class State(StrEnum):
-    """What the car may do just now."""
+    """What the car may do now."""
 
     DISARMED = "disarmed"
     COUNTDOWN = "countdown"
@@ -94,9 +98,9 @@ class Verdict:
 
     Attributes:
         state: What the car may do.
-        speed_share: Share of the wished speed that is allowed; 0 is neutral.
-        steers: Whether the wish of this frame is fit to steer by.
-        reason: Why the car is slow or stands; empty when it drives.
+        speed_share: Allowed share of the wanted speed; 0 is neutral.
+        steers: Whether the steering of this frame may be used.
+        reason: Why the car is slow or stopped; empty when it drives.
     """
 
     state: State
@@ -106,10 +110,10 @@ class Verdict:
 
 
 class SafetyJudge:
-    """Decides, step by step, whether the car drives, slows down, stands or gives up."""
+    """State machine that decides in each turn whether the car drives, slows down, stops or gives up."""
 
     def __init__(self, settings: SafetySettings, armed: bool) -> None:
-        """Start disarmed; ``armed`` lets the countdown begin once the lane is seen."""
+        """Start disarmed; ``armed`` allows the countdown to begin once the lane is seen."""
         self._settings, self._armed = settings, armed
         self._counting_since_s = math.nan
         self._slow_since_s = math.nan
@@ -118,15 +122,15 @@ class SafetyJudge:
         self._ended = ""
 
     def judge(self, now_s: float, fault: str, confidence: float = math.nan) -> Verdict:
-        """Judge one step.
+        """Judge one turn of the loop.
 
         Args:
             now_s: Time on the monotonic clock.
-            fault: What keeps this step from giving a command; empty if nothing does.
+            fault: Why this turn gives no command; empty if it does.
             confidence: Of the estimate; NaN counts as 0.
 
         Returns:
-            The verdict; once the state is ``ended`` it stays so.
+            The verdict; the state ``ended`` is final.
         """
         s = self._settings
         confidence = confidence if math.isfinite(confidence) else 0.0
@@ -169,7 +173,7 @@ class SafetyJudge:
 
 
 class FrameCheck:
-    """Finds frames that may not steer: missing, late, from another clock, or the same as before."""
+    """Finds frames that must not be used: missing, late, from another clock, or repeated."""
 
     def __init__(self, settings: SafetySettings) -> None:
         """Take the limits; no frame has been seen."""
@@ -177,7 +181,7 @@ class FrameCheck:
         self._before: UInt8[np.ndarray, "h w 3"] | None = None
 
     def fault_of(self, frame: Frame | None, now_s: float) -> str:
-        """Return what is wrong with a frame, in words; empty if nothing is."""
+        """Return what is wrong with a frame; empty if nothing is."""
         if frame is None:
             return "no frame from the camera"
         before, self._before = self._before, frame.image_bgr
@@ -191,12 +195,12 @@ class FrameCheck:
             and before is not None
             and same_image(before, frame.image_bgr)
         ):
-            return f"frame {frame.number} is the one before once more: the camera hangs"
+            return f"frame {frame.number} repeats the one before: the camera hangs"
         return ""
 
 
 class CommandLimiter:
-    """Keeps steering and throttle, and how fast they change, within limits."""
+    """Limits steering and throttle, and how fast they change."""
 
     def __init__(self, settings: LimitSettings) -> None:
         """Start straight ahead and in neutral."""
@@ -206,11 +210,11 @@ class CommandLimiter:
         self.throttle = 0.0
 
     def limit(self, steering_rad: float, throttle: float, now_s: float) -> tuple[float, float]:
-        """Return the nearest command that is allowed now.
+        """Return the nearest allowed command.
 
         Args:
-            steering_rad: Wished steering, positive left; NaN keeps what is.
-            throttle: Wished throttle; NaN is neutral.
+            steering_rad: Wanted steering, positive left; NaN keeps the present one.
+            throttle: Wanted throttle; NaN is neutral.
             now_s: Time of the command on the monotonic clock.
         """
         s = self._settings
@@ -236,7 +240,7 @@ def same_image(before: UInt8[np.ndarray, "h w 3"], now: UInt8[np.ndarray, "h w 3
     """Tell whether two images are equal, pixel for pixel."""
     if before.shape != now.shape:
         return False
-    # Noise tells frames apart in a few pixels; only frames that may be the same are compared in full.
+    # Sensor noise makes frames differ in a few pixels; only frames that may be equal are compared in full.
     if not np.array_equal(before[::_SAMPLE, ::_SAMPLE], now[::_SAMPLE, ::_SAMPLE]):
         return False
     return bool(np.array_equal(before, now))

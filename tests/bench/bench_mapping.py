@@ -31,7 +31,6 @@ from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.maps.folder import read_map
 from lanenet.data.maps.labelled_frames import read_map_frames
-from lanenet.data.trajectory import read_tum
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
@@ -164,7 +163,7 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     miss = np.linalg.norm(aligned(drive_map.poses[:, :2], xy) - xy, axis=1)
     lap_cm = settings.track.length_cm or 0.0
     row["ate_cm_per_10_m"] = round(float(np.sqrt(np.mean(miss**2))) * 1000.0 / lap_cm, 3)
-    row["open_drift_percent"] = round(drift_percent(read_tum(out / "open_loop.tum")[1], xy), 3)
+    row["open_drift_percent"] = round(drift_percent(100.0 * np.loadtxt(out / "open_loop.tum")[:, 1:3], xy), 3)
     row["revisits"] = report.figures["segments_mapped"][0]["revisits"]
     row["laps"] = drive_map.meta.laps
     row["focal_error_percent"] = round(

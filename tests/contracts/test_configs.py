@@ -53,7 +53,7 @@ def read_donkeycar_pilot(path: Path) -> Any:
 
 
 def read_car(path: Path) -> Any:
-    from lanenet.onboard.drive_settings import load_drive_settings
+    from lanenet.onboard.drive import load_drive_settings
 
     return load_drive_settings(path)
 

@@ -23,9 +23,9 @@ from lanenet.control.controller import ControlSettings, LaneController, Wish
 from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.hardware import Frame
-from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
+from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.edges import road as birdseye
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.network import detector as network
@@ -171,14 +171,10 @@ controller = LaneController(control)
 lost = {"control answers NaN": lambda estimate, *_: Wish(math.nan, math.nan, estimate)}
 controller.wish = at_fault("control", controller.wish, lost)  # type: ignore[method-assign]
 loop = DriveLoop(
-    Camera(),
-    detector,
-    controller,
-    sink,
+    CarParts(Camera(), detector, controller, sink, Recorder()),
     safety,
-    CommandLimiter(LimitSettings()),
+    LimitSettings(),
     control.speed,
-    armed=True,
-    recorder=Recorder(),
+    DriveMode(armed=True),
 )
 sys.exit(3 if loop.run().by_fault else 0)

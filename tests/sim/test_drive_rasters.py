@@ -16,9 +16,10 @@ from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.parquet import ParquetTable
 from lanenet.onboard.cameras.replay import ReplaySettings, ReplaySource
 from lanenet.onboard.guard import NoActuator
-from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings
-from lanenet.perception.network.detector import INPUT_NAME, NetworkDetector
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.safety import LimitSettings, SafetySettings
+from lanenet.perception.network.detector import NetworkDetector
+from lanenet.perception.network.model_file import INPUT_NAME
 
 MODEL = Path(__file__).resolve().parents[2] / "checkpoints" / "small" / "model.onnx"
 
@@ -51,13 +52,16 @@ def test_the_car_shows_the_network_what_training_showed_it(tmp_path: Path) -> No
     detector._session = tap
     control = ControlSettings(steering=SteeringSettings(wheelbase_cm=camera.wheelbase_cm))
     loop = DriveLoop(
-        ReplaySource(ReplaySettings(path=path, pace="fast")),
-        detector,
-        LaneController(control),
-        NoActuator(),
+        CarParts(
+            ReplaySource(ReplaySettings(path=path, pace="fast")),
+            detector,
+            LaneController(control),
+            NoActuator(),
+        ),
         SafetySettings(),
-        CommandLimiter(LimitSettings()),
+        LimitSettings(),
         control.speed,
+        DriveMode(),
     )
     report = loop.run()
     labels = read_labels(tmp_path / "labels.parquet")

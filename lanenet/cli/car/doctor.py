@@ -12,7 +12,7 @@ from lanenet.cli.shared.options import CameraOption
 from lanenet.errors import ConfigError, LanenetError
 
 if TYPE_CHECKING:
-    from lanenet.onboard.drive_settings import DriveSettings
+    from lanenet.onboard.drive import DriveSettings
 
 app = typer.Typer()
 
@@ -33,7 +33,7 @@ def doctor(
 ) -> None:
     """Check the installation, a camera file if one is given, and a whole car with --config."""
     from lanenet.onboard.doctor.installation import run_checks
-    from lanenet.onboard.drive_settings import load_drive_settings
+    from lanenet.onboard.drive import load_drive_settings
 
     settings = None if config is None else load_drive_settings(config)
     if wheels_off_ground:

@@ -30,9 +30,8 @@ def drive(
     ] = None,
 ) -> None:
     """Drive the car by what its camera sees; without --arm the motor stays in neutral."""
-    from lanenet.onboard.drive import build_loop
+    from lanenet.onboard.drive import build_loop, load_drive_settings
     from lanenet.onboard.drive_report import Step
-    from lanenet.onboard.drive_settings import load_drive_settings
 
     settings = load_drive_settings(config, overrides)
     with console.live_line() as show:

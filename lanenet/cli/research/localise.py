@@ -18,7 +18,7 @@ from lanenet.errors import CalibrationError, ConfigError, HardwareError
 if TYPE_CHECKING:
     from datagen.localise.live_filter import Moment
     from datagen.localise.localise import LiveReport
-    from lanenet.onboard.hardware import FrameSource
+    from lanenet.onboard.cameras.source import FrameSource
 
 app = typer.Typer()
 log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def localise(
         console.next_command("map", given, "--lane-width", "CM", "--out", "MAP")
         return
     from lanenet.onboard.cameras import open_source
-    from lanenet.onboard.drive_settings import load_drive_settings
+    from lanenet.onboard.drive import load_drive_settings
 
     car = load_drive_settings(live)
     chosen = camera if camera is not None else car.camera
@@ -184,7 +184,7 @@ class LiveMoments:
     def _frames(self) -> Iterator[Moment]:
         from datagen.localise.live_filter import Moment
         from lanenet.data.drives.recording import Commands
-        from lanenet.onboard.hardware import SourceEnded
+        from lanenet.onboard.cameras.source import SourceEnded
 
         commands = Commands(speed_cm_s=np.array([self._speed_cm_s]))
         taken, number, t_s = 0, -1, -math.inf

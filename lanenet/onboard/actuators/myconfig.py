@@ -1,7 +1,7 @@
-"""A Donkeycar's ``myconfig.py`` as settings of its PCA9685: the file is parsed, and never run.
+"""A Donkeycar's ``myconfig.py`` as settings of its PCA9685; the file is parsed, never run.
 
 Source: donkeycar 5.3, ``templates/complete.py`` (``add_drivetrain``), ``parts/pins.py`` and
-``templates/cfg_complete.py``; the older names stand in ``DRIVE_TRAIN_TYPE = "I2C_SERVO"``.
+``templates/cfg_complete.py``; the older names belong to ``DRIVE_TRAIN_TYPE = "I2C_SERVO"``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lanenet.onboard.actuators.pca9685 import OSCILLATOR_HZ, PCA9685Settings, pr
 
 #: Donkeycar counts pulses in 4096ths of a period at this nominal rate.
 _FREQUENCY_HZ = 60.0
-#: As in ``PCA9685.1:40.7``: bus, address in hexadecimal, channel.
+#: For example ``PCA9685.1:40.7``: bus, hexadecimal address, channel.
 _PIN = re.compile(r"PCA9685\.(\d+):([0-9a-fA-F]+)\.(\d+)")
 _PULSES = {
     "STEERING_LEFT_PWM": "steering_left_us",
@@ -37,8 +37,7 @@ _OLD_PLACES = {
 def read_assignments(path: Path) -> dict[str, Any]:
     """Read the plain ``NAME = value`` lines of a Python file without running it.
 
-    Values that are not literals (calls, arithmetic, other names) are left out: Donkeycar's own file joins
-    paths, for example. A later line replaces an earlier one.
+    Values that are not literals (calls, arithmetic, names) are left out. Later lines replace earlier ones.
 
     Args:
         path: The file.
@@ -72,10 +71,9 @@ def read_assignments(path: Path) -> dict[str, Any]:
 
 
 def settings_from_myconfig(path: Path) -> dict[str, Any]:
-    """Return what a Donkeycar's files tell about its PCA9685, as keys of :class:`PCA9685Settings`.
+    """Return what a Donkeycar's files say about its PCA9685, as keys of :class:`PCA9685Settings`.
 
-    Donkeycar's ``config.py`` beside ``myconfig.py`` holds the values that the latter does not change, so it
-    is read first, as Donkeycar does.
+    ``config.py`` beside ``myconfig.py`` holds Donkeycar's defaults and is read first, as Donkeycar does.
 
     Args:
         path: ``myconfig.py``.
@@ -84,8 +82,7 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
         Only what the files say.
 
     Raises:
-        ConfigError: If a file is not Python, the car is driven by something else than a PCA9685, or a value
-            is of another kind than Donkeycar's.
+        ConfigError: If a file is not Python, the car has no PCA9685, or a value is not of Donkeycar's type.
     """
     values: dict[str, Any] = {}
     base = path.with_name("config.py")
@@ -109,12 +106,12 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
         return {**_pulses(values, path), **places}
     raise ConfigError(
         f"{path}: DRIVE_TRAIN_TYPE {train!r}, expected 'PWM_STEERING_THROTTLE' or 'I2C_SERVO': only a servo "
-        "and a speed controller on a PCA9685 can be taken over"
+        "and a speed controller on a PCA9685 are supported"
     )
 
 
 def with_myconfig(settings: PCA9685Settings) -> PCA9685Settings:
-    """Fill in from ``settings.myconfig`` what the settings do not say themselves.
+    """Fill unset settings from ``settings.myconfig``.
 
     Raises:
         ConfigError: If the file cannot be used, or its values are out of range.
@@ -127,7 +124,7 @@ def with_myconfig(settings: PCA9685Settings) -> PCA9685Settings:
 
 
 def _pulses(values: dict[str, Any], path: Path) -> dict[str, float]:
-    """Turn counts into the times that the chip makes of them at its real rate."""
+    """Convert counts to pulse lengths at the chip's true rate."""
     count_us = 1e6 * (prescale_of(_FREQUENCY_HZ) + 1) / OSCILLATOR_HZ
     pulses = {}
     for name, key in _PULSES.items():
@@ -147,19 +144,20 @@ def _pins(values: dict[str, Any], path: Path) -> dict[str, int]:
     for side in ("STEERING", "THROTTLE"):
         if values.get(f"PWM_{side}_INVERTED", False):
             raise ConfigError(
-                f"{path}: PWM_{side}_INVERTED: found True, expected False: signals that are inverted by the "
-                "wiring are not supported"
+                f"{path}: PWM_{side}_INVERTED: found True, expected False: inverted signals are not supported"
             )
         name = f"PWM_{side}_PIN"
         if name not in values:
             continue
         match = _PIN.fullmatch(str(values[name]))
         if match is None:
-            raise ConfigError(f"{path}: {name}: found {values[name]!r}, expected one as 'PCA9685.1:40.0'")
+            raise ConfigError(
+                f"{path}: {name}: found {values[name]!r}, expected for example 'PCA9685.1:40.0'"
+            )
         place = {"bus": int(match[1]), "address": int(match[2], 16)}
         for key, value in place.items():
             if places.setdefault(key, value) != value:
-                raise ConfigError(f"{path}: steering and throttle lie on two chips, expected one ({name})")
+                raise ConfigError(f"{path}: steering and throttle are on two chips, expected one ({name})")
         places[f"{side.lower()}_channel"] = int(match[3])
     return places
 

@@ -1,7 +1,7 @@
 """Servo and speed controller on a PCA9685, the 16-channel pulse generator of most Donkeycars, over I2C.
 
-The chip goes on with the last pulses when the computer falls silent: it has no watchdog of its own. Where
-that matters, use a board with one (``firmware/lanenet_uno``).
+The chip has no watchdog: it repeats the last pulses when the computer stops sending. Where that matters, use
+a board that has one (``firmware/lanenet_uno``).
 
 Source: NXP PCA9685 data sheet, revision 4: registers in 7.3, prescaler in 7.3.5, restart in 7.3.1.1.
 """
@@ -23,13 +23,13 @@ from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
 RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
-#: MODE2: outputs drive high and low, as servos expect, and change with the I2C stop.
+#: MODE2: outputs drive high and low, as servos need, and change at the I2C stop.
 OUTDRV = 0x04
 OSCILLATOR_HZ = 25e6
 COUNTS = 4096
 #: The oscillator needs 0.5 ms to start after sleep.
 _OSCILLATOR_START_S = 0.001
-#: Motors disturb the bus now and then; what was not acknowledged is sent again.
+#: Motors disturb the bus now and then; a transfer without acknowledgement is repeated.
 _TRIES = 3
 
 _log = logging.getLogger(__name__)
@@ -40,11 +40,11 @@ class PCA9685Settings(PulseSettings):
 
     Attributes:
         kind: Chooses this actuator.
-        myconfig: A Donkeycar's ``myconfig.py``, whose values hold for all that the settings leave out. It is
-            read, and never run.
-        bus: Number of the I2C bus: 1 is the one on the header of a Raspberry Pi.
-        address: Of the chip; 0x40 (64) unless its jumpers were soldered.
-        frequency_hz: Pulses per second. The chip makes the nearest rate that it can.
+        myconfig: A Donkeycar's ``myconfig.py``, which sets what these settings leave out; it is parsed, never
+            run.
+        bus: Number of the I2C bus; 1 is on the header of a Raspberry Pi.
+        address: Of the chip; 0x40 (64) unless its jumpers are soldered.
+        frequency_hz: Pulses per second; the chip takes the nearest rate it can.
         steering_channel: Output of the steering servo.
         throttle_channel: Output of the speed controller.
     """
@@ -77,14 +77,14 @@ class PCA9685:
         self._bus: Any = None
         self._message: Any = None
         self._lock = threading.Lock()
-        #: Counts the calls of ``neutral``, so that a command which hung meanwhile does not undo it.
+        #: Counts calls of ``neutral``, so that a command that hung meanwhile does not undo it.
         self._stops = 0
 
     def open(self) -> None:
         """Set the rate, load neutral pulses, and only then wake the outputs.
 
         Raises:
-            HardwareError: If bus or chip do not answer, or the chip is another one.
+            HardwareError: If bus or chip do not answer, or the chip is no PCA9685.
             MissingExtraError: If smbus2 is not installed.
         """
         smbus2 = require("smbus2", "car")
@@ -110,15 +110,15 @@ class PCA9685:
             raise
 
     def _start(self) -> None:
-        # The prescaler can be written in sleep only. Pulses are loaded before the chip wakes, so that the
-        # first one that the motor controller gets is neutral.
+        # The prescaler can be written only in sleep. Pulses are loaded before the chip wakes, so that the
+        # speed controller's first pulse is neutral.
         self._write(MODE1, AUTO_INCREMENT | SLEEP)
         self._write(MODE2, OUTDRV)
         self._write(PRE_SCALE, self._prescale)
         self._write_neutral()
         self._write(MODE1, AUTO_INCREMENT)
         time.sleep(_OSCILLATOR_START_S)
-        # Outputs that were put to sleep while they ran wait for this bit.
+        # Outputs that were running before the sleep start again with this bit.
         self._write(MODE1, AUTO_INCREMENT | RESTART)
         found = self._read(PRE_SCALE)
         if found != self._prescale:
@@ -129,11 +129,11 @@ class PCA9685:
             )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.hardware.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not a number, or the chip did not answer or has
-                started again.
+            HardwareError: If it is not open, a value is not finite, or the chip did not answer or has
+                restarted.
         """
         stops = self._stops
         pulses = command_pulses(self._settings, steering_rad, throttle)
@@ -152,8 +152,8 @@ class PCA9685:
                 ) from None
         if asleep:
             raise HardwareError(
-                f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} has started "
-                "again by itself, and gives no pulses; check its supply"
+                f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} has restarted "
+                "and sends no pulses; check its supply"
             )
 
     def neutral(self) -> None:
@@ -168,7 +168,7 @@ class PCA9685:
                 _log.error("pca9685: neutral could not be sent: %s", error)
 
     def close(self) -> None:
-        """Go to neutral and release the bus; the chip goes on with neutral pulses."""
+        """Go to neutral and release the bus; the chip keeps sending neutral pulses."""
         self.neutral()
         self._release()
 
@@ -184,13 +184,13 @@ class PCA9685:
         self._write_channel(self._settings.steering_channel, pulses.steering_us)
 
     def _write_channel(self, channel: int, pulse_us: float) -> None:
-        """Let the output go high at count 0 and low at the pulse's end: ON_L, ON_H, OFF_L, OFF_H."""
+        """Set an output high at count 0 and low at the pulse's end: ON_L, ON_H, OFF_L, OFF_H."""
         off = counts_of(pulse_us, self._prescale)
         self._write(LED0_ON_L + 4 * channel, 0, 0, off & 0xFF, off >> 8)
 
     def _is_asleep(self) -> bool:
-        """Tell whether the chip has started anew: after a moment without supply it answers, and sleeps."""
-        # The bus has no checksum: one wrong bit ends no drive.
+        """Tell whether the chip has restarted: after a moment without supply it answers, but sleeps."""
+        # Read twice: the bus has no checksum, and one wrong bit must not end a drive.
         return all(self._read(MODE1) & SLEEP for _ in range(2))
 
     def _write(self, register: int, *values: int) -> None:

@@ -1,7 +1,4 @@
-"""From a steering angle and a throttle to the pulses of a servo and of an electronic speed controller.
-
-A lock that is waited for only briefly: a command that hangs must not keep the motor running.
-"""
+"""From steering angle and throttle to the pulses of a servo and of an electronic speed controller."""
 
 from __future__ import annotations
 
@@ -16,23 +13,23 @@ from pydantic import Field, model_validator
 from lanenet.config import Settings
 from lanenet.errors import HardwareError
 
-#: Servos and speed controllers understand pulses of 1 to 2 ms; some take a little more on either side.
+#: Servos and speed controllers take pulses of 1 to 2 ms; some take half a millisecond more.
 SHORTEST_US, LONGEST_US = 500.0, 2500.0
 
 
 class PulseSettings(Settings):
-    """Which pulses turn this car's wheels how far, and how they drive its motor.
+    """Pulses of this car's steering and motor.
 
-    A wheel that turns the wrong way is mended by exchanging the two pulses of its side. The defaults are
-    those of Donkeycar's, at the rate that its PCA9685 really runs at.
+    If the wheels or the motor turn the wrong way, exchange the two pulses. The defaults are Donkeycar's
+    counts at the true rate of its PCA9685.
 
     Attributes:
-        max_steering_rad: Angle of the front wheels at the ends of the servo's way; a larger one is cut off.
+        max_steering_rad: Angle of the front wheels at the ends of the servo's travel; others are clipped.
         steering_trim_rad: Added to every angle, so that the car runs straight at 0; positive left.
-        steering_left_us: Pulse at full left lock.
-        steering_right_us: Pulse at full right lock.
+        steering_left_us: Pulse at the left end.
+        steering_right_us: Pulse at the right end.
         throttle_forward_us: Pulse of throttle 1.
-        throttle_stopped_us: Pulse of throttle 0, at which the motor stands.
+        throttle_stopped_us: Pulse of throttle 0: neutral.
         throttle_reverse_us: Pulse of throttle -1.
     """
 
@@ -62,8 +59,8 @@ class Pulses:
     """The two pulses of a command.
 
     Attributes:
-        steering_us: Of the steering servo.
-        throttle_us: Of the speed controller.
+        steering_us: Pulse of the steering servo.
+        throttle_us: Pulse of the speed controller.
     """
 
     steering_us: float
@@ -73,7 +70,7 @@ class Pulses:
 def command_pulses(settings: PulseSettings, steering_rad: float, throttle: float) -> Pulses:
     """Return the pulses of a command.
 
-    Linear from lock to lock, and from standstill to either end of the throttle. What lies beyond is cut off.
+    Linear between the ends of the steering, and from neutral to either end of the throttle; clipped beyond.
 
     Args:
         settings: The car's pulses.
@@ -81,14 +78,13 @@ def command_pulses(settings: PulseSettings, steering_rad: float, throttle: float
         throttle: -1 (full reverse) to 1 (full ahead).
 
     Raises:
-        HardwareError: If a value is not a number: no pulse may come from it.
+        HardwareError: If a value is not finite.
     """
     if not (math.isfinite(steering_rad) and math.isfinite(throttle)):
         raise HardwareError(
             f"actuator: found steering {steering_rad} rad and throttle {throttle}, expected finite numbers"
         )
-    lock = settings.max_steering_rad
-    left = _clip((steering_rad + settings.steering_trim_rad) / lock)
+    left = _clip((steering_rad + settings.steering_trim_rad) / settings.max_steering_rad)
     middle_us = 0.5 * (settings.steering_left_us + settings.steering_right_us)
     ahead = _clip(throttle)
     end_us = settings.throttle_forward_us if ahead >= 0.0 else settings.throttle_reverse_us
@@ -99,7 +95,7 @@ def command_pulses(settings: PulseSettings, steering_rad: float, throttle: float
 
 
 def neutral_pulses(settings: PulseSettings) -> Pulses:
-    """Return the pulses of a standing motor and of straight wheels."""
+    """Return the pulses of neutral and of straight wheels."""
     return command_pulses(settings, 0.0, 0.0)
 
 
@@ -107,12 +103,13 @@ def _clip(share: float) -> float:
     return min(max(share, -1.0), 1.0)
 
 
+#: Longest wait of neutral for a command in progress, which takes a few milliseconds.
 _LONGEST_WAIT_S = 0.02
 
 
 @contextmanager
 def brief_lock(lock: threading.Lock) -> Iterator[None]:
-    """Hold a lock if it can be had at once or nearly so; go on without it if not.
+    """Take a lock, but go on without it if it is not free soon: a hanging command must not block neutral.
 
     Args:
         lock: Held by commands while they are sent.

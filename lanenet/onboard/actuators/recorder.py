@@ -1,4 +1,4 @@
-"""An actuator without a car: it notes what it was told."""
+"""An actuator without a car: it keeps the commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RecorderSettings(Settings):
 
     Attributes:
         kind: Chooses this actuator.
-        keep: Commands that are kept; older ones are forgotten.
+        keep: Number of newest commands that are kept.
     """
 
     kind: Literal["recorder"] = "recorder"
@@ -40,10 +40,10 @@ class SentCommand:
 
 
 class Recorder:
-    """Keeps the newest commands; for replays, rehearsals and tests.
+    """Keeps the newest commands; for replays and tests.
 
     Attributes:
-        commands: What was sent, oldest first; ``neutral`` and ``close`` count as a command of 0 and 0.
+        commands: Oldest first; ``neutral`` and ``close`` count as a command of 0 and 0.
         is_open: Between ``open`` and ``close``.
     """
 
@@ -52,20 +52,20 @@ class Recorder:
         self.is_open = False
 
     def open(self) -> None:
-        """Start; see :class:`lanenet.onboard.hardware.Actuator`."""
+        """Start; see :class:`lanenet.onboard.actuators.actuator.Actuator`."""
         self.is_open = True
         self.neutral()
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Note a command."""
+        """Keep a command."""
         self.commands.append(SentCommand(time.monotonic(), steering_rad, throttle))
 
     def neutral(self) -> None:
-        """Note standstill."""
+        """Keep a command of 0 and 0."""
         self.send(0.0, 0.0)
 
     def close(self) -> None:
-        """Note standstill, once."""
+        """Keep a command of 0 and 0, once."""
         if self.is_open:
             self.neutral()
         self.is_open = False

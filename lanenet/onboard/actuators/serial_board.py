@@ -1,31 +1,28 @@
 """Servo and speed controller on an Arduino, or another microcontroller, over a serial line.
 
-The board has a watchdog of its own, so the motor stops even when this computer is frozen or unplugged. The
-lines are those of :mod:`lanenet.onboard.actuators.serial_board`, the sketch is ``firmware/lanenet_uno``.
+The board has its own watchdog, so the motor stops even when this computer hangs or is unplugged. Its sketch
+is ``firmware/lanenet_uno``, whose ``protocol.h`` has the same protocol in C++; tests connect the two.
 
-The lines between the computer and a microcontroller that makes the pulses; version 1.
-
-ASCII at 115200 baud, 8N1. A line is a letter, whole numbers joined by commas, ``*``, a checksum and a line
-feed: ``S1500,1500*49``. The checksum is the CRC-8 of all before the ``*`` (polynomial 0x07, start 0, as SMBus
-has it), as two hexadecimal digits in capitals. A line whose checksum or form is wrong is dropped and counted;
-so is a number beyond what the line may hold.
+Protocol, version 1: ASCII at 115200 baud, 8N1. A line is a letter, whole numbers separated by commas, ``*``,
+a checksum and a line feed: ``S1500,1500*49``. The checksum is the CRC-8 of everything before the ``*``
+(CRC-8/SMBUS) as two upper-case hexadecimal digits. A line with a wrong checksum, form or number is dropped
+and counted.
 
 From the computer:
 
-    V                          asks who is there
-    N<steering_us>,<throttle_us>    pulses of straight wheels and of a standing motor; the board goes there
-    S<steering_us>,<throttle_us>    pulses to put out now
+    V                               asks for the version
+    N<steering_us>,<throttle_us>    sets the pulses of straight wheels and neutral, and goes there
+    S<steering_us>,<throttle_us>    sets the pulses now
 
 From the board:
 
-    V<version>                 answers V, and is sent once after the board has started
-    A<accepted>,<rejected>,<driving>,<steering_us>,<throttle_us>    every 50 ms: counts of lines modulo 65536,
-                               1 while commands arrive and 0 in neutral, and the pulses that are put out
+    V<version>                      answers V; also sent once after the board has started
+    A<accepted>,<rejected>,<driving>,<steering_us>,<throttle_us>
+                                    every 50 ms: counts of lines modulo 65536, 1 while commands arrive and 0
+                                    in neutral, and the present pulses
 
-The board goes to its neutral pulses when 100 ms pass without a valid ``S``. It drives only after an ``N``
-since it was started, so that a board that restarted by itself stands until the computer has noticed.
-
-The same protocol stands in C++ in ``firmware/lanenet_uno/protocol.h``; the tests let the two talk.
+The board goes to its neutral pulses after 100 ms without a valid ``S``. After a start it drives only once it
+got an ``N``, so that a board that restarted stays in neutral until the computer has noticed.
 """
 
 from __future__ import annotations
@@ -45,21 +42,25 @@ from lanenet.onboard.actuators.pulses import Pulses, PulseSettings, brief_lock, 
 
 VERSION = 1
 BAUD = 115200
-#: The board is in neutral this long after the last valid command.
+#: After this time without a valid command the board goes to neutral.
 WATCHDOG_S = 0.1
 #: Time between two reports of the board.
 REPORT_S = 0.05
-#: The longest line, its end included.
+#: The longest line, with its end.
 MAX_LINE = 40
 _POLYNOMIAL = 0x07
+#: A line takes 2 ms; a port that takes none of it for this long is dead.
+_WRITE_TIMEOUT_S = 0.05
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line with a right checksum.
+    """One valid line.
 
     Attributes:
-        letter: What it says.
+        letter: Its kind.
         numbers: Its numbers.
     """
 
@@ -84,7 +85,7 @@ def encode(letter: str, *numbers: int) -> bytes:
 
 
 def decode(line: bytes) -> Line | None:
-    """Read a line without its end; None if its form or its checksum is wrong."""
+    """Read a line without its end; None if its form or checksum is wrong."""
     text, star, checksum = line.rstrip(b"\r").rpartition(b"*")
     if not star or len(checksum) != 2 or checksum != f"{crc8(text):02X}".encode("ascii"):
         return None
@@ -95,22 +96,17 @@ def decode(line: bytes) -> Line | None:
 
 
 class LineReader:
-    """Puts bytes together to lines, wherever they were cut."""
+    """Splits a stream of bytes into lines."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Line]:
-        """Return the valid lines that end in ``data``; others are dropped."""
+        """Return the valid lines that end in ``data``; invalid ones are dropped."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        # Noise without an end does not pile up.
+        # Noise without a line end must not pile up.
         self._rest = self._rest[-MAX_LINE:]
         return [line for line in map(decode, lines) if line is not None]
-
-
-_log = logging.getLogger(__name__)
-#: A line takes 2 ms; a port that takes none of it for so long is dead.
-_WRITE_TIMEOUT_S = 0.05
 
 
 class SerialBoardSettings(PulseSettings):
@@ -118,10 +114,10 @@ class SerialBoardSettings(PulseSettings):
 
     Attributes:
         kind: Chooses this actuator.
-        port: Device of the serial line. The names under ``/dev/serial/by-id`` stay the same.
-        start_s: How long to wait for the board to answer; an Uno restarts when its port is opened, which
-            takes two seconds.
-        silence_s: The board reports 20 times per second; after so long without a report it counts as gone.
+        port: Device of the serial line; names under ``/dev/serial/by-id`` do not change between boots.
+        start_s: Longest wait for the board's answer; an Uno restarts when its port is opened, which takes two
+            seconds.
+        silence_s: A board that sends no report for this long counts as gone; it reports every 0.05 s.
     """
 
     kind: Literal["serial"] = "serial"
@@ -139,16 +135,16 @@ class SerialBoard:
         self._lock = threading.Lock()
         self._reader = LineReader()
         self._heard_s = 0.0
-        #: The board's newest report: lines taken, lines dropped, driving, the two pulses.
+        #: The board's newest report: lines accepted, lines rejected, driving, the two pulses.
         self._report: tuple[int, ...] | None = None
 
     @property
     def rejected_lines(self) -> int:
-        """Lines that the board dropped since it started, as far as it has reported."""
+        """Lines that the board has rejected since it started, by its last report."""
         return 0 if self._report is None else self._report[1]
 
     def open(self) -> None:
-        """Wait for the board, tell it the neutral pulses, and see that it took them.
+        """Wait for the board, send it the neutral pulses, and wait until it reports them.
 
         Raises:
             HardwareError: If the port or the board do not answer, or the sketch is of another version.
@@ -181,7 +177,7 @@ class SerialBoard:
         end_s = time.monotonic() + self._settings.start_s
         version: int | None = None
         while time.monotonic() < end_s:
-            # Lines that come while the board's boot loader listens are lost, so they are said again.
+            # Repeated, since lines are lost while the board's boot loader runs.
             self._port.write(encode("V") if version is None else encode("N", *pulses))
             wait_s = time.monotonic() + 0.1
             while time.monotonic() < wait_s:
@@ -190,24 +186,24 @@ class SerialBoard:
                         version = line.numbers[0]
                 if version not in (None, VERSION):
                     raise HardwareError(
-                        f"{self._settings.port}: the board speaks version {version} of the protocol, "
+                        f"{self._settings.port}: the board uses version {version} of the protocol, "
                         f"expected {VERSION}; load the sketch firmware/lanenet_uno"
                     )
                 if version is not None and self._report is not None and self._report[3:] == pulses:
                     return
                 time.sleep(0.005)
-        what = "no answer" if version is None else f"neutral pulses {pulses} not taken over"
+        what = "no answer" if version is None else f"neutral pulses {pulses} not accepted"
         raise HardwareError(
             f"{self._settings.port}: {what} within {self._settings.start_s:g} s; is the sketch "
             "firmware/lanenet_uno on the board?"
         )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.hardware.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not a number, or the board is gone, silent or has
-                started again.
+            HardwareError: If it is not open, a value is not finite, or the board is gone, silent or has
+                restarted.
         """
         pulses = command_pulses(self._settings, steering_rad, throttle)
         if self._port is None:
@@ -220,8 +216,7 @@ class SerialBoard:
                 raise HardwareError(f"{self._settings.port}: the board is gone ({error})") from None
         if any(line.letter == "V" for line in lines):
             raise HardwareError(
-                f"{self._settings.port}: the board has started again by itself, and stands in neutral; check "
-                "its supply"
+                f"{self._settings.port}: the board has restarted and is in neutral; check its supply"
             )
         silent_s = time.monotonic() - self._heard_s
         if silent_s > self._settings.silence_s:
@@ -239,7 +234,7 @@ class SerialBoard:
                 self._write(neutral_pulses(self._settings))
             except Exception as error:
                 _log.error(
-                    "%s: neutral could not be sent, the board's watchdog stops: %s",
+                    "%s: neutral could not be sent, the board's watchdog stops the motor: %s",
                     self._settings.port,
                     error,
                 )

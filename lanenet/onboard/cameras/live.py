@@ -1,4 +1,4 @@
-"""A running camera as a source: a thread keeps its newest frame, and looks for the camera when it is lost."""
+"""A running camera as a source: a thread keeps the newest frame, and restarts a camera that is lost."""
 
 from __future__ import annotations
 
@@ -18,32 +18,33 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.errors import HardwareError
-from lanenet.onboard.hardware import Frame
+from lanenet.onboard.cameras.source import Frame
 
 _log = logging.getLogger(__name__)
 
-#: The longest that one call of a device waits, so that ``close`` is not held up.
+#: The longest wait of one call of a device, so that ``close`` is not held up.
 _GRAB_S = 0.1
-#: First and longest pause between two attempts to find a lost camera; each is as long as it has been lost.
+#: First and longest pause between two attempts to restart a lost camera; each pause is as long as the camera
+#: has been lost. Chosen: a plug that slipped is back at once, a driver that crashed is not flooded.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
-#: A camera driver may hang; nothing waits for it longer than this.
+#: Closing waits no longer than this for a driver that hangs.
 _JOIN_S = 3.0
-#: A device all of whose exposures are older than this measures them on another clock.
+#: If all exposure times of a device are older than this, they are from another clock.
 _OLDEST_S = 1.0
 
 
 class CameraSettings(Settings):
-    """What all cameras have in common.
+    """Settings of all cameras.
 
     Attributes:
-        width: Of the image, [px]; the camera file's.
-        height: Of the image, [px].
+        width: Image width as in the camera file, [px].
+        height: Image height, [px].
         rate_hz: Frames per second.
-        rotate_180: Turn the image, for a camera that hangs upside down; the camera file then belongs to the
-            turned image.
-        start_s: How long the first frame may take.
-        silence_s: A camera without a frame for so long counts as lost.
-        give_up_s: A lost camera is looked for during this time.
+        rotate_180: Turn the image, for a camera mounted upside down; the camera file is that of the turned
+            image.
+        start_s: The longest wait for the first frame.
+        silence_s: A camera that sends no frame for this long counts as lost.
+        give_up_s: For how long a lost camera is restarted.
     """
 
     width: int = Field(default=320, ge=16, le=4096)
@@ -60,9 +61,9 @@ class Capture:
     """One image from a device.
 
     Attributes:
-        image_bgr: The image; the device does not touch it any more.
-        t_s: When it was exposed, on the clock of :func:`time.monotonic`; None where the device does not know.
-        skipped: Images that the device dropped since the last one, because this one is newer.
+        image_bgr: The image; the device does not change it any more.
+        t_s: Time of exposure on the clock of :func:`time.monotonic`; None if the device does not give it.
+        skipped: Older images that the device dropped since the last one.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] = field(repr=False)
@@ -72,10 +73,10 @@ class Capture:
 
 @runtime_checkable
 class Device(Protocol):
-    """A camera driver: started, asked for images and stopped by one thread at a time.
+    """A camera driver, used by one thread at a time.
 
     Attributes:
-        name: As people know it, for messages.
+        name: For messages.
     """
 
     name: str
@@ -85,16 +86,16 @@ class Device(Protocol):
         ...
 
     def grab(self, timeout_s: float) -> Capture | None:
-        """Return the next image, or None if there is none in time; raises HardwareError when it is lost."""
+        """Return the next image, None if there is none in time; raises HardwareError if it is lost."""
         ...
 
     def stop(self) -> None:
-        """Stop the camera; harmless when it does not run, never raises."""
+        """Stop the camera; harmless if it does not run, never raises."""
         ...
 
 
 class LiveSource:
-    """Newest frame of a device; a ``FrameSource``."""
+    """The newest frame of a device; a ``FrameSource``."""
 
     def __init__(self, device: Device, settings: CameraSettings) -> None:
         self._device = device
@@ -109,7 +110,7 @@ class LiveSource:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Start the camera and wait for its first frame; see :class:`lanenet.onboard.hardware.FrameSource`.
+        """Start the camera and wait for its first frame; see :class:`.source.FrameSource`.
 
         Raises:
             HardwareError: If the camera is not there, sends nothing, or sends images of another size.
@@ -139,7 +140,7 @@ class LiveSource:
         """Return the newest frame that was not returned before; see ``FrameSource``.
 
         Raises:
-            HardwareError: If the camera was lost and not found again in time, or it is not open.
+            HardwareError: If the camera was lost and did not come back in time, or it is not open.
         """
         if self._thread is None:
             raise HardwareError(f"{self._device.name}: not open")
@@ -161,7 +162,7 @@ class LiveSource:
         self._closing.set()
         thread.join(_JOIN_S)
         if thread.is_alive():
-            _log.warning("%s: its driver hangs and is left behind", self._device.name)
+            _log.warning("%s: its driver hangs; its thread is abandoned", self._device.name)
         self._newest = None
 
     def _has_news(self) -> bool:
@@ -169,7 +170,7 @@ class LiveSource:
         return news or self._failure is not None
 
     def _run(self) -> None:
-        """Grab until closed; the thread is the only one that touches the device meanwhile."""
+        """Grab until closed; meanwhile no other thread uses the device."""
         heard_s = time.monotonic()
         lost_s = math.nan
         while not self._closing.is_set():
@@ -179,8 +180,8 @@ class LiveSource:
                 elif time.monotonic() - heard_s > self._settings.silence_s:
                     raise HardwareError(f"{self._device.name}: no frame for {self._settings.silence_s:g} s")
             except Exception as error:
-                # A driver may raise anything when its device is pulled out. A camera that starts again
-                # without sending what is expected was not found.
+                # A driver may raise anything when its device is pulled out. A camera that restarts but does
+                # not send the expected images is still lost.
                 lost_s = time.monotonic() if math.isnan(lost_s) else lost_s
                 if not self._find_again(error, lost_s):
                     break
@@ -188,7 +189,7 @@ class LiveSource:
         self._device.stop()
 
     def _find_again(self, error: Exception, lost_s: float) -> bool:
-        """Start the device anew until it works; False if it is closed or given up."""
+        """Restart the device until it works; False if it is closed or given up."""
         _log.error("camera lost: %s; looking for it", error)
         while not self._closing.is_set():
             self._device.stop()
@@ -235,16 +236,16 @@ class LiveSource:
         return True
 
     def _exposed_s(self, stamp_s: float | None, arrived_s: float) -> float:
-        """Return when an image was exposed: as the device tells it, else when it arrived."""
+        """Return the time of exposure: the device's if it can be used, else the time of arrival."""
         if stamp_s is None or not stamp_s <= arrived_s:
             return arrived_s
-        # Once the clocks have agreed, an old time belongs to an old image, which nobody may steer by.
+        # Once the clocks have agreed, an old time means an old image, which must not be used.
         self._clock_agrees = self._clock_agrees or arrived_s - stamp_s < _OLDEST_S
         return stamp_s if self._clock_agrees else arrived_s
 
 
 def stop_quietly(*actions: Callable[[], object]) -> None:
-    """Call each action and forget what it raises: a device that is gone cannot be stopped in good order."""
+    """Call each action and ignore its errors: a device that is gone cannot be stopped properly."""
     for action in actions:
         with contextlib.suppress(Exception):
             action()

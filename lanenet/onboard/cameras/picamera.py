@@ -17,7 +17,7 @@ from pydantic import Field
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.cameras.live import CameraSettings, Capture, stop_quietly
 
-#: Where blue, green and red stand in a pixel of each of picamera2's formats.
+#: Positions of blue, green and red in a pixel of each of picamera2's formats.
 _BGR_OF: dict[str, tuple[int, int, int]] = {
     "RGB888": (0, 1, 2),
     "BGR888": (2, 1, 0),
@@ -31,8 +31,8 @@ class PiCameraSettings(CameraSettings):
 
     Attributes:
         kind: Chooses this source.
-        camera: Which one, as ``rpicam-hello --list-cameras`` counts them.
-        pixel_format: Asked of picamera2, in its own names; "RGB888" needs no conversion.
+        camera: Its number in ``rpicam-hello --list-cameras``.
+        pixel_format: In picamera2's names; "RGB888" needs no conversion.
     """
 
     kind: Literal["picamera2"] = "picamera2"
@@ -62,7 +62,7 @@ class PiCamera:
                 buffer_count=4,
             )
             self._camera.configure(wanted)
-            # The driver may have chosen another format than it was asked for.
+            # The driver may choose another format than the requested one.
             found = str(self._camera.camera_configuration()["main"]["format"])
             if found not in _BGR_OF:
                 raise HardwareError(
@@ -87,7 +87,7 @@ class PiCamera:
         try:
             request = self._job.get_result(timeout=timeout_s)
         except TimeoutError:
-            # The same job is asked again: a new one each time would pile up in the driver.
+            # Keep the job: new ones would pile up in the driver.
             return None
         self._job = None
         try:
@@ -95,7 +95,7 @@ class PiCamera:
             stamp_ns = request.get_metadata().get("SensorTimestamp")
         finally:
             request.release()
-        # Nanoseconds since the start of the system, on the clock of time.monotonic.
+        # Nanoseconds since boot, on the clock of time.monotonic.
         return Capture(image, None if stamp_ns is None else 1e-9 * float(stamp_ns))
 
     def stop(self) -> None:
@@ -106,11 +106,11 @@ class PiCamera:
 
 
 def to_bgr(pixels: UInt8[np.ndarray, "h w c"], order: tuple[int, int, int]) -> UInt8[np.ndarray, "h w 3"]:
-    """Bring an image into OpenCV's order, as an array of its own.
+    """Copy an image into OpenCV's order.
 
     Args:
         pixels: As picamera2 returns it.
-        order: Where blue, green and red stand in a pixel.
+        order: Positions of blue, green and red in a pixel.
     """
     if pixels.shape[2] == 3 and order == (0, 1, 2):
         return np.ascontiguousarray(pixels)
@@ -118,7 +118,7 @@ def to_bgr(pixels: UInt8[np.ndarray, "h w c"], order: tuple[int, int, int]) -> U
 
 
 def _require_picamera2() -> ModuleType:
-    """Import picamera2, which no extra of lanenet can install."""
+    """Import picamera2, which comes with the system and not with an extra."""
     try:
         return importlib.import_module("picamera2")
     except ImportError as error:

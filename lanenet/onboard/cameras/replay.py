@@ -14,8 +14,9 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import DriveFormatError, HardwareError
-from lanenet.onboard.hardware import Frame, SourceEnded
+from lanenet.onboard.cameras.source import Frame, SourceEnded
 
+#: Of a drive with a single frame: Donkeycar's 20 frames/s.
 _DEFAULT_STEP_S = 0.05
 _log = logging.getLogger(__name__)
 
@@ -26,11 +27,11 @@ class ReplaySettings(Settings):
     Attributes:
         kind: Chooses this source.
         path: A drive folder, a Donkeycar tub or a video.
-        pace: ``real`` shows each frame at its time and drops what the reader is too slow for, like a camera;
-            ``fast`` shows every frame, as soon as it is asked for.
+        pace: ``real`` gives each frame at its time and drops those that the reader is too slow for, like a
+            camera; ``fast`` gives every frame as soon as it is requested.
         rate_hz: Frames per second in place of the recorded times.
         loop: Start again at the end.
-        may_drive: Let an armed car with wheels follow the recording. It is blind then: for a car on a box.
+        may_drive: Let an armed car with a motor follow the recording, blind: for a car on a stand.
     """
 
     kind: Literal["replay"] = "replay"
@@ -44,8 +45,8 @@ class ReplaySettings(Settings):
 class ReplaySource:
     """Frames of a drive, one after the other; a ``FrameSource``.
 
-    A frame that cannot be read is left out, with a line in the log. ``t_s`` is when a frame was due, or when
-    it was asked for at full speed.
+    An unreadable frame is left out, with a line in the log. ``t_s`` is the time at which a frame was due, or
+    was requested with the pace ``fast``.
     """
 
     def __init__(self, settings: ReplaySettings) -> None:
@@ -54,12 +55,12 @@ class ReplaySource:
         self._due_s: Float[np.ndarray, "n"] = np.zeros(0)
         self._lap_s = 0.0
         self._start_s = 0.0
-        #: The next frame, counted on through all laps.
+        #: Number of the next frame, counted through all repetitions.
         self._next = 0
         self._unreadable = 0
 
     def open(self) -> None:
-        """Open the drive; time runs from now on.
+        """Open the drive; its time starts now.
 
         Raises:
             HardwareError: If there is no drive that can be read.
@@ -77,7 +78,7 @@ class ReplaySource:
 
         Raises:
             SourceEnded: If all frames were shown.
-            HardwareError: If it is not open, or not one frame can be read.
+            HardwareError: If it is not open, or no frame can be read.
         """
         drive = self._drive
         if drive is None:
@@ -105,15 +106,15 @@ class ReplaySource:
                 self._note(error, len(drive))
 
     def close(self) -> None:
-        """Let go of the drive."""
+        """Release the drive."""
         self._drive = None
 
     def _skip_late(self, now_s: float) -> None:
-        """Move on to the newest frame that is due."""
+        """Skip to the newest frame that is due."""
         lap, in_lap_s = divmod(now_s - self._start_s, self._lap_s)
         n = len(self._due_s)
         newest = int(lap) * n + int(np.searchsorted(self._due_s, in_lap_s, side="right")) - 1
-        # Without a loop the last frame is shown even to a reader that comes late.
+        # Without a loop even a late reader gets the last frame.
         self._next = max(self._next, newest if self._settings.loop else min(newest, n - 1))
 
     def _note(self, error: DriveFormatError, n_frames: int) -> None:
@@ -124,15 +125,15 @@ class ReplaySource:
 
 
 def _schedule(drive: Drive, rate_hz: float | None) -> tuple[Float[np.ndarray, "n"], float]:
-    """Return when each frame is due after the start, [s], and how long one lap takes.
+    """Return the time of each frame after the start, [s], and the duration of one repetition, [s].
 
-    A pause where the recording was interrupted is not waited for.
+    Breaks in the recording are cut out.
     """
     n = len(drive)
     if rate_hz is not None:
         return np.arange(n) / rate_hz, n / rate_hz
     steps = np.diff(drive.t_s)
-    usual_s = float(np.median(steps)) if steps.size else _DEFAULT_STEP_S
-    steps = np.where(drive.breaks[1:], usual_s, steps)
+    median_s = float(np.median(steps)) if steps.size else _DEFAULT_STEP_S
+    steps = np.where(drive.breaks[1:], median_s, steps)
     due_s = np.concatenate([[0.0], np.cumsum(steps)])
-    return due_s, float(due_s[-1]) + usual_s
+    return due_s, float(due_s[-1]) + median_s

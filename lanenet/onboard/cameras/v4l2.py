@@ -1,4 +1,4 @@
-"""USB cameras, and whatever else Linux shows as /dev/video*, through OpenCV."""
+"""USB cameras and other /dev/video* devices of Linux, through OpenCV."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class V4L2Settings(CameraSettings):
 
     Attributes:
         kind: Chooses this source.
-        device: Device file. The names under ``/dev/v4l/by-id`` stay the same.
-        fourcc: Format that is asked for: MJPG needs little of the USB, YUYV costs no decoding.
+        device: Device file; names under ``/dev/v4l/by-id`` do not change between boots.
+        fourcc: Requested format: MJPG needs little USB bandwidth, YUYV no decoding.
     """
 
     kind: Literal["v4l2"] = "v4l2"
@@ -35,7 +35,7 @@ class V4L2Camera:
         self._capture: Any = None
 
     def start(self) -> None:
-        """Open the device and ask for size and rate; see :class:`lanenet.onboard.cameras.live.Device`."""
+        """Open the device and request size and rate; see :class:`lanenet.onboard.cameras.live.Device`."""
         settings = self._settings
         capture = cv2.VideoCapture(settings.device, cv2.CAP_V4L2)
         self._capture = capture
@@ -49,15 +49,15 @@ class V4L2Camera:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
         capture.set(cv2.CAP_PROP_FPS, settings.rate_hz)
-        # Old frames in a queue would only be late.
+        # Queued frames would only be late.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
 
     def grab(self, timeout_s: float) -> Capture | None:
-        """Return the next frame. OpenCV itself decides how long it waits; see ``Device``."""
+        """Return the next frame; OpenCV decides how long to wait. See ``Device``."""
         ok, image = self._capture.read()
         if not ok or image is None:
             raise HardwareError(f"{self.name}: sends no frame; was it unplugged?")
-        # OpenCV tells the driver's time of the buffer, which Linux takes from the monotonic clock.
+        # The driver's time of the buffer, which Linux takes from the monotonic clock.
         stamp_ms = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         return Capture(
             np.asarray(image), 1e-3 * stamp_ms if 0.0 < stamp_ms <= 1e3 * time.monotonic() else None

@@ -16,18 +16,22 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
+from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
-from lanenet.onboard.drive import build_drive_detector
-from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
+from lanenet.onboard.drive import DriveSettings, build_drive_detector
 
-#: The camera is watched for so long.
+#: The camera is watched for this long: at 20 frames/s, 40 frames.
 _WATCH_S = 2.0
-#: Below this share of the asked rate something is wrong.
+#: Below this share of the requested rate something is wrong; chosen: more than jitter takes.
 _LEAST_RATE_SHARE = 0.8
+#: A Raspberry Pi lowers its clock from 80 degrees Celsius on; warn 10 degrees earlier.
 _HOT_C, _WARM_C = 80.0, 70.0
+#: The delay from exposure above which a note is shown: two frames of a 30 Hz camera.
+_LATE_MS = 60.0
+#: Mean brightness outside this range: a covered lens, or an overexposed image.
+_DARK, _BRIGHT = 20.0, 235.0
 _THERMAL_ZONE = Path("/sys/class/thermal/thermal_zone0/temp")
-#: Bits of ``vcgencmd get_throttled``; 16 higher they tell that it happened since the start.
+#: Bits of ``vcgencmd get_throttled``; 16 bits higher: it has happened since boot.
 _THROTTLE_BITS = {
     0: "the supply's voltage is too low",
     1: "the processor's clock is capped",
@@ -37,15 +41,15 @@ _THROTTLE_BITS = {
 
 
 def check_car(settings: DriveSettings) -> list[Check]:
-    """Check what a car's file describes; opens the camera and the actuator for a moment.
+    """Check the devices of a car's file; opens the camera and the actuator for a moment.
 
     The actuator goes to neutral, which may straighten the wheels; the motor does not turn.
 
     Args:
-        settings: Of the car.
+        settings: The car's settings.
 
     Returns:
-        All checks in the order in which people read them; nothing is raised for what is found.
+        All checks in the order of the report; problems are checks, not errors.
     """
     checks = [] if settings.camera is None else check_camera_file(settings.camera)
     camera = None
@@ -62,8 +66,8 @@ def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | No
 
     Args:
         source: Not open yet; it is closed again.
-        rate_hz: Frames per second that were asked for, if they were.
-        camera: Camera file that its images have to fit.
+        rate_hz: Requested frames per second; None if none were requested.
+        camera: Camera whose size the images must have; None for no check.
     """
     try:
         source.open()
@@ -82,10 +86,10 @@ def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | No
     else:
         checks.append(Check("image size", "ok", f"{width}x{height} px"))
     late_ms = 1e3 * float(np.median([a - f.t_s for f, a in zip(frames, arrived_s, strict=True)]))
-    state: State = "note" if late_ms > 60.0 else "ok"
-    checks.append(Check("delay", state, f"{late_ms:.0f} ms from exposure, as the driver tells it, to here"))
+    state: State = "note" if late_ms > _LATE_MS else "ok"
+    checks.append(Check("delay", state, f"{late_ms:.0f} ms from exposure, by the driver, to here"))
     brightness = float(np.mean([f.image_bgr.mean() for f in frames[-5:]]))
-    if not 20.0 <= brightness <= 235.0:
+    if not _DARK <= brightness <= _BRIGHT:
         text = f"mean brightness {brightness:.0f} of 255: is the lens covered, the room dark?"
         checks.append(Check("image", "note", text))
     return checks
@@ -106,10 +110,10 @@ def check_temperature(sensor: Path = _THERMAL_ZONE) -> Check:
 
 
 def check_throttling(ask: Callable[[], str] | None = None) -> Check:
-    """Ask a Raspberry Pi whether its supply and its temperature held so far.
+    """Check a Raspberry Pi's record of undervoltage and throttling.
 
     Args:
-        ask: Returns what ``vcgencmd get_throttled`` says; by default runs it.
+        ask: Returns the output of ``vcgencmd get_throttled``; None runs it.
     """
     if ask is None:
         if shutil.which("vcgencmd") is None:
@@ -126,8 +130,8 @@ def check_throttling(ask: Callable[[], str] | None = None) -> Check:
         hint = "; use a supply of 5 V and at least 3 A, apart from the motor's" if bits & 1 else ""
         return Check("throttling", "problem", f"{' and '.join(now)}{hint}")
     if before:
-        return Check("throttling", "note", f"since the start it happened that {' and '.join(before)}")
-    return Check("throttling", "ok", "supply and temperature held since the start")
+        return Check("throttling", "note", f"since boot it happened that {' and '.join(before)}")
+    return Check("throttling", "ok", "no undervoltage and no throttling since boot")
 
 
 def _watch(source: FrameSource) -> tuple[list[Frame], list[float]]:
@@ -150,7 +154,7 @@ def _rate(frames: list[Frame], wanted_hz: float | None) -> Check:
     text = f"{found_hz:.1f} frames per second, longest pause {1e3 * steps_s.max():.0f} ms"
     if wanted_hz is not None and found_hz < _LEAST_RATE_SHARE * wanted_hz:
         text += (
-            f": {wanted_hz:g} were asked for; a dark room lengthens the exposure, a large image costs time"
+            f": {wanted_hz:g} were requested; a dark room lengthens the exposure, a large image costs time"
         )
         return Check("camera", "problem", text)
     return Check("camera", "ok", text)
@@ -178,7 +182,7 @@ def _actuator(settings: DriveSettings) -> Check:
     except LanenetError as error:
         return Check(name, "problem", str(error))
     actuator.close()
-    return Check(name, "ok", "answers, and stands in neutral")
+    return Check(name, "ok", "answers, and is in neutral")
 
 
 def _vcgencmd() -> str:

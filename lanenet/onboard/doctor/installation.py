@@ -20,7 +20,7 @@ from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 State = Literal["ok", "note", "problem"]
 
-#: y = -x in ONNX (IR 7, opset 13): runs the runtime without the onnx package, which the car does not have.
+#: y = -x in ONNX (IR 7, opset 13): tests the runtime without the onnx package, which a car does not have.
 _NEGATE_ONNX = bytes.fromhex(
     "080712003a320a0b0a017812017922034e65671201675a0f0a0178120a0a08080112040a020801620f0a0179120a0a0808011204"
     "0a02080142040a00100d"
@@ -38,9 +38,9 @@ class Check:
     """One line of the report.
 
     Attributes:
-        name: What was looked at.
-        state: ``problem`` stops something from working; ``note`` is worth knowing.
-        text: What was found, and for a problem what to do.
+        name: What was checked.
+        state: ``problem`` keeps something from working; ``note`` is worth knowing.
+        text: What was found, and what to do about a problem.
     """
 
     name: str
@@ -55,7 +55,7 @@ def run_checks(camera: Path | None = None) -> list[Check]:
         camera: Camera YAML to check.
 
     Returns:
-        All checks in the order in which people read them; nothing is raised for what is found.
+        All checks in the order of the report; problems are checks, not errors.
     """
     checks = [_python(), *_packages(), _opencv_packages(), _opencv(), _onnxruntime()]
     if camera is not None:
@@ -64,7 +64,7 @@ def run_checks(camera: Path | None = None) -> list[Check]:
 
 
 def check_camera_file(path: Path) -> list[Check]:
-    """Check that a camera file can be read and that its camera sees the road where labels lie."""
+    """Check that a camera file can be read and that its camera sees the road at the label rows."""
     try:
         camera = read_camera(path)
     except LanenetError as error:
@@ -122,7 +122,7 @@ def _python() -> Check:
 
 
 def _packages() -> list[Check]:
-    """Versions of the base packages, and which extras are complete."""
+    """Return the versions of the base packages, and which extras are complete."""
     try:
         lines = metadata.requires("lanenet") or []
         version = metadata.version("lanenet")
@@ -166,7 +166,7 @@ def _opencv_packages() -> Check:
 
 
 def _opencv() -> Check:
-    """Find the edge of a painted step, and pack and unpack a JPEG."""
+    """Test OpenCV: find the edge of a drawn step, and encode and decode a JPEG."""
     try:
         import cv2
 
@@ -174,17 +174,17 @@ def _opencv() -> Check:
         step[:, 16:] = 200
         edges = cv2.Canny(step, 40.0, 100.0)
         columns = np.unique(np.nonzero(edges)[1])
-        packed, data = cv2.imencode(".jpg", step)
-        back = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if packed else None
+        encoded, data = cv2.imencode(".jpg", step)
+        back = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if encoded else None
     except Exception as error:
         return Check("opencv", "problem", f"self test failed ({error}): pip install opencv-python-headless")
     if columns.size != 1 or abs(int(columns[0]) - 15.5) > 1.0 or back is None or back.shape != step.shape:
         return Check("opencv", "problem", f"{cv2.__version__}: self test gave a wrong answer; reinstall it")
-    return Check("opencv", "ok", f"{cv2.__version__}, edge and JPEG found as expected")
+    return Check("opencv", "ok", f"{cv2.__version__}, edges and JPEG work")
 
 
 def _onnxruntime() -> Check:
-    """Negate one number with a model of one node."""
+    """Test onnxruntime: negate a number with a model of one node."""
     try:
         import onnxruntime
 

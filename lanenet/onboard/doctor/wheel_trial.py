@@ -1,4 +1,4 @@
-"""Signs and trim of a car whose wheels are off the ground, found by asking who stands beside it."""
+"""Signs and trim of a car whose wheels are off the ground, found by asking a person beside it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from lanenet.errors import ConfigError, LanenetError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
 from lanenet.onboard.actuators.pulses import PulseSettings
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings
 from lanenet.onboard.guard import CommandSink
 
 _log = logging.getLogger(__name__)
 
-#: Asks a question; the answer is one of the letters.
+#: Asks a question; returns one of the letters.
 Ask = Callable[[str, str], str]
 
+#: A command is repeated this often: well within the watchdog's 80 ms.
 _REPEAT_S = 0.03
+#: Share of the largest angle that shows the side clearly without reaching the end of the travel.
+_SIDE_SHARE = 0.7
+#: Half a degree, about what an eye sees at a wheel.
 _TRIM_STEP_RAD = 0.01
+#: Limit of ``steering_trim_rad``, 17 degrees.
 _MAX_TRIM_RAD = 0.3
+#: Chosen: a fifth of the default ``throttle_at_rest``.
 _THROTTLE_STEP = 0.02
 
 
@@ -31,7 +37,7 @@ class TrialResult:
     """What the trial found.
 
     Attributes:
-        changes: New values of the car's file by their dotted key; empty if all was right.
+        changes: New values of the car's file by their dotted key; empty if nothing has to change.
         lines: What was found, a sentence each.
     """
 
@@ -39,8 +45,49 @@ class TrialResult:
     lines: list[str] = field(default_factory=list)
 
 
+def try_wheels(settings: DriveSettings, sink: CommandSink, ask: Ask) -> TrialResult:
+    """Turn the wheels and the motor, and ask what they did.
+
+    The motor is in neutral before and after, whatever happens in between.
+
+    Args:
+        settings: The car's settings.
+        sink: Its actuator behind the guard, which stops it if this process hangs.
+        ask: Asks a person; gets the question and the letters of the answers.
+
+    Returns:
+        Values for the car's file.
+
+    Raises:
+        ConfigError: If the car has no actuator with wheels.
+        HardwareError: If the actuator does not answer, or fails meanwhile.
+    """
+    pulses = pulses_of(settings)
+    if ask("Are all wheels off the ground, and nothing near them?", "yn") != "y":
+        return TrialResult(lines=["nothing was tried: put the car on a stand first"])
+    with _Holder(sink, settings.safety.watchdog_s) as holder:
+        trial = _Trial(pulses, holder, ask)
+        sign = trial.sides()
+        trial.trim(sign)
+        trial.motor(settings.limits.max_throttle)
+    return trial.result
+
+
+def pulses_of(settings: DriveSettings) -> PulseSettings:
+    """Return the pulses of the car's actuator.
+
+    Raises:
+        ConfigError: If the car has no actuator with wheels, or its ``myconfig.py`` cannot be used.
+    """
+    actuator = settings.actuator
+    if not isinstance(actuator, PulseSettings):
+        found = "none" if actuator is None else f"kind: {actuator.kind}"
+        raise ConfigError(f"key 'actuator': found {found}, expected one with wheels (pca9685, serial)")
+    return with_myconfig(actuator) if isinstance(actuator, PCA9685Settings) else actuator
+
+
 class _Holder:
-    """Repeats a command in a thread while a person thinks: actuators stop by themselves otherwise."""
+    """Repeats a command in a thread while a person thinks, since the guard would stop the car."""
 
     def __init__(self, sink: CommandSink, watchdog_s: float) -> None:
         self._sink, self._watchdog_s = sink, watchdog_s
@@ -75,101 +122,64 @@ class _Holder:
                 return
 
 
-def pulses_of(settings: DriveSettings) -> PulseSettings:
-    """Return the pulses that the car's actuator works with.
+class _Trial:
+    """The questions, and what their answers change."""
 
-    Raises:
-        ConfigError: If the car has no actuator with wheels, or its ``myconfig.py`` cannot be used.
-    """
-    actuator = settings.actuator
-    if not isinstance(actuator, PulseSettings):
-        found = "none" if actuator is None else f"kind: {actuator.kind}"
-        raise ConfigError(f"key 'actuator': found {found}, expected one with wheels (pca9685, serial)")
-    return with_myconfig(actuator) if isinstance(actuator, PCA9685Settings) else actuator
+    def __init__(self, pulses: PulseSettings, holder: _Holder, ask: Ask) -> None:
+        self.result = TrialResult()
+        self._pulses, self._holder, self._ask = pulses, holder, ask
 
+    def sides(self) -> float:
+        """Return 1 if left is left, -1 if the servo turns the other way."""
+        self._holder.hold(_SIDE_SHARE * self._pulses.max_steering_rad, 0.0)
+        answer = self._ask("To which side do the front wheels point, seen from behind: left or right?", "lr")
+        self._holder.hold(0.0, 0.0)
+        if answer == "l":
+            self.result.lines.append("steering: left is left")
+            return 1.0
+        self.result.changes["actuator.steering_left_us"] = self._pulses.steering_right_us
+        self.result.changes["actuator.steering_right_us"] = self._pulses.steering_left_us
+        self.result.lines.append("steering: the servo turned the wrong way, its two pulses are exchanged")
+        return -1.0
 
-def try_wheels(settings: DriveSettings, sink: CommandSink, ask: Ask) -> TrialResult:
-    """Turn the wheels and the motor, and ask what they did.
+    def trim(self, sign: float) -> None:
+        """Move the wheels in small steps until they are straight; ``sign`` as of :meth:`sides`."""
+        before_rad = self._pulses.steering_trim_rad
+        turn_rad = 0.0
+        while True:
+            self._holder.hold(sign * turn_rad, 0.0)
+            answer = self._ask("Where do the front wheels point now: left, right, or straight ahead?", "lrs")
+            if answer == "s":
+                break
+            turn_rad += _TRIM_STEP_RAD if answer == "r" else -_TRIM_STEP_RAD
+            if abs(sign * before_rad + turn_rad) > _MAX_TRIM_RAD:
+                self.result.lines.append("trim: more than 17 degrees would be needed; refit the servo's horn")
+                return
+        trim_rad = round(sign * before_rad + turn_rad, 4)
+        if trim_rad != before_rad:
+            self.result.changes["actuator.steering_trim_rad"] = trim_rad
+        self.result.lines.append(f"trim: {trim_rad:+.3f} rad")
 
-    The motor is in neutral before and after, whatever happens in between.
-
-    Args:
-        settings: Of the car.
-        sink: Its actuator behind the guard, which stops it when this process hangs.
-        ask: Asks a person; gets the question and the letters that are answers.
-
-    Returns:
-        Values for the car's file.
-
-    Raises:
-        ConfigError: If the car has no actuator with wheels.
-        HardwareError: If the actuator does not answer, or fails meanwhile.
-    """
-    pulses = pulses_of(settings)
-    result = TrialResult()
-    if ask("Are all wheels off the ground, and nothing near them?", "yn") != "y":
-        result.lines.append("nothing was tried: put the car on a box first")
-        return result
-    with _Holder(sink, settings.safety.watchdog_s) as holder:
-        sign = _try_sides(pulses, holder, ask, result)
-        _try_trim(pulses, holder, ask, result, sign)
-        _try_motor(settings, pulses, holder, ask, result)
-    return result
-
-
-def _try_sides(pulses: PulseSettings, holder: _Holder, ask: Ask, result: TrialResult) -> float:
-    """Return 1 if left is left, -1 if the servo turns the other way."""
-    holder.hold(0.7 * pulses.max_steering_rad, 0.0)
-    answer = ask("To which side do the front wheels point, seen from behind: left or right?", "lr")
-    holder.hold(0.0, 0.0)
-    if answer == "l":
-        result.lines.append("steering: left is left")
-        return 1.0
-    result.changes["actuator.steering_left_us"] = pulses.steering_right_us
-    result.changes["actuator.steering_right_us"] = pulses.steering_left_us
-    result.lines.append("steering: the servo turned the wrong way, its two pulses are exchanged")
-    return -1.0
-
-
-def _try_trim(pulses: PulseSettings, holder: _Holder, ask: Ask, result: TrialResult, sign: float) -> None:
-    """Move the wheels in small steps until they are straight."""
-    turn_rad = 0.0
-    while True:
-        holder.hold(sign * turn_rad, 0.0)
-        answer = ask("Where do the front wheels point now: left, right, or straight ahead?", "lrs")
-        if answer == "s":
-            break
-        turn_rad += _TRIM_STEP_RAD if answer == "r" else -_TRIM_STEP_RAD
-        if abs(sign * pulses.steering_trim_rad + turn_rad) > _MAX_TRIM_RAD:
-            result.lines.append("trim: more than 17 degrees would be needed; set the servo's horn anew")
+    def motor(self, max_throttle: float) -> None:
+        """Open the throttle in small steps until the wheels turn."""
+        throttle = 0.0
+        while throttle < max_throttle - 1e-9:
+            throttle = round(min(throttle + _THROTTLE_STEP, max_throttle), 4)
+            self._holder.hold(0.0, throttle)
+            question = f"Throttle {throttle:.2f}: do the wheels turn: not yet, forward, or backward?"
+            answer = self._ask(question, "nfb")
+            if answer == "n":
+                continue
+            self._holder.hold(0.0, 0.0)
+            self.result.changes["control.speed.throttle_at_rest"] = throttle
+            if answer == "b":
+                self.result.changes["actuator.throttle_forward_us"] = self._pulses.throttle_reverse_us
+                self.result.changes["actuator.throttle_reverse_us"] = self._pulses.throttle_forward_us
+                self.result.lines.append("motor: it turned backward, its two pulses are exchanged")
+            self.result.lines.append(f"motor: in the air it turns from a throttle of {throttle:.2f} on")
             return
-    trim_rad = round(sign * pulses.steering_trim_rad + turn_rad, 4)
-    if trim_rad != pulses.steering_trim_rad:
-        result.changes["actuator.steering_trim_rad"] = trim_rad
-    result.lines.append(f"trim: {trim_rad:+.3f} rad")
-
-
-def _try_motor(
-    settings: DriveSettings, pulses: PulseSettings, holder: _Holder, ask: Ask, result: TrialResult
-) -> None:
-    """Open the throttle in small steps until the wheels turn."""
-    throttle = 0.0
-    while throttle < settings.limits.max_throttle - 1e-9:
-        throttle = round(min(throttle + _THROTTLE_STEP, settings.limits.max_throttle), 4)
-        holder.hold(0.0, throttle)
-        answer = ask(f"Throttle {throttle:.2f}: do the wheels turn: not yet, forward, or backward?", "nfb")
-        if answer == "n":
-            continue
-        holder.hold(0.0, 0.0)
-        result.changes["control.speed.throttle_at_rest"] = throttle
-        if answer == "b":
-            result.changes["actuator.throttle_forward_us"] = pulses.throttle_reverse_us
-            result.changes["actuator.throttle_reverse_us"] = pulses.throttle_forward_us
-            result.lines.append("motor: it turned backward, its two pulses are exchanged")
-        result.lines.append(f"motor: it turns from a throttle of {throttle:.2f} on, in the air")
-        return
-    holder.hold(0.0, 0.0)
-    result.lines.append(
-        f"motor: stood up to a throttle of {settings.limits.max_throttle:g} (limits.max_throttle); is the "
-        "speed controller switched on, and does it know this neutral (throttle_stopped_us)?"
-    )
+        self._holder.hold(0.0, 0.0)
+        self.result.lines.append(
+            f"motor: did not turn up to a throttle of {max_throttle:g} (limits.max_throttle); is the speed "
+            "controller switched on, and does it know this neutral (throttle_stopped_us)?"
+        )

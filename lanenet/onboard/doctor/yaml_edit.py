@@ -1,4 +1,8 @@
-"""Changes single values of a YAML file that people wrote; comments and everything else stay."""
+"""Changes single values of a YAML file that people wrote, and no other byte of it.
+
+Written here because ruamel.yaml keeps comments, but rewrites the indentation, and the spacing of lists and
+comments, of files in another style than its own.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +22,10 @@ def set_values(text: str, changes: Mapping[str, float], where: str) -> str:
     Args:
         text: Nested sections in block style, as in the configs that ship.
         changes: Numbers by their dotted key, as ``control.speed.throttle_at_rest``.
-        where: Names the file in the error.
+        where: The file, for the error.
 
     Raises:
-        ConfigError: If the file is written in another style, so that it has to be changed by hand.
+        ConfigError: If the file is not in block style; it has to be changed by hand.
     """
     try:
         expected = copy.deepcopy(yaml.safe_load(text)) or {}
@@ -36,7 +40,7 @@ def set_values(text: str, changes: Mapping[str, float], where: str) -> str:
         done = False
     if not done:
         values = ", ".join(f"{key}={value:g}" for key, value in changes.items())
-        raise ConfigError(f"{where}: cannot be changed line by line; write these values yourself: {values}")
+        raise ConfigError(f"{where}: cannot be changed automatically; change these values yourself: {values}")
     return changed
 
 
@@ -44,7 +48,7 @@ def _set_plain(data: dict[str, Any], path: list[str], value: float) -> None:
     *parents, last = path
     for parent in parents:
         data = data.setdefault(parent, {})
-    # As YAML reads it back.
+    # As YAML will read it.
     data[last] = yaml.safe_load(f"{value:g}")
 
 
@@ -63,7 +67,7 @@ def _set_line(lines: list[str], path: list[str], value: str) -> list[str]:
             changed = f"{' ' * indent}{name}: {value}{tail.group() if tail else ''}"
             return [*lines[:at], changed, *lines[at + 1 :]]
         start, end = at + 1, _end_of_block(lines, at + 1, end, indent)
-        indent = next((_indent(line) for line in lines[start:end] if _says(line)), indent + 2)
+        indent = next((_indent(line) for line in lines[start:end] if _has_content(line)), indent + 2)
     raise AssertionError("a path has at least one part")
 
 
@@ -76,14 +80,14 @@ def _end_of_block(lines: list[str], start: int, end: int, indent: int) -> int:
     """Return the line after the last one that is indented deeper; later comments belong to what follows."""
     last = start
     for i in range(start, end):
-        if _says(lines[i]):
+        if _has_content(lines[i]):
             if _indent(lines[i]) <= indent:
                 break
             last = i + 1
     return last
 
 
-def _says(line: str) -> bool:
+def _has_content(line: str) -> bool:
     return bool(line.strip()) and not line.lstrip().startswith("#")
 
 

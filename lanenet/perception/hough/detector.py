@@ -12,6 +12,7 @@ from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS
 from lanenet.perception.detector_kind import DetectorKind
+from lanenet.perception.edges.canny import check_size
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.hough import lines, steering
 from lanenet.perception.hough.edges import HoughEdgeSettings, find_contours
@@ -21,7 +22,6 @@ from lanenet.perception.hough.steering import HoughSteeringSettings
 from lanenet.perception.image_lane import (
     ImageLane,
     Polyline,
-    check_size,
     rows_on_road,
     sample_segment,
     to_bgr,

@@ -11,36 +11,16 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM, SIDES, lane_width_cm
+from lanenet.geometry.lane import ROWS_CM, lane_width_cm
 from lanenet.geometry.steering import proportional_angle_rad
 from lanenet.perception.detector_kind import DetectorInputs, DetectorKind
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.lane_memory import LaneMemory
-from lanenet.perception.network.model_file import (
-    ANY_CAMERA,
-    INPUT_NAME,
-    OUTPUT_NAMES,
-    WIDTH_NAME,
-    ModelMeta,
-    open_model,
-    read_model_meta,
-)
-
-__all__ = [
-    "ANY_CAMERA",
-    "INPUT_NAME",
-    "OUTPUT_NAMES",
-    "ModelMeta",
-    "NetworkDetector",
-    "open_model",
-    "read_model_meta",
-]
+from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 
 #: A frame with more edges than this share of its road pixels is noise.
 _MAX_EDGE_SHARE = 0.15
-#: With a model that does not tell the presence of lines: marked cells from which on they count as seen.
-_ENOUGH_CELLS = 120
 #: A camera fits a model for any camera if it sees at least this share of the far half of the window.
 _LEAST_SHARE_SEEN = 1.0 / 3.0
 
@@ -116,18 +96,12 @@ class NetworkDetector:
 
     def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
         """Find the lane in a bird's-eye raster of 0 and 255."""
-        n_cells = int(np.count_nonzero(raster))
-        if n_cells == 0:
+        if not np.count_nonzero(raster):
             return LaneEstimate()
         if raster.base is not self._raster and raster is not self._raster:
             self._raster[0, 0] = raster
-        if self.meta.tells_sigma:
-            found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
-            points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
-        else:
-            (points,) = self._session.run(("points_cm",), self._feed)
-            points_cm, sigma_cm = np.asarray(points[0], np.float64), np.array(self.meta.rmse_cm)
-            presence = np.full(len(SIDES), min(1.0, n_cells / _ENOUGH_CELLS))
+        found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
+        points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
         row = 1
         centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))

@@ -1,6 +1,6 @@
-"""Model files: an ONNX file that says what it is, and the check that it is that.
+"""Model files: finding one, its description, and the check that both fit.
 
-Where the model of a checkpoint folder lies: whoever takes a model takes the folder as well.
+Wherever a model is expected, its checkpoint folder will do.
 """
 
 from __future__ import annotations
@@ -21,12 +21,34 @@ from lanenet.perception.edges.road import PerceptionSettings
 if TYPE_CHECKING:
     import onnxruntime
 
-#: The network as the car runs it.
+#: A checkpoint's ONNX file, which the car runs.
 MODEL_NAME = "model.onnx"
-#: Says that a folder is a checkpoint.
+#: Marks a folder as a checkpoint.
 MARKER_NAME = "checkpoint.yaml"
-#: More folders than these are not listed in an error.
+#: Folders listed in an error; chosen: about two lines of a terminal.
 _MOST_NAMED = 8
+
+FORMAT = "lanenet-model/2"
+INPUT_NAME = "raster"
+#: Optional input for the lane's width, [cm]; 0 is unknown.
+WIDTH_NAME = "lane_width_cm"
+#: The dimension of inputs and outputs that counts the rasters.
+BATCH_NAME = "n"
+OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
+#: Stands for the cameras of a model that was trained with many.
+ANY_CAMERA = "any"
+#: Error of a lane width that was measured on the floor; chosen: half a centimetre of a ruler's reading.
+_WIDTH_SLACK_CM = 0.5
+
+_UNITS = {
+    "points_cm": "cm",
+    "sigma_cm": "cm",
+    "presence": "probability",
+    "parabolas": "1/cm, 1, cm",
+    "centre_cm": "cm",
+    "steering_rad": "rad",
+}
+_SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positive left"}
 
 
 def is_model(path: Path) -> bool:
@@ -63,32 +85,6 @@ def _is_checkpoint(path: Path) -> bool:
     return any((path / name).is_file() for name in (MODEL_NAME, MARKER_NAME))
 
 
-FORMAT = "lanenet-model/2"
-#: Of models from before the network told its uncertainty; they are still read.
-FORMAT_WITHOUT_SIGMA = "lanenet-model/1"
-INPUT_NAME = "raster"
-#: Input of a network that can be told the lane's width, [cm]; it may be left out, and 0 is unknown.
-WIDTH_NAME = "lane_width_cm"
-#: The dimension of inputs and outputs that counts the rasters.
-BATCH_NAME = "n"
-OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
-#: Stands for the cameras of a model that was trained with many.
-ANY_CAMERA = "any"
-#: So exactly is a lane's width known that was measured on the floor.
-_WIDTH_SLACK_CM = 0.5
-
-_UNITS = {
-    "points_cm": "cm",
-    "sigma_cm": "cm",
-    "presence": "probability",
-    "parabolas": "1/cm, 1, cm",
-    "centre_cm": "cm",
-    "steering_rad": "rad",
-}
-_SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positive left"}
-_NEW_OUTPUTS = ("sigma_cm", "presence")
-
-
 @dataclass(frozen=True)
 class ModelMeta:
     """What a model file says about itself.
@@ -105,8 +101,7 @@ class ModelMeta:
         perception: How the edge points of its rasters were found.
         lane_width_range_cm: The narrowest and the widest lane of its training data; None if all had the mean
             width.
-        tells_sigma: False for a model of the older format, which has no outputs for spread and presence.
-        takes_width: It can be told the lane's width beside the raster.
+        takes_width: The network has an input for the lane's width beside the raster.
     """
 
     window: BirdseyeWindow
@@ -118,7 +113,6 @@ class ModelMeta:
     reference: str
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
     lane_width_range_cm: tuple[float, float] | None = None
-    tells_sigma: bool = True
     takes_width: bool = False
 
     @property
@@ -153,7 +147,7 @@ class ModelMeta:
         """Warn of lanes that are narrower or wider than those of the training data.
 
         Args:
-            lane_widths_cm: What the model will be told, or will see.
+            lane_widths_cm: Widths that the model will get or see.
             where: Names the model's file in the warning.
 
         Returns:
@@ -164,11 +158,10 @@ class ModelMeta:
         others = sorted({width for width in lane_widths_cm if not least <= width <= most})
         if not others:
             return []
-        told = " and ".join(f"{width:g}" for width in others)
+        found = " and ".join(f"{width:g}" for width in others)
         known = f"{low:.0f} cm" if high - low < 1.0 else f"{low:.0f} to {high:.0f} cm"
         return [
-            f"lane width {told} cm: {where} was trained on lanes of {known}, and how wrong it is on others "
-            "is not known"
+            f"lane width {found} cm: {where} was trained on lanes of {known}; its error on others is unknown"
         ]
 
     def to_properties(self) -> dict[str, str]:
@@ -205,7 +198,7 @@ class ModelMeta:
                 outputs mean something else.
         """
         found = properties.get("format")
-        if found not in (FORMAT, FORMAT_WITHOUT_SIGMA):
+        if found != FORMAT:
             what = f"format {found!r}" if found else "no format"
             raise ModelMismatchError(f"{where}: {what}, expected {FORMAT!r}; export the model again")
 
@@ -220,7 +213,7 @@ class ModelMeta:
         for key, expected in (("rows_cm", list(ROWS_CM)), ("points", list(POINT_NAMES)), ("signs", _SIGNS)):
             if value(key) != expected:
                 raise ModelMismatchError(f"{where}: {key} {value(key)}, expected {expected}")
-        widths = value("lane_width_range_cm") if found == FORMAT else None
+        widths = value("lane_width_range_cm")
         try:
             meta = ModelMeta(
                 window=BirdseyeWindow(**value("window")),
@@ -231,9 +224,8 @@ class ModelMeta:
                 rmse_cm=tuple(math.nan if v is None else float(v) for v in value("rmse_cm")),
                 reference=str(properties.get("reference", "")),
                 perception=check_settings(PerceptionSettings, value("perception"), "perception"),
-                lane_width_range_cm=None if widths is None else (float(widths[0]), float(widths[1])),
-                tells_sigma=found == FORMAT,
-                takes_width="takes_width" in properties and value("takes_width") is True,
+                lane_width_range_cm=(float(widths[0]), float(widths[1])),
+                takes_width=value("takes_width") is True,
             )
         except (TypeError, ValueError, IndexError, ConfigError) as error:
             raise ModelMismatchError(f"{where}: unreadable description ({error})") from None
@@ -276,16 +268,15 @@ def open_model(
     expected = {INPUT_NAME: ("tensor(uint8)", [1, meta.window.rows, meta.window.columns])}
     if inputs != expected:
         raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
-    may_be_told = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
-    if may_be_told != meta.takes_width:
-        has = "has an" if may_be_told else "has no"
+    takes_width = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
+    if takes_width != meta.takes_width:
+        has = "has an" if takes_width else "has no"
         raise ModelMismatchError(
             f"{path}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
         )
     outputs = [o.name for o in session.get_outputs()]
-    wanted = [name for name in OUTPUT_NAMES if meta.tells_sigma or name not in _NEW_OUTPUTS]
-    if not set(wanted) <= set(outputs):
-        raise ModelMismatchError(f"{path}: outputs {outputs}, expected {wanted}")
+    if not set(OUTPUT_NAMES) <= set(outputs):
+        raise ModelMismatchError(f"{path}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
     return session, meta
 
 

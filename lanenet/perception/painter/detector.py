@@ -19,8 +19,9 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, ROWS_CM
 from lanenet.geometry.steering import proportional_angle_rad
 from lanenet.perception.detector_kind import DetectorKind
+from lanenet.perception.edges.canny import check_size
 from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.image_lane import ImageLane, check_size, rows_of_points, to_bgr
+from lanenet.perception.image_lane import ImageLane, rows_of_points, to_bgr
 from lanenet.perception.painter.curves import (
     CurveSettings,
     Plane,

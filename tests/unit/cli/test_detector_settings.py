@@ -17,8 +17,7 @@ from lanenet.data.detections import read_detections
 from lanenet.data.sources import Source, find_mask, read_mask
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.drive import build_drive_detector
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings, build_drive_detector
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.lane_filter.detector import LaneFilter, lane_filter_settings
 from lanenet.perception.network.detector import NetworkDetector
@@ -173,10 +172,10 @@ def test_mask_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="masks the whole image"):
         read_mask(path)
     path.write_bytes(b"no picture")
-    with pytest.raises(ConfigError, match="not a picture"):
+    with pytest.raises(ConfigError, match="not a readable PNG"):
         read_mask(path)
     path.write_bytes(b"")
-    with pytest.raises(ConfigError, match="not a picture"):
+    with pytest.raises(ConfigError, match="not a readable PNG"):
         read_mask(path)
     with pytest.raises(ConfigError, match=r"none\.png: cannot be read"):
         read_mask(tmp_path / "none.png")

@@ -13,8 +13,7 @@ from lanenet.data.drives import open_drive
 from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
-from lanenet.onboard.drive import build_loop
-from lanenet.onboard.drive_settings import load_drive_settings
+from lanenet.onboard.drive import build_loop, load_drive_settings
 from lanenet.onboard.safety import State
 
 

@@ -18,7 +18,7 @@ from lanenet.data.drives.writer import DriveWriter
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import LanenetError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_frames
-from lanenet.perception.network.detector import read_model_meta
+from lanenet.perception.network.model_file import read_model_meta
 
 CHECKPOINT = Path(__file__).resolve().parents[3] / "checkpoints" / "small"
 CAMERA = CHECKPOINT / "camera.yaml"

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
-from lanenet.errors import DriveFormatError, LabelFormatError
 
 SPECS = {
     "frame": ColumnSpec("int", low=0.0, increasing=True),
@@ -35,46 +34,6 @@ def test_columns_are_read_by_name_and_kind(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["left_0_cm"], [np.nan, -2.25])
     assert "angle" not in table
     assert "notes" not in table
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "empty, expected a header"),
-        ("frame,file\n0,a\n", "line 1: column 't_s' is missing"),
-        ("frame,frame,file,t_s\n", "line 1: column 'frame' occurs twice"),
-        ("frame,file,t_s,angel\n", "line 1: unknown column 'angel', did you mean 'angle'"),
-        ("frame,file,t_s\n0,a,0.1\n1,b\n", "line 3: expected 3 fields, found 2"),
-        ("frame,file,t_s\n0,a,0.1\n1,b,0.2,9\n", "line 3: expected 3 fields, found 4"),
-        ("frame,file,t_s\n0,a,0.1\n1,b,nan\n", "line 3, column 't_s': expected a number, found 'nan'"),
-        ("frame,file,t_s\n0,a,inf\n", "line 2, column 't_s': expected a number, found 'inf'"),
-        ("frame,file,t_s\n0,a,\n", "line 2, column 't_s': the cell is empty"),
-        ("frame,file,t_s\n0,,0.1\n", "line 2, column 'file': the cell is empty"),
-        ("frame,file,t_s\n0,a,1_0\n", "line 2, column 't_s': expected a number, found '1_0'"),
-        ("frame,file,t_s\n0.5,a,1\n", "line 2, column 'frame': expected a whole number, found '0.5'"),
-        ("frame,file,t_s\n99999999999999999999,a,1\n", "line 2, column 'frame': expected a whole number"),
-        ("frame,file,t_s\n-1,a,1\n", "line 2, column 'frame': expected 0 to inf, found -1"),
-        ("frame,file,t_s\n1,a,1\n\n1,a,1\n", "line 4, column 'frame': expected more than 1"),
-        ("frame,file,t_s,angle\n0,a,1,-30\n", "line 2, column 'angle': expected -1 to 1, found -30"),
-        ("frame;file;t_s\n0;a;1\n", "line 1: column 'frame' is missing; found frame;file;t_s"),
-    ],
-)
-def test_what_is_wrong_is_named_by_line_and_column(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(DriveFormatError) as caught:
-        read_csv(written(tmp_path, text), SPECS)
-    assert f"frames.csv: {message}" in str(caught.value)
-
-
-def test_bytes_that_are_not_text(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(LabelFormatError, match=r"a\.csv: cannot be read as CSV"):
-        read_csv(path, SPECS, LabelFormatError)
-
-
-def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(DriveFormatError, match=r"a\.csv: no such file"):
-        read_csv(tmp_path / "a.csv", SPECS)
 
 
 @given(

@@ -4,51 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from drives import record, write_tub
 
 from lanenet.data.drives import open_drive
 from lanenet.errors import DriveFormatError
-
-
-def record(k: int, **changes: Any) -> dict[str, Any]:
-    return {
-        "_index": k,
-        "_session_id": "24-01-01_0",
-        "_timestamp_ms": 1700000000000 + 50 * k,
-        "cam/image_array": f"{k}_cam_image_array_.jpg",
-        "user/angle": -0.25,
-        "user/mode": "user",
-        "user/throttle": 0.01 * k,
-        **changes,
-    }
-
-
-def write_tub(
-    path: Path, records: list[dict[str, Any] | str], deleted: list[int] | None = None, per_catalog: int = 1000
-) -> Path:
-    """A tub as Donkeycar 4 writes it; a text in place of a record is written as it is."""
-    (path / "images").mkdir(parents=True)
-    picture = cv2.imencode(".jpg", np.full((12, 16, 3), 90, np.uint8))[1].tobytes()
-    names = []
-    for start in range(0, len(records), per_catalog):
-        names.append(f"catalog_{len(names)}.catalog")
-        lines = [r if isinstance(r, str) else json.dumps(r) for r in records[start : start + per_catalog]]
-        (path / names[-1]).write_text("\n".join(lines) + "\n")
-    for r in records:
-        if isinstance(r, dict) and isinstance(r.get("cam/image_array"), str):
-            (path / "images" / r["cam/image_array"]).write_bytes(picture)
-    inputs = ["cam/image_array", "user/angle", "user/throttle", "user/mode"]
-    catalogs = {
-        "paths": names,
-        "current_index": len(records),
-        "max_len": 1000,
-        "deleted_indexes": deleted or [],
-    }
-    lines = [inputs, ["image_array", "float", "float", "str"], {}, {"created_at": 1.0}, catalogs]
-    (path / "manifest.json").write_text("\n".join(json.dumps(line) for line in lines) + "\n")
-    return path
 
 
 def test_a_clean_tub(tmp_path: Path) -> None:
@@ -186,33 +147,6 @@ def test_a_lost_catalog_is_a_problem_only_if_others_are_there(tmp_path: Path) ->
     (path / "catalog_1.catalog").unlink()
     with pytest.raises(DriveFormatError, match=r"catalog_0\.catalog, catalog_1\.catalog are not there"):
         open_drive(path)
-
-
-def test_an_empty_tub(tmp_path: Path) -> None:
-    with pytest.raises(DriveFormatError, match="the tub is empty: the manifest lists no catalog"):
-        open_drive(write_tub(tmp_path / "a", []))
-    path = write_tub(tmp_path / "b", [record(0)])
-    (path / "catalog_0.catalog").write_text("")
-    with pytest.raises(DriveFormatError, match="no usable frames"):
-        open_drive(path)
-    with pytest.raises(DriveFormatError, match=r"no usable frames .*1 rows are not JSON"):
-        open_drive(write_tub(tmp_path / "c", ["broken"]))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("not json", "not a readable tub manifest"),
-        ("[]\n[]\n{}\n{}\n", "expected five lines of JSON, the last with the catalogs' 'paths', found 4"),
-        ('[]\n[]\n{}\n{}\n{"paths": ["a"], "deleted_indexes": "none"}', "'deleted_indexes'"),
-    ],
-)
-def test_a_broken_manifest_is_named(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "manifest.json").write_text(text)
-    with pytest.raises(DriveFormatError) as caught:
-        open_drive(tmp_path)
-    assert "manifest.json: " in str(caught.value)
-    assert message in str(caught.value)
 
 
 def test_a_drive_yaml_in_the_tub_is_used(tmp_path: Path) -> None:

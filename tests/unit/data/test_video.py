@@ -3,25 +3,14 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from drives import VIDEO_FRAMES as N
+from drives import write_video
 
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.video import VideoImages
 from lanenet.errors import DriveFormatError
-
-N = 40
-
-
-def write_video(path: Path, n: int = N, fps: float = 25.0) -> Path:
-    """Frame k is gray with the level 5 k, so that each image tells its number."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), fps, (64, 48))
-    noise = np.random.default_rng(0).integers(0, 3, (48, 64, 3))
-    for k in range(n):
-        writer.write((5 * k + noise).astype(np.uint8))
-    writer.release()
-    return path
 
 
 def number_of(image: np.ndarray) -> int:
@@ -99,13 +88,6 @@ def test_a_frame_beyond_the_end_is_an_error_and_no_more(tmp_path: Path, beyond: 
     with pytest.raises(DriveFormatError, match=rf"lap\.avi: video frame {beyond} cannot be decoded"):
         images.read(beyond)
     assert number_of(images.read(2)) == 2
-
-
-def test_what_is_not_a_video(tmp_path: Path) -> None:
-    path = tmp_path / "lap.mp4"
-    path.write_bytes(b"not a video at all" * 50)
-    with pytest.raises(DriveFormatError, match=r"lap\.mp4: not a video that OpenCV can open"):
-        open_drive(path)
 
 
 def test_a_real_video(shared_data: Path) -> None:

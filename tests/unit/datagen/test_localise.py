@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from tum import read_tum
 from typer.testing import CliRunner
 
 from datagen.localise.live_filter import Moment, StartSettings, moments_of
@@ -23,9 +24,8 @@ from lanenet.cli.app import app
 from lanenet.cli.research.localise import LiveMoments
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive, read_truth
-from lanenet.data.trajectory import read_tum
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
-from lanenet.onboard.hardware import Frame, SourceEnded
+from lanenet.onboard.cameras.source import Frame, SourceEnded
 
 SETTINGS = MapSettings(filter=FilterSettings(particles=60))
 KNOWN = StartSettings(factor=1.0)

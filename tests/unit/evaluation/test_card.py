@@ -4,7 +4,7 @@ from synthetic_labels import make_label_set
 from lanenet.evaluation.card import model_card
 from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.perception.network.detector import ModelMeta
+from lanenet.perception.network.model_file import ModelMeta
 
 TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (50, 1))
 METRICS = {"parameters": 97310, "epochs": 8, "best_epoch": 7, "val_frames": 12, "val_rmse_cm": 0.5}

@@ -20,7 +20,7 @@ from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
-from lanenet.perception.network.detector import ModelMeta, read_model_meta
+from lanenet.perception.network.model_file import ModelMeta, read_model_meta
 
 torch.set_num_threads(1)
 
@@ -39,7 +39,7 @@ def make_network():
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     folder = tmp_path_factory.mktemp("checkpoint")
-    (folder / "config.yaml").write_text(dump_settings(LearnSettings()))
+    (folder / "config.yaml").write_text(dump_settings(LearnSettings(network=NetworkSettings(bins=0))))
     write_weights(folder / "weights.safetensors", make_network(), META)
     write_rasters(folder / "check_rasters.png", RASTERS)
     export_checkpoint(folder)

@@ -5,8 +5,7 @@ from synthetic_labels import WINDOW, make_label_set
 
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.network import new_network
-from lanenet.learn.predict import answer_rasters, predict
-from lanenet.learn.train import calibrate_presence, calibrate_sigma
+from lanenet.learn.predict import answer_rasters, calibrate_presence, calibrate_sigma, predict
 from lanenet.samples.dataset import LaneSamples
 from lanenet.samples.settings import AugmentSettings
 

@@ -30,10 +30,15 @@ def test_a_single_bin_is_refused():
 
 
 def test_alexnet_has_its_own_size_and_the_others_no_pretrained_weights():
-    with pytest.raises(ConfigError, match="alexnet has a size of its own"):
+    with pytest.raises(ConfigError, match="hidden: alexnet"):
         check_settings(LearnSettings, {"network": {"kind": "alexnet", "hidden": 8}}, "x.yaml")
-    with pytest.raises(ConfigError, match="weights are for alexnet"):
+    with pytest.raises(ConfigError, match="weights: small"):
         check_settings(LearnSettings, {"network": {"weights": "w.pth"}}, "x.yaml")
+
+
+def test_an_unknown_network_is_named_with_those_that_there_are():
+    with pytest.raises(ConfigError, match=r"network\.kind.*'smal'.*nano, small, base, alexnet"):
+        check_settings(LearnSettings, {"network": {"kind": "smal"}}, "x.yaml")
 
 
 def test_misspelt_nested_key_is_named():

@@ -31,10 +31,9 @@ def test_the_family_grows_and_stays_compact():
 
 
 def test_channels_and_hidden_go_before_the_kind():
-    assert NetworkSettings(kind="nano", channels=(4, 8)).size == (
-        (4, 8),
-        NetworkSettings(kind="nano").size[1],
-    )
+    nano = LaneNet(NetworkSettings(kind="nano", channels=(4, 8)), 24, 32)
+    assert nano.trunk.hidden_width == LaneNet(NetworkSettings(kind="nano"), 24, 32).trunk.hidden_width == 32
+    assert nano.trunk.biased_channels == (8,)
     a = LaneNet(NetworkSettings(kind="nano", channels=(4, 8), hidden=16), 24, 32)
     b = LaneNet(NetworkSettings(kind="base", channels=(4, 8), hidden=16), 24, 32)
     assert a.n_parameters == b.n_parameters
@@ -187,7 +186,7 @@ def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
     plain = new_network(NetworkSettings(channels=(4, 8), hidden=8, bins=0), 24, 32, 0).eval()
     with torch.inference_mode():
         assert torch.equal(plain(raster).points_cm, plain(raster, torch.full((3,), 25.0)).points_cm)
-    with pytest.raises(ValueError, match="takes a raster alone"):
+    with pytest.raises(ValueError, match="takes_width: alexnet"):
         NetworkSettings(kind="alexnet", takes_width=True)
-    with pytest.raises(ValueError, match="bins: 0"):
+    with pytest.raises(ValueError, match="bins: alexnet"):
         NetworkSettings(kind="alexnet", bins=32)

@@ -11,6 +11,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import sweep as sweep_module
 from lanenet.learn.config import LearnSettings, LossSettings, NetworkSettings
 from lanenet.learn.sweep import sweep, trials_csv, trials_table
+from lanenet.learn.trunks.compact import SmallTrunk
 
 torch.set_num_threads(1)
 
@@ -48,7 +49,7 @@ def quick(monkeypatch):
 
 def test_what_is_tried_first_is_the_small_network_as_it_is():
     first = {name: values[0] for name, values in sweep_module.CHOICES.items()}
-    channels, hidden = NetworkSettings(kind="small").size
+    channels, hidden = SmallTrunk.default_channels, SmallTrunk.default_hidden
     assert [first["first_channels"] * k for k in range(1, first["layers"] + 1)] == list(channels)
     assert first["hidden"] == hidden
     assert (first["loss"], first["evenness"]) == ("bins", LossSettings().evenness)
@@ -100,7 +101,8 @@ def test_a_network_that_is_told_the_width_is_told_it_in_every_trial():
         _, chosen = sweep_module._draw(trial, settings)
         assert chosen.network.takes_width == takes_width
         # What is tried is all that is changed.
-        assert chosen.network.size == settings.network.size
+        assert chosen.network.channels == SmallTrunk.default_channels
+        assert chosen.network.hidden == SmallTrunk.default_hidden
         assert chosen.model_copy(update={"network": settings.network}) == settings
 
 
@@ -135,7 +137,7 @@ def test_a_diverging_trial_is_given_up(quick, paths, tmp_path, monkeypatch):
         raise LanenetError("training diverged")
 
     monkeypatch.setattr(sweep_module.TrainingRun, "run_epoch", diverge)
-    assert "1 given up early" in sweep(SETTINGS, *paths, tmp_path, 600.0, 1)
+    assert "1 stopped early" in sweep(SETTINGS, *paths, tmp_path, 600.0, 1)
 
 
 def test_tables():
@@ -146,7 +148,7 @@ def test_tables():
         {"trial": 3, "state": "pruned", "val_rmse_cm": None, **ROW, "epochs": 3},
     ]
     lines = trials_table(rows, ("loss", "cell_cm")).splitlines()
-    assert lines[0].startswith("3 trials to the end, 1 given up early")
+    assert lines[0].startswith("3 complete trials, 1 stopped early")
     assert lines[4].startswith("| 0.8 | 0.75 | 72 | 48 | 16 | 4 | 64 | laplace | 1 | 0.003 | 97310 | 8 |")
     assert (
         "| loss | student | 2 | 0.931 | 1.016 |" in lines
@@ -158,7 +160,7 @@ def test_tables():
 
 
 def test_without_trials_there_is_a_table_without_rows():
-    assert trials_table([], ("loss",)).startswith("0 trials to the end, 0 given up early")
+    assert trials_table([], ("loss",)).startswith("0 complete trials, 0 stopped early")
 
 
 def test_alexnet_is_refused_before_anything_is_read(tmp_path):

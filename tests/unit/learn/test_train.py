@@ -19,11 +19,10 @@ from lanenet.evaluation.errors import RasterModel, point_errors
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.network import new_network
-from lanenet.learn.optimiser import learning_rate_at, new_optimizer, set_learning_rate
 from lanenet.learn.quantise import Int8Report, export_int8
 from lanenet.learn.run_state import EpochRecord, read_state, write_state
-from lanenet.learn.train import TrainingRun, train
-from lanenet.perception.network.detector import open_model, read_model_meta
+from lanenet.learn.train import TrainingRun, learning_rate_at, new_optimizer, set_learning_rate, train
+from lanenet.perception.network.model_file import open_model, read_model_meta
 from lanenet.samples.dataset import LaneSamples
 from lanenet.samples.settings import AugmentSettings
 

@@ -14,11 +14,11 @@ from lanenet.config import check_settings
 from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import HardwareError
 from lanenet.onboard.bench import example_camera
+from lanenet.onboard.cameras.source import Frame
 from lanenet.onboard.doctor import car as doctor_car
 from lanenet.onboard.doctor import installation as doctor
 from lanenet.onboard.doctor.car import check_car, check_source, check_temperature, check_throttling
-from lanenet.onboard.drive_settings import DriveSettings
-from lanenet.onboard.hardware import Frame
+from lanenet.onboard.drive import DriveSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 CHECKPOINT = ROOT / "checkpoints" / "small"
@@ -69,7 +69,7 @@ def test_good_camera():
     ("source", "name", "state", "text"),
     [
         (Camera(missing=True), "camera", "problem", "cannot be started"),
-        (Camera(rate_hz=10.0), "camera", "problem", "40 were asked for"),
+        (Camera(rate_hz=10.0), "camera", "problem", "40 were requested"),
         (Camera(size=(120, 160)), "image size", "problem", "160x120 px, but the camera file is for 320x240"),
         (Camera(late_s=0.2), "delay", "note", "200 ms"),
         (Camera(value=3), "image", "note", "is the lens covered"),
@@ -95,10 +95,10 @@ def test_temperature(tmp_path, milli, state):
 @pytest.mark.parametrize(
     ("said", "state", "text"),
     [
-        ("throttled=0x0", "ok", "held"),
+        ("throttled=0x0", "ok", "no throttling"),
         ("throttled=0x50005", "problem", "voltage is too low and the processor is throttled; use a supply"),
         ("throttled=0x80008", "problem", "limit of temperature"),
-        ("throttled=0x20000", "note", "since the start it happened that the processor's clock is capped"),
+        ("throttled=0x20000", "note", "since boot it happened that the processor's clock is capped"),
         ("VCHI initialization failed", "note", "VCHI"),
     ],
 )

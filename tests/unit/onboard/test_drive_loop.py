@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,10 @@ import pytest
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
+from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
 from lanenet.onboard.drive_report import LatencyHistogram, Step
-from lanenet.onboard.hardware import Frame, FrameSource, SourceEnded
-from lanenet.onboard.loop import DriveLoop
-from lanenet.onboard.safety import CommandLimiter, LimitSettings, SafetySettings, State
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.safety import LimitSettings, SafetySettings, State
 from lanenet.perception.estimate import LaneEstimate
 
 RATE_HZ = 30.0
@@ -108,16 +109,13 @@ class Car:
         self.steps: list[Step] = []
         control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
-            self.camera,
-            Eye(answer),
-            LaneController(control),
-            self.wire,
+            CarParts(self.camera, Eye(answer), LaneController(control), self.wire),
             SafetySettings(countdown_s=0.0),
-            CommandLimiter(LimitSettings()),
+            LimitSettings(),
             control.speed,
-            watch=self.steps.append,
-            clock=self.clock,
-            **options,
+            DriveMode(**options),
+            self.steps.append,
+            self.clock,
         )
 
 
@@ -167,7 +165,7 @@ FAULTS: dict[str, tuple[str, Callable[[int], LaneEstimate] | None, str]] = {
         "confidence 0.10",
     ),
     "no frame": ("camera", None, "no frame from the camera"),
-    "frozen": ("camera", None, "the one before once more"),
+    "frozen": ("camera", None, "repeats the one before"),
     "late": ("camera", None, "300 ms old"),
     "ahead": ("camera", None, "ahead of the clock"),
 }
@@ -229,11 +227,12 @@ def test_an_exception_is_neutral_first_and_goes_on_up(where: str, caplog: pytest
     if where == "camera":
         car.camera._faults = {30: fail}  # type: ignore[dict-item]
     elif where == "detector":
-        car.loop._detector = Eye(lambda k: LANE if k < 30 else fail())
+        failing = Eye(lambda k: LANE if k < 30 else fail())
+        car.loop._parts = replace(car.loop._parts, detector=failing)
     elif where == "controller":
         calls = iter(range(31))
-        whole = car.loop._controller.wish
-        car.loop._controller.wish = lambda *words: (  # type: ignore[method-assign]
+        whole = car.loop._parts.controller.wish
+        car.loop._parts.controller.wish = lambda *words: (  # type: ignore[method-assign]
             whole(*words) if next(calls) < 30 else fail()
         )
     elif where == "actuator":

@@ -105,7 +105,7 @@ def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
         ('PWM_STEERING_THROTTLE = "x"', "expected a dictionary"),
         (
             'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "RPI_GPIO.BOARD.33"}',
-            "expected one as 'PCA9685.1:40",
+            "expected for example 'PCA9685.1:40",
         ),
         ('PWM_STEERING_THROTTLE = {"PWM_THROTTLE_INVERTED": True}', "PWM_THROTTLE_INVERTED: found True"),
         ('STEERING_LEFT_PWM = "460"', "STEERING_LEFT_PWM: expected a number, found '460'"),

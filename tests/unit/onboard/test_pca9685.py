@@ -9,8 +9,8 @@ import pytest
 
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
-from lanenet.onboard.hardware import Actuator
 
 SETTINGS = PCA9685Settings(max_steering_rad=0.4)
 
@@ -114,7 +114,7 @@ def test_glitch_is_tried_again(bus, actuator):
 def test_chip_that_lost_its_supply_is_noticed(bus, actuator):
     actuator.send(0.0, 0.1)
     bus.chip.power_on()
-    with pytest.raises(HardwareError, match="started again by itself, and gives no pulses"):
+    with pytest.raises(HardwareError, match="restarted and sends no pulses"):
         actuator.send(0.0, 0.1)
     assert bus.chip.asleep and bus.chip.pulse_us(0) == 0.0
 

@@ -9,7 +9,7 @@ from lanenet.config import check_settings
 from lanenet.errors import ConfigError, HardwareError
 from lanenet.onboard.actuators.pulses import PulseSettings, command_pulses
 from lanenet.onboard.doctor.wheel_trial import try_wheels
-from lanenet.onboard.drive_settings import DriveSettings
+from lanenet.onboard.drive import DriveSettings
 
 PULSES = {
     "max_steering_rad": 0.4,
@@ -121,7 +121,7 @@ def test_motor_that_never_turns_ends_at_the_limit():
     car = Car(settings, rolls_at_us=400.0)
     result = try_wheels(settings, car, car.ask)
     assert max(throttle for _, _, throttle in car.sent) == pytest.approx(0.3)
-    assert result.changes == {} and "stood up to a throttle of 0.3" in result.lines[-1]
+    assert result.changes == {} and "did not turn up to a throttle of 0.3" in result.lines[-1]
     assert car.sent[-1][1:] == (0.0, 0.0)
 
 
@@ -129,7 +129,7 @@ def test_crooked_servo_horn_is_named():
     settings = settings_of()
     car = Car(settings, straight_us=400.0)
     result = try_wheels(settings, car, car.ask)
-    assert any("set the servo's horn anew" in line for line in result.lines)
+    assert any("refit the servo's horn" in line for line in result.lines)
     assert "actuator.steering_trim_rad" not in result.changes
 
 
@@ -151,7 +151,7 @@ def test_commands_are_repeated_while_a_person_thinks():
 def test_nothing_moves_without_yes():
     car = Car(settings_of())
     result = try_wheels(settings_of(), car, lambda question, letters: "n")
-    assert not car.opened and result.changes == {} and "put the car on a box" in result.lines[0]
+    assert not car.opened and result.changes == {} and "put the car on a stand" in result.lines[0]
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])

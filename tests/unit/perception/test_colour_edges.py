@@ -10,7 +10,13 @@ from hypothesis.extra.numpy import arrays
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
-from lanenet.perception.edges.markings_only import ColourSettings, measure_components
+from lanenet.perception.edges.markings_only import (
+    COLOURS,
+    ColourSettings,
+    MarkingColour,
+    colour_edges,
+    measure_components,
+)
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadEdgeExtractor
 
@@ -166,3 +172,15 @@ def test_components_tell_a_strip_from_a_disk() -> None:
     chosen[bar] = True
     assert np.count_nonzero(found.paint(chosen)) == 160
     np.testing.assert_allclose(found.mean(mask)[1:], 255.0)
+
+
+def test_another_colour_is_an_entry(monkeypatch):
+    # Blue tape on a floor of the same lightness: b falls towards blue.
+    frame = np.full((60, 80, 3), (110, 128, 128), np.uint8)
+    frame[10:50, 38:43] = (250, 110, 90)
+    settings = ColourSettings(white_floor=255)
+    assert len(colour_edges(frame, settings, 3).uv_px) == 0
+    blue = MarkingColour(2, lambda settings: settings.yellow_floor, falls=True)
+    monkeypatch.setitem(COLOURS, "blue", blue)
+    u = colour_edges(frame, settings, 3).uv_px[:, 0]
+    assert len(u) > 60 and np.median(np.abs(np.abs(u - 40.0) - 2.5)) < 0.5

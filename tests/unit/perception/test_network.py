@@ -15,7 +15,8 @@ from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.lane_memory import LaneMemory
-from lanenet.perception.network.detector import ModelMeta, NetworkDetector, read_model_meta
+from lanenet.perception.network.detector import NetworkDetector
+from lanenet.perception.network.model_file import ModelMeta, read_model_meta
 
 torch.set_num_threads(1)
 
@@ -217,25 +218,13 @@ def test_a_model_for_any_camera_takes_those_that_see_its_window(model_path, tmp_
     assert NetworkDetector(path, CAMERA.with_mounting(yaw_rad=3.0), any_camera=True).meta.any_camera
 
 
-def test_a_model_without_outputs_for_its_doubt_is_still_read(model_path, tmp_path):
+def test_a_model_without_an_output_is_refused(model_path, tmp_path):
     model = onnx.load(model_path)
     for output in [o for o in model.graph.output if o.name in ("sigma_cm", "presence")]:
         model.graph.output.remove(output)
     onnx.save(model, tmp_path / "bare.onnx")
     with pytest.raises(ModelMismatchError, match="outputs"):
         read_model_meta(tmp_path / "bare.onnx")
-    old = {"format": "lanenet-model/1", "lane_width_range_cm": None}
-    path = change_properties(tmp_path / "bare.onnx", tmp_path / "old.onnx", **old)
-    detector = NetworkDetector(path, CAMERA)
-    assert not detector.meta.tells_sigma and detector.meta.widths_cm == (40.0, 40.0)
-    frame = striped_frame()
-    estimate = detector.detect(frame)
-    np.testing.assert_array_equal(estimate.sigma_cm, META.rmse_cm)
-    new = NetworkDetector(model_path, CAMERA).detect(frame)
-    np.testing.assert_array_equal(estimate.points_cm, new.points_cm)
-    one_cell = np.zeros((24, 32), np.uint8)
-    one_cell[10, 10] = 255
-    assert detector.detect_raster(one_cell).confidence < 0.02 < 0.3 < estimate.confidence
 
 
 class _Session:

@@ -47,7 +47,7 @@ from lanenet.cli.app import app
 from lanenet.config import check_settings
 from lanenet.evaluation.answers import build_compared, choose_names
 from lanenet.onboard.bench import example_camera, time_paths
-from lanenet.onboard.drive_settings import DriveDetectorSettings
+from lanenet.onboard.drive import DriveDetectorSettings
 
 def run(*words):
     result = CliRunner().invoke(app, list(words), env={"COLUMNS": "1000", "TERM": "dumb"})

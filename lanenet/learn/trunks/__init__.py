@@ -1,0 +1,13 @@
+"""The networks that a config can name: a new one is a module in this folder and a line in ``TRUNKS``."""
+
+from lanenet.learn.trunks.alexnet import AlexNetTrunk
+from lanenet.learn.trunks.compact import BaseTrunk, NanoTrunk, SmallTrunk
+from lanenet.learn.trunks.trunk import Trunk
+
+#: By the name in ``learn.network.kind``.
+TRUNKS: dict[str, type[Trunk]] = {
+    "nano": NanoTrunk,
+    "small": SmallTrunk,
+    "base": BaseTrunk,
+    "alexnet": AlexNetTrunk,
+}

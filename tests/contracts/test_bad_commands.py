@@ -1,0 +1,171 @@
+"""Bad command lines: one line that names option and file, an exit code, and nothing half-written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from commands import refused
+from drives import edit, write_tub
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
+from lanenet.data.camera_file import write_camera
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.geometry.camera import Camera, Mounting
+
+
+def camera(width: int = 64, height: int = 48) -> Camera:
+    K = np.array([[30.0, 0.0, (width - 1) / 2], [0.0, 30.0, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return Camera("fisheye", width, height, K, np.zeros(4), Mounting(15.0, 0.4), 20.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a drive of 70 frames."""
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive", camera=camera(), lane_width_cm=40.0) as writer:
+        for k in range(70):
+            frame = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+            writer.add(frame, k * 0.05, speed_cm_s=50.0, steering_rad=0.0)
+    return tmp_path
+
+
+def cut_image(folder: Path) -> None:
+    image = folder / "drive" / "images" / "000035.jpg"
+    image.write_bytes(image.read_bytes()[:200])
+
+
+def nan_in_the_table(folder: Path) -> None:
+    edit(folder / "drive" / "frames.csv", "000012.jpg,0.6,", "000012.jpg,nan,")
+
+
+def nan_in_the_camera(folder: Path) -> None:
+    path = folder / "drive" / "camera.yaml"
+    data = yaml.safe_load(path.read_text())
+    data["mounting"]["height_cm"] = float("nan")
+    path.write_text(yaml.safe_dump(data))
+
+
+def still_images(folder: Path) -> None:
+    images = folder / "drive" / "images"
+    shutil.rmtree(images)
+    images.mkdir()
+    for k in range(70):
+        cv2.imwrite(str(images / f"{k:06d}.jpg"), np.full((48, 64, 3), 90, np.uint8))
+
+
+def other_camera(folder: Path) -> None:
+    write_camera(folder / "other.yaml", camera(80, 60), "made up")
+
+
+def empty_tub(folder: Path) -> None:
+    (write_tub(folder / "tub", [{}]) / "catalog_0.catalog").write_text("")
+
+
+def folders(*names: str) -> Callable[[Path], None]:
+    return lambda folder: [(folder / name).mkdir() for name in names] and None
+
+
+MAP = ("--lane-width", "40", "--out", "@m")
+FILTER = ("--detector", "lane-filter", "--out", "@o.csv")
+HOUGH = ("--detector", "hough", "--out", "@o.csv")
+#: What is done to the folder, the command (``@`` stands for the folder), and what its line has to name.
+BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, ...]]] = {
+    "map: no drive": (None, ("map", "@nowhere", *MAP), ("nowhere",)),
+    "detect: no drive": (None, ("detect", "@nowhere", *FILTER), ("nowhere",)),
+    "map: an empty tub": (empty_tub, ("map", "@tub", *MAP), ("tub", "no ")),
+    "map: a corrupt image": (cut_image, ("map", "@drive", *MAP), ("000035.jpg",)),
+    "detect: a corrupt image": (
+        cut_image,
+        ("detect", "@drive", *FILTER, "--video", "@o.mp4"),
+        ("000035.jpg",),
+    ),
+    "map: another camera": (
+        other_camera,
+        ("map", "@drive", "--camera", "@other.yaml", *MAP),
+        ("80x60", "64x48"),
+    ),
+    "detect: another camera": (
+        other_camera,
+        ("detect", "@drive", "--camera", "@other.yaml", *FILTER),
+        ("80x60", "64x48"),
+    ),
+    "map: a nan in the table": (
+        nan_in_the_table,
+        ("map", "@drive", *MAP),
+        ("frames.csv", "line 14", "'t_s'"),
+    ),
+    "map: a nan in the camera": (
+        nan_in_the_camera,
+        ("map", "@drive", *MAP),
+        ("camera.yaml", "height_cm", "NaN"),
+    ),
+    **{
+        f"detect: frames {text}": (
+            None,
+            ("detect", "@drive", *HOUGH, "--frames", text),
+            ("FIRST:LAST", text),
+        )
+        for text in ("5:2", "5", ":", "5:", "-3:7", "1.5:7", "\u00b2:\u00b2", "a:b")
+    },
+    "detect: frames beyond the end": (
+        None,
+        ("detect", "@drive", *HOUGH, "--frames", "500:600"),
+        ("500", "0 to 69"),
+    ),
+    # Found before the drive is, which is not there.
+    "detect: the output is a folder": (
+        folders("folder.csv"),
+        ("detect", "@nowhere", "--detector", "hough", "--out", "@folder.csv"),
+        ("folder.csv", "is a folder"),
+    ),
+    "detect: the output lies below a file": (
+        None,
+        ("detect", "@nowhere", "--detector", "hough", "--out", "@drive/frames.csv/o.csv"),
+        ("frames.csv is a file",),
+    ),
+    "detect: the video is a folder": (
+        folders("v.mp4"),
+        ("detect", "@drive", *HOUGH, "--video", "@v.mp4"),
+        ("v.mp4", "is a folder"),
+    ),
+    "label: no map": (folders("m"), ("label", "@m", "--out", "@l.parquet"), ("map.yaml",)),
+    "map: a drive that shows nothing": (
+        still_images,
+        ("map", "@drive", *MAP),
+        ("the car stands still", "mapping needs a moving car"),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_command_is_refused(folder: Path, what: str) -> None:
+    prepare, words, named = BAD[what]
+    if prepare is not None:
+        prepare(folder)
+    line = refused(folder, *(word.replace("@", f"{folder}/") for word in words))
+    for text in named:
+        assert text in line, line
+
+
+def test_detect_can_go_on_past_a_corrupt_image(folder: Path) -> None:
+    cut_image(folder)
+    out = folder / "o.csv"
+    words = ["detect", folder / "drive", "--detector", "lane-filter", "--out", out, "--skip-unreadable"]
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0 and "000035.jpg" in result.stderr
+    assert len(out.read_text().splitlines()) == 71
+
+
+def test_outputs_of_others_are_kept(folder: Path) -> None:
+    keep = folder / "keep"
+    keep.mkdir()
+    (keep / "thesis.txt").write_text("years of work")
+    refused(folder, "map", folder / "drive", "--lane-width", "40", "--out", keep)
+    assert (keep / "thesis.txt").read_text() == "years of work"

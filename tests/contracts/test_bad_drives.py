@@ -1,0 +1,171 @@
+"""Bad drives: folders, tubs, videos and photos. Each row names what the error has to name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bad_input import Bad, each
+from drives import edit, frame_image, record, write_drive, write_tub, write_video
+
+from lanenet.data.drives import open_drive, read_truth
+from lanenet.data.drives.folder import TRUTH_NAMES
+from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.sources import open_source
+from lanenet.errors import CalibrationError, DriveFormatError
+
+Open = Callable[[Path], Any]
+
+
+def folder(*edits: tuple[str, str, str], size: int = 5, then: Open = open_drive) -> Open:
+    """A drive folder with some texts replaced in its files, opened."""
+
+    def act(tmp_path: Path) -> Any:
+        path = write_drive(tmp_path / "lap", size)
+        for name, old, new in edits:
+            edit(path / name, old, new)
+        return then(path)
+
+    return act
+
+
+def frames(old: str, new: str) -> Open:
+    return folder(("frames.csv", old, new))
+
+
+def without(*names: str, size: int = 2) -> Open:
+    """A drive folder without some of its files, opened."""
+
+    def act(tmp_path: Path) -> Any:
+        path = write_drive(tmp_path / "lap", size)
+        for name in names:
+            for file in path.glob(name):
+                file.unlink()
+        return open_drive(path)
+
+    return act
+
+
+def holding(name: str, content: str | bytes, opened: str = ".", then: Open = open_drive) -> Open:
+    """A folder that holds one file, opened as a whole or by the name of the file."""
+
+    def act(tmp_path: Path) -> Any:
+        data = content.encode() if isinstance(content, str) else content
+        (tmp_path / name).write_bytes(data)
+        return then(tmp_path / opened)
+
+    return act
+
+
+def tub(rows: list[Any], empty: bool = False) -> Open:
+    def act(tmp_path: Path) -> Any:
+        path = write_tub(tmp_path / "tub", rows)
+        if empty:
+            (path / "catalog_0.catalog").write_text("")
+        return open_drive(path)
+
+    return act
+
+
+def missing(then: Open) -> Open:
+    return lambda tmp_path: then(tmp_path / "nowhere")
+
+
+def pose_unknown(tmp_path: Path) -> Any:
+    row = {name: float(j) for j, name in enumerate(TRUTH_NAMES)}
+    with DriveWriter(tmp_path / "sim") as writer:
+        writer.add(frame_image(0), 0.0, truth=row)
+    edit(tmp_path / "sim" / "truth.csv", "0,0,1,2,", "0,,1,2,")
+    return read_truth(tmp_path / "sim")
+
+
+def rows_beyond_the_video(tmp_path: Path) -> Any:
+    write_video(tmp_path / "lap.avi")
+    (tmp_path / "lap.csv").write_text("frame,t_s\n500,0.1\n")
+    return open_drive(tmp_path / "lap.avi")
+
+
+def first_image(path: Path) -> Any:
+    return open_source(path).image(0)
+
+
+ROW = "1,images/000001.jpg,0.05,60,0.01"
+LOST = ("no usable frames",)
+D, C = DriveFormatError, CalibrationError
+
+BAD = [
+    Bad("no drive", holding("notes", "x"), D, ("frames.csv", "manifest.json", ".mp4")),
+    Bad("no such drive", missing(open_drive), D, ("nowhere", "no such")),
+    Bad("another ending", holding("a.txt", "x", "a.txt"), D, ("a.txt", ".mp4")),
+    Bad("a tub of version 1", holding("record_0.json", "{}"), D, ("version 1 tub",)),
+    # frames.csv
+    Bad("a command is nan", frames(ROW, ROW[:-4] + "nan"), D, ("frames.csv", "line 3", "'steering_rad'")),
+    Bad("a command is empty", frames(ROW, ROW.replace("60", "")), D, ("line 3", "'speed_cm_s'")),
+    Bad("steering in degrees", frames(ROW, ROW[:-4] + "17"), D, ("line 3", "'steering_rad'", "17")),
+    Bad("time stands", frames("4,images/000004.jpg,0.2", "4,images/000004.jpg,0.15"), D, ("line 6", "'t_s'")),
+    Bad("a frame twice", frames("4,images/000004.jpg", "3,images/000004.jpg"), D, ("line 6", "'frame'")),
+    Bad("a misspelt column", frames("steering_rad", "steering_deg"), D, ("'steering_deg'", "'steering_rad'")),
+    Bad("no column of times", frames("t_s", "time"), D, ("frames.csv", "'t_s'", "missing")),
+    Bad("no rows", holding("frames.csv", "frame,file,t_s\n"), D, ("frames.csv", "no frames")),
+    Bad("no image", without("images/*"), D, ("lap", "2 frames", "000000.jpg")),
+    # drive.yaml and its camera
+    Bad(
+        "another version",
+        folder(("drive.yaml", "lanenet-drive/1", "lanenet-drive/9")),
+        D,
+        ("drive.yaml", "'format'", "'lanenet-drive/9'"),
+    ),
+    Bad(
+        "a misspelt key",
+        folder(("drive.yaml", "lane_width_cm", "lane_with_cm")),
+        D,
+        ("drive.yaml", "'lane_with_cm'", "'lane_width_cm'"),
+    ),
+    Bad(
+        "a negative lane width",
+        folder(("drive.yaml", "lane_width_cm: 40.0", "lane_width_cm: -40.0")),
+        D,
+        ("drive.yaml", "'lane_width_cm'", "-40"),
+    ),
+    Bad("another size", folder(("camera.yaml", "width: 64", "width: 640")), D, ("64x48", "640x48")),
+    Bad("no camera file", without("camera.yaml"), C, ("camera.yaml", "no such file")),
+    # truth.csv
+    Bad("an unknown pose", pose_unknown, D, ("truth.csv", "line 2", "'x_cm'")),
+    # tubs
+    Bad("no catalog", tub([]), D, ("manifest.json", "no catalog")),
+    Bad("an empty catalog", tub([record(0)], empty=True), D, LOST),
+    Bad("only broken rows", tub(["broken"]), D, (*LOST, "catalog_0.catalog", "1 rows")),
+    Bad("a manifest that is not json", holding("manifest.json", "not json"), D, ("manifest.json",)),
+    Bad(
+        "a manifest without paths",
+        holding("manifest.json", "[]\n[]\n{}\n{}\n"),
+        D,
+        ("manifest.json", "'paths'", "found 4"),
+    ),
+    Bad(
+        "deleted rows as a text",
+        holding("manifest.json", '[]\n[]\n{}\n{}\n{"paths": ["a"], "deleted_indexes": "none"}'),
+        D,
+        ("manifest.json", "'deleted_indexes'"),
+    ),
+    # videos
+    Bad("no video", holding("lap.mp4", b"not a video at all" * 50, "lap.mp4"), D, ("lap.mp4", "OpenCV")),
+    Bad("rows beyond the video", rows_beyond_the_video, D, ("lap.csv", "40 frames")),
+    # photos
+    Bad("no source", missing(open_source), D, ("nowhere", "no such")),
+    Bad("a folder without photos", holding("notes", "x", then=open_source), D, ("frames.csv", ".jpg")),
+    Bad("a table as a source", holding("t.xyz", "1", "t.xyz", open_source), D, ("t.xyz", ".mp4", ".jpg")),
+    Bad("a broken photo", holding("b.jpg", b"no jpeg", then=first_image), D, ("b.jpg",)),
+]
+
+
+@each(BAD)
+def test_a_bad_drive_is_refused(tmp_path: Path, bad: Bad) -> None:
+    bad.check(tmp_path)
+
+
+def test_a_table_needs_distinct_rows() -> None:
+    with pytest.raises(AssertionError, match="one name"):
+        each([BAD[0], BAD[0]])

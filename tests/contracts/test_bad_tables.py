@@ -1,0 +1,141 @@
+"""Bad tables: CSV as such, and tables of detections as CSV and Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from bad_input import Bad, each
+
+from lanenet.data.detections import DetectionTable, read_detections
+from lanenet.data.tables import ColumnSpec, read_csv
+from lanenet.errors import DriveFormatError, LabelFormatError
+from lanenet.perception.estimate import LaneEstimate
+
+Act = Callable[[Path], Any]
+
+SPECS = {
+    "frame": ColumnSpec("int", low=0.0, increasing=True),
+    "file": ColumnSpec("text"),
+    "t_s": ColumnSpec(),
+    "angle": ColumnSpec(required=False, low=-1.0, high=1.0),
+}
+
+
+def csv(what: str, text: str, *named: str) -> Bad:
+    def act(folder: Path) -> Any:
+        (folder / "frames.csv").write_text(text, encoding="utf-8")
+        return read_csv(folder / "frames.csv", SPECS)
+
+    return Bad(what, act, DriveFormatError, ("frames.csv", *named))
+
+
+def no_text(folder: Path) -> Any:
+    (folder / "a.csv").write_bytes(b"\xff\xfe\x00\x81")
+    return read_csv(folder / "a.csv", SPECS, LabelFormatError)
+
+
+def detections() -> DetectionTable:
+    table = DetectionTable()
+    table.add(3, 0.15, LaneEstimate(confidence=0.875))
+    table.add(8, 0.4, LaneEstimate(confidence=0.5, radius_cm=145.5, offset_cm=-3.25))
+    return table
+
+
+def edited(old: str, new: str) -> Act:
+    """A table of detections as CSV with a text replaced, read."""
+
+    def act(folder: Path) -> Any:
+        path = folder / "seen.csv"
+        detections().write(path)
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        return read_detections(path)
+
+    return act
+
+
+def version_of_csv(folder: Path) -> Any:
+    path = folder / "seen.csv"
+    detections().write(path)
+    header, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([header, *(f"{line.rpartition(',')[0]},2" for line in lines)]) + "\n")
+    return read_detections(path)
+
+
+def version_of_parquet(folder: Path) -> Any:
+    path = folder / "seen.parquet"
+    detections().write(path)
+    meta = {b"lanenet": b'{"format": "lanenet-detections/2"}'}
+    pq.write_table(pq.read_table(path).replace_schema_metadata(meta), path)
+    return read_detections(path)
+
+
+def refused_to_write(name: str, **values: float) -> Act:
+    def act(folder: Path) -> None:
+        table = detections()
+        if values:
+            table.add(9, 0.5, LaneEstimate(**{"confidence": 0.5, **values}))  # type: ignore[arg-type]
+        try:
+            table.write(folder / name)
+        finally:
+            assert list(folder.iterdir()) == []
+
+    return act
+
+
+def labels(what: str, act: Act, *named: str) -> Bad:
+    return Bad(what, act, LabelFormatError, named)
+
+
+INF, NAN = float("inf"), float("nan")
+
+BAD = [
+    csv("an empty file", "", "empty"),
+    csv("a missing column", "frame,file\n0,a\n", "line 1", "'t_s'", "missing"),
+    csv("a column twice", "frame,frame,file,t_s\n", "line 1", "'frame'", "twice"),
+    csv("a misspelt column", "frame,file,t_s,angel\n", "line 1", "'angel'", "'angle'"),
+    csv("too few fields", "frame,file,t_s\n0,a,0.1\n1,b\n", "line 3", "expected 3", "found 2"),
+    csv("too many fields", "frame,file,t_s\n0,a,0.1\n1,b,0.2,9\n", "line 3", "expected 3", "found 4"),
+    csv("nan", "frame,file,t_s\n0,a,0.1\n1,b,nan\n", "line 3", "'t_s'", "a number", "'nan'"),
+    csv("infinity", "frame,file,t_s\n0,a,inf\n", "line 2", "'t_s'", "a number", "'inf'"),
+    csv("an empty number", "frame,file,t_s\n0,a,\n", "line 2", "'t_s'", "empty"),
+    csv("an empty text", "frame,file,t_s\n0,,0.1\n", "line 2", "'file'", "empty"),
+    csv("an underscore", "frame,file,t_s\n0,a,1_0\n", "line 2", "'t_s'", "a number", "'1_0'"),
+    csv("a fraction", "frame,file,t_s\n0.5,a,1\n", "line 2", "'frame'", "a whole number", "'0.5'"),
+    csv("too large", "frame,file,t_s\n99999999999999999999,a,1\n", "line 2", "'frame'", "a whole number"),
+    csv("too small", "frame,file,t_s\n-1,a,1\n", "line 2", "'frame'", "0 to inf", "-1"),
+    csv("no increase", "frame,file,t_s\n1,a,1\n\n1,a,1\n", "line 4", "'frame'", "more than 1"),
+    csv("out of range", "frame,file,t_s,angle\n0,a,1,-30\n", "line 2", "'angle'", "-1 to 1", "-30"),
+    csv("semicolons", "frame;file;t_s\n0;a;1\n", "line 1", "'frame'", "frame;file;t_s"),
+    labels("no text", no_text, "a.csv"),
+    Bad("no file", lambda f: read_csv(f / "a.csv", SPECS), DriveFormatError, ("a.csv", "no such file")),
+    labels("an infinite offset", edited("-3.25", "inf"), "seen.csv", "line 3", "'offset_cm'", "'inf'"),
+    labels("a text for a number", edited("0.875", "high"), "seen.csv", "line 2", "'confidence'", "'high'"),
+    labels("a missing point", edited("left_30_cm", "left_31_cm"), "seen.csv", "'left_30_cm'"),
+    labels("no version", edited(",format_version", ",version"), "seen.csv", "'format_version'"),
+    labels("another version of CSV", version_of_csv, "seen.csv", "'format_version'", "found 2", "expected 1"),
+    labels("another version of Parquet", version_of_parquet, "seen.parquet", "'lanenet-detections/1'"),
+    labels("no Parquet file", lambda f: read_detections(f / "none.parquet"), "none.parquet", "no such file"),
+    labels("reads another ending", lambda f: read_detections(f / "seen.txt"), ".parquet", ".csv"),
+    labels("reads no ending", lambda f: read_detections(f / "seen"), ".parquet", ".csv"),
+    labels("writes another ending", refused_to_write("seen.txt"), ".parquet", ".csv"),
+    labels("writes no ending", refused_to_write("seen"), ".parquet", ".csv"),
+    *(
+        labels(f"writes {column} as {value} to {name}", refused_to_write(name, **{column: value}), *named)
+        for name in ("seen.csv", "seen.parquet")
+        for column, value, named in (
+            ("steering_rad", INF, ("frame 9", "'steering_rad'", "inf")),
+            ("confidence", NAN, ("frame 9", "'confidence'", "NaN")),
+            ("offset_cm", INF, ("frame 9", "'offset_cm'", "inf")),
+        )
+    ),
+]
+
+
+@each(BAD)
+def test_a_bad_table_is_refused(tmp_path: Path, bad: Bad) -> None:
+    bad.check(tmp_path)
