@@ -12,9 +12,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lanenet.cli import calibrate, detect, export, label, map, train, val
+from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive
-from lanenet.cli.research import judge, localise, reality, sheets, simulate, sweep, track
+from lanenet.cli.research import judge, localise, reality, sheets, simulate, track
 from lanenet.errors import LanenetError
 
 _VERBS = (

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import UInt8
 
-    from lanenet.data.sources import Source
+    from lanenet.data.drives.sources import Source
 
     DetectorName = str
 else:
@@ -82,7 +82,7 @@ def detect(
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.detections import check_table_path
-    from lanenet.data.sources import open_source
+    from lanenet.data.drives.sources import open_source
     from lanenet.evaluation.detect import run_detector
 
     check_ending(out, ".parquet", ".csv")
@@ -142,7 +142,7 @@ def detect(
 
 def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarray, "h w"] | None:
     """Find or read the mask, and print what was found."""
-    from lanenet.data.sources import find_mask, read_mask
+    from lanenet.data.drives.sources import find_mask, read_mask
 
     if mask is None:
         return None

@@ -1,8 +1,6 @@
-"""Parquet tables: columns in and out of NumPy, with errors that name the file and the column.
+"""Parquet tables: columns in and out of NumPy, with errors that name file and column; images as PNG bytes.
 
-pyarrow comes with the extra ``data`` and is imported inside the functions, so that the car can do without it.
-
-PNG pictures as bytes, as tables hold them.
+pyarrow comes with the extra ``data`` and is imported inside the functions: the car does not have it.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ class ParquetTable:
     """A Parquet file in memory, read column by column.
 
     Attributes:
-        path: Where it came from.
+        path: The file.
         meta: The JSON under :data:`META_KEY`.
     """
 
@@ -59,14 +57,7 @@ class ParquetTable:
     def __len__(self) -> int:
         return int(self._table.num_rows)
 
-    @property
-    def column_names(self) -> tuple[str, ...]:
-        """The columns that the file has."""
-        return tuple(self._table.column_names)
-
-    def floats(
-        self, name: str, allow_null: bool = False, allow_infinite: bool = False
-    ) -> Float[np.ndarray, "n"]:
+    def floats(self, name: str, allow_null: bool = False) -> Float[np.ndarray, "n"]:
         """Return a column of numbers, float64; null is NaN.
 
         Raises:
@@ -74,7 +65,7 @@ class ParquetTable:
                 where none is allowed; names the file and the column.
         """
         values = self._numpy(name, np.float64)
-        bad = (np.isnan(values) & (not allow_null)) | (np.isinf(values) & (not allow_infinite))
+        bad = (np.isnan(values) & (not allow_null)) | np.isinf(values)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             raise LabelFormatError(f"{self.path}: column {name!r}, row {row}: found {values[row]}")
@@ -91,7 +82,7 @@ class ParquetTable:
         return self._numpy(name, np.int64)
 
     def flags(self, name: str) -> Bool[np.ndarray, "n"]:
-        """Return a column of yes and no.
+        """Return a column of booleans.
 
         Raises:
             LabelFormatError: If the column is missing, holds something else, or a null.
@@ -152,7 +143,7 @@ class ParquetTable:
     def _numpy(self, name: str, dtype: type[np.generic]) -> np.ndarray:
         values = np.asarray(self._column(name).to_numpy())
         if values.dtype.kind not in ("f", "i", "u") or (dtype is np.int64 and values.dtype.kind == "f"):
-            # A column without any value has no type of its own.
+            # A column without values has no type.
             if values.dtype == object and all(value is None for value in values):
                 return np.full(len(values), np.nan).astype(dtype)
             raise LabelFormatError(f"{self.path}: column {name!r}: expected numbers, found {values.dtype}")
@@ -167,7 +158,7 @@ def write_parquet(
     Args:
         path: Destination.
         arrays: pyarrow arrays of equal length by column name.
-        meta: What the table is; stored as JSON under :data:`META_KEY`.
+        meta: What the table is, stored as JSON under :data:`META_KEY`.
         more_meta: Further schema metadata, for other tools.
     """
     arrow = require("pyarrow", "data")
@@ -179,7 +170,7 @@ def write_parquet(
 
 
 def write_columns(path: Path, columns: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-    """Write arrays of equal length as Parquet, atomically, each in the type that it has."""
+    """Write arrays of equal length as Parquet, atomically, each in its own type."""
     arrow = require("pyarrow", "data")
     write_parquet(path, {name: arrow.array(values) for name, values in columns.items()}, meta)
 
@@ -204,7 +195,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def png_bytes(image: UInt8[np.ndarray, "h w *c"]) -> bytes:
-    """Encode a picture; the same picture always gives the same bytes."""
+    """Encode an image as PNG; the same image always gives the same bytes."""
     _, data = cv2.imencode(".png", image)
     return bytes(data.tobytes())
 

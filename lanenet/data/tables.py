@@ -1,4 +1,4 @@
-"""CSV tables of numbers, read strictly: an error names the file, the line and the column."""
+"""CSV tables, read strictly: an error names the file, the line and the column."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lanenet.data.files import write_text
 from lanenet.errors import DriveFormatError, LanenetError, did_you_mean
 
 _INT64_MAX = 2**63 - 1
-#: Above this, nine digits would lose microseconds of a clock that counts from 1970.
+#: Numbers above this are written in full: nine digits would lose the microseconds of Unix time.
 _SHORT_BELOW = 1e6
 
 
@@ -26,11 +26,10 @@ class ColumnSpec:
     Attributes:
         kind: Numbers, whole numbers, or text.
         required: Whether the file must have the column.
-        allow_empty: Whether a cell may be empty; it reads as NaN (numbers) or an empty text.
+        allow_empty: Whether a cell may be empty, read as NaN or an empty text.
         low: Smallest value of a number.
         high: Largest value of a number.
-        increasing: Whether each number has to be larger than the one before.
-        allow_infinite: Whether a number may be infinite, written ``inf``.
+        increasing: Whether each number must be larger than the one before.
     """
 
     kind: Literal["float", "int", "text"] = "float"
@@ -39,7 +38,6 @@ class ColumnSpec:
     low: float = -math.inf
     high: float = math.inf
     increasing: bool = False
-    allow_infinite: bool = False
 
 
 def read_csv(
@@ -51,13 +49,13 @@ def read_csv(
 ) -> dict[str, np.ndarray]:
     """Read the named columns of a CSV file with a header.
 
-    Columns that nobody asked for are skipped, unless one looks like a misspelt optional column.
+    Other columns are skipped, unless one looks like a misspelt optional column.
 
     Args:
         path: The file, UTF-8, separated by commas.
         columns: What to read.
         error: The error to raise.
-        skip_torn: Leave out a last line of which :func:`is_torn` tells that its writer was stopped in it.
+        skip_torn: Leave out a last line that was cut off; see :func:`is_torn`.
 
     Returns:
         An array per column that the file has: float64, int64 or text. Row i is line i + 2 of a file without
@@ -107,8 +105,8 @@ def read_csv(
 def is_torn(path: Path) -> bool:
     """Tell whether the last line of a table was cut off while it was written, as by a power cut.
 
-    Such a line has no end, and lacks fields of the header or the text of its last one. A complete last line
-    without an end, as some editors leave it, is not torn.
+    Such a line has no line feed, and lacks fields or the text of the last field. A complete last line without
+    a line feed, as some editors leave it, is not torn.
     """
     head, _, rest = Path(path).read_bytes().partition(b"\n")
     last = rest.rpartition(b"\n")[2]
@@ -145,7 +143,7 @@ def write_csv(
 
 
 def _lines(reader: Any) -> Iterator[tuple[int, list[str]]]:
-    """Line number and stripped cells of every line that is not blank."""
+    """Yield line number and stripped cells of every line that is not blank."""
     for cells in reader:
         stripped = [cell.strip() for cell in cells]
         if any(stripped):
@@ -176,15 +174,14 @@ def _parsed(cell: str, spec: ColumnSpec) -> float | int | str:
     if spec.kind == "text":
         return cell
     expected = "a whole number" if spec.kind == "int" else "a number"
-    # Python's own parsers take "1_000" for a number, which no other tool writes.
+    # Python takes "1_000" for a number, which no other tool writes.
     if "_" in cell:
         raise ValueError(f"expected {expected}, found {cell[:40]!r}")
     try:
         value = int(cell) if spec.kind == "int" else float(cell)
     except ValueError:
         raise ValueError(f"expected {expected}, found {cell[:40]!r}") from None
-    infinite = spec.allow_infinite and isinstance(value, float) and math.isinf(value)
-    if not (math.isfinite(value) or infinite) or (spec.kind == "int" and abs(value) > _INT64_MAX):
+    if not math.isfinite(value) or (spec.kind == "int" and abs(value) > _INT64_MAX):
         raise ValueError(f"expected {expected}, found {cell[:40]!r}")
     if not spec.low <= value <= spec.high:
         raise ValueError(f"expected {spec.low:g} to {spec.high:g}, found {cell[:40]}")

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.data.detections import DetectionTable, check_table_path
+from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
-from lanenet.data.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.draw import draw_estimate

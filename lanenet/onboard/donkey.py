@@ -39,7 +39,7 @@ from pydantic import Field
 from lanenet.config import Settings, check_settings, load_settings
 from lanenet.control.controller import ControlSettings, LaneController, throttle_of
 from lanenet.data.camera_file import read_camera
-from lanenet.data.sources import read_mask
+from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera

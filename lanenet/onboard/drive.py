@@ -15,7 +15,7 @@ from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_drive_folder
-from lanenet.data.sources import read_mask
+from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator

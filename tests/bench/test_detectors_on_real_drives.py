@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lanenet.data.drives import open_drive
-from lanenet.data.sources import find_mask, open_source
+from lanenet.data.drives.sources import find_mask, open_source
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.estimate import Detector

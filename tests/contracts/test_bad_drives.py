@@ -12,8 +12,8 @@ from drives import edit, frame_image, record, write_drive, write_tub, write_vide
 
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.folder import TRUTH_NAMES
+from lanenet.data.drives.sources import open_source
 from lanenet.data.drives.writer import DriveWriter
-from lanenet.data.sources import open_source
 from lanenet.errors import CalibrationError, DriveFormatError
 
 Open = Callable[[Path], Any]

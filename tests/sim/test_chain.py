@@ -10,10 +10,10 @@ import time
 import numpy as np
 import pytest
 import yaml
+from detections import read_detections
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
-from lanenet.data.detections import read_detections
 from lanenet.data.drives import read_truth
 from lanenet.data.label_set import read_labels
 from lanenet.geometry.lane import POINT_NAMES

@@ -39,7 +39,7 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
     # Imported here: commands that read no drive need not wait for OpenCV.
     from lanenet.data.drives import FORMATS, find_format
-    from lanenet.data.sources import PHOTO_ENDINGS
+    from lanenet.data.drives.sources import PHOTO_ENDINGS
 
     if not resolved.is_dir():
         # A link may lead elsewhere, but the files beside a source are found by the name that was given.

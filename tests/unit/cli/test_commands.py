@@ -14,13 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from detections import read_detections
 from typer.testing import CliRunner, Result
 
 from datagen.prepare import MapRequest
 from lanenet.cli import app as cli
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.detections import read_detections
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
 from lanenet.evaluation.errors import RasterAnswers, RasterModel

@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from detections import read_detections
 from typer.testing import CliRunner, Result
 
 from lanenet.cli import app as cli
 from lanenet.config import check_settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.detections import read_detections
-from lanenet.data.sources import Source, find_mask, read_mask
+from lanenet.data.drives.sources import Source, find_mask, read_mask
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.drive import DriveSettings, build_drive_detector

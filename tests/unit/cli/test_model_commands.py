@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from detections import read_detections
 from typer.testing import CliRunner, Result
 
 from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.detections import read_detections
 from lanenet.data.drives.writer import DriveWriter
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import LanenetError

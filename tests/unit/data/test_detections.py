@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from detections import read_detections
 
-from lanenet.data.detections import DetectionTable, read_detections
+from lanenet.data.detections import DetectionTable
 from lanenet.geometry.lane import POINT_NAMES, points_from_parabolas
 from lanenet.perception.estimate import LaneEstimate
 
@@ -89,6 +90,6 @@ def test_radius_and_offset_where_a_detector_knows_them(tmp_path: Path, name: str
 def test_an_empty_table(tmp_path: Path, name: str) -> None:
     DetectionTable().write(tmp_path / name)
     back = read_detections(tmp_path / name)
-    assert len(back) == 0
+    assert len(back.frame) == 0
     assert back.points_cm.shape == (0, 6)
     assert back.parabolas.shape == (0, 2, 3)

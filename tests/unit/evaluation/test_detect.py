@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from detections import read_detections
 
-from lanenet.data.detections import read_detections
-from lanenet.data.sources import Source
+from lanenet.data.drives.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import answer_edges
 from lanenet.evaluation.detect import run_detector

@@ -10,6 +10,7 @@ import cv2
 import jaxtyping
 import numpy as np
 import pytest
+from detections import read_detections
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -17,7 +18,6 @@ from typer.testing import CliRunner
 
 from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.detections import read_detections
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.perception.detector_kind import DetectorInputs
