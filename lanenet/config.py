@@ -1,7 +1,7 @@
 """Strict, typed settings read from YAML.
 
-Every schema derives from :class:`Settings`: frozen, unknown keys refused, no value repaired in silence.
-A YAML file lists only what differs from the defaults; ``key=value`` overrides come last.
+Every schema derives from :class:`Settings`: frozen, and unknown keys are refused. A YAML file lists only what
+differs from the defaults; ``key=value`` overrides come last.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SettingsT = TypeVar("SettingsT", bound=Settings)
 
 
 def flat_settings(settings: Settings) -> dict[str, Any]:
-    """Return all values of settings under keys as overrides write them, such as ``edges.blur_px``."""
+    """Return all values by their dotted keys, such as ``edges.blur_px``."""
     flat: dict[str, Any] = {}
     for key, value in settings:
         if isinstance(value, Settings):
@@ -99,7 +99,7 @@ def load_settings(schema: type[SettingsT], path: Path, overrides: list[str] | No
 
 
 def check_settings(schema: type[SettingsT], data: dict[str, Any], where: str) -> SettingsT:
-    """Check plain data against a schema; ``where`` names its origin in the error.
+    """Check plain data against a schema; ``where`` is its origin, for the error.
 
     Raises:
         ConfigError: Naming the origin, the key, what was found and what was expected.
@@ -113,7 +113,7 @@ def check_settings(schema: type[SettingsT], data: dict[str, Any], where: str) ->
 
 
 def dump_settings(settings: Settings) -> str:
-    """Return the resolved settings as YAML, every key written out."""
+    """Return the settings as YAML, with every key."""
     return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
 
@@ -133,7 +133,7 @@ def _describe(schema: type[BaseModel], error: Any) -> str:
 
 
 def _known_keys(schema: type[BaseModel], path: list[str]) -> list[str]:
-    """Field names of the schema nested at ``path`` (list indices and union tags are skipped)."""
+    """Return the field names of the schema nested at ``path``; list indices and union tags are skipped."""
     for part in path:
         field = schema.model_fields.get(part)
         if field is None:

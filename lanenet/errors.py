@@ -12,7 +12,7 @@
     |- MissingExtraError     a package of an extra that is not installed
     |- HardwareError         a camera or an actuator that does not answer
 
-A message says what was found, what was expected and where (file, key, frame).
+A message names what was found, what was expected and where (file, key, frame).
 """
 
 import difflib
@@ -20,19 +20,19 @@ from collections.abc import Iterable
 
 
 def did_you_mean(name: str, known: Iterable[str], least: float = 0.6) -> str:
-    """Return the end of a message on an unknown name, with the known one most like it; empty without one.
+    """Return the end of a message about an unknown name: the most similar known one, or an empty text.
 
     Args:
         name: What was found.
         known: What was expected.
-        least: How alike the two have to be, from 0 to 1.
+        least: Smallest similarity, from 0 to 1 (``difflib``).
     """
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=least)
     return f", did you mean {close[0]!r}?" if close else ""
 
 
 class LanenetError(Exception):
-    """Base of every error that is the input's fault, shown to the user as one line."""
+    """Base of all errors of the input, shown to the user as one line."""
 
 
 class ConfigError(LanenetError):
@@ -64,12 +64,12 @@ class TrackingLostError(LanenetError):
 
 
 class ModelMismatchError(LanenetError):
-    """A model was made for another camera, window or format."""
+    """A model is for another camera, window or format."""
 
 
 class MissingExtraError(LanenetError):
-    """A command needs a package that this installation left out."""
+    """A package of an extra is not installed."""
 
 
 class HardwareError(LanenetError):
-    """A camera or an actuator is not there, or does not answer."""
+    """A camera or an actuator is missing, or does not answer."""

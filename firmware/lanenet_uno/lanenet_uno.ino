@@ -2,18 +2,18 @@
 //
 //   pin 9    signal of the steering servo
 //   pin 10   signal of the electronic speed controller
-//   GND      joined with the ground of both; the servo gets its supply from the speed controller, not from here
+//   GND      ground of both; the servo's supply comes from the speed controller, not from the board
 //
-// The computer sends lines over USB (protocol.h). 100 ms without a valid command put the motor into neutral,
-// whatever became of the computer.
+// The computer sends lines over USB (protocol.h). After 100 ms without a valid command the motor goes to
+// neutral.
 //
-// Both pulses come from timer 1 itself, so they do not tremble while bytes arrive; no library is needed.
+// Timer 1 makes both pulses, so they do not jitter while bytes arrive; no library is needed.
 
 #include "protocol.h"
 
 namespace {
 
-// Timer 1 counts half microseconds (16 MHz / 8) and starts again after 20 ms: 50 pulses per second.
+// Timer 1 counts half microseconds (16 MHz / 8) with a period of 20 ms: 50 pulses per second.
 const uint16_t kCountsPerUs = 2;
 const uint16_t kPeriodCounts = 20000 * kCountsPerUs;
 
@@ -52,7 +52,7 @@ void loop() {
   while (Serial.available() > 0) {
     if (board.TakeByte(static_cast<char>(Serial.read()), millis(), reply)) Serial.print(reply);
   }
-  // A full output buffer would stop the loop, and with it the watchdog: the report is left out then.
+  // Leave the report out if the output buffer is full: waiting would stop the loop and the watchdog.
   if (board.Tick(millis(), reply) && Serial.availableForWrite() >= static_cast<int>(sizeof(reply))) {
     Serial.print(reply);
   }

@@ -1,5 +1,5 @@
-// What the board does with the lines it gets: the protocol of lanenet/onboard/actuators/serial_board.py,
-// version 1, and the watchdog. No Arduino header is needed, so that it is tested on a computer, too.
+// The board's side of the protocol in lanenet/onboard/actuators/serial_board.py, version 1, with the watchdog.
+// Uses no Arduino header, so that it can be tested on a computer.
 
 #ifndef LANENET_PROTOCOL_H
 #define LANENET_PROTOCOL_H
@@ -12,9 +12,9 @@ namespace lanenet {
 const uint8_t kVersion = 1;
 const uint16_t kWatchdogMs = 100;
 const uint16_t kReportMs = 50;
-// The longest line, its end left out.
+// The longest line, without its end.
 const uint8_t kMaxLine = 39;
-// Whatever a line says, no servo gets a pulse outside these.
+// No pulse leaves this range, whatever a line says.
 const uint16_t kShortestUs = 500, kLongestUs = 2500;
 
 // CRC-8: polynomial 0x07, start 0, not reflected.
@@ -27,7 +27,7 @@ inline uint8_t Crc8(const char* text, uint8_t length) {
   return crc;
 }
 
-// Ends `text` with the checksum and a line feed; it needs room for five more characters.
+// Appends the checksum and a line feed to `text`, which needs room for five more characters.
 inline void Seal(char* text) {
   uint8_t length = 0;
   while (text[length]) ++length;
@@ -40,7 +40,7 @@ class Board {
   bool TakeByte(char byte, uint32_t now_ms, char* reply) {
     if (byte != '\n') {
       if (byte == '\r') return false;
-      // A line that is too long is dropped as a whole at its end.
+      // A line that is too long is dropped at its end.
       if (length_ <= kMaxLine) line_[length_++] = byte;
       return false;
     }
@@ -69,16 +69,16 @@ class Board {
     return false;
   }
 
-  // Fills `reply` with the greeting; sent once at the start, too.
+  // Fills `reply` with the version; also sent once at the start.
   bool Greet(char* reply) const {
     snprintf(reply, kMaxLine, "V%u", static_cast<unsigned>(kVersion));
     Seal(reply);
     return true;
   }
 
-  // To be called in every turn of the loop. Returns true when `reply` holds a report to send.
+  // Called in every turn of the loop. Returns true when `reply` holds a report to send.
   bool Tick(uint32_t now_ms, char* reply) {
-    // The difference of unsigned times is right when the clock starts again at 0 after 49 days.
+    // Unsigned subtraction stays correct when the clock wraps to 0 after 49 days.
     if (driving_ && now_ms - last_command_ms_ >= kWatchdogMs) driving_ = false;
     if (now_ms - last_report_ms_ < kReportMs) return false;
     last_report_ms_ = now_ms;
@@ -100,7 +100,7 @@ class Board {
     return -1;
   }
 
-  // Reads digits up to `end` or a comma; false if there are none, too many, or the pulse is out of range.
+  // Reads digits up to `end` or a comma; false if there are none or too many, or the pulse is out of range.
   bool Number(uint8_t* at, uint8_t end, uint16_t* value) const {
     uint32_t sum = 0;
     const uint8_t start = *at;

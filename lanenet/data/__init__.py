@@ -1,1 +1,1 @@
-"""Files on disk: cameras, drives and their sources, trajectories, label sets and tables of detections."""
+"""Files on disk: cameras, drives, maps, label sets, detections and trajectories."""

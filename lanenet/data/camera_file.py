@@ -1,4 +1,4 @@
-"""Camera files: lanenet's own YAML, and ROS ``camera_info`` YAML in both directions."""
+"""Camera files: lanenet's own YAML, and ROS ``camera_info`` YAML; both can be read and written."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class MountingFile(Settings):
 
 
 class CarFile(Settings):
-    """What a camera file knows about the car."""
+    """The car in a camera file."""
 
     wheelbase_cm: Length
 
@@ -50,7 +50,7 @@ class CameraFile(Settings):
         K: Camera matrix, [px].
         D: Distortion in OpenCV's order: four numbers for a fisheye, four or five for a pinhole.
         mounting: Pose above the road.
-        car: The car it is mounted on.
+        car: The car that carries it.
         method: How the camera was found.
         residuals: Figures of the fit; each name ends in its unit.
         date: Day of the calibration.
@@ -76,7 +76,7 @@ class CameraFile(Settings):
     @field_validator("D")
     @classmethod
     def _check_distortion(cls, D: tuple[float, ...], info: Any) -> tuple[float, ...]:
-        # The model is absent here when it was refused itself.
+        # The model is missing here if it was refused itself.
         return _checked_distortion(D, info.data["model"]) if "model" in info.data else D
 
     def camera(self) -> Camera:
@@ -119,7 +119,7 @@ def write_camera(
         date: Day of the calibration, ISO 8601; the same inputs give the same file, so there is no default.
 
     Raises:
-        CalibrationError: If the camera is one that :func:`read_camera` would refuse.
+        CalibrationError: If :func:`read_camera` would refuse the camera.
     """
     m = camera.mounting
     data = {
@@ -154,7 +154,7 @@ class _RosMatrix(Settings):
 
 
 class RosCameraInfo(Settings):
-    """A ROS ``camera_info`` file; keys that lanenet has no use for are skipped."""
+    """A ROS ``camera_info`` file; other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -186,7 +186,7 @@ def read_ros_camera_info(path: Path, mounting: Mounting, wheelbase_cm: float) ->
 
     Args:
         path: The file.
-        mounting: Pose above the road, which ROS keeps elsewhere.
+        mounting: Pose above the road, which is not in the file.
         wheelbase_cm: Distance between the car's axles.
 
     Raises:
@@ -207,9 +207,9 @@ def read_ros_camera_info(path: Path, mounting: Mounting, wheelbase_cm: float) ->
 
 
 def write_ros_camera_info(path: Path, camera: Camera, name: str) -> None:
-    """Write a ROS ``camera_info`` YAML; ROS has no place in it for mounting and wheelbase.
+    """Write a ROS ``camera_info`` YAML, which has no mounting and no wheelbase.
 
-    A pinhole with four coefficients gets k3 = 0, because ``plumb_bob`` has five.
+    A pinhole with four coefficients gets k3 = 0: ``plumb_bob`` has five.
 
     Args:
         path: Destination.
@@ -241,7 +241,7 @@ def _ros_matrix(matrix: np.ndarray) -> dict[str, Any]:
 
 
 def _dump(data: dict[str, Any]) -> str:
-    # Flow style for the innermost level keeps a matrix row on one line.
+    # Flow style for the innermost level: one line per matrix row.
     return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110))
 
 

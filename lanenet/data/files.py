@@ -1,9 +1,7 @@
-"""Files and folders that are either complete or not there, and packages that may be missing.
+"""Atomic files and folders, and packages that may be missing.
 
-Everything is written under a temporary name beside its destination and moved into place at the end, so that
-a crash, a full disk or Ctrl-C never leaves half a file under the name that others read.
-
-What a killed run leaves beside its output, cleared away by the next one.
+Everything is written under a temporary name beside its destination and moved into place at the end, so that a
+crash, a full disk or Ctrl-C never leaves half a file under the final name.
 """
 
 from __future__ import annotations
@@ -26,12 +24,12 @@ import numpy as np
 from lanenet.config import read_yaml
 from lanenet.errors import ConfigError, LanenetError, MissingExtraError
 
-#: Kinds of folder that may be written again; each holds ``<kind>.yaml`` with ``format: lanenet-<kind>/n``.
+#: Kinds of folder that may be replaced; each holds ``<kind>.yaml`` with ``format: lanenet-<kind>/n``.
 FOLDER_KINDS: tuple[str, ...] = ("drive", "map", "checkpoint")
 
 
 def require(package: str, extra: str) -> ModuleType:
-    """Import a package that only an extra installs.
+    """Import a package of an extra.
 
     Args:
         package: Dotted name, for example ``pyarrow.parquet``.
@@ -60,7 +58,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
         path: Destination; missing parent folders are made, an existing file is replaced.
 
     Yields:
-        A path in the same folder with the same ending, to be written by the block. Removed on any error.
+        A path in the same folder with the same ending, for the block to write. Removed on any error.
 
     Raises:
         LanenetError: If the destination is a folder, or cannot be written.
@@ -121,7 +119,7 @@ def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
 
 
 def check_destination(path: Path) -> None:
-    """Refuse a file that cannot be written, before the work whose result it is to hold; makes nothing.
+    """Refuse a file that could not be written, before the work starts; creates nothing.
 
     Raises:
         LanenetError: If the destination is a folder, or lies below a file or a folder that cannot be
@@ -138,11 +136,11 @@ def check_destination(path: Path) -> None:
 
 
 def check_replaceable(path: Path, kind: str | None = None) -> None:
-    """Refuse a folder that :func:`atomic_folder` would not replace, before the work that is to fill it.
+    """Refuse a folder that :func:`atomic_folder` would not replace, before the work starts.
 
     Args:
-        path: Destination; it need not exist.
-        kind: What the folder is to be, one of :data:`FOLDER_KINDS`; None accepts an earlier output of any.
+        path: Destination; may be missing.
+        kind: What the folder will be, one of :data:`FOLDER_KINDS`; None accepts an earlier output of any.
 
     Raises:
         LanenetError: If the destination is a file or a folder that lanenet did not write.
@@ -178,8 +176,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 def json_text(obj: Any) -> str:
     """Return indented JSON.
 
-    NumPy arrays and numbers, paths, tuples and nested containers are accepted. Floats that are not finite
-    become null, because JSON has no word for them.
+    Accepts NumPy arrays and numbers, paths, tuples and nested containers. Floats that are not finite become
+    null: JSON has no value for them.
     """
     return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
@@ -190,7 +188,7 @@ def write_json(path: Path, obj: Any) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Have the disk hold what was written, so that a power cut after the move finds the whole file."""
+    """Sync a file or folder to the disk, so that it survives a power cut."""
     if path.is_dir() and os.name == "nt":
         return
     descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
@@ -232,7 +230,7 @@ def _holds_marker(path: Path, kind: str) -> bool:
 
 
 def _move_folder(temporary: Path, path: Path) -> None:
-    """Move a folder into place; an old one is set aside first and comes back if the move fails."""
+    """Move a folder into place; an old one is set aside first and restored if the move fails."""
     old = path.with_name(f".{path.name}.{secrets.token_hex(4)}.old.tmp") if path.exists() else None
     try:
         if old is not None:
@@ -254,15 +252,15 @@ def clear_unfinished(out: Path) -> None:
     """Remove the temporary folders of killed runs beside an output folder.
 
     A run that was killed between setting the old folder aside and moving the new one into place leaves the
-    old one under its temporary name: it comes back.
+    old one under a temporary name: it is restored.
 
     Args:
-        out: The folder as :func:`lanenet.data.files.atomic_folder` is to write it.
+        out: The folder, as for :func:`atomic_folder`.
     """
     out = out.resolve()
     if not out.parent.is_dir():
         return
-    # As atomic_folder names them; a name that only begins the same is another output's.
+    # The names of atomic_folder; a name that only starts alike belongs to another output.
     pattern = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]{{8}}(\.old)?\.tmp")
     for left in sorted(out.parent.iterdir()):
         found = pattern.fullmatch(left.name)
