@@ -1,4 +1,4 @@
-"""A camera file's worth of knowledge from one drive: ``lanenet calibrate drive``."""
+"""A camera with its uncertainties from one drive: ``lanenet calibrate drive``."""
 
 from __future__ import annotations
 
@@ -31,9 +31,11 @@ from lanenet.geometry.camera import Camera
 
 #: Called with (stage, done, total).
 StageProgress = Callable[[str, int, int], None]
-#: A lane that differs by this much from the given one, where the scale is known otherwise, is worth a word.
+#: Relative difference from the given lane width, where the scale comes from elsewhere, that is worth a note.
+#: Chosen: more than the sigma of a measured lane width on a good drive.
 _OTHER_LANE = 0.05
-#: Frames in the pictures, and how far ahead they show the road, in camera heights.
+#: Frames in the pictures, and distance ahead to which they show the road, in camera heights. Chosen: a person
+#: sees there whether the lines run straight and parallel.
 _SHOWN, _SEEN_HEIGHTS = 3, 6.0
 
 
@@ -45,12 +47,12 @@ class CalibratedDrive:
         camera: The camera, [cm].
         sigma: Standard deviations; each name ends in its unit. A height that was given has none.
         candidates: Cameras of the coarse search; none where one was given.
-        closed: Whether a place was seen twice.
-        notes: What the user should know, a sentence each.
+        closed: Whether a loop was closed.
+        notes: What was assumed or left out, a sentence each.
         method: How the camera was found.
         frames: Number of frames that were used.
-        revisits: Places that were seen twice.
-        robust_sd_px: Robust standard deviation of what edges miss between frames.
+        revisits: Number of loop closures.
+        robust_sd_px: Robust standard deviation of the residuals between frames.
         lane_cm: Width of the driven lane with this camera; None where none was found.
         shown: Frames for pictures, in which the car drives straight ahead.
         drive: The drive, without frames in which the car stands.
@@ -83,34 +85,32 @@ class CalibratedDrive:
 def starting_camera(
     drive_path: Path, camera_path: Path | None, refine: bool
 ) -> tuple[Camera | None, list[str]]:
-    """Decide with which camera a calibration begins.
+    """Choose the camera with which a calibration starts.
 
     Args:
-        drive_path: The drive, which may know its camera.
+        drive_path: The drive, which may have a camera of its own.
         camera_path: A camera file; None takes the drive's own.
-        refine: Whether the camera is to be refined. A known camera is otherwise used as it is.
+        refine: Refine the camera instead of looking for one.
 
     Returns:
         The camera to refine, or None to look for one; and notes.
 
     Raises:
-        CalibrationError: If a camera is given and nothing is to be done to it, or one is missing.
+        CalibrationError: If a camera is given but not to be refined, or there is none to refine.
     """
     if camera_path is not None:
         if not refine:
             raise CalibrationError(
                 f"{camera_path}: a known camera is used as it is; add --refine to adjust it to the drive, or "
-                "leave --camera out to find one"
+                "leave out --camera to find one"
             )
         return read_camera(camera_path), []
     own = open_drive(drive_path).camera
     if refine and own is None:
-        raise CalibrationError(f"{drive_path}: the drive names no camera to refine; give one with --camera")
+        raise CalibrationError(f"{drive_path}: the drive has no camera to refine; give one with --camera")
     if refine or own is None:
         return own, []
-    return None, [
-        f"the drive names a camera of its own, which is left alone (focal length {own.K[0, 0]:.1f} px)"
-    ]
+    return None, [f"the drive has a camera of its own, which is not used (focal length {own.K[0, 0]:.1f} px)"]
 
 
 def calibrate_drive(
@@ -125,17 +125,17 @@ def calibrate_drive(
 ) -> CalibratedDrive:
     """Find or refine the camera of a drive.
 
-    The pictures tell all but the scale. It comes from the camera's height where that is given, else from the
-    lane's width, else from the height of the camera to refine.
+    Images show everything but the scale. It comes from the camera's height where that is given, else from the
+    lane width, else from the height of the camera to refine.
 
     Args:
         drive_path: Drive folder, Donkeycar tub or video.
         lane_width_cm: Between the middles of the two lines of the driven lane.
         camera_height_cm: Height of the lens above the road.
         start: Camera to refine; None looks for one.
-        settings: Settings of all mapping stages; ``guess`` is where the search begins.
+        settings: Settings of all mapping stages; ``guess`` is what the search tries.
         progress: Called with (stage, done, total).
-        accept_open_loop: Take a focal length that is guessed where no place was seen twice.
+        accept_open_loop: Accept a guessed focal length where no loop was closed.
 
     Returns:
         The camera with its uncertainties.
@@ -147,7 +147,7 @@ def calibrate_drive(
     """
     if lane_width_cm is None and camera_height_cm is None and start is None:
         raise CalibrationError(
-            "pictures do not tell lengths: expected the lane's width or the camera's height, found neither"
+            "images do not show the scale: expected the lane's width or the camera's height, found neither"
         )
     drive, notes = _moving_part(keep_images(open_drive(drive_path)), start)
     settings, hidden = hide_bumper(drive, settings)
@@ -197,7 +197,7 @@ _ADJUST = "adjust poses and camera"
 
 
 def _track_progress(progress: StageProgress | None) -> Progress | None:
-    """Report the filter's progress, and after it the stage of the adjustment, which has no steps."""
+    """Report the progress of tracking, and after it the adjustment, which has no steps."""
     if progress is None:
         return None
 
@@ -210,7 +210,7 @@ def _track_progress(progress: StageProgress | None) -> Progress | None:
 
 
 def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str]]:
-    """Longest uninterrupted stretch of the frames in which the car moves, and what was left out."""
+    """Longest segment of the frames in which the car moves, and notes on what was left out."""
     notes = list(recorded.problems)
     if start is not None and (start.width, start.height) != (recorded.width, recorded.height):
         raise CalibrationError(
@@ -228,8 +228,8 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
     longest = max(segments, key=lambda s: s.stop - s.start)
     drive = moving.subset(longest)
     if len(drive) < len(moving):
-        _check_count(recorded, len(drive), "frames without a break")
-        notes.append(f"the longest stretch without a break is used, {len(drive)} of {len(moving)} frames")
+        _check_count(recorded, len(drive), "frames without a gap")
+        notes.append(f"the longest segment is used, {len(drive)} of {len(moving)} frames")
     return drive, notes
 
 
@@ -252,7 +252,7 @@ def _lane_of(found: FoundCamera, settings: MapSettings, where: Path, needed: boo
 def _scale(
     camera: Camera, lane: LaneScale | None, lane_width_cm: float | None, camera_height_cm: float | None
 ) -> tuple[float, float | None, str]:
-    """Factor to centimetres, the relative sigma of the height (None where it was given), and its source."""
+    """Factor to centimetres, relative sigma of the height (None where it was given), and source of both."""
     if camera_height_cm is not None:
         return (
             camera_height_cm / camera.mounting.height_cm,

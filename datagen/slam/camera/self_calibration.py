@@ -121,16 +121,14 @@ class FoundCamera:
 
     @property
     def note(self) -> str:
-        """The camera in a sentence."""
+        """The camera in one sentence."""
         focal, m = float(self.camera.K[0, 0]), self.camera.mounting
         found = (
             f"camera {'refined on' if self.refined else 'from'} the drive: focal length {focal:.1f} +- "
             f"{focal * self.sigma['focal']:.1f} px, pitch {np.rad2deg(m.pitch_down_rad):.1f} +- "
             f"{np.rad2deg(self.sigma['pitch']):.1f} degrees"
         )
-        return (
-            found if self.closed else f"{found}; no place was seen twice, so that the lens is as it started"
-        )
+        return found if self.closed else f"{found}; no place was seen twice, so the lens is as it started"
 
 
 def find_camera(
@@ -244,11 +242,11 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
 
     Args:
         found: The camera.
-        where: Names the drive in messages.
+        where: Name of the drive for messages.
         accept_open_loop: Accept the focal length's prior where no loop was closed.
 
     Returns:
-        Notes on what had to be accepted.
+        Notes on what was accepted.
 
     Raises:
         CalibrationError: If the drive is too straight, does not come back to where it was, or leaves the
@@ -271,21 +269,23 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
     if problem is not None:
         if not accept_open_loop:
             raise CalibrationError(
-                f"{where}: {problem}. The pictures alone do not tell the focal length then: {DRIVE_INSTEAD}, "
-                "or accept a focal length that is guessed (--accept-open-loop)"
+                f"{where}: {problem}. Such a drive does not determine the focal length: {DRIVE_INSTEAD}, or "
+                "accept a guessed one (--accept-open-loop)"
             )
         return [f"{problem}: the focal length is guessed, give or take {100.0 * found.sigma['focal']:.0f} %"]
     strained = (
-        f"the pictures pull principal point or roll {found.strain:.1f} times as far as cameras differ: "
-        "something in them is not on a flat road, such as lamps mirrored in the floor"
+        f"principal point or roll are {found.strain:.1f} standard deviations from those of ordinary cameras: "
+        "something in the images is not on a flat road, such as lamps mirrored in the floor"
     )
     if found.strain > MAX_STRAIN:
         raise CalibrationError(
             f"{where}: {strained}. {DRIVE_INSTEAD.capitalize()}, without such things in view"
         )
-    if found.sigma["focal"] > MAX_FOCAL_SIGMA:
+    focal_sigma = found.sigma["focal"]
+    if focal_sigma > MAX_FOCAL_SIGMA:
         raise CalibrationError(
-            f"{where}: the focal length is known to {100.0 * found.sigma['focal']:.1f} % only ({driven}, "
-            f"{len(solved.revisits)} revisits), expected {100.0 * MAX_FOCAL_SIGMA:.0f} %: {DRIVE_INSTEAD}"
+            f"{where}: the focal length has a sigma of {100.0 * focal_sigma:.1f} % ({driven}, "
+            f"{len(solved.revisits)} revisits), expected at most {100.0 * MAX_FOCAL_SIGMA:.0f} %: "
+            f"{DRIVE_INSTEAD}"
         )
     return [strained] if found.strain > _STRAINED else []

@@ -13,11 +13,10 @@ from pixel_road import camera_numbers, fisheye
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.self_calibration import SIGMA_FACTOR
-from datagen.slam.commands import CommandedMotion
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
-from datagen.slam.segment import SegmentSolver, SolvedSegment
+from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.recording import Commands, Drive
@@ -148,10 +147,29 @@ def test_pairs_around_a_revisit_stay_within_the_drive():
     assert pairs == [(4 + d, 60 + d) for d in range(-4, 13, 4)] + [(30 + d, 95 + d) for d in range(-12, 5, 4)]
 
 
-def test_ways_are_relative_to_the_usual_one():
-    commands = CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
-    np.testing.assert_allclose(commands.relative_steps, [0.0, 1.0, 1.0, 2.0, 0.0])
-    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_steps, np.zeros(3))
+def _revisit(earlier: int, later: int) -> Revisit:
+    return Revisit(earlier, later, np.zeros(3), 0.8)
+
+
+def test_laps_are_as_long_as_the_path_between_visits():
+    path = 3.0 * np.arange(350)
+    revisits = [_revisit(k, k + 100) for k in range(0, 200, 20)]
+    laps = count_laps(path, revisits)
+    np.testing.assert_array_equal(laps, np.arange(350) // 100)
+
+
+def test_revisits_that_skip_a_lap_do_not_lengthen_it():
+    path = 3.0 * np.arange(350)
+    revisits = [_revisit(k, k + 100) for k in range(0, 100, 20)] + [
+        _revisit(k, k + 200) for k in range(0, 140, 20)
+    ]
+    assert count_laps(path, revisits)[-1] == 3
+
+
+def test_without_revisits_all_is_one_lap():
+    laps = count_laps(3.0 * np.arange(50), [])
+    assert laps.dtype.kind == "i"
+    assert not laps.any()
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ def test_a_camera_whose_middle_shows_no_road_keeps_its_angles():
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.7])
 def test_a_known_scale_stretches_the_road_and_keeps_the_car(factor):
     camera = guessed_camera(160, 120, 80.0, 15.0, GUESS)
-    scaled = with_known_scale(camera, factor, GUESS)
+    scaled = with_known_scale(camera, factor, GUESS.wheelbase_cm)
     assert scaled.wheelbase_cm == camera.wheelbase_cm
     assert scaled.mounting.height_cm == pytest.approx(factor * camera.mounting.height_cm)
     lever, scaled_lever = (c.wheelbase_cm + c.mounting.ahead_of_front_axle_cm for c in (camera, scaled))

@@ -1,4 +1,4 @@
-"""The pipeline's small steps: cutting a drive into segments, counting laps, checking sizes."""
+"""A drive before it is tracked: cut into segments, checked, its images read once."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.prepare import check_size, hide_bumper, split_segments
+from datagen.prepare import KeptImages, check_size, hide_bumper, split_segments
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import guessed_camera
-from datagen.slam.loops.places import Revisit
-from datagen.slam.segment import count_laps
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.recording import Commands, Drive
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 
 
 class _NoImages:
@@ -61,31 +59,6 @@ def test_a_drive_of_scraps_cannot_be_mapped():
         split_segments(_drive(59, []))
 
 
-def _revisit(earlier: int, later: int) -> Revisit:
-    return Revisit(earlier, later, np.zeros(3), 0.8)
-
-
-def test_laps_are_as_long_as_the_path_between_visits():
-    path = 3.0 * np.arange(350)
-    revisits = [_revisit(k, k + 100) for k in range(0, 200, 20)]
-    laps = count_laps(path, revisits)
-    np.testing.assert_array_equal(laps, np.arange(350) // 100)
-
-
-def test_revisits_that_skip_a_lap_do_not_lengthen_it():
-    path = 3.0 * np.arange(350)
-    revisits = [_revisit(k, k + 100) for k in range(0, 100, 20)] + [
-        _revisit(k, k + 200) for k in range(0, 140, 20)
-    ]
-    assert count_laps(path, revisits)[-1] == 3
-
-
-def test_without_revisits_all_is_one_lap():
-    laps = count_laps(3.0 * np.arange(50), [])
-    assert laps.dtype.kind == "i"
-    assert not laps.any()
-
-
 def test_a_camera_of_another_size_is_refused():
     drive = _drive(100, [])
     check_size(guessed_camera(160, 120, 80.0, 0.2, GuessSettings()), drive, None)
@@ -100,3 +73,44 @@ def test_rows_in_which_the_car_sees_itself_are_left_out(shared_data: Path) -> No
     assert hide_bumper(open_drive(shared_data / "donkey_circuit"), MapSettings()) == (MapSettings(), ())
     given = MapSettings(find_bumper=False)
     assert hide_bumper(open_drive(shared_data / "garage_tape"), given) == (given, ())
+
+
+class _Counting:
+    """Makes an image of each row, but for row 9, and counts."""
+
+    def __init__(self) -> None:
+        self.reads: list[int] = []
+
+    def read(self, row: int) -> np.ndarray:
+        self.reads.append(row)
+        if row == 9:
+            raise DriveFormatError("row 9: no such image")
+        return np.full((4, 5, 3), row, np.uint8)
+
+
+def test_an_image_is_read_once_and_stays_as_it_was():
+    source = _Counting()
+    images = KeptImages(source)
+    for row in (3, 1, 3, 1, 3):
+        np.testing.assert_array_equal(images.read(row), np.full((4, 5, 3), row))
+    assert source.reads == [3, 1]
+    with pytest.raises(ValueError, match="read-only"):
+        images.read(3)[0, 0] = 0
+
+
+def test_what_does_not_fit_is_read_again():
+    source = _Counting()
+    images = KeptImages(source, most_bytes=2 * 60 + 59)
+    for _ in range(2):
+        for row in (0, 1, 2):
+            assert images.read(row)[0, 0, 0] == row
+    assert source.reads == [0, 1, 2, 2]
+
+
+def test_an_image_that_cannot_be_read_is_not_kept():
+    source = _Counting()
+    images = KeptImages(source)
+    for _ in range(2):
+        with pytest.raises(DriveFormatError, match="row 9"):
+            images.read(9)
+    assert source.reads == [9, 9]

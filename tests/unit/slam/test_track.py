@@ -203,3 +203,9 @@ def test_the_filter_moves_as_the_odometry_says():
     for k in (1, 2):
         motion.predict(states, k, rng)
     np.testing.assert_allclose(states[:, :3], np.tile(odometry.poses[-1], (20, 1)), atol=1e-6)
+
+
+def test_steps_are_relative_to_the_typical_one():
+    commands = CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
+    np.testing.assert_allclose(commands.relative_steps, [0.0, 1.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_steps, np.zeros(3))
