@@ -64,10 +64,11 @@ def train(
     overrides: OverridesArgument = None,
     marking: MarkingOption = None,
 ) -> None:
-    """Make what CONFIG needs and is not there yet (drives, maps, labels), then train, evaluate and export."""
+    """Make the drives, maps and labels that CONFIG needs, then train, evaluate and export."""
     from datagen.datasets.build import prepare
     from lanenet.data.files import json_text
     from lanenet.data.label_set import read_labels
+    from lanenet.evaluation.answers import Compared
     from lanenet.evaluation.card import CARD_NAME, model_card
     from lanenet.evaluation.report import default_names, evaluate
     from lanenet.evaluation.robustness import as_dict
@@ -85,7 +86,7 @@ def train(
         data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
     if data.left_out:
         console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
-    # A folder per settings and data: a stopped run finds its own state again, and no other.
+    # One folder per settings and data, so that a stopped run finds its own state.
     run_hash = hash_run(settings.learn, data.train, data.validation)
     run_folder = settings.work_folder / f"train-{run_hash}"
     with console.training_bar() as progress:
@@ -99,14 +100,11 @@ def train(
     with console.progress_bar("test") as progress:
         evaluation = evaluate(
             sources,
-            default_names(sources, with_model=True),
-            model,
-            training=training,
-            marking_cm=marking,
-            # Which camera made which test drive is settled by the config.
-            any_camera=True,
-            workers=settings.data.processes,
-            progress=progress,
+            # The config decides which camera made which test drive.
+            Compared(default_names(sources, with_model=True), {"network": model}, marking, any_camera=True),
+            training,
+            settings.data.processes,
+            progress,
         )
     val_cli.show(evaluation.comparison)
     robustness = _robustness(model, sources)
@@ -140,7 +138,7 @@ def train(
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:
     """Errors of a model on changed test frames; none if a label set knows no lines to change."""
-    from lanenet.evaluation.errors import RasterModel
+    from lanenet.evaluation.answers import RasterModel
     from lanenet.evaluation.robustness import can_measure, measure_robustness
 
     known = [(source.labels, str(source.path)) for source in sources if source.labels is not None]

@@ -58,8 +58,8 @@ def val(
     trained_on: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Label set that MODEL has learned from; may be given again. Parts of the same map are told "
-            "by their distance from it.",
+            help="Label set that MODEL has learned from; may be given again. Errors on the same map are also "
+            "shown by the distance from it.",
         ),
     ] = None,
     robust: Annotated[
@@ -72,13 +72,14 @@ def val(
 ) -> None:
     """Show errors in cm of a model and of the other detectors on the same frames.
 
-    Simulated drives are compared with their truth, maps and the label sets made of them with the map. Label
+    Simulated drives are compared with their truth, maps and their label sets with the map. Label
     sets hold no frames, so that only detectors that work on edge points can be run on them. Without the
     network no MODEL is needed.
     """
     from datagen.labels.truth import truth_labels
     from lanenet.data.files import write_bytes, write_json, write_text
     from lanenet.data.label_set import read_labels
+    from lanenet.evaluation.answers import Compared
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network.model_file import read_model_meta
 
@@ -103,14 +104,10 @@ def val(
     with console.progress_bar("val") as progress:
         evaluation = evaluate(
             sources,
-            names,
-            model,
-            also=more,
-            training=[read_labels(path) for path in trained_on or []],
-            marking_cm=marking,
-            any_camera=any_camera,
-            workers=os.cpu_count() or 1,
-            progress=progress,
+            Compared(names, ({} if model is None else {"network": model}) | more, marking, any_camera),
+            [read_labels(path) for path in trained_on or []],
+            os.cpu_count() or 1,
+            progress,
         )
     show(evaluation.comparison)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
@@ -198,7 +195,7 @@ def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[
     """Measure, show and return the table as Markdown and as plain values."""
     from rich.console import Console
 
-    from lanenet.evaluation.errors import RasterModel
+    from lanenet.evaluation.answers import RasterModel
     from lanenet.evaluation.robustness import as_dict, measure_robustness, robust_table
 
     opened = {name: RasterModel(path) for name, path in models.items()}

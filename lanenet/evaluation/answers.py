@@ -1,9 +1,10 @@
-"""Every detector over the same labelled frames."""
+"""What detectors answer: on frames, on the edge points of label sets, and networks on rasters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,36 +12,86 @@ from jaxtyping import Float, UInt8
 
 from lanenet.data.label_set import LabelSet
 from lanenet.data.maps.labelled_frames import LabelledFrames
-from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
+from lanenet.errors import ConfigError, ModelMismatchError
+from lanenet.evaluation.run import run_detectors
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.perception.detector_kind import DetectorInputs, EdgeDetector
+from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.estimate import Detector
-from lanenet.perception.registry import build_detector, compared_names, kind_of
+from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, open_model
+from lanenet.perception.registry import build_detector, build_on_edges, compared_names, kind_of
+from lanenet.processes import run_jobs
 
-Progress = Callable[[int, int], None]
+#: Called with (source, frames done, frames).
+Progress = Callable[[str, int, int], None]
+
+#: Fewer frames are answered sooner than a process starts. Chosen: some 10 s of work.
+_WORTH_PROCESSES = 600
+#: Rasters that a network is given at a time; bounds the memory.
+_CHUNK = 64
 
 
 @dataclass(frozen=True)
-class FrameAnswers:
-    """What detectors said about the frames of a source, by their names.
+class Answers:
+    """What detectors say about the frames of a source, by their names.
 
     Attributes:
         points_cm: Six points per frame, frame car; NaN where a detector has no answer.
-        sigma_cm: Standard deviation of each point; NaN where a detector does not know it.
-        presence: Probability that the left and the right line can be seen; NaN likewise.
-        confidence: By which the car slows down and stops.
-        brightness: Mean grey level of each frame, 0 to 255.
+        sigma_cm: Sigma of each point; a detector that predicts none is left out or has NaN.
+        presence: Probability that the left and the right line can be seen; likewise.
+        confidence: Of each frame; empty for label sets.
+        brightness: Mean grey level of each frame, 0 to 255; None for label sets.
     """
 
     points_cm: dict[str, Float[np.ndarray, "n 6"]]
-    sigma_cm: dict[str, Float[np.ndarray, "n 6"]]
-    presence: dict[str, Float[np.ndarray, "n 2"]]
-    confidence: dict[str, Float[np.ndarray, "n"]]
-    brightness: Float[np.ndarray, "n"]
+    sigma_cm: dict[str, Float[np.ndarray, "n 6"]] = field(default_factory=dict)
+    presence: dict[str, Float[np.ndarray, "n 2"]] = field(default_factory=dict)
+    confidence: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
+    brightness: Float[np.ndarray, "n"] | None = None
+
+
+def answer_frames(
+    frames: LabelledFrames,
+    detectors: Mapping[str, Detector],
+    progress: Callable[[int, int], None] | None = None,
+) -> Answers:
+    """Collect what detectors say about every frame.
+
+    Args:
+        frames: The source.
+        detectors: By name.
+        progress: Called with (frames done, frames).
+
+    Raises:
+        LanenetError: As :func:`run_detectors`.
+    """
+    n = len(frames)
+    brightness = np.empty(n)
+    answers = Answers(
+        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
+        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
+        {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
+        {name: np.full(n, np.nan) for name in detectors},
+        brightness,
+    )
+    for seen in run_detectors(frames, detectors):
+        i, image = seen.index, seen.image
+        assert image is not None
+        # Every fourth pixel is enough for a mean.
+        brightness[i] = image[::4, ::4].mean()
+        for name, found in seen.estimates.items():
+            answers.points_cm[name][i] = found.points_cm
+            answers.sigma_cm[name][i] = found.sigma_cm
+            answers.presence[name][i] = found.presence
+            answers.confidence[name][i] = found.confidence
+        if progress is not None:
+            progress(i + 1, n)
+    return answers
 
 
 def choose_names(text: str) -> tuple[str, ...]:
-    """Read a list of detectors, as in ``network,painter``; they come back in the order of the tables.
+    """Read a list of detectors, as in ``network,painter``; returned in the order of the tables.
 
     Raises:
         ConfigError: If a name is unknown, or there is none.
@@ -54,43 +105,99 @@ def choose_names(text: str) -> tuple[str, ...]:
     return tuple(name for name in known if name in wanted)
 
 
-def build_compared(
-    names: Sequence[str],
-    frames: LabelledFrames,
-    *,
-    model: Path | None = None,
-    marking_cm: float | None = None,
-    any_camera: bool = False,
-) -> dict[str, Detector]:
-    """Build detectors for the camera, the lane and the markings of a source.
+@dataclass(frozen=True)
+class Compared:
+    """Which detectors are compared, and what they are built from.
 
-    Args:
-        names: Which ones.
-        frames: Where they will be run.
-        model: ONNX file, needed by ``network``.
-        marking_cm: Thickness of the tape for ``lane-filter``; None takes the source's, or the default.
-        any_camera: Accept a model that was trained with another camera.
-
-    Raises:
-        ConfigError: If something that a detector needs is missing or out of range.
-        ModelMismatchError: If the model cannot be used with this camera.
-        CalibrationError: If the camera sees no road.
+    Attributes:
+        names: Detectors of the registry.
+        models: ONNX files by name: ``network``, and more networks under other names.
+        marking_cm: Thickness of the tape for the lane filter; None takes the source's, or the default.
+        any_camera: Accept a model that was trained with another camera than that of the frames or labels.
     """
-    inputs = DetectorInputs(
-        camera=frames.camera,
-        model=model,
-        any_camera=any_camera,
-        # The network gets the same lane width as the lane filter, as on the car.
-        lane_width_cm=frames.lane_width_cm,
-        marking_cm=frames.marking_cm if marking_cm is None else marking_cm,
-        perception=frames.perception,
-    )
-    # Beside the rows that a model leaves out, those in which this car sees itself.
-    hidden = hidden_rows(frames) if frames.perception.range.bottom_rows else None
-    return {
-        name: build_detector(name, replace(inputs, mask=hidden if kind_of(name).takes_mask else None))
-        for name in names
-    }
+
+    names: Sequence[str]
+    models: Mapping[str, Path] = field(default_factory=dict)
+    marking_cm: float | None = None
+    any_camera: bool = False
+
+    @property
+    def in_order(self) -> list[str]:
+        """All names, in the order of the tables; other networks follow the first one."""
+        more = [name for name in self.models if name != "network"]
+        network = [name for name in self.names if name == "network"]
+        return [*network, *more, *(name for name in self.names if name != "network")]
+
+    def build(self, frames: LabelledFrames) -> dict[str, Detector]:
+        """Build the detectors for the camera, the lane and the markings of a source.
+
+        Raises:
+            ConfigError: If something that a detector needs is missing or out of range.
+            ModelMismatchError: If a model cannot be used with this camera.
+            CalibrationError: If the camera sees no road.
+        """
+        # Besides the rows that a model leaves out, those in which this car sees itself.
+        hidden = hidden_rows(frames) if frames.perception.range.bottom_rows else None
+        detectors = {}
+        for name in self.in_order:
+            kind = "network" if name in self.models else name
+            detectors[name] = build_detector(
+                kind,
+                DetectorInputs(
+                    camera=frames.camera,
+                    model=self.models.get(name),
+                    any_camera=self.any_camera,
+                    # The network gets the same lane width as the lane filter, as on the car.
+                    lane_width_cm=frames.lane_width_cm,
+                    marking_cm=frames.marking_cm if self.marking_cm is None else self.marking_cm,
+                    perception=frames.perception,
+                    mask=hidden if kind_of(kind).takes_mask else None,
+                ),
+            )
+        return detectors
+
+    def answer(self, frames: LabelledFrames, progress: Progress | None = None) -> Answers:
+        """Run the detectors over a source."""
+        report = None if progress is None else partial(progress, Path(frames.name).name)
+        return answer_frames(frames, self.build(frames), report)
+
+    def answer_each(
+        self, sources: Sequence[LabelledFrames], workers: int, progress: Progress | None
+    ) -> list[Answers]:
+        """Run the detectors over sources, in several processes where that is faster.
+
+        Args:
+            sources: Labelled frames.
+            workers: Processes at a time.
+            progress: As for one source; of several processes called with ("sources", sources done, sources).
+        """
+        if workers == 1 or len(sources) == 1 or sum(map(len, sources)) < _WORTH_PROCESSES:
+            return [self.answer(source, progress) for source in sources]
+        report = None if progress is None else partial(progress, "sources")
+        return run_jobs(self.answer, [(source.name, source) for source in sources], workers, report)
+
+    def answer_labels(self, labels: LabelSet, source: Path) -> Answers:
+        """Run networks on a label set's rasters, and the other detectors on its edge points.
+
+        Raises:
+            ConfigError: If a detector needs frames.
+            ModelMismatchError: If a model does not fit the label set, which lies at ``source``.
+        """
+        meta, answers = labels.meta, Answers({})
+        for name in self.in_order:
+            path = self.models.get(name)
+            if path is None:
+                marking_cm = meta.marking_cm if self.marking_cm is None else self.marking_cm
+                inputs = DetectorInputs(lane_width_cm=meta.lane_width_cm, marking_cm=marking_cm)
+                answers.points_cm[name] = answer_edges(labels, build_on_edges(name, inputs))
+                continue
+            model = RasterModel(path)
+            if not self.any_camera:
+                model.meta.check_trained_with(meta.camera_hash, f"the camera of {source}", str(path))
+            found = model.answer_labels(labels)
+            answers.points_cm[name], answers.sigma_cm[name] = found.points_cm, found.sigma_cm
+            answers.presence[name] = found.presence
+        return answers
 
 
 def hidden_rows(frames: LabelledFrames) -> UInt8[np.ndarray, "h w"]:
@@ -98,51 +205,6 @@ def hidden_rows(frames: LabelledFrames) -> UInt8[np.ndarray, "h w"]:
     mask = np.zeros((frames.camera.height, frames.camera.width), np.uint8)
     mask[frames.camera.height - frames.perception.range.bottom_rows :] = 255
     return mask
-
-
-def answer_frames(
-    frames: LabelledFrames, detectors: Mapping[str, Detector], progress: Progress | None = None
-) -> FrameAnswers:
-    """Run detectors over every frame in order; all forget what they saw where the source is interrupted.
-
-    Args:
-        frames: The source; each image is read once.
-        detectors: By name.
-        progress: Called with (frames done, frames).
-
-    Raises:
-        DriveFormatError: If a frame cannot be read; names it.
-        CalibrationError: If a frame does not fit the camera; names it.
-    """
-    n = len(frames)
-    answers = FrameAnswers(
-        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
-        {name: np.full((n, N_POINTS), np.nan) for name in detectors},
-        {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
-        {name: np.full(n, np.nan) for name in detectors},
-        np.empty(n),
-    )
-    for i in range(n):
-        try:
-            image = frames.image(i)
-        except DriveFormatError as error:
-            raise DriveFormatError(f"{frames.name}: {error}") from None
-        # Every fourth pixel is enough for a mean.
-        answers.brightness[i] = image[::4, ::4].mean()
-        for name, detector in detectors.items():
-            if i == 0 or frames.starts[i]:
-                detector.reset()
-            try:
-                found = detector.detect(image)
-            except CalibrationError as error:
-                raise CalibrationError(f"{frames.name}, frame {frames.frames[i]}: {error}") from None
-            answers.points_cm[name][i] = found.points_cm
-            answers.sigma_cm[name][i] = found.sigma_cm
-            answers.presence[name][i] = found.presence
-            answers.confidence[name][i] = found.confidence
-        if progress is not None:
-            progress(i + 1, n)
-    return answers
 
 
 def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarray, "n 6"]:
@@ -169,3 +231,97 @@ def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarra
         edges = np.asarray(edges, np.float64)
         points[i] = detector.estimate(edges[:, :2], edges[:, 2:]).points_cm
     return points
+
+
+@dataclass(frozen=True)
+class RasterAnswers:
+    """What a network says about rasters.
+
+    Attributes:
+        points_cm: Six points each, frame car; NaN for an empty raster.
+        sigma_cm: Their sigmas; NaN where the model predicts none.
+        presence: Probability that the left and the right line can be seen; NaN likewise.
+    """
+
+    points_cm: Float[np.ndarray, "n 6"]
+    sigma_cm: Float[np.ndarray, "n 6"]
+    presence: Float[np.ndarray, "n 2"]
+
+
+class RasterModel:
+    """A model file that is run on rasters, as label sets hold them.
+
+    The camera is not compared: a label set's edges are already on the road.
+
+    Attributes:
+        path: The file.
+        meta: Its description.
+    """
+
+    def __init__(self, path: Path, threads: int = 1) -> None:
+        """Open a file.
+
+        Raises:
+            ModelMismatchError: If it cannot be used.
+        """
+        self.path = path
+        self._session, self.meta = open_model(path, threads)
+        outputs = {output.name for output in self._session.get_outputs()}
+        # Models of the first format have points only.
+        self._names = [name for name in ("points_cm", "sigma_cm", "presence") if name in outputs]
+
+    def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
+        """Refuse rasters of another window, or of edges that were found with other settings.
+
+        Raises:
+            ModelMismatchError: Naming both.
+        """
+        if window != self.meta.window:
+            raise ModelMismatchError(
+                f"{self.path}: made for the window {self.meta.window}, but the label set has {window}; "
+                "give the map or the drive itself, which has edges for any window"
+            )
+        unlike = perception.unlike(self.meta.perception)
+        if unlike:
+            raise ModelMismatchError(
+                f"{self.path}: made for edges with other settings than those of the label set ({unlike}); "
+                "give the map or the drive itself, or label it with another --colour-weight"
+            )
+
+    def answer(
+        self, rasters: UInt8[np.ndarray, "n 1 r c"], lane_cm: Float[np.ndarray, "n"] | None = None
+    ) -> RasterAnswers:
+        """Run the model on rasters of 0 and 255.
+
+        Args:
+            rasters: Bird's-eye rasters.
+            lane_cm: Lane width of each, for a model that takes it; None: not known.
+        """
+        n = len(rasters)
+        columns = {"points_cm": N_POINTS, "sigma_cm": N_POINTS, "presence": len(SIDES)}
+        values = {name: np.full((n, width), np.nan) for name, width in columns.items()}
+        for start in range(0, n, _CHUNK):
+            part = rasters[start : start + _CHUNK]
+            feed = {INPUT_NAME: part}
+            if self.meta.takes_width and lane_cm is not None:
+                feed[WIDTH_NAME] = lane_cm[start : start + _CHUNK].astype(np.float32)
+            # As on the car: an empty raster gets no points.
+            marked = np.asarray(part.any(axis=(1, 2, 3)))[:, None]
+            for name, answer in zip(self._names, self._session.run(self._names, feed), strict=True):
+                values[name][start : start + _CHUNK] = np.where(marked, answer, np.nan)
+        if "presence" in self._names:
+            # An empty raster shows no line; that is an answer.
+            values["presence"][~rasters.any(axis=(1, 2, 3))] = 0.0
+        return RasterAnswers(**values)
+
+    def answer_labels(self, labels: LabelSet) -> RasterAnswers:
+        """Run the model on the frames of a label set, whose lane width is known.
+
+        Raises:
+            ModelMismatchError: If it has another window or other edges.
+        """
+        self.check_rasters(labels.meta.window, labels.meta.perception)
+        rasters = [labels.raster(i)[None] for i in range(len(labels.points_cm))]
+        shape = (-1, 1, self.meta.window.rows, self.meta.window.columns)
+        lane_cm = np.full(len(rasters), labels.meta.lane_width_cm)
+        return self.answer(np.array(rasters, np.uint8).reshape(shape), lane_cm)

@@ -1,4 +1,4 @@
-"""Where errors come from: by condition of the frame, by drive, and whether doubt and presence are right."""
+"""Where errors come from: by condition of the frame, by drive, and whether sigma and presence are right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from lanenet.evaluation.errors import ErrorStats, error_stats
 from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
 
-#: By condition: what its groups mean, and name and lower limit of each; the last one has no upper limit.
+#: By condition: what its groups mean, and name and lower limit of each; the last one has no upper limit. The
+#: limits are chosen: sharp bends, light and distances as they occur on model roads.
 GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
     "bend": (
         "radius of the lane at y = 15 cm",
@@ -21,7 +22,7 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
         "lines of the lane that the frame shows",
         (("none", 0.0), ("partly", 0.5), ("one", 1.0), ("both", 2.0)),
     ),
-    # The limits are those of lanenet.onboard.safety.SafetySettings.
+    # The car's limits: lanenet.onboard.safety.SafetySettings.
     "confidence": (
         "confidence of the first detector (a car slows down below 0.5 and stops below 0.2)",
         (("under 0.2", 0.0), ("0.2 to 0.5", 0.2), ("over 0.5", 0.5)),
@@ -31,35 +32,37 @@ GROUPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
         (("under 60", 0.0), ("60 to 140", 60.0), ("over 140", 140.0)),
     ),
     "place": (
-        "way to the nearest pose of the training frames of the same map, cm",
+        "distance to the nearest pose of the training frames of the same map, cm",
         (("under 2 cm", 0.0), ("2 to 5 cm", 2.0), ("5 to 15 cm", 5.0), ("over 15 cm", 15.0)),
     ),
 }
-#: Shares of a normal distribution within so many standard deviations of its mean.
+#: Intervals of a normal distribution by the share within them, in sigmas to each side.
 INTERVALS = {"68": 1.0, "95": 1.959964}
-#: Of the reliability diagram: standard deviations and the share that a normal distribution has within them.
+#: Of the reliability diagram: sigmas, and the share of a normal distribution within them.
 RELIABILITY_SIGMAS = (0.1257, 0.2533, 0.3853, 0.5244, 0.6745, 0.8416, 1.0364, 1.2816, 1.6449, 1.96, 2.5758)
 RELIABILITY_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
-#: Frames of a stretch, where there are too few drives to draw from: two seconds of a usual recording.
-STRETCH_FRAMES = 40
+#: Frames of a segment, where there are too few drives to draw from. Chosen: two seconds at 20 frames/s.
+SEGMENT_FRAMES = 40
+#: Draws of the bootstrap. Chosen: the ends of a 95 % interval are then right to some per cent of its width.
 _RESAMPLES = 2000
-#: Fewer drives or stretches give no interval.
+#: Fewer drives or segments give no interval. Chosen.
 _FEWEST = 3
+#: From this probability on a line counts as predicted.
 _LIKELY = 0.5
 _MIDDLE_ROW = 1
 
 
 @dataclass(frozen=True)
 class PresenceStats:
-    """How well a detector tells whether lines are there; a probability of 0.5 or more says yes.
+    """How well a detector predicts whether lines can be seen; from a probability of 0.5 on it predicts one.
 
     Attributes:
-        precision: Share of the lines said to be there that are.
-        recall: Share of the lines that are there and are said to be.
-        absent_recall: Share of the lines that are not there and are said not to be.
-        there: Lines that are there.
-        absent: Lines that are not.
+        precision: Share of the predicted lines that can be seen.
+        recall: Share of the lines that can be seen and are predicted.
+        absent_recall: Share of the absent lines that are not predicted.
+        there: Lines that can be seen.
+        absent: Lines that cannot.
     """
 
     precision: float
@@ -74,14 +77,14 @@ class PresenceStats:
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Whether a detector's standard deviations are right.
+class SigmaStats:
+    """Whether a detector's sigmas are right.
 
     Attributes:
         coverage: By interval (``68``, ``95``): the share of the errors within it.
-        reliability: Share of the errors within each of ``RELIABILITY_SIGMAS`` standard deviations.
-        median_sigma_cm: What the detector says of its errors.
-        count: Points with a label, an answer and a standard deviation.
+        reliability: Share of the errors within each of ``RELIABILITY_SIGMAS`` sigmas.
+        median_sigma_cm: Median of the predicted sigmas.
+        count: Points with a label, an answer and a sigma.
     """
 
     coverage: dict[str, float]
@@ -100,7 +103,7 @@ class Doubt:
 
 
 def lane_curvature(points_cm: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n"]:
-    """Return the curvature of the lane at y = 15 cm without its sign, [1/cm]; NaN where no line is whole.
+    """Return the absolute curvature of the lane at y = 15 cm, [1/cm]; NaN where no line has three labels.
 
     Source:
         Curvature of a graph: |x''| / (1 + x'^2)^1.5; the mean of the lines that have all three labels.
@@ -115,7 +118,7 @@ def lane_curvature(points_cm: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n"
 
 
 def lines_shown(visible: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Return how many lines frames show: a piece that is too short to count as seen is half of one."""
+    """Return how many lines frames show: a section that is too short to count as seen is half a line."""
     shown: Float[np.ndarray, "n"] = np.where(np.isfinite(visible), visible, 0.5).sum(axis=1)
     return np.where(np.isfinite(visible).any(axis=1), shown, np.nan)
 
@@ -144,12 +147,12 @@ def errors_by_group(
 def rmse_interval_cm(
     errors_cm: Sequence[Float[np.ndarray, "_ 6"]], rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return the 95 % interval of the RMSE over drives like these, by bootstrap over drives or stretches.
+    """Return the 95 % interval of the RMSE over drives like these, by bootstrap over drives or segments.
 
-    Neighbouring frames are alike, so that drawing frames would promise far too much.
+    Neighbouring frames are alike, so that drawing frames would give an interval that is far too narrow.
 
     Args:
-        errors_cm: Absolute errors of each drive or stretch, see :func:`drawn_parts`.
+        errors_cm: Absolute errors of each drive or segment, see :func:`bootstrap_segments`.
         rng: Source of randomness.
 
     Returns:
@@ -166,35 +169,35 @@ def rmse_interval_cm(
     return float(low), float(high)
 
 
-def drawn_parts(frames: Sequence[int]) -> tuple[Int[np.ndarray, "_"], str]:
-    """Say what the bootstrap draws: whole drives, or where there are too few of them, stretches of these.
+def bootstrap_segments(frames: Sequence[int]) -> tuple[Int[np.ndarray, "_"], str]:
+    """Return what the bootstrap draws: whole drives, or if there are too few, segments of them.
 
-    Stretches of a single drive tell how far chance on this road reaches, not what another road would bring.
+    Segments of a single drive show the effect of chance on this road, not what another road would bring.
 
     Args:
         frames: Number of frames of each drive, in their order.
 
     Returns:
-        Where to cut between the parts, by frame, and what the parts are called.
+        Where to cut, by frame, and what is drawn, in words.
     """
     ends = np.cumsum(np.asarray(frames, np.int64))
     if len(ends) >= _FEWEST:
         return ends[:-1], "drives like these"
     starts = ends - np.asarray(frames, np.int64)
     cuts = [
-        np.append(np.arange(a + STRETCH_FRAMES, b - STRETCH_FRAMES // 2, STRETCH_FRAMES), b)
+        np.append(np.arange(a + SEGMENT_FRAMES, b - SEGMENT_FRAMES // 2, SEGMENT_FRAMES), b)
         for a, b in zip(starts, ends, strict=True)
     ]
-    return np.concatenate(cuts)[:-1], f"stretches of {STRETCH_FRAMES} frames"
+    return np.concatenate(cuts)[:-1], f"segments of {SEGMENT_FRAMES} frames"
 
 
-def doubt_of(errors_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]) -> Doubt | None:
-    """Hold standard deviations against errors; None where the detector tells none."""
+def sigma_stats(errors_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]) -> SigmaStats | None:
+    """Compare sigmas with errors; None where the detector predicts none."""
     known = np.isfinite(errors_cm) & np.isfinite(sigma_cm)
     if not known.any():
         return None
     ratio = errors_cm[known] / np.maximum(sigma_cm[known], 1e-9)
-    return Doubt(
+    return SigmaStats(
         coverage={name: float(np.mean(ratio <= sigmas)) for name, sigmas in INTERVALS.items()},
         reliability=tuple(float(np.mean(ratio <= sigmas)) for sigmas in RELIABILITY_SIGMAS),
         median_sigma_cm=float(np.median(sigma_cm[known])),
@@ -202,10 +205,10 @@ def doubt_of(errors_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n
     )
 
 
-def presence_of(
+def presence_stats(
     presence: Float[np.ndarray, "n 2"], visible: Float[np.ndarray, "n 2"]
 ) -> PresenceStats | None:
-    """Hold probabilities of lines against which lines can be seen; None where none of it is known."""
+    """Compare probabilities of lines with which lines can be seen; None where nothing is known."""
     known = np.isfinite(presence) & np.isfinite(visible)
     if not known.any():
         return None
@@ -225,30 +228,30 @@ def presence_of(
 
 @dataclass(frozen=True)
 class Breakdown:
-    """What a comparison says beyond its errors.
+    """What a comparison finds beyond its errors.
 
     Attributes:
         groups: By condition and detector, the errors of each group of frames.
         interval_cm: By detector, the 95 % interval of its RMSE; None where the frames are too few.
-        interval_over: What the intervals are over, in words: drives, or stretches of one or two drives.
-        doubt: By detector that tells standard deviations.
-        presence: By detector that tells which lines are there.
+        interval_over: What the intervals are over, in words: drives, or segments of one or two drives.
+        sigma: By detector that predicts sigmas.
+        presence: By detector that predicts which lines can be seen.
     """
 
     groups: Mapping[str, Mapping[str, Mapping[str, ErrorStats]]]
     interval_cm: Mapping[str, tuple[float, float] | None]
     interval_over: str
-    doubt: Mapping[str, Doubt]
+    sigma: Mapping[str, SigmaStats]
     presence: Mapping[str, PresenceStats]
 
     def of(self, detector: str) -> dict[str, object]:
         """Return plain values for JSON of one detector."""
-        doubt, presence = self.doubt.get(detector), self.presence.get(detector)
+        sigma, presence = self.sigma.get(detector), self.presence.get(detector)
         interval = self.interval_cm[detector]
         return {
             "rmse_95_interval_cm": None if interval is None else list(interval),
             "rmse_95_interval_over": self.interval_over,
-            "doubt": None if doubt is None else doubt.as_dict(),
+            "doubt": None if sigma is None else sigma.as_dict(),
             "presence": None if presence is None else presence.as_dict(),
             "conditions": {
                 condition: {name: stats.as_dict() for name, stats in by_detector[detector].items()}

@@ -17,10 +17,11 @@ from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.network.model_file import ModelMeta
 
 CARD_NAME = "MODEL_CARD.md"
-#: What is so much worse than the whole is told as a weakness.
+#: A group whose RMSE is this many times that of the whole is a weakness. Chosen.
 _WORSE = 1.5
-#: Errors beyond this make a lane hard to follow: a tenth of a lane of 40 cm.
+#: Larger errors make a lane hard to follow. Chosen: a tenth of a 40 cm lane.
 _LARGE_CM = 4.0
+#: Worst sources that are looked at. Chosen.
 _N_SOURCES = 3
 
 
@@ -38,7 +39,7 @@ def model_card(
         name: Of the checkpoint.
         meta: Description in the model's file.
         metrics: Content of ``metrics.json``.
-        training: The label sets that it has learned from, each once.
+        training: The label sets that it learned from, each once.
         comparison: Its errors on the test drives; the network is the first detector.
         robustness: Its errors when something is wrong; may be empty.
     """
@@ -63,8 +64,8 @@ def _what(meta: ModelMeta, metrics: Mapping[str, Any]) -> str:
         f"{window.rows} x "
         f"{window.columns} cells of {window.cell_cm:g} cm, from {window.left_cm:g} to {right_cm:g} cm across "
         f"and {window.near_cm:g} to {far_cm:g} cm ahead.\nOut: x of the left and the right line 0, 15 and "
-        "30 cm ahead of the front axle, the uncertainty of each, and whether each line is there.\nLines "
-        "beside the window, and what lies further ahead, it does not see."
+        "30 cm ahead of the front axle, the uncertainty of each, and whether each line is there.\nIt "
+        "sees nothing beside the window or further ahead."
     )
 
 
@@ -75,7 +76,7 @@ def _training(meta: ModelMeta, metrics: Mapping[str, Any], training: Sequence[La
     count = len({labels.meta.camera_hash for labels in training})
     return (
         f"{sum(map(len, training))} frames of {_plural(len(training), 'label set')}, labels from the "
-        f"{sources}; {_plural(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} passes, the best "
+        f"{sources}; {_plural(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} epochs, the best "
         f"one ({metrics['best_epoch']}) chosen by {metrics['val_frames']} frames of other drives or laps "
         f"(RMSE {show_cm(metrics['val_rmse_cm'])} cm).\nThe whole config is `run.yaml`."
     )
@@ -89,17 +90,17 @@ def _errors(comparison: Comparison) -> str:
     if interval is not None:
         spread = f" ({show_cm(interval[0])} to {show_cm(interval[1])} over {rest.interval_over})"
     lines = [
-        f"On {frames} frames of {_plural(len(comparison.sources), 'test drive')} that it has not seen, "
+        f"On {frames} frames of {_plural(len(comparison.sources), 'test drive')} held out from the training, "
         f"against the {comparison.reference}: RMSE {show_cm(stats.rmse_cm)} cm{spread}, median "
         f"{show_cm(stats.median_cm)}, 95 % below {show_cm(stats.p95_cm)}, worst {show_cm(stats.worst_cm)}."
     ]
-    doubt, presence = rest.doubt.get(name), rest.presence.get(name)
-    if doubt is not None:
-        lines.append(f"{show_share(doubt.coverage['68'])} of the errors lie within its standard deviation.")
+    sigma, presence = rest.sigma.get(name), rest.presence.get(name)
+    if sigma is not None:
+        lines.append(f"{show_share(sigma.coverage['68'])} of the errors lie within one predicted sigma.")
     if presence is not None:
         found, gaps = show_share(presence.recall), show_share(presence.absent_recall)
-        absent = f"; of the {presence.absent} that are not, it calls {gaps} absent" if presence.absent else ""
-        lines.append(f"Of the lines that are there it finds {found}{absent}.")
+        absent = f"; of the {presence.absent} that cannot, it calls {gaps} absent" if presence.absent else ""
+        lines.append(f"Of the lines that can be seen it finds {found}{absent}.")
     lines.append("All tables, with the other detectors: `results.md`.")
     return "\n".join(lines)
 
@@ -114,23 +115,23 @@ def _failures(meta: ModelMeta, comparison: Comparison) -> str:
     ]
     weak = _weak_spots(comparison)
     if weak:
-        lines += [f"More than {_WORSE:g} times as wrong as on the whole:", "\n".join(weak)]
+        lines += [f"RMSE more than {_WORSE:g} times that of the whole:", "\n".join(weak)]
     else:
-        lines.append(f"No group of frames, point or drive is {_WORSE:g} times as wrong as the whole.")
+        lines.append(f"No group of frames, point or drive has an RMSE of {_WORSE:g} times that of the whole.")
     low, high = _widths_cm(meta)
     other = (
         f"of another width than {low} cm" if low == high else f"narrower than {low} or wider than {high} cm"
     )
-    lines.append(f"Lanes {other}, and roads without painted lines, were not in its training.")
+    lines.append(f"Its training had no lanes {other}, and no roads without painted lines.")
     return "\n\n".join(lines)
 
 
 def _weak_spots(comparison: Comparison) -> list[str]:
-    """Where the network is much worse than on the whole, a line each."""
+    """Return where the network is much worse than on the whole, a line each."""
     name = comparison.first
     groups = comparison.tables[name].groups
     spots = [
-        # Here only one detector is spoken of.
+        # The card is about one detector.
         (f"{GROUPS[condition][0].replace('the first detector', 'the network')} {group}", stats)
         for condition, by_detector in comparison.breakdown.groups.items()
         for group, stats in by_detector[name].items()

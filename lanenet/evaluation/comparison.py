@@ -12,13 +12,13 @@ from lanenet.errors import LabelFormatError
 from lanenet.evaluation.breakdown import (
     GROUPS,
     Breakdown,
-    doubt_of,
-    drawn_parts,
+    bootstrap_segments,
     errors_by_group,
     lane_curvature,
     lines_shown,
-    presence_of,
+    presence_stats,
     rmse_interval_cm,
+    sigma_stats,
 )
 from lanenet.evaluation.errors import ErrorStats, ErrorTable, error_stats, point_errors
 from lanenet.geometry.lane import ROWS_CM
@@ -30,7 +30,7 @@ _UNITS = {"*_cm": "centimetre", "coverage": "share of the labelled points, 0 to 
 
 @dataclass(frozen=True)
 class SourceAnswers:
-    """What the detectors said about one drive, map or label set.
+    """What the detectors say about one drive, map or label set.
 
     Attributes:
         name: The path, as people know it.
@@ -38,8 +38,8 @@ class SourceAnswers:
         reference: Where the labels come from: ``truth`` or ``map``.
         truth_cm: Six labels per frame; NaN where there is none.
         answers_cm: By detector, six points per frame; NaN where it has no answer.
-        sigma_cm: By detector, the standard deviations that it tells; who tells none may be left out.
-        presence: By detector, its probability that the left and the right line are there; likewise.
+        sigma_cm: By detector, its sigmas; a detector that predicts none may be left out.
+        presence: By detector, its probability that the left and the right line can be seen; likewise.
         visible: Whether each line can be seen: 1, 0, or NaN for unknown; None if unknown throughout.
         conditions: By name (see :data:`lanenet.evaluation.breakdown.GROUPS`) its value for each frame.
     """
@@ -60,8 +60,8 @@ class SharedErrors:
     """Errors of two detectors on the points that both answered.
 
     Attributes:
-        own: Of the one.
-        first: Of the other, which is the first of the comparison.
+        own: Of a detector.
+        first: Of the first detector of the comparison.
     """
 
     own: ErrorStats
@@ -89,13 +89,13 @@ class SourceErrors:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Detectors beside each other.
+    """The errors of several detectors.
 
     Attributes:
         reference: What the errors are against: ``truth``, ``map`` or ``map and truth``.
         tables: Errors by detector, over all sources together.
-        shared: By detector but the first: it and the first on the points that both answered. Detectors that
-            answer only what is easy look good on their own answers.
+        shared: By detector but the first: it and the first on the points that both answered. A detector that
+            answers only what is easy looks good on its own answers.
         sources: The errors by source.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
         breakdown: Where the errors come from.
@@ -110,7 +110,7 @@ class Comparison:
 
     @property
     def first(self) -> str:
-        """Name of the detector that the others are held against."""
+        """Name of the detector that the others are compared with."""
         return next(iter(self.tables))
 
     def as_dict(self) -> dict[str, object]:
@@ -213,24 +213,24 @@ def _break_down(
         condition: {n: errors_by_group(condition, value, errors_cm[n], labelled) for n in names}
         for condition, value in values.items()
     }
-    cuts, interval_over = drawn_parts([len(source.truth_cm) for source in sources])
-    doubt, presence, interval = {}, {}, {}
+    cuts, interval_over = bootstrap_segments([len(source.truth_cm) for source in sources])
+    sigma, presence, interval = {}, {}, {}
     for name in names:
-        # The same parts are drawn for every detector.
+        # The same segments are drawn for every detector.
         interval[name] = rmse_interval_cm(np.split(errors_cm[name], cuts), np.random.default_rng(0))
-        own = doubt_of(errors_cm[name], _joined(sources, [s.sigma_cm.get(name) for s in sources], 6))
+        own = sigma_stats(errors_cm[name], _joined(sources, [s.sigma_cm.get(name) for s in sources], 6))
         if own is not None:
-            doubt[name] = own
-        told = presence_of(_joined(sources, [s.presence.get(name) for s in sources], 2), visible)
-        if told is not None:
-            presence[name] = told
-    return Breakdown(groups, interval, interval_over, doubt, presence)
+            sigma[name] = own
+        lines = presence_stats(_joined(sources, [s.presence.get(name) for s in sources], 2), visible)
+        if lines is not None:
+            presence[name] = lines
+    return Breakdown(groups, interval, interval_over, sigma, presence)
 
 
 def _joined(
     sources: Sequence[SourceAnswers], parts: Sequence[np.ndarray | None], width: int
 ) -> Float[np.ndarray, "n w"]:
-    """One after the other; NaN for a source that has none."""
+    """Concatenate what sources know; NaN for a source that knows nothing."""
     unknown = [np.full((len(source.truth_cm), width), np.nan) for source in sources]
     return np.concatenate([u if part is None else part for u, part in zip(unknown, parts, strict=True)])
 

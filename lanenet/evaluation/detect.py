@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,13 +15,14 @@ from jaxtyping import UInt8
 from lanenet.data.detections import DetectionTable, check_table_path
 from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
-from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.errors import DriveFormatError
+from lanenet.evaluation.run import run_detectors
 from lanenet.geometry.camera import Camera
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.image_lane import ImageLane
 
-#: Annotated frames are enlarged to at least this width, so that the text can be read.
+#: Annotated frames are enlarged to at least this width. Chosen: the text can be read.
 VIDEO_WIDTH_PX = 640
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
 Progress = Callable[[int, int], None]
@@ -34,7 +34,7 @@ class DetectReport:
 
     Attributes:
         out: The table of detections.
-        video: The annotated video, if one was asked for.
+        video: The annotated video, if wanted.
         frames: Rows of the table.
         complete: Frames with all six points.
         steered: Frames with a steering target.
@@ -65,13 +65,12 @@ def run_detector(
 ) -> DetectReport:
     """Run a detector over every frame of a source and write what it finds.
 
-    Files are moved into place when they are complete. The detector forgets its state where the source is
-    interrupted.
+    Files are moved into place when they are complete. The detector is reset where the source is interrupted.
 
     Args:
         source: The frames.
         detector: Any detector.
-        camera: Camera of the frames, for drawing; None where the detector does without.
+        camera: Camera of the frames, for drawing; None for a detector without one.
         out: Table of detections, ``.parquet`` or ``.csv``.
         video: Annotated video (mp4v), or None.
         progress: Called with (frames done, frames).
@@ -86,7 +85,7 @@ def run_detector(
         LabelFormatError: If the ending of ``out`` is unknown.
         LanenetError: If ``out`` or ``video`` cannot be written there; found before the first frame.
     """
-    # Before the work, which may take an hour, and not after it.
+    # Before the work, which may take an hour.
     check_table_path(out)
     if video is not None:
         if video.suffix.lower() not in VIDEO_ENDINGS:
@@ -96,33 +95,21 @@ def run_detector(
     times_s: list[float] = []
     problems: list[str] = []
     complete = steered = 0
+    running = run_detectors(source, {"it": detector}, skip_unreadable=skip_unreadable)
     with ExitStack() as stack:
         writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None
-        detector.reset()
-        for i in range(len(source)):
-            if source.starts[i]:
-                detector.reset()
-            frame, estimate = None, LaneEstimate()
-            try:
-                frame = source.image(i)
-            except DriveFormatError as error:
-                if not skip_unreadable:
-                    raise
-                problems.append(str(error))
-            if frame is not None:
-                start_s = time.perf_counter()
-                try:
-                    estimate = detector.detect(frame)
-                except CalibrationError as error:
-                    raise CalibrationError(f"{source.name}, frame {source.frames[i]}: {error}") from None
-                times_s.append(time.perf_counter() - start_s)
+        for seen in running:
+            i, estimate = seen.index, seen.estimates["it"]
+            times_s += seen.seconds.values()
+            if seen.problem is not None:
+                problems.append(seen.problem)
             complete += bool(estimate.mask.all())
             steered += bool(np.isfinite(estimate.steering_rad))
             table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
             if writer is not None:
                 rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
-                lane = getattr(detector, "last", None) if frame is not None else None
-                writer.add(frame, estimate, f"{source.frames[i]}{rate}", lane)
+                lane = getattr(detector, "last", None) if seen.image is not None else None
+                writer.add(seen.image, estimate, f"{source.frames[i]}{rate}", lane)
             if progress is not None:
                 progress(i + 1, len(source))
         if not times_s:
@@ -193,9 +180,9 @@ class _AnnotatedVideo:
         image_lane: ImageLane | None,
     ) -> None:
         assert self._size is not None
-        picture = draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption, image_lane)
+        drawn = draw_estimate(frame_bgr, estimate, self.camera, self.scale, caption, image_lane)
         size = (self._size[0] * self.scale, self._size[1] * self.scale)
-        if (picture.shape[1], picture.shape[0]) != size:
+        if (drawn.shape[1], drawn.shape[0]) != size:
             # Photos of a folder may differ in size.
-            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
-        self._writer.write(picture)
+            drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA))
+        self._writer.write(drawn)

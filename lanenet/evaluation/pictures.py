@@ -1,11 +1,4 @@
-"""A comparison as a picture: how the errors of each detector spread, by row.
-
-A comparison's breakdown as a picture: errors by bend, and whether the doubt of each detector is right.
-
-Pictures by Matplotlib, where it is installed.
-
-A picture of the frames that a detector got most wrong: its lane beside the one that is there.
-"""
+"""The report's pictures: errors by row and by bend, coverage of sigma, and the worst frames."""
 
 from __future__ import annotations
 
@@ -27,11 +20,38 @@ from lanenet.geometry.lane import ROWS_CM, SIDES
 from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR, draw_estimate
 from lanenet.perception.estimate import LaneEstimate
 
+#: Smaller errors are drawn as this, [cm]: on a logarithmic axis the simulator's rounding would only stretch
+#: it.
+_LEAST_CM = 0.01
+#: Of the sheet of worst frames: width of a frame, frames side by side, height of the legend.
+_TILE_WIDTH_PX, _COLUMNS, _LEGEND_PX = 400, 4, 24
+#: Neighbours look alike: of frames this close only the worst is shown. Chosen.
+_APART_FRAMES = 15
+#: A sheet of photographs takes a tenth of its size as PNG.
+_JPEG_QUALITY = 88
+
+
+def report_pictures(
+    comparison: Comparison, seen: Sequence[tuple[LabelledFrames, Float[np.ndarray, "_ 6"]]]
+) -> dict[str, bytes]:
+    """Draw what can be drawn of a comparison, by the ending of the file's name.
+
+    Args:
+        comparison: The figures.
+        seen: Sources with frames, and the first detector's points on each.
+    """
+    drawn = {".png": error_picture(comparison), "-breakdown.png": breakdown_picture(comparison)}
+    frames, answers_cm = [source for source, _ in seen], [answer for _, answer in seen]
+    worst = find_worst(frames, answers_cm)
+    if worst:
+        drawn["-worst.jpg"] = jpeg_bytes(draw_worst(frames, answers_cm, worst))
+    return {ending: content for ending, content in drawn.items() if content is not None}
+
 
 def new_figure(width_in: float, height_in: float) -> Any | None:
     """Return an empty figure; None where Matplotlib is not installed.
 
-    It is made without pyplot, which would pick a window system and keep global state.
+    Made without pyplot, which picks a window system and keeps global state.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -44,14 +64,10 @@ def new_figure(width_in: float, height_in: float) -> Any | None:
 
 
 def png_bytes(figure: Any) -> bytes:
-    """Return a figure as a PNG, cut to what is drawn."""
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", bbox_inches="tight")
-    return picture.getvalue()
-
-
-#: Below this the simulator's own rounding shows; on a logarithmic axis it would only stretch the picture.
-_LEAST_CM = 0.01
+    """Return a figure as a PNG, cropped to what is drawn."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", bbox_inches="tight")
+    return png.getvalue()
 
 
 def error_picture(comparison: Comparison) -> bytes | None:
@@ -98,11 +114,11 @@ def error_picture(comparison: Comparison) -> bytes | None:
         fontsize=10,
     )
     axes.grid(True, axis="y", which="major", alpha=0.3)
-    # The boxes of a log axis end where they end; the shares need room below them.
+    # Room for the shares below the boxes.
     low, high = axes.get_ylim()
     axes.set_ylim(low * (low / high) ** 0.08, high)
     handles = [Patch(facecolor=f"C{i}", label=name) for i, name in enumerate(names)]
-    # Under the axes, where no box can lie below it.
+    # Below the axes, where no box is covered.
     axes.legend(
         handles=handles, fontsize=9, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, -0.07)
     )
@@ -116,7 +132,7 @@ def _row_errors(errors_cm: Float[np.ndarray, "n 6"], row: int) -> Float[np.ndarr
 
 
 def breakdown_picture(comparison: Comparison) -> bytes | None:
-    """Draw the RMSE by curvature of the lane, and the reliability diagram of the standard deviations.
+    """Draw the RMSE by curvature of the lane, and the reliability diagram of the sigmas.
 
     Returns:
         A PNG, or None where Matplotlib is not installed.
@@ -124,7 +140,7 @@ def breakdown_picture(comparison: Comparison) -> bytes | None:
     figure = new_figure(10.0, 4.5)
     if figure is None:
         return None
-    bend, doubt = figure.subplots(1, 2)
+    bend, coverage = figure.subplots(1, 2)
     names = list(comparison.tables)
     groups = [name for name, _ in GROUPS["bend"][1]]
     width = 0.8 / len(names)
@@ -137,32 +153,24 @@ def breakdown_picture(comparison: Comparison) -> bytes | None:
     bend.set_title(f"By bend, against the {comparison.reference}", fontsize=10)
     bend.grid(True, axis="y", alpha=0.3)
     bend.legend(fontsize=8)
-    doubt.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linestyle="--", label="right")
+    coverage.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linestyle="--", label="calibrated")
     for i, name in enumerate(names):
-        own = comparison.breakdown.doubt.get(name)
+        own = comparison.breakdown.sigma.get(name)
         if own is not None:
-            doubt.plot(RELIABILITY_SHARES, own.reliability, marker="o", color=f"C{i}", label=name)
-    doubt.set_xlabel("share of the errors that the interval promises")
-    doubt.set_ylabel("share that lies in it")
-    doubt.set_title("Above the line: too careful; below: too sure", fontsize=10)
-    doubt.set_xlim(0.0, 1.0)
-    doubt.set_ylim(0.0, 1.0)
-    doubt.grid(True, alpha=0.3)
-    doubt.legend(fontsize=8)
+            coverage.plot(RELIABILITY_SHARES, own.reliability, marker="o", color=f"C{i}", label=name)
+    coverage.set_xlabel("share of the errors that the interval should hold")
+    coverage.set_ylabel("share that lies in it")
+    coverage.set_title("Above the line: sigma too large; below: too small", fontsize=10)
+    coverage.set_xlim(0.0, 1.0)
+    coverage.set_ylim(0.0, 1.0)
+    coverage.grid(True, alpha=0.3)
+    coverage.legend(fontsize=8)
     return png_bytes(figure)
-
-
-_TILE_WIDTH_PX = 400
-_COLUMNS = 4
-_LEGEND_PX = 24
-#: Neighbours look alike: of frames this close only the worst is shown.
-_APART_FRAMES = 15
-_JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """A frame and how wrong the answer is.
+    """A frame and its error.
 
     Attributes:
         source: Position of its source.
@@ -178,12 +186,12 @@ class WorstFrame:
 def find_worst(
     sources: Sequence[LabelledFrames], answers_cm: Sequence[Float[np.ndarray, "_ 6"]], count: int = 12
 ) -> list[WorstFrame]:
-    """Return the frames with the largest errors, the worst first, no two of them neighbours.
+    """Return the frames with the largest errors, the worst first, without close neighbours.
 
     Args:
         sources: Frames and labels.
         answers_cm: A detector's six points for each frame of each source; NaN where it has no answer.
-        count: How many, at most.
+        count: Frames at most.
     """
     candidates = []
     for k, (source, answer) in enumerate(zip(sources, answers_cm, strict=True)):
@@ -207,7 +215,7 @@ def draw_worst(
     answers_cm: Sequence[Float[np.ndarray, "_ 6"]],
     worst: Sequence[WorstFrame],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw frames side by side, and below them what the colours mean.
+    """Draw frames side by side, with a legend of the colours below.
 
     The labels are magenta, the answer is green (left) and orange (right).
 
@@ -254,6 +262,6 @@ def _legend(width_px: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def jpeg_bytes(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Encode a picture as JPEG: a sheet of photographs is a tenth of its size as PNG."""
+    """Encode a picture as JPEG."""
     _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""How much worse a model becomes when something is wrong: label sets, changed in one way at a time."""
+"""How errors grow when something is wrong: label sets, changed in one way at a time."""
 
 from __future__ import annotations
 
@@ -11,8 +11,15 @@ from jaxtyping import Float
 
 from lanenet.data.label_set import LabelSet
 from lanenet.errors import LabelFormatError
-from lanenet.evaluation.breakdown import Doubt, PresenceStats, doubt_of, presence_of, rmse_interval_cm
-from lanenet.evaluation.errors import ErrorStats, RasterAnswers, RasterModel, error_stats
+from lanenet.evaluation.answers import RasterAnswers, RasterModel
+from lanenet.evaluation.breakdown import (
+    PresenceStats,
+    SigmaStats,
+    presence_stats,
+    rmse_interval_cm,
+    sigma_stats,
+)
+from lanenet.evaluation.errors import ErrorStats, error_stats
 from lanenet.evaluation.tables import TextTable, show_cm, show_share
 from lanenet.perception.lane_memory import LaneMemory
 from lanenet.samples.dataset import LaneSamples
@@ -23,7 +30,9 @@ Progress = Callable[[int, int], None]
 
 FORMAT = "lanenet-robustness/1"
 
-#: What is changed, and how much; with the draw "limit" every frame by all of it, with either sign.
+#: What is changed, and by how much. With the draw "limit" every frame is changed by all of it, with either
+#: sign. The amounts are chosen: what a home-made car meets; 15 degrees and 8 cm are the augmentation's
+#: limits.
 CHANGES: dict[str, dict[str, object]] = {
     "none": {},
     "one line missing": {"missing_line": 1.0},
@@ -36,12 +45,11 @@ CHANGES: dict[str, dict[str, object]] = {
     "height 5 % wrong": {"height": 0.05, "draw": "limit"},
     "both lines missing": {"missing_both": 1.0},
 }
-#: These have no error worth telling: nothing of the lane is seen.
+#: These have no errors: nothing of the lane can be seen.
 _PRESENCE_ALONE = ("both lines missing",)
-#: Of these the errors are those of the line that is missing, where the other one is there.
+#: Here the errors are those of the missing line, where the other one can be seen.
 _MISSING_SIDE = ("one line missing", "same, width known", "same, width unknown")
-#: Whether the lane's width is known. Elsewhere it is to a model that can be told it, since that is how such a
-#: model is used, and to no other.
+#: Whether the lane width is known. Elsewhere it is known to models that take it, as they are used so.
 _WIDTH_KNOWN = {"same, width known": True, "same, width unknown": False}
 _SEED = 20
 
@@ -55,15 +63,15 @@ class RobustRow:
         model: Name of the model.
         errors: Over all points, or over those of the missing line; None where nothing of the lane is seen.
         interval_cm: 95 % interval of their RMSE over drives.
-        doubt: Whether the model knows how wrong it is.
-        presence: Whether it tells which lines are there.
+        sigma: Whether its sigmas are right.
+        presence: Whether it predicts which lines can be seen.
     """
 
     change: str
     model: str
     errors: ErrorStats | None
     interval_cm: tuple[float, float] | None
-    doubt: Doubt | None
+    sigma: SigmaStats | None
     presence: PresenceStats | None
 
     def as_dict(self) -> dict[str, object]:
@@ -73,7 +81,7 @@ class RobustRow:
             "model": self.model,
             "errors": None if self.errors is None else self.errors.as_dict(),
             "rmse_95_interval_cm": None if self.interval_cm is None else list(self.interval_cm),
-            "doubt": None if self.doubt is None else self.doubt.as_dict(),
+            "doubt": None if self.sigma is None else self.sigma.as_dict(),
             "presence": None if self.presence is None else self.presence.as_dict(),
         }
 
@@ -87,14 +95,14 @@ def measure_robustness(
     """Answer every frame of label sets under each change.
 
     Args:
-        models: By name; all see the same rasters. One that can be told the lane's width is told it.
+        models: By name; all get the same rasters, and those that take it the lane width.
         label_sets: With lane lines, from which the labels of a moved car follow.
         names: Where each label set came from, for messages.
         progress: Called after each change.
 
     Returns:
-        A row per change and model. With one line missing there is a second row: with the width known, or,
-        of a model that is told it in all others, unknown.
+        A row per change and model. With one line missing there is a second row: with the width known, or for
+        a model that takes it, unknown.
 
     Raises:
         LabelFormatError: If a label set has no lane lines, or two have different windows.
@@ -114,7 +122,7 @@ def measure_robustness(
         for name, model in models.items():
             width_known = _WIDTH_KNOWN.get(change, model.meta.takes_width)
             if change in _WIDTH_KNOWN and width_known == model.meta.takes_width:
-                continue  # one line missing shows it
+                continue  # the same as "one line missing"
             answers = model.answer(batch.rasters, batch.lane_cm if width_known else None)
             if change in _MISSING_SIDE and width_known:
                 answers = _with_width(answers, batch.lane_cm)
@@ -130,8 +138,8 @@ def measure_robustness(
                     name,
                     None if alone else error_stats(errors, np.isfinite(errors), labelled),
                     None if alone else rmse_interval_cm(np.split(errors, ends), np.random.default_rng(0)),
-                    None if alone else doubt_of(errors, answers.sigma_cm),
-                    presence_of(answers.presence, visible),
+                    None if alone else sigma_stats(errors, answers.sigma_cm),
+                    presence_stats(answers.presence, visible),
                 )
             )
         if progress is not None:
@@ -140,12 +148,12 @@ def measure_robustness(
 
 
 def can_measure(labels: LabelSet) -> bool:
-    """Return whether a label set knows lane lines, from which the labels of a changed frame follow."""
+    """Return whether a label set has lane lines, from which the labels of a changed frame follow."""
     return any(np.isfinite(line).any() for pair in labels.lines for line in pair)
 
 
 def _with_width(answers: RasterAnswers, widths_cm: Float[np.ndarray, "n"]) -> RasterAnswers:
-    """Rebuild missing lines as the car does whose memory has the width of the lane."""
+    """Rebuild missing lines from the lane width, as the car does."""
     points, sigma = answers.points_cm.copy(), answers.sigma_cm.copy()
     for i, width_cm in enumerate(widths_cm):
         memory = LaneMemory(float(width_cm))
@@ -162,7 +170,7 @@ def robust_table(rows: Sequence[RobustRow]) -> TextTable:
     """Lay out what was measured, a line per change and model."""
     lines = []
     for row in rows:
-        stats, interval, doubt, presence = row.errors, row.interval_cm, row.doubt, row.presence
+        stats, interval, sigma, presence = row.errors, row.interval_cm, row.sigma, row.presence
         lines.append(
             [
                 row.change,
@@ -170,7 +178,7 @@ def robust_table(rows: Sequence[RobustRow]) -> TextTable:
                 "-" if stats is None else show_cm(stats.rmse_cm),
                 "-" if interval is None else f"{show_cm(interval[0])}-{show_cm(interval[1])}",
                 "-" if stats is None else show_cm(stats.p95_cm),
-                show_share(None if doubt is None else doubt.coverage["68"]),
+                show_share(None if sigma is None else sigma.coverage["68"]),
                 show_share(None if presence is None else presence.recall),
                 show_share(None if presence is None else presence.absent_recall),
             ]
@@ -179,11 +187,11 @@ def robust_table(rows: Sequence[RobustRow]) -> TextTable:
         title="Errors in cm when something is wrong",
         header=["change", "model", "RMSE", "95%", "p95", "in 68%", "lines found", "gaps found"],
         lines=lines,
-        note="a network that can be told the lane's width is told it, except where it says unknown; one line "
-        "missing: the errors are those of that line where the other one is there; if the width is known, the "
-        "missing one is rebuilt from it, as on the car; all else is the network alone; heading and offset: "
-        "up to 15 degrees and 8 cm; 95%: interval of the RMSE over drives; in 68%: errors within a standard "
-        "deviation; found: lines that are there and called so, and lines that are not and called absent",
+        note="networks that take the lane width get it, except where it says unknown; one line missing: "
+        "errors of that line where the other can be seen; with the width known it is rebuilt from it, as on "
+        "the car; all else is the network alone; heading and offset: up to 15 degrees and 8 cm; 95%: "
+        "interval of the RMSE over drives; in 68%: errors within one sigma; found: lines that can be seen "
+        "and are predicted, and absent lines that are not",
         texts=2,
         # With one model every line would be a group of its own.
         grouped=len({row.model for row in rows}) > 1,

@@ -1,4 +1,4 @@
-"""Labels opened from drives, maps and label sets, for detectors to be compared on."""
+"""Labelled sources, on which detectors are compared: drives, maps and label sets."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
 
 from lanenet.config import read_yaml
 from lanenet.errors import DriveFormatError
@@ -28,7 +31,7 @@ class Opened:
 
     Attributes:
         path: Where it lies.
-        content: A label set, which holds edge points only, or frames with labels.
+        content: Frames with labels, or a label set, which holds edge points only.
         beside: The label set of the frames, if there is one: it knows which lines can be seen.
     """
 
@@ -52,7 +55,7 @@ class Opened:
 
     @property
     def drive(self) -> Path:
-        """The recording: the source itself, or the drive that a map was made of."""
+        """The recording: the source itself, or the drive that a map was made from."""
         file = self.path / "map.yaml"
         return Path(read_yaml(file)["drive"]) if file.is_file() else self.path
 
@@ -75,7 +78,7 @@ def open_source(
 
     Args:
         path: Where it lies.
-        window: Points of drives and maps beside this bird's-eye window have no label.
+        window: Points of drives and maps outside this bird's-eye window have no label.
         perception: How the edges of a simulated drive's label set are found; None takes the defaults.
         read_truth_labels: Reads the label set of a simulated drive from its truth
             (:func:`datagen.labels.truth.truth_labels`).
@@ -120,18 +123,16 @@ def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
 
 
 def _as_labelled(frames: LabelledFrames, labels: LabelSet) -> LabelledFrames:
-    """Frames with the points of their label set, which leaves out what no frame can tell."""
-    from lanenet.evaluation.conditions import at_frames
-
+    """Return frames with the points of their label set, which masks what no frame can show."""
     return replace(frames, points_cm=at_frames(labels.points_cm, labels.frame, frames.frames))
 
 
 def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
-    """Open the test part of a training run, from frames where they are still there.
+    """Open the test part of a training run, with its frames where they still exist.
 
     Args:
         labels: Label sets.
-        frames: For each label set the simulated drive or the map that it was made of.
+        frames: For each label set the simulated drive or the map that it was made from.
 
     Raises:
         LanenetError: If one cannot be read.
@@ -144,11 +145,78 @@ def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
         opened = Opened(labels_path, label_set)
         if frames_path.is_dir():
             whole = _open_frames(frames_path, label_set.meta.window)
-            # A recorded drive was cut along its time; the network has learned from its first part.
+            # Only the part of a recorded drive that the network has not learned from.
             part = whole.numbered(int(label_set.frame[0]), int(label_set.frame[-1]))
             meta = label_set.meta
-            # As wherever the other detectors look at frames, they look at gray.
+            # The other detectors use brightness alone, as they do everywhere.
             part = replace(part, perception=meta.perception.with_colours(0.0), marking_cm=meta.marking_cm)
             opened = Opened(frames_path, _as_labelled(part, label_set), label_set)
         sources.append(opened)
     return sources
+
+
+def lines_seen(labels: LabelSet) -> Float[np.ndarray, "n 2"]:
+    """Return whether each frame's raster shows the left and the right line: 1, 0, or NaN for unknown."""
+    from lanenet.samples.augment import join_frames, plain_batch
+
+    frames = join_frames(labels.edges, labels.lines, labels.points_cm)
+    return plain_batch(frames, np.arange(len(labels)), labels.meta.window).present.astype(np.float64)
+
+
+def distance_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[np.ndarray, "n"]:
+    """Return the distance of each frame to the nearest training frame of the same map, [cm].
+
+    Two label sets are of one map if their drives have the same name, their cameras are the same and both take
+    their labels from a map: parts of one recorded drive. NaN where no training frame is of this map, or of
+    this segment of it.
+    """
+    from lanenet.data.segments import map_segments
+
+    same = [
+        other
+        for other in training
+        if labels.meta.source == other.meta.source == "map"
+        and labels.meta.camera_hash == other.meta.camera_hash
+        and labels.drive[:1] == other.drive[:1]
+    ]
+    parts = [*same, labels]
+    frames, poses = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "poses"))
+    learned = np.arange(len(frames)) < len(frames) - len(labels)
+    order = np.argsort(frames, kind="stable")
+    segments = np.empty(len(frames), np.int64)
+    segments[order] = map_segments(frames[order], poses[order])
+    result = np.full(len(labels), np.nan)
+    for segment in np.unique(segments[~learned]):
+        mine = segments[~learned] == segment
+        result[mine] = nearest_pose_cm(labels.poses[mine], poses[learned & (segments == segment)])
+    return result
+
+
+def nearest_pose_cm(
+    poses: Float[np.ndarray, "n 3"], training_poses: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "n"]:
+    """Return the distance of each pose to the nearest training pose, [cm]; headings do not count."""
+    if not len(training_poses):
+        return np.full(len(poses), np.nan)
+    result = np.empty(len(poses))
+    for k, pose in enumerate(poses):
+        result[k] = np.sqrt(((training_poses[:, :2] - pose[:2]) ** 2).sum(axis=1).min())
+    return result
+
+
+def at_frames(
+    values: Float[np.ndarray, "n *k"], frames: Int[np.ndarray, "n"], wanted: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "m *k"]:
+    """Return the values of frames by their numbers; NaN for a number without a value.
+
+    Args:
+        values: A row per frame.
+        frames: Numbers of the rows, increasing.
+        wanted: Numbers to look up.
+    """
+    result = np.full((len(wanted), *values.shape[1:]), np.nan)
+    if len(frames):
+        row = np.minimum(np.searchsorted(frames, wanted), len(frames) - 1)
+        found = frames[row] == wanted
+        result[found] = values[row[found]]
+    return result

@@ -21,15 +21,15 @@ _PRESENCE = ("line precision", "line recall", "absent recall")
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of words.
+    """A table as text.
 
     Attributes:
         title: What it shows.
-        header: One word or more per column.
+        header: Of the columns.
         lines: Cells.
-        note: What has to be known to read it.
-        texts: How many columns, from the left, are text and not figures.
-        grouped: Set lines apart where the first cell changes; an empty cell goes on with the group.
+        note: How to read it.
+        texts: Number of columns, from the left, that are text and not figures.
+        grouped: Separate lines where the first cell changes; an empty cell continues the group.
     """
 
     title: str
@@ -61,7 +61,7 @@ class TextTable:
 
 
 def lay_out(comparison: Comparison) -> list[TextTable]:
-    """Lay out a comparison: by point, on shared points, by source and by condition (of several)."""
+    """Lay out a comparison: by point, on shared points, by source, by condition, sigma and presence."""
     tables = [_by_point(comparison)]
     if comparison.shared:
         tables.append(_on_shared_points(comparison))
@@ -69,11 +69,11 @@ def lay_out(comparison: Comparison) -> list[TextTable]:
         tables.append(_by_source(comparison))
     for condition, by_detector in comparison.breakdown.groups.items():
         groups = by_detector[comparison.first].values()
-        # All in one group is what the first table says.
+        # A single group repeats the first table.
         if sum(stats.truth_count > 0 for stats in groups) > 1:
             tables.append(_by_condition(comparison, condition))
-    if comparison.breakdown.doubt or comparison.breakdown.presence:
-        tables.append(_doubt_and_presence(comparison))
+    if comparison.breakdown.sigma or comparison.breakdown.presence:
+        tables.append(_sigma_and_presence(comparison))
     return tables
 
 
@@ -136,7 +136,7 @@ def _by_source(comparison: Comparison) -> TextTable:
     for source in comparison.sources:
         cells = (source.detectors[name] for name in names)
         shown = [f"{show_cm(s.rmse_cm)} {_percent(s)}" for s in cells]
-        # Where all sources are alike, the title of the first table says it.
+        # If all sources are alike, the title of the first table says it.
         name = Path(source.name).name + (f" ({source.reference})" if mixed else "")
         lines.append([name, *shown])
     return TextTable(
@@ -162,32 +162,31 @@ def _by_condition(comparison: Comparison, condition: str) -> TextTable:
     )
 
 
-def _doubt_and_presence(comparison: Comparison) -> TextTable:
+def _sigma_and_presence(comparison: Comparison) -> TextTable:
     breakdown, lines = comparison.breakdown, []
     for name in comparison.tables:
-        doubt, presence = breakdown.doubt.get(name), breakdown.presence.get(name)
-        if doubt is None and presence is None:
+        sigma, presence = breakdown.sigma.get(name), breakdown.presence.get(name)
+        if sigma is None and presence is None:
             continue
-        shares: list[float | None] = [None, None] if doubt is None else list(doubt.coverage.values())
+        shares: list[float | None] = [None, None] if sigma is None else list(sigma.coverage.values())
         shares += (
             [None, None, None]
             if presence is None
             else [presence.precision, presence.recall, presence.absent_recall]
         )
-        sigma = "-" if doubt is None else show_cm(doubt.median_sigma_cm)
-        lines.append([name, sigma, *map(show_share, shares)])
+        median = "-" if sigma is None else show_cm(sigma.median_sigma_cm)
+        lines.append([name, median, *map(show_share, shares)])
     return TextTable(
-        title="What detectors say of themselves",
+        title="Predicted uncertainty and presence",
         header=["detector", "sigma", *(f"{name}% interval" for name in INTERVALS), *_PRESENCE],
         lines=lines,
-        note="median standard deviation in cm; share of the errors within the intervals; of the lines said "
-        "to be there, those that are, of those that are there, those found, and of those that are not, those "
-        "said to be absent",
+        note="median sigma in cm; share of the errors within the intervals; share of the predicted lines "
+        "that can be seen, of the lines that can be seen those predicted, of the absent lines those not",
     )
 
 
 def show_share(value: float | None) -> str:
-    """Show a share in per cent; a dash where it is unknown."""
+    """Show a share in per cent; a dash if it is unknown."""
     return "-" if value is None or math.isnan(value) else f"{100.0 * value:.0f}%"
 
 
@@ -200,7 +199,7 @@ def _percent(stats: ErrorStats) -> str:
 
 
 def show_cm(value: float) -> str:
-    """Show a length with three digits or so: a tenth of a millimetre is nothing beside a metre."""
+    """Show a length, [cm], with about three digits."""
     if math.isnan(value):
         return "-"
     return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"

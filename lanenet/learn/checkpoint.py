@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_file, atomic_folder, write_json, write_text
 from lanenet.errors import CheckpointError
-from lanenet.evaluation.breakdown import presence_of
+from lanenet.evaluation.breakdown import presence_stats
 from lanenet.evaluation.pictures import new_figure, png_bytes
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.export import (
@@ -95,7 +95,7 @@ def write_checkpoint(folder: Path, run: FinishedRun) -> None:
     write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
     write_curve(folder, run.history)
-    presence = presence_of(answers.presence, answers.present)
+    presence = presence_stats(answers.presence, answers.present)
     metrics: dict[str, Any] = {
         "format": METRICS_FORMAT,
         "run_hash": run.run_hash,

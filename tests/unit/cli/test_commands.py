@@ -23,7 +23,7 @@ from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import TrackingLostError
-from lanenet.evaluation.errors import RasterAnswers, RasterModel
+from lanenet.evaluation.answers import RasterAnswers, RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.perception.edges.road import PerceptionSettings
@@ -293,7 +293,7 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             n = len(labels)
             return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
-    monkeypatch.setattr("lanenet.evaluation.errors.RasterModel", OneOff)
+    monkeypatch.setattr("lanenet.evaluation.answers.RasterModel", OneOff)
     monkeypatch.setattr("lanenet.perception.network.detector.read_model_meta", lambda path: meta)
     return opened
 

@@ -10,13 +10,13 @@ from lanenet.data.files import write_json
 from lanenet.data.parquet import png_size
 from lanenet.evaluation.breakdown import (
     RELIABILITY_SHARES,
-    doubt_of,
-    drawn_parts,
+    bootstrap_segments,
     errors_by_group,
     lane_curvature,
     lines_shown,
-    presence_of,
+    presence_stats,
     rmse_interval_cm,
+    sigma_stats,
 )
 from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
 from lanenet.evaluation.pictures import breakdown_picture
@@ -78,15 +78,15 @@ def test_the_interval_is_over_drives_and_not_over_frames():
 
 
 def test_of_few_drives_stretches_are_drawn():
-    cuts, over = drawn_parts([100, 7, 30])
+    cuts, over = bootstrap_segments([100, 7, 30])
     assert cuts.tolist() == [100, 107] and over == "drives like these"
     # A rest of less than half a stretch belongs to the one before; no stretch reaches into another drive.
-    cuts, over = drawn_parts([115, 70])
-    assert cuts.tolist() == [40, 80, 115, 155] and over == "stretches of 40 frames"
-    assert drawn_parts([99])[0].tolist() == [40]
-    assert drawn_parts([10])[0].tolist() == []
+    cuts, over = bootstrap_segments([115, 70])
+    assert cuts.tolist() == [40, 80, 115, 155] and over == "segments of 40 frames"
+    assert bootstrap_segments([99])[0].tolist() == [40]
+    assert bootstrap_segments([10])[0].tolist() == []
     alike = np.repeat([1.0, 3.0], 60)[:, None] * np.ones((1, 6))
-    low, high = rmse_interval_cm(np.split(alike, drawn_parts([120])[0]), np.random.default_rng(0))
+    low, high = rmse_interval_cm(np.split(alike, bootstrap_segments([120])[0]), np.random.default_rng(0))
     # Three stretches, of mean squares 1, 5 and 9, drawn three at a time.
     assert low == pytest.approx(1.0) and high == pytest.approx(3.0)
 
@@ -95,25 +95,25 @@ def test_honest_doubt_is_on_the_diagonal():
     rng = np.random.default_rng(0)
     sigma = rng.uniform(0.3, 2.0, (20_000, 6))
     errors = np.abs(rng.normal(0.0, sigma))
-    honest = doubt_of(errors, sigma)
+    honest = sigma_stats(errors, sigma)
     assert honest.coverage["68"] == pytest.approx(0.683, abs=0.005)
     assert honest.coverage["95"] == pytest.approx(0.95, abs=0.005)
     np.testing.assert_allclose(honest.reliability, RELIABILITY_SHARES, atol=0.006)
-    assert doubt_of(errors, 0.5 * sigma).coverage["68"] < 0.4
+    assert sigma_stats(errors, 0.5 * sigma).coverage["68"] < 0.4
     errors[:, 0] = NAN
-    assert doubt_of(errors, sigma).count == 100_000
-    assert doubt_of(errors, np.full_like(sigma, NAN)) is None
+    assert sigma_stats(errors, sigma).count == 100_000
+    assert sigma_stats(errors, np.full_like(sigma, NAN)) is None
 
 
 def test_presence_is_counted_both_ways():
     said = np.array([[0.9, 0.1], [0.6, 0.5], [0.2, NAN], [0.8, 0.3]])
     there = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [NAN, 0.0]])
-    found = presence_of(said, there)
+    found = presence_stats(said, there)
     assert (found.there, found.absent) == (3, 3)
     assert found.precision == pytest.approx(2 / 3) and found.recall == pytest.approx(2 / 3)
     assert found.absent_recall == pytest.approx(2 / 3)
-    assert presence_of(said, np.full_like(there, NAN)) is None
-    everywhere = presence_of(np.ones((4, 2)), np.ones((4, 2)))
+    assert presence_stats(said, np.full_like(there, NAN)) is None
+    everywhere = presence_stats(np.ones((4, 2)), np.ones((4, 2)))
     assert everywhere.recall == 1.0 and np.isnan(everywhere.absent_recall)
 
 
@@ -145,8 +145,8 @@ def test_a_comparison_tells_where_errors_come_from(tmp_path):
     bends = found.breakdown.groups["bend"]["network"]
     rmse = [stats.rmse_cm for stats in bends.values()]
     assert rmse == pytest.approx([0.3, 1.3, 2.3], rel=0.1)
-    assert found.breakdown.doubt["network"].coverage["68"] == pytest.approx(0.683, abs=0.03)
-    assert "painter" not in found.breakdown.doubt and "painter" not in found.breakdown.presence
+    assert found.breakdown.sigma["network"].coverage["68"] == pytest.approx(0.683, abs=0.03)
+    assert "painter" not in found.breakdown.sigma and "painter" not in found.breakdown.presence
     told = found.breakdown.presence["network"]
     assert (told.there, told.absent, told.recall, told.absent_recall) == (1000, 200, 1.0, 0.0)
     # The light of the first drive is unknown.

@@ -38,7 +38,7 @@ def test_it_says_what_it_learned_from_and_how_good_it_is():
     assert text.startswith("# mine\n") and "97,310 weights" in text
     assert "9 frames of 2 label sets, labels from the map; 2 cameras; lanes of 40 cm" in text
     assert "100 frames of 2 test drives" in text and "RMSE 1.00 cm" in text
-    assert "No group of frames, point or drive is 1.5 times as wrong" in text
+    assert "No group of frames, point or drive has an RMSE of 1.5 times" in text
     assert "0.00 % of the points are off by more than 4 cm" in text
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lanenet.data.maps.labelled_frames import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
-from lanenet.evaluation.answers import answer_frames, build_compared, choose_names
+from lanenet.evaluation.answers import Compared, answer_frames, choose_names
 from lanenet.evaluation.breakdown import GROUPS
 from lanenet.evaluation.pictures import WorstFrame, draw_worst, find_worst, jpeg_bytes
 from lanenet.geometry.camera import Camera
@@ -103,7 +103,7 @@ def test_a_bad_frame_is_named():
         answer_frames(labelled(image=corrupt), {"a": Counter()})
     small = labelled(image=lambda i: np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(CalibrationError, match=r"drives/gray, frame 100: .*8x8"):
-        answer_frames(small, build_compared(["lane-filter"], small))
+        answer_frames(small, Compared(["lane-filter"]).build(small))
 
 
 def test_all_detectors_but_the_network_see_a_rendered_lane():
@@ -111,7 +111,7 @@ def test_all_detectors_but_the_network_see_a_rendered_lane():
     pictures = example_frames(camera, 3, np.random.default_rng(1))
     frames = labelled(3, camera=camera, image=lambda i: pictures[i])
     names = compared_names(lambda kind: not kind.needs_model)
-    answers = answer_frames(frames, build_compared(names, frames))
+    answers = answer_frames(frames, Compared(names).build(frames))
     assert list(answers.points_cm) == names
     for name in ("lane-filter", "hough-value", "painter"):
         assert np.isfinite(answers.points_cm[name]).any(), name
@@ -120,18 +120,18 @@ def test_all_detectors_but_the_network_see_a_rendered_lane():
 def test_detectors_are_built_for_the_source():
     hidden = PerceptionSettings(range=RangeSettings(bottom_rows=24))
     frames = labelled(perception=hidden, marking_cm=3.5, lane_width_cm=33.0)
-    built = build_compared(["lane-filter", "hough", "hough-value"], frames)
+    built = Compared(["lane-filter", "hough", "hough-value"]).build(frames)
     lane_filter = built["lane-filter"]
     assert isinstance(lane_filter, LaneFilter)
     assert (lane_filter.settings.lane_width_cm, lane_filter.settings.marking_cm) == (33.0, 3.5)
-    given = build_compared(["lane-filter"], frames, marking_cm=5.0)["lane-filter"]
+    given = Compared(["lane-filter"], marking_cm=5.0).build(frames)["lane-filter"]
     assert isinstance(given, LaneFilter) and given.settings.marking_cm == 5.0
     # Only the brightness differs between the two trackers.
     plain, value = built["hough"], built["hough-value"]
     assert isinstance(plain, HoughTracker) and isinstance(value, HoughTracker)
     assert value.settings.edges.channel == "value" and plain.settings == type(plain.settings)()
     with pytest.raises(ConfigError, match="--model"):
-        build_compared(["network"], frames)
+        Compared(["network"]).build(frames)
 
 
 def test_hidden_rows_are_hidden_from_the_lane_filter():
@@ -141,7 +141,7 @@ def test_hidden_rows_are_hidden_from_the_lane_filter():
     for rows in (0, 140):
         hidden = PerceptionSettings(range=RangeSettings(bottom_rows=rows))
         frames = labelled(1, camera=camera, perception=hidden, image=lambda i: picture)
-        found = answer_frames(frames, build_compared(["lane-filter"], frames))
+        found = answer_frames(frames, Compared(["lane-filter"]).build(frames))
         answers.append(np.isfinite(found.points_cm["lane-filter"]).any())
     assert answers == [True, False]
 

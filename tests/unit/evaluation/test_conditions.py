@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 from synthetic_labels import make_label_set
 
-from lanenet.evaluation.conditions import at_frames, lines_seen, nearest_pose_cm, way_to_training_cm
+from lanenet.evaluation.sources import at_frames, distance_to_training_cm, lines_seen, nearest_pose_cm
 from lanenet.geometry.birdseye import BirdseyeWindow
 
 
@@ -19,18 +19,18 @@ def test_only_parts_of_the_same_map_are_near():
     training.poses[:, 0] = [1.0, 4.0, 8.0]
     test = replace(test, frame=np.array([3, 4, 5]))
     test.poses[:, 0] = [12.0, 8.0, 4.5]
-    np.testing.assert_allclose(way_to_training_cm(test, [training]), [4.0, 0.0, 0.5])
+    np.testing.assert_allclose(distance_to_training_cm(test, [training]), [4.0, 0.0, 0.5])
     # After a jump the poses are those of another piece, in a frame of its own.
     away = replace(test, poses=test.poses.copy(), frame=np.array([3, 4, 5]))
     away.poses[1:, 0] += 400.0
-    np.testing.assert_allclose(way_to_training_cm(away, [training]), [4.0, np.nan, np.nan])
+    np.testing.assert_allclose(distance_to_training_cm(away, [training]), [4.0, np.nan, np.nan])
     others = [
         replace(training, drive=["other"] * 3),
         replace(training, meta=replace(training.meta, camera_hash="other")),
         replace(training, meta=replace(training.meta, source="truth")),
     ]
-    assert np.isnan(way_to_training_cm(test, others)).all()
-    np.testing.assert_allclose(way_to_training_cm(test, [*others, training]), [4.0, 0.0, 0.5])
+    assert np.isnan(distance_to_training_cm(test, others)).all()
+    np.testing.assert_allclose(distance_to_training_cm(test, [*others, training]), [4.0, 0.0, 0.5])
 
 
 def test_values_are_looked_up_by_frame_number():

@@ -8,7 +8,9 @@ from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.files import json_text
 from lanenet.data.maps.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError
+from lanenet.evaluation import answers
 from lanenet.evaluation import report as evaluation
+from lanenet.evaluation.answers import Compared
 from lanenet.evaluation.sources import Opened
 
 
@@ -27,12 +29,12 @@ def sources(tmp_path_factory) -> list[Opened]:
 
 
 def test_several_processes_give_the_answers_of_one(sources, monkeypatch):
-    monkeypatch.setattr(evaluation, "_WORTH_PROCESSES", 1)
+    monkeypatch.setattr(answers, "_WORTH_PROCESSES", 1)
     names = evaluation.default_names(sources, with_model=False)
     told: dict[int, list] = {1: [], 2: []}
     one, two = (
         evaluation.evaluate(
-            sources, names, None, workers=n, progress=lambda *done, told=told[n]: told.append(done)
+            sources, Compared(names), workers=n, progress=lambda *done, told=told[n]: told.append(done)
         )
         for n in (1, 2)
     )
@@ -48,18 +50,18 @@ def test_few_frames_are_not_worth_processes(sources, monkeypatch):
     def refuse(*_):
         raise AssertionError("processes were started")
 
-    monkeypatch.setattr("lanenet.processes.run_jobs", refuse)
-    found = evaluation.evaluate(sources, ("hough",), None, workers=2).comparison.as_dict()
+    monkeypatch.setattr("lanenet.evaluation.answers.run_jobs", refuse)
+    found = evaluation.evaluate(sources, Compared(["hough"]), workers=2).comparison.as_dict()
     assert np.isfinite(found["detectors"]["hough"]["groups"]["all"]["rmse_cm"])
 
 
 def test_a_broken_frame_is_named_by_another_process_too(sources, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "_WORTH_PROCESSES", 1)
+    monkeypatch.setattr(answers, "_WORTH_PROCESSES", 1)
     drive = tmp_path / "drive"
     simulate_drive(SimulationSettings(seed=3, frames=4, camera=CameraSettings(width=160, height=120)), drive)
     broken = sorted((drive / "images").iterdir())[2]
     broken.write_bytes(b"no picture")
     with pytest.raises(DriveFormatError, match=broken.name):
         evaluation.evaluate(
-            [sources[0], Opened(drive, read_truth_frames(drive))], ("hough",), None, workers=2
+            [sources[0], Opened(drive, read_truth_frames(drive))], Compared(["hough"]), workers=2
         )

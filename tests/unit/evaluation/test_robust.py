@@ -9,7 +9,7 @@ from synthetic_labels import make_label_set
 
 from lanenet.data.files import write_json
 from lanenet.errors import LabelFormatError, ModelMismatchError
-from lanenet.evaluation.errors import RasterAnswers, RasterModel
+from lanenet.evaluation.answers import RasterAnswers, RasterModel
 from lanenet.evaluation.robustness import CHANGES, as_dict, change_settings, measure_robustness, robust_table
 from lanenet.geometry.birdseye import BirdseyeWindow
 

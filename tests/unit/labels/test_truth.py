@@ -11,6 +11,7 @@ from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import SimulationSettings, simulate_drive
 from lanenet.data.drives import read_truth
 from lanenet.data.label_set import write_labels
+from lanenet.evaluation.answers import Compared
 from lanenet.evaluation.report import evaluate
 from lanenet.evaluation.sources import open_source, open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -84,7 +85,7 @@ def test_what_is_scored_is_what_the_labels_name(tmp_path):
     for found in (source.frames, opened.frames):
         assert found is not None
         np.testing.assert_array_equal(found.points_cm, labels.points_cm)
-    table = evaluate([source], ("lane-filter",), None).comparison.as_dict()["detectors"]["lane-filter"]
+    table = evaluate([source], Compared(["lane-filter"])).comparison.as_dict()["detectors"]["lane-filter"]
     # What the car would make of the answers stands beside the other conditions.
     groups = table["conditions"]["confidence"]
     assert list(groups) == ["under 0.2", "0.2 to 0.5", "over 0.5"]

@@ -14,7 +14,7 @@ from synthetic_labels import WINDOW, make_label_set
 from lanenet.config import dump_settings
 from lanenet.data.label_set import write_labels
 from lanenet.errors import CheckpointError, ModelMismatchError
-from lanenet.evaluation.errors import RasterModel
+from lanenet.evaluation.answers import RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
@@ -129,7 +129,7 @@ def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
             ("weights.safetensors", None, "was the training finished"),
             ("weights.safetensors", "rubbish", "cannot be read as safetensors"),
             ("check_rasters.png", None, "no such file"),
-            ("check_rasters.png", "rubbish", "no picture"),
+            ("check_rasters.png", "rubbish", "no image"),
         ]
     ):
         folder = tmp_path / str(i)

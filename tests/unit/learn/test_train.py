@@ -15,7 +15,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lanenet.config import load_settings
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
-from lanenet.evaluation.errors import RasterModel, point_errors
+from lanenet.evaluation.answers import RasterModel
+from lanenet.evaluation.errors import point_errors
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.network import new_network

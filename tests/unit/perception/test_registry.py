@@ -45,7 +45,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 from lanenet.cli.app import app
 from lanenet.config import check_settings
-from lanenet.evaluation.answers import build_compared, choose_names
+from lanenet.evaluation.answers import choose_names
 from lanenet.onboard.bench import example_camera, time_paths
 from lanenet.onboard.drive import DriveDetectorSettings
 
