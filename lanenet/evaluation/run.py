@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.maps.labelled_frames import LabelledFrames
 from lanenet.data.drives.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.perception.estimate import Detector, LaneEstimate
+
+if TYPE_CHECKING:
+    from lanenet.data.maps.labelled_frames import LabelledFrames
 
 
 @dataclass(frozen=True)
