@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numba import njit
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
@@ -59,78 +60,107 @@ class TraceSettings(Settings):
     visit_lanes: float = Field(default=2.0, gt=0.0)
 
 
-def best_lane(
-    path: Path,
-    tapes: Float[np.ndarray, "m c"],
-    profile: EdgeProfile,
-    lane_width_cm: float,
-    settings: TraceSettings,
-) -> tuple[float, Float[np.ndarray, "m"]]:
-    """Find the lane's width, within a tenth of the given one, and the offset of its centre."""
-    best: tuple[float, float, Float[np.ndarray, "m"]] | None = None
-    outside = settings.inside * _car_outside(path, profile, lane_width_cm)
-    for width in lane_width_cm * np.linspace(0.9, 1.1, 9):
-        cells = width / profile.cell_cm
-        left, right = shifted(tapes, 0.5 * cells), shifted(tapes, -0.5 * cells)
-        # One line counts nearly as much as two, so that a lane with a worn line does not lose to its
-        # neighbour.
-        support = np.maximum(left, right) + settings.second_line * np.minimum(left, right)
-        centre, score = _best_track(path, support, outside, settings)
-        if best is None or score > best[0]:
-            best = (score, float(width), (centre - profile.half_cells) * profile.cell_cm)
-    assert best is not None
-    return best[1], best[2]
+@dataclass(frozen=True, eq=False)
+class Markings:
+    """Where markings of one width may lie along a path.
 
+    Attributes:
+        path: The path, with the frames' positions.
+        profile: Density of edges along it.
+        tape_cm: Width of the markings.
+        settings: Cell sizes, costs and bounds.
+        support: Support of a marking with its middle in each cell of the profile, 0..1.
+    """
 
-def follow_line(
-    path: Path,
-    tapes: Float[np.ndarray, "m c"],
-    profile: EdgeProfile,
-    guess_cm: Float[np.ndarray, "m"],
-    band_cm: float,
-    settings: TraceSettings,
-) -> Float[np.ndarray, "m"]:
-    """Follow one marking within a band about a guess; returns its offset."""
-    reach = max(2, int(band_cm / profile.cell_cm))
-    offsets = np.arange(-reach, reach + 1)
-    column = np.clip(guess_cm / profile.cell_cm + profile.half_cells, 0.0, tapes.shape[1] - 1.0)
-    nearest = np.rint(column).astype(np.intp)
-    window = np.clip(nearest[:, None] + offsets, 0, tapes.shape[1] - 1)
-    support = np.take_along_axis(tapes, window, axis=1)
-    # Of two markings side by side, prefer the one nearer to the guess.
-    against = np.broadcast_to(0.1 * np.abs(offsets) / reach, support.shape)
-    track, _ = _best_track(path, support, np.ascontiguousarray(against), settings)
-    return (nearest + track - reach - profile.half_cells) * profile.cell_cm
+    path: Path
+    profile: EdgeProfile
+    tape_cm: float
+    settings: TraceSettings
+    support: Float[np.ndarray, "m c"]
 
+    @classmethod
+    def of(cls, path: Path, profile: EdgeProfile, tape_cm: float, settings: TraceSettings) -> Markings:
+        """Find the support of markings of this width."""
+        return cls(path, profile, tape_cm, settings, profile.tapes(tape_cm))
 
-def _car_outside(path: Path, profile: EdgeProfile, lane_cm: float) -> Float[np.ndarray, "m c"]:
-    """Mean over all visits of how far the car is outside a lane centred at each offset, 0..1."""
-    m, columns = profile.left.shape
-    at = (np.arange(columns) - profile.half_cells) * profile.cell_cm
-    forward = path.drives_forward
-    rows = np.rint(path.s_frames_cm / path.step_cm).astype(np.intp) % m
-    total, visits = np.zeros((m, columns)), np.zeros(m)
-    for row, offset in zip(rows[forward], path.offsets_cm[forward], strict=True):
-        total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0) ** 2
-        visits[row] += 1.0
-    near = max(1.0, 0.25 * lane_cm / path.step_cm)
-    total = gaussian_filter1d(total, near, axis=0, mode="wrap" if path.closed else "nearest")
-    visits = gaussian_filter1d(visits, near, mode="wrap" if path.closed else "nearest")
-    return total / np.maximum(visits, 1e-3)[:, None]
+    def best_lane(self, lane_width_cm: float) -> tuple[float, Float[np.ndarray, "m"]]:
+        """Find the lane's width, within a tenth of the given one, and the offset of its centre."""
+        best: tuple[float, float, Float[np.ndarray, "m"]] | None = None
+        profile = self.profile
+        outside = self.settings.inside * self._car_outside(lane_width_cm)
+        for width in lane_width_cm * np.linspace(0.9, 1.1, 9):
+            cells = width / profile.cell_cm
+            left, right = shifted(self.support, 0.5 * cells), shifted(self.support, -0.5 * cells)
+            # One line counts nearly as much as two, or a lane with a worn line would lose to its neighbour.
+            support = np.maximum(left, right) + self.settings.second_line * np.minimum(left, right)
+            centre, score = self._best_track(support, outside)
+            if best is None or score > best[0]:
+                best = (score, float(width), (centre - profile.half_cells) * profile.cell_cm)
+        assert best is not None
+        return best[1], best[2]
 
+    def follow(self, guess_cm: Float[np.ndarray, "m"], band_cm: float) -> Float[np.ndarray, "m"]:
+        """Follow one marking within a band about a guess; returns its offset."""
+        cell_cm, half_cells = self.profile.cell_cm, self.profile.half_cells
+        columns = self.support.shape[1]
+        reach = max(2, int(band_cm / cell_cm))
+        offsets = np.arange(-reach, reach + 1)
+        nearest = np.rint(np.clip(guess_cm / cell_cm + half_cells, 0.0, columns - 1.0)).astype(np.intp)
+        window = np.clip(nearest[:, None] + offsets, 0, columns - 1)
+        support = np.take_along_axis(self.support, window, axis=1)
+        # Of two markings side by side, prefer the one nearer to the guess.
+        against = np.broadcast_to(0.1 * np.abs(offsets) / reach, support.shape)
+        track, _ = self._best_track(support, np.ascontiguousarray(against))
+        return (nearest + track - reach - half_cells) * cell_cm
 
-def _best_track(
-    path: Path, support: Float[np.ndarray, "m c"], against: Float[np.ndarray, "m c"], settings: TraceSettings
-) -> tuple[Float[np.ndarray, "m"], float]:
-    """Columns with the most support; a closed path is extended by half a lap at either end."""
-    m = len(support)
-    lead = m // 2 if path.closed else 0
-    if lead:
-        support, against = (np.concatenate([part[-lead:], part, part[:lead]]) for part in (support, against))
-    track, score = _viterbi(
-        support.astype(np.float32), against.astype(np.float32), settings.smoothness, settings.sideways
-    )
-    return track[lead : lead + m].astype(np.float64), float(score)
+    def seen(self, line_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Keep a followed line where both borders of its marking are seen; NaN elsewhere."""
+        edges = []
+        for density, sign in ((self.profile.left, 0.5), (self.profile.right, -0.5)):
+            column = self._column(line_cm + sign * self.tape_cm)
+            window = np.clip(column[:, None] + np.arange(-1, 2), 0, density.shape[1] - 1)
+            edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
+        return np.where(np.minimum(*edges) >= self.settings.min_support, line_cm, np.nan)
+
+    def mean_support(self, line_cm: Float[np.ndarray, "m"]) -> float:
+        """Mean support along a line."""
+        column = np.clip(self._column(line_cm), 0, self.support.shape[1] - 1)
+        return float(self.support[np.arange(len(column)), column].mean())
+
+    def _column(self, d_cm: Float[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
+        return np.rint(d_cm / self.profile.cell_cm).astype(np.intp) + self.profile.half_cells
+
+    def _car_outside(self, lane_cm: float) -> Float[np.ndarray, "m c"]:
+        """Mean over all visits of how far the car is outside a lane centred at each offset, 0..1."""
+        path = self.path
+        m, columns = self.support.shape
+        at = (np.arange(columns) - self.profile.half_cells) * self.profile.cell_cm
+        forward = path.drives_forward
+        rows = np.rint(path.s_frames_cm / path.step_cm).astype(np.intp) % m
+        total, visits = np.zeros((m, columns)), np.zeros(m)
+        for row, offset in zip(rows[forward], path.offsets_cm[forward], strict=True):
+            total[row] += np.clip(np.abs(at - offset) / (0.5 * lane_cm) - 1.0, 0.0, 1.0) ** 2
+            visits[row] += 1.0
+        near = max(1.0, 0.25 * lane_cm / path.step_cm)
+        total = gaussian_filter1d(total, near, axis=0, mode="wrap" if path.closed else "nearest")
+        visits = gaussian_filter1d(visits, near, mode="wrap" if path.closed else "nearest")
+        return total / np.maximum(visits, 1e-3)[:, None]
+
+    def _best_track(
+        self, support: Float[np.ndarray, "m c"], against: Float[np.ndarray, "m c"]
+    ) -> tuple[Float[np.ndarray, "m"], float]:
+        """Columns with the most support; a closed path is extended by half a lap at either end."""
+        m = len(support)
+        lead = m // 2 if self.path.closed else 0
+        if lead:
+            support, against = (np.concatenate([a[-lead:], a, a[:lead]]) for a in (support, against))
+        track, score = _viterbi(
+            support.astype(np.float32),
+            against.astype(np.float32),
+            self.settings.smoothness,
+            self.settings.sideways,
+        )
+        return track[lead : lead + m].astype(np.float64), float(score)
 
 
 @njit(cache=True)

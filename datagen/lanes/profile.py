@@ -126,7 +126,7 @@ def without_crossings(path: Path, edges: PathEdges, camera_height_cm: float, sid
             beside = _within(density, low, high)
             striped &= (beside > _PAINT) & (_edges_of(beside) >= _AS_MANY * own)
     rows = max(2, round(_LONG_HEIGHTS * camera_height_cm / path.step_cm))
-    striped = _opened(striped, rows, path.closed)
+    striped = long_runs(striped, rows, path.closed)
     row = np.rint(edges.s_cm / path.step_cm).astype(np.intp) % len(striped)
     column = np.rint(edges.d_cm / cell).astype(np.intp) + half
     inside = (column >= 0) & (column <= 2 * half)
@@ -148,8 +148,8 @@ def _edges_of(density: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
     return density / np.maximum(1.0 - density, 1e-6)
 
 
-def _opened(mask: Bool[np.ndarray, "m c"], rows: int, closed: bool) -> Bool[np.ndarray, "m c"]:
-    """Keep runs of at least that many rows."""
+def long_runs(mask: Bool[np.ndarray, "m c"], rows: int, closed: bool) -> Bool[np.ndarray, "m c"]:
+    """Keep runs of at least that many rows in each column; if closed, a run may cross the seam."""
     mode: Literal["wrap", "constant"] = "wrap" if closed else "constant"
     padded = np.pad(mask, ((rows, rows), (0, 0)), mode=mode)
     return np.asarray(binary_opening(padded, np.ones((rows, 1), dtype=bool)))[rows:-rows]

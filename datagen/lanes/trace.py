@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.lanes.follow import TraceSettings, best_lane, follow_line
+from datagen.lanes.follow import Markings, TraceSettings
 from datagen.lanes.path import Path, PathEdges
-from datagen.lanes.profile import EdgeProfile, edge_profile
+from datagen.lanes.profile import EdgeProfile, edge_profile, long_runs
 from datagen.lanes.width import find_lane_width, find_tape_width
 from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
@@ -84,16 +84,14 @@ def trace_lane(
     if not path.closed:
         driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
     tape = find_tape_width(profile, driven, camera_height_cm, settings)
-    tapes = profile.tapes(tape)
+    markings = Markings.of(path, profile, tape, settings)
     if lane_width_cm is None:
-        lane_width_cm = find_lane_width(path, tapes, profile, driven, camera_height_cm, settings)
-    lane, centre = best_lane(path, tapes, profile, lane_width_cm, settings)
+        lane_width_cm = find_lane_width(markings, driven, camera_height_cm)
+    lane, centre = markings.best_lane(lane_width_cm)
     band = settings.width_share * lane
-    left = follow_line(path, tapes, profile, centre + 0.5 * lane, band, settings)
-    right = follow_line(path, tapes, profile, centre - 0.5 * lane, band, settings)
     left, right = (
-        _without_bulges(path, _seen_middle(profile, line, tape, settings), centre, lane)
-        for line in (left, right)
+        _without_bulges(path, markings.seen(markings.follow(centre + share * lane, band)), centre, lane)
+        for share in (0.5, -0.5)
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
         raise TrackingLostError(
@@ -185,7 +183,7 @@ def trace_adjacent(
         The driven lane, with the lines of adjacent lanes.
     """
     profile = _profile_along(path, edges, camera_height_cm, settings)
-    tapes = profile.tapes(lane.tape_cm)
+    markings = Markings.of(path, profile, lane.tape_cm, settings)
     band = 2.0 * settings.width_share * lane.lane_cm
     adjacent: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
     sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [
@@ -195,10 +193,10 @@ def trace_adjacent(
     for side, sign, line in sides:
         inner = np.where(np.isfinite(line), line, lane.centre_cm + 0.5 * sign * lane.lane_cm)
         for rank in range(1, settings.neighbours + 1):
-            found = follow_line(path, tapes, profile, inner + sign * lane.lane_cm, band, settings)
-            known = _seen_middle(profile, found, lane.tape_cm, settings)
+            found = markings.follow(inner + sign * lane.lane_cm, band)
+            known = markings.seen(found)
             visits = _visits(path, sign * inner, sign, lane.lane_cm)
-            if not _is_line(path, known, visits, lane.lane_cm, settings):
+            if not _is_line(markings, known, visits, lane.lane_cm):
                 break
             adjacent[side, rank] = known
             inner = np.where(np.isfinite(known), known, found)
@@ -215,15 +213,12 @@ def _visits(
 
 
 def _is_line(
-    path: Path,
-    line_cm: Float[np.ndarray, "m"],
-    visits: Bool[np.ndarray, "n"],
-    lane_cm: float,
-    settings: TraceSettings,
+    markings: Markings, line_cm: Float[np.ndarray, "m"], visits: Bool[np.ndarray, "n"], lane_cm: float
 ) -> bool:
     """Whether it is a painted line rather than clutter: enough of it, in runs rather than specks."""
+    path, settings = markings.path, markings.settings
     shortest = max(2, int(_SPECK * lane_cm / path.step_cm))
-    seen = _in_runs(np.isfinite(line_cm), shortest, path.closed)
+    seen = long_runs(np.isfinite(line_cm)[:, None], shortest, path.closed)[:, 0]
     if float(seen.sum()) * path.step_cm < settings.neighbour_lanes * lane_cm:
         return False
     if float(seen.mean()) >= settings.neighbour_share:
@@ -243,14 +238,6 @@ def _driven_cm(path: Path) -> Float[np.ndarray, "n"]:
     return np.abs(step)
 
 
-def _in_runs(seen: Bool[np.ndarray, "m"], shortest: int, closed: bool) -> Bool[np.ndarray, "m"]:
-    """Drop runs of fewer samples than ``shortest``."""
-    kept = np.zeros(len(seen), dtype=bool)
-    for run in true_runs(seen, closed):
-        kept[run] = len(run) >= shortest
-    return kept
-
-
 def _profile_along(
     path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings
 ) -> EdgeProfile:
@@ -258,18 +245,6 @@ def _profile_along(
     cell = settings.cell_heights * camera_height_cm
     half = int(settings.side_heights / settings.cell_heights)
     return edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
-
-
-def _seen_middle(
-    profile: EdgeProfile, line_cm: Float[np.ndarray, "m"], tape_cm: float, settings: TraceSettings
-) -> Float[np.ndarray, "m"]:
-    """Keep a followed line where both borders of its marking are seen; NaN elsewhere."""
-    edges = []
-    for density, offset in ((profile.left, 0.5 * tape_cm), (profile.right, -0.5 * tape_cm)):
-        column = np.rint((line_cm + offset) / profile.cell_cm).astype(np.intp) + profile.half_cells
-        window = np.clip(column[:, None] + np.arange(-1, 2), 0, density.shape[1] - 1)
-        edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
-    return np.where(np.minimum(*edges) >= settings.min_support, line_cm, np.nan)
 
 
 def _without_bulges(

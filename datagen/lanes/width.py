@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.lanes.follow import TraceSettings, best_lane, follow_line
+from datagen.lanes.follow import Markings, TraceSettings
 from datagen.lanes.path import Path
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.errors import TrackingLostError
@@ -46,37 +46,27 @@ def find_tape_width(
     return float(widths[int(np.argmax(gaussian_filter1d(np.array(scores), 1.0)))])
 
 
-def find_lane_width(
-    path: Path,
-    tapes: Float[np.ndarray, "m c"],
-    profile: EdgeProfile,
-    driven: int,
-    camera_height_cm: float,
-    settings: TraceSettings,
-) -> float:
+def find_lane_width(markings: Markings, driven: int, camera_height_cm: float) -> float:
     """Find the distance at which two markings run along the path, one on either side of the car.
 
     Args:
-        path: The path, with the frames' positions.
-        tapes: Support of a marking in each cell of the profile.
-        profile: Density of edges.
+        markings: Where markings may lie.
         driven: Number of path samples that the car has driven over.
         camera_height_cm: Sets the scale of bounds.
-        settings: Bounds.
 
     Raises:
         TrackingLostError: If no two lines run side by side.
     """
-    low, high = (w * camera_height_cm for w in settings.lane_heights)
+    profile, support = markings.profile, markings.support[:driven]
+    low, high = (w * camera_height_cm for w in markings.settings.lane_heights)
     widths = np.arange(low, high, 2.0 * profile.cell_cm)
     scores = []
     for width in widths:
         cells = 0.5 * width / profile.cell_cm
-        pair = shifted(tapes[:driven], cells) * shifted(tapes[:driven], -cells)
+        pair = shifted(support, cells) * shifted(support, -cells)
         within = int(_OFF_CENTRE * width / profile.cell_cm)
-        scores.append(
-            np.sqrt(pair[:, profile.half_cells - within : profile.half_cells + within + 1]).max(axis=1).mean()
-        )
+        inside = pair[:, profile.half_cells - within : profile.half_cells + within + 1]
+        scores.append(np.sqrt(inside).max(axis=1).mean())
     score = gaussian_filter1d(np.array(scores), 1.5)
     peaks = [i for i in range(1, len(score) - 1) if score[i] >= score[i - 1] and score[i] > score[i + 1]]
     if not peaks:
@@ -87,23 +77,17 @@ def find_lane_width(
         half, whole = sorted((float(widths[best]), float(widths[other])))
         if score[other] < _AS_WELL * score[best] or not _HALF[0] < half / whole < _HALF[1]:
             continue
-        _, middle = best_lane(path, tapes, profile, whole, settings)
-        if _has_middle_line(path, tapes, profile, middle, whole, settings):
-            return half if _keeps_to_a_half(path, middle, whole) else whole
+        _, middle = markings.best_lane(whole)
+        if _has_middle_line(markings, middle, whole):
+            return half if _keeps_to_a_half(markings.path, middle, whole) else whole
     return float(widths[best])
 
 
-def _has_middle_line(
-    path: Path,
-    tapes: Float[np.ndarray, "m c"],
-    profile: EdgeProfile,
-    middle_cm: Float[np.ndarray, "m"],
-    whole_cm: float,
-    settings: TraceSettings,
-) -> bool:
+def _has_middle_line(markings: Markings, middle_cm: Float[np.ndarray, "m"], whole_cm: float) -> bool:
     """Whether three lines run along the road."""
+    band_cm = (max(_HALF) - 0.5) * whole_cm
     left, left_lane, middle, right_lane, right = (
-        _followed_support(path, tapes, profile, middle_cm + share * whole_cm, whole_cm, settings)
+        markings.mean_support(markings.follow(middle_cm + share * whole_cm, band_cm))
         for share in (0.5, 0.25, 0.0, -0.25, -0.5)
     )
     return min(left, middle, right) >= _CLEAR * max(left_lane, right_lane)
@@ -116,17 +100,3 @@ def _keeps_to_a_half(path: Path, middle_cm: Float[np.ndarray, "m"], whole_cm: fl
     left = np.where(path.drives_forward, offset, -offset) / whole_cm
     left = left[np.abs(left) < _ON_ROAD]
     return bool(max(np.sum(left > _IN_HALF), np.sum(left < -_IN_HALF)) > _MOST * len(left))
-
-
-def _followed_support(
-    path: Path,
-    tapes: Float[np.ndarray, "m c"],
-    profile: EdgeProfile,
-    guess_cm: Float[np.ndarray, "m"],
-    whole_cm: float,
-    settings: TraceSettings,
-) -> float:
-    """Mean support of the best marking along these offsets."""
-    followed = follow_line(path, tapes, profile, guess_cm, (max(_HALF) - 0.5) * whole_cm, settings)
-    column = np.rint(followed / profile.cell_cm).astype(np.intp) + profile.half_cells
-    return float(tapes[np.arange(len(tapes)), np.clip(column, 0, tapes.shape[1] - 1)].mean())

@@ -203,36 +203,27 @@ def share_rows(labelled: dict[str, Any]) -> list[Row]:
 
 def loop_rows(segments: list[dict[str, Any]]) -> list[Row]:
     """Distance, revisits, loop closure and residuals between frames, by segment."""
-    rows: list[Row] = [
-        (
-            "first frame",
-            "frames",
-            "distance, m",
-            "revisits",
-            "closure along, cm",
-            "across, cm",
-            "heading, deg",
-            "drift, deg/m",
-            "between frames, px",
-        )
-    ]
+    rows = []
     for segment in segments:
         closure = segment["closure_residual_median"]
-        heading, drift = closure["heading_rad"], segment["heading_drift_rad_per_m"]
         rows.append(
-            (
-                str(segment["first_frame"]),
-                str(segment["frames"]),
-                _number(0.01 * segment["path_cm"], 1),
-                str(segment["revisits"]),
-                _number(closure["along_cm"]),
-                _number(closure["across_cm"]),
-                _number(None if heading is None else math.degrees(heading)),
-                _number(None if drift is None else math.degrees(drift)),
-                _number(segment["reprojection_robust_sd_px"]),
-            )
+            {
+                "first frame": str(segment["first_frame"]),
+                "frames": str(segment["frames"]),
+                "distance, m": _number(0.01 * segment["path_cm"], 1),
+                "revisits": str(segment["revisits"]),
+                "closure along, cm": _number(closure["along_cm"]),
+                "across, cm": _number(closure["across_cm"]),
+                "heading, deg": _number(_degrees(closure["heading_rad"])),
+                "drift, deg/m": _number(_degrees(segment["heading_drift_rad_per_m"])),
+                "between frames, px": _number(segment["reprojection_robust_sd_px"]),
+            }
         )
-    return rows
+    return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
 
 
 def camera_rows(camera: Camera, calibration: dict[str, Any] | None) -> list[Row]:

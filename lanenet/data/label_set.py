@@ -97,12 +97,12 @@ class LabelSet:
     divides: Bool[np.ndarray, "n 2"]
 
     def __post_init__(self) -> None:
-        names = ("drive", "file", "t_s", "lap", "poses", "points_cm", "edges", "lines", "quality", "divides")
-        for name in names:
-            if len(getattr(self, name)) != len(self.frame):
-                raise LabelFormatError(
-                    f"label set: {len(self.frame)} frames, but {len(getattr(self, name))} of {name!r}"
-                )
+        for name, values in self._columns().items():
+            if len(values) != len(self.frame):
+                raise LabelFormatError(f"label set: {len(self.frame)} frames, but {len(values)} of {name!r}")
+
+    def _columns(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.name != "meta"}
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -114,20 +114,11 @@ class LabelSet:
     def subset(self, keep: slice | Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> LabelSet:
         """Return the selected rows, in the given order."""
         rows = np.arange(len(self))[keep]
-        return LabelSet(
-            meta=self.meta,
-            drive=[self.drive[i] for i in rows],
-            file=[self.file[i] for i in rows],
-            frame=self.frame[rows],
-            t_s=self.t_s[rows],
-            lap=self.lap[rows],
-            poses=self.poses[rows],
-            points_cm=self.points_cm[rows],
-            edges=[self.edges[i] for i in rows],
-            lines=[self.lines[i] for i in rows],
-            quality=self.quality[rows],
-            divides=self.divides[rows],
-        )
+        kept: dict[str, Any] = {
+            name: [values[i] for i in rows] if isinstance(values, list) else values[rows]
+            for name, values in self._columns().items()
+        }
+        return LabelSet(meta=self.meta, **kept)
 
 
 def write_labels(path: Path, label_set: LabelSet) -> None:
