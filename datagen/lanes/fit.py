@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.offset import Borders, CubicBasis, FittedOffset, Prior, adapted_breaks, fit_offset
-from datagen.lanes.path import Path, PathEdges, left_of
+from datagen.lanes.path import Path, PathEdges, SampleMask, Samples, left_of
 from datagen.lanes.support import supported_sections
 from datagen.lanes.trace import TracedLane
 from lanenet.config import Settings
@@ -90,7 +90,7 @@ def fit_lines(
     narrowest = settings.corner_heights * camera_height_cm
     basis = CubicBasis(adapted_breaks(_curvature(path), path.step_cm, widest, narrowest), path.closed)
     fitter = _Fitter(path, edges, basis, lane.lane_cm, camera_height_cm, settings)
-    traced: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {
+    traced: dict[tuple[Side, int], Samples] = {
         ("left", 0): lane.left_cm,
         ("right", 0): lane.right_cm,
         **lane.adjacent_cm,
@@ -131,9 +131,7 @@ class _Fitter:
     height_cm: float
     settings: FitSettings
 
-    def alone(
-        self, traced_cm: Float[np.ndarray, "m"], guess_cm: Float[np.ndarray, "m"], tape_cm: float
-    ) -> FittedOffset:
+    def alone(self, traced_cm: Samples, guess_cm: Samples, tape_cm: float) -> FittedOffset:
         """Fit a line from its trace alone; the guess fills the gaps of the trace."""
         start = np.where(np.isfinite(traced_cm), traced_cm, guess_cm)
         loose = np.full(len(start), self.settings.loose_lanes * self.lane_cm)
@@ -141,10 +139,10 @@ class _Fitter:
 
     def parallel(
         self,
-        known_cm: Float[np.ndarray, "m"],
+        known_cm: Samples,
         other: FittedOffset,
         sign: float,
-        apart: tuple[Float[np.ndarray, "m"], float],
+        apart: tuple[Samples, float],
         tape_cm: float,
     ) -> FittedOffset:
         """Fit a line that runs to the left (sign 1) or to the right (-1) of a fitted one."""
@@ -155,9 +153,7 @@ class _Fitter:
         start = np.where(np.isfinite(known_cm), known_cm, guess)
         return self._fit(start, guess, guess, sigma, tape_cm)
 
-    def apart(
-        self, inner_cm: Float[np.ndarray, "m"], outer_cm: Float[np.ndarray, "m"], known: Bool[np.ndarray, "m"]
-    ) -> tuple[Float[np.ndarray, "m"], float]:
+    def apart(self, inner_cm: Samples, outer_cm: Samples, known: SampleMask) -> tuple[Samples, float]:
         """Distance of two lines, smoothed and interpolated in gaps, and its variation."""
         path, lane_cm = self.path, self.lane_cm
         least = self.settings.guide_lanes * lane_cm
@@ -170,7 +166,7 @@ class _Fitter:
         varies = 1.4826 * float(np.median(np.abs(found[good] - np.median(found[good]))))
         return _smoothed(path, filled, 0.5 * lane_cm), max(varies, least)
 
-    def line(self, side: Side, rank: int, offset: FittedOffset, guided: Bool[np.ndarray, "m"]) -> LaneLine:
+    def line(self, side: Side, rank: int, offset: FittedOffset, guided: SampleMask) -> LaneLine:
         """Turn an offset into a line on the map; ``guided`` is where a parallel line is seen."""
         path, basis = self.path, self.basis
         control = basis.fitted(path.s_cm, path.points(offset.d_cm))
@@ -190,16 +186,11 @@ class _Fitter:
             unpainted=offset.unpainted,
         )
 
-    def _smoothed(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    def _smoothed(self, d_cm: Samples) -> Samples:
         return _smoothed(self.path, d_cm, 0.25 * self.lane_cm)
 
     def _fit(
-        self,
-        start_cm: Float[np.ndarray, "m"],
-        guess_cm: Float[np.ndarray, "m"],
-        shape_cm: Float[np.ndarray, "m"],
-        sigma_cm: Float[np.ndarray, "m"],
-        tape_cm: float,
+        self, start_cm: Samples, guess_cm: Samples, shape_cm: Samples, sigma_cm: Samples, tape_cm: float
     ) -> FittedOffset:
         smooth = self._smoothed(start_cm)
         prior = Prior(
@@ -214,9 +205,7 @@ class _Fitter:
         points = self._borders(start_cm, smooth, tape_cm)
         return fit_offset(self.path, self.basis, points, smooth, tape_cm, prior)
 
-    def _borders(
-        self, start_cm: Float[np.ndarray, "m"], smooth_cm: Float[np.ndarray, "m"], tape_cm: float
-    ) -> Borders:
+    def _borders(self, start_cm: Samples, smooth_cm: Samples, tape_cm: float) -> Borders:
         """Edge points that may be borders of the marking whose middle is near the given offset."""
         path, edges, settings = self.path, self.edges, self.settings
         # The left border of a bright marking brightens to the right.
@@ -239,9 +228,7 @@ class _Fitter:
         )
 
 
-def parallel_offset(
-    path: Path, d_cm: Float[np.ndarray, "m"], apart_cm: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "m"]:
+def parallel_offset(path: Path, d_cm: Samples, apart_cm: Samples) -> Samples:
     """Offset from the path of the line parallel to another one.
 
     Args:
@@ -262,12 +249,7 @@ def parallel_offset(
     return np.interp(path.s_cm, s[order], offset[order], period=path.period_cm)
 
 
-def distance_across(
-    path: Path,
-    from_cm: Float[np.ndarray, "m"],
-    to_cm: Float[np.ndarray, "m"],
-    known: Bool[np.ndarray, "m"],
-) -> Float[np.ndarray, "m"]:
+def distance_across(path: Path, from_cm: Samples, to_cm: Samples, known: SampleMask) -> Samples:
     """Distance from each sample of a line to another line; NaN where that is unknown opposite.
 
     Args:
@@ -299,7 +281,7 @@ def _around(path: Path, apart_cm: float) -> Int[np.ndarray, "m k"]:
     return rows % m if path.closed else np.clip(rows, 0, m - 1)
 
 
-def _curvature(path: Path) -> Float[np.ndarray, "m"]:
+def _curvature(path: Path) -> Samples:
     heading = np.arctan2(-path.left[:, 0], path.left[:, 1])
     if path.closed:
         turn = np.unwrap(np.concatenate([heading[-1:], heading, heading[:1]]))
@@ -307,11 +289,11 @@ def _curvature(path: Path) -> Float[np.ndarray, "m"]:
     return gaussian_filter1d(np.gradient(np.unwrap(heading)) / path.step_cm, 2.0, mode="nearest")
 
 
-def _smoothed(path: Path, values: Float[np.ndarray, "m"], over_cm: float) -> Float[np.ndarray, "m"]:
+def _smoothed(path: Path, values: Samples, over_cm: float) -> Samples:
     return gaussian_filter1d(values, over_cm / path.step_cm, mode="wrap" if path.closed else "nearest")
 
 
-def _slope(path: Path, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+def _slope(path: Path, d_cm: Samples) -> Samples:
     """Derivative of an offset along the path."""
     if path.closed:
         return 0.5 * (np.roll(d_cm, -1) - np.roll(d_cm, 1)) / path.step_cm

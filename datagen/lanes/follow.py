@@ -11,7 +11,7 @@ from numba import njit
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.lanes.path import Path
+from datagen.lanes.path import Path, Samples
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.config import Settings
 
@@ -83,9 +83,9 @@ class Markings:
         """Find the support of markings of this width."""
         return cls(path, profile, tape_cm, settings, profile.tapes(tape_cm))
 
-    def best_lane(self, lane_width_cm: float) -> tuple[float, Float[np.ndarray, "m"]]:
+    def best_lane(self, lane_width_cm: float) -> tuple[float, Samples]:
         """Find the lane's width, within a tenth of the given one, and the offset of its centre."""
-        best: tuple[float, float, Float[np.ndarray, "m"]] | None = None
+        best: tuple[float, float, Samples] | None = None
         profile = self.profile
         outside = self.settings.inside * self._car_outside(lane_width_cm)
         for width in lane_width_cm * np.linspace(0.9, 1.1, 9):
@@ -99,7 +99,7 @@ class Markings:
         assert best is not None
         return best[1], best[2]
 
-    def follow(self, guess_cm: Float[np.ndarray, "m"], band_cm: float) -> Float[np.ndarray, "m"]:
+    def follow(self, guess_cm: Samples, band_cm: float) -> Samples:
         """Follow one marking within a band about a guess; returns its offset."""
         cell_cm, half_cells = self.profile.cell_cm, self.profile.half_cells
         columns = self.support.shape[1]
@@ -113,7 +113,7 @@ class Markings:
         track, _ = self._best_track(support, np.ascontiguousarray(against))
         return (nearest + track - reach - half_cells) * cell_cm
 
-    def seen(self, line_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    def seen(self, line_cm: Samples) -> Samples:
         """Keep a followed line where both borders of its marking are seen; NaN elsewhere."""
         edges = []
         for density, sign in ((self.profile.left, 0.5), (self.profile.right, -0.5)):
@@ -122,12 +122,12 @@ class Markings:
             edges.append(np.take_along_axis(density, window, axis=1).max(axis=1))
         return np.where(np.minimum(*edges) >= self.settings.min_support, line_cm, np.nan)
 
-    def mean_support(self, line_cm: Float[np.ndarray, "m"]) -> float:
+    def mean_support(self, line_cm: Samples) -> float:
         """Mean support along a line."""
         column = np.clip(self._column(line_cm), 0, self.support.shape[1] - 1)
         return float(self.support[np.arange(len(column)), column].mean())
 
-    def _column(self, d_cm: Float[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
+    def _column(self, d_cm: Samples) -> Int[np.ndarray, "m"]:
         return np.rint(d_cm / self.profile.cell_cm).astype(np.intp) + self.profile.half_cells
 
     def _car_outside(self, lane_cm: float) -> Float[np.ndarray, "m c"]:
@@ -148,7 +148,7 @@ class Markings:
 
     def _best_track(
         self, support: Float[np.ndarray, "m c"], against: Float[np.ndarray, "m c"]
-    ) -> tuple[Float[np.ndarray, "m"], float]:
+    ) -> tuple[Samples, float]:
         """Columns with the most support; a closed path is extended by half a lap at either end."""
         m = len(support)
         lead = m // 2 if self.path.closed else 0

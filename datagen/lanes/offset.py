@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from datagen.lanes.path import Path
+from datagen.lanes.path import Path, SampleMask, Samples
 from datagen.lanes.support import seen_samples, supported_sections, unpainted_share, within
 
 _DEGREE = 3
@@ -81,9 +81,9 @@ class Prior:
         height_cm: Height of the camera, which sets the scale of errors.
     """
 
-    guess_cm: Float[np.ndarray, "m"]
-    shape_cm: Float[np.ndarray, "m"]
-    sigma_cm: Float[np.ndarray, "m"]
+    guess_cm: Samples
+    shape_cm: Samples
+    sigma_cm: Samples
     lane_cm: float
     bend_per_cm: float
     knot_cm: float
@@ -103,21 +103,16 @@ class FittedOffset:
         unpainted: Share without paint, see :func:`datagen.lanes.support.unpainted_share`.
     """
 
-    d_cm: Float[np.ndarray, "m"]
-    sigma_cm: Float[np.ndarray, "m"]
-    seen: Bool[np.ndarray, "m"]
+    d_cm: Samples
+    sigma_cm: Samples
+    seen: SampleMask
     marking_cm: float
     residual_cm: float
     unpainted: float
 
 
 def fit_offset(
-    path: Path,
-    basis: CubicBasis,
-    points: Borders,
-    start_cm: Float[np.ndarray, "m"],
-    tape_cm: float,
-    prior: Prior,
+    path: Path, basis: CubicBasis, points: Borders, start_cm: Samples, tape_cm: float, prior: Prior
 ) -> FittedOffset:
     """Fit a cubic spline to the borders of one marking, robustly.
 
@@ -205,7 +200,7 @@ class _Equations:
         return cls(basis.design(path.s_cm), basis.design(points.s_cm), stiffness, shape, prior, path.step_cm)
 
     def solve(
-        self, weight: Float[np.ndarray, "n"], middle_cm: Float[np.ndarray, "n"], seen: Bool[np.ndarray, "m"]
+        self, weight: Float[np.ndarray, "n"], middle_cm: Float[np.ndarray, "n"], seen: SampleMask
     ) -> tuple[Float[np.ndarray, "c"], SuperLU, csc_array]:
         """Return the coefficients, the factorised normal matrix, and the data's share of that matrix."""
         prior, at_samples, at_points = self.prior, self.at_samples, self.at_points
@@ -219,7 +214,7 @@ class _Equations:
         return factor.solve(np.asarray(right)), factor, data
 
 
-def _away_from_gaps(path: Path, seen: Bool[np.ndarray, "m"], height_cm: float) -> Bool[np.ndarray, "m"]:
+def _away_from_gaps(path: Path, seen: SampleMask, height_cm: float) -> SampleMask:
     """Return the samples that are not at the ends of paint before long gaps.
 
     There, paint may turn off into a side road. The ends of an open path are no gaps.
@@ -232,7 +227,7 @@ def _away_from_gaps(path: Path, seen: Bool[np.ndarray, "m"], height_cm: float) -
     return within(path, ends)
 
 
-def _at(path: Path, mask: Bool[np.ndarray, "m"], s_cm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+def _at(path: Path, mask: SampleMask, s_cm: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Look up a mask of path samples at positions between them."""
     row = np.rint(s_cm / path.step_cm).astype(np.intp)
     return mask[row % len(mask) if path.closed else np.clip(row, 0, len(mask) - 1)]
@@ -275,7 +270,7 @@ def _design_effect(
     return max(1.0, common / max(free, 1e-9))
 
 
-def _variance(factor: SuperLU, at_samples: csr_array) -> Float[np.ndarray, "m"]:
+def _variance(factor: SuperLU, at_samples: csr_array) -> Samples:
     variance = np.zeros(at_samples.shape[0])
     for first in range(0, len(variance), _CHUNK):
         rows = np.ascontiguousarray(at_samples[first : first + _CHUNK].todense().T)
@@ -312,7 +307,7 @@ class CubicBasis:
             return np.concatenate([b[-4:-1] - period, b, b[1:4] + period])
         return np.concatenate([np.full(3, b[0]), b, np.full(3, b[-1])])
 
-    def design(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> csr_array:
+    def design(self, s_cm: Samples, derivative: int = 0) -> csr_array:
         """Return the matrix that turns coefficients into values, or a derivative, at the positions."""
         if not len(s_cm):
             return csr_array((0, self.size))
@@ -328,9 +323,7 @@ class CubicBasis:
             matrix = matrix @ diags_array([-slope, slope], offsets=[0, 1], shape=(count - 1, count))
         return csr_array(matrix @ self._unfold()) if self.periodic else csr_array(matrix)
 
-    def fitted(
-        self, s_cm: Float[np.ndarray, "m"], values: Float[np.ndarray, "m *d"]
-    ) -> Float[np.ndarray, "c *d"]:
+    def fitted(self, s_cm: Samples, values: Float[np.ndarray, "m *d"]) -> Float[np.ndarray, "c *d"]:
         """Least-squares coefficients for values at positions; every interval needs some positions."""
         design = self.design(s_cm)
         return np.asarray(splu(csc_array(design.T @ design)).solve(np.asarray(design.T @ values)))
@@ -346,7 +339,7 @@ class CubicBasis:
 
 
 def adapted_breaks(
-    curvature_per_cm: Float[np.ndarray, "m"], step_cm: float, widest_cm: float, narrowest_cm: float
+    curvature_per_cm: Samples, step_cm: float, widest_cm: float, narrowest_cm: float
 ) -> Float[np.ndarray, "b"]:
     """Place breaks along a path, more densely in bends.
 

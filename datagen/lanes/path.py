@@ -29,6 +29,11 @@ _OFF_HEIGHTS, _MAX_OFF = 6.0, 0.15
 _SMOOTH_CM = 6.0
 
 
+#: A value at each sample of a path, and a choice of samples.
+Samples = Float[np.ndarray, "m"]
+SampleMask = Bool[np.ndarray, "m"]
+
+
 @dataclass(frozen=True)
 class Path:
     """A smooth path with even samples.
@@ -67,11 +72,11 @@ class Path:
         return np.ones(len(self.s_frames_cm), dtype=bool) if self.forward is None else self.forward
 
     @property
-    def s_cm(self) -> Float[np.ndarray, "m"]:
+    def s_cm(self) -> Samples:
         """Position of the samples along the path."""
         return np.arange(len(self.xy_cm)) * self.step_cm
 
-    def points(self, d_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
+    def points(self, d_cm: Samples) -> Float[np.ndarray, "m 2"]:
         """Return the point at offset d to the left of each sample, [cm], frame map."""
         return self.xy_cm + d_cm[:, None] * self.left
 
@@ -119,10 +124,7 @@ def left_of(direction: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
 
 
 def lap_path(
-    poses: Float[np.ndarray, "n 3"],
-    revisits: list[tuple[int, int]],
-    step_cm: float,
-    camera_height_cm: float,
+    poses: Float[np.ndarray, "n 3"], revisits: list[tuple[int, int]], step_cm: float, camera_height_cm: float
 ) -> Path | None:
     """Close one lap of a drive and find the position of every frame on it.
 

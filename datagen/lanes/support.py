@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
-from datagen.lanes.path import Path
+from datagen.lanes.path import Path, SampleMask
 
 #: Weight of one border's edge points per path sample above which it counts as seen: absolute, and relative to
 #: the line's median. Chosen: paint shows several points per sample and frame, clutter one now and then.
@@ -26,7 +26,7 @@ def seen_samples(
     weight: Float[np.ndarray, "n"],
     along_cm: float,
     alone_cm: float,
-) -> Bool[np.ndarray, "m"]:
+) -> SampleMask:
     """Return at which path samples a marking is seen.
 
     A single border counts only close to a place where both are seen: elsewhere it may be a joint or a shadow.
@@ -63,11 +63,7 @@ def seen_samples(
 
 
 def supported_sections(
-    path: Path,
-    seen: Bool[np.ndarray, "m"],
-    bridge_cm: float,
-    extend_cm: float,
-    guided: Bool[np.ndarray, "m"] | None = None,
+    path: Path, seen: SampleMask, bridge_cm: float, extend_cm: float, guided: SampleMask | None = None
 ) -> Float[np.ndarray, "g 2"]:
     """Join seen samples to sections, across gaps that are no longer than the bridge.
 
@@ -129,7 +125,7 @@ def unpainted_share(
     return 1.0 - float(cells[counts].sum() / length[counts].sum()) if counts.any() else float("nan")
 
 
-def within(path: Path, sections_cm: Float[np.ndarray, "g 2"]) -> Bool[np.ndarray, "m"]:
+def within(path: Path, sections_cm: Float[np.ndarray, "g 2"]) -> SampleMask:
     """Return which path samples lie in any of the sections."""
     inside = np.zeros(len(path.xy_cm), dtype=bool)
     for start, end in sections_cm:

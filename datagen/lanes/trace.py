@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from datagen.lanes.follow import Markings, TraceSettings
-from datagen.lanes.path import Path, PathEdges
+from datagen.lanes.path import Path, PathEdges, Samples
 from datagen.lanes.profile import EdgeProfile, edge_profile, long_runs
 from datagen.lanes.width import find_lane_width, find_tape_width
 from lanenet.data.maps.line import Side
@@ -52,12 +52,12 @@ class TracedLane:
         adjacent_cm: Further lines, by side and rank; ranks count outwards from 1.
     """
 
-    left_cm: Float[np.ndarray, "m"]
-    right_cm: Float[np.ndarray, "m"]
-    centre_cm: Float[np.ndarray, "m"]
+    left_cm: Samples
+    right_cm: Samples
+    centre_cm: Samples
     lane_cm: float
     tape_cm: float
-    adjacent_cm: dict[tuple[Side, int], Float[np.ndarray, "m"]] = field(default_factory=dict)
+    adjacent_cm: dict[tuple[Side, int], Samples] = field(default_factory=dict)
 
 
 def trace_lane(
@@ -185,8 +185,8 @@ def trace_adjacent(
     profile = _profile_along(path, edges, camera_height_cm, settings)
     markings = Markings.of(path, profile, lane.tape_cm, settings)
     band = 2.0 * settings.width_share * lane.lane_cm
-    adjacent: dict[tuple[Side, int], Float[np.ndarray, "m"]] = {}
-    sides: list[tuple[Side, float, Float[np.ndarray, "m"]]] = [
+    adjacent: dict[tuple[Side, int], Samples] = {}
+    sides: list[tuple[Side, float, Samples]] = [
         ("left", 1.0, lane.left_cm),
         ("right", -1.0, lane.right_cm),
     ]
@@ -203,18 +203,14 @@ def trace_adjacent(
     return replace(lane, adjacent_cm=adjacent)
 
 
-def _visits(
-    path: Path, outwards_cm: Float[np.ndarray, "m"], sign: float, lane_cm: float
-) -> Bool[np.ndarray, "n"]:
+def _visits(path: Path, outwards_cm: Samples, sign: float, lane_cm: float) -> Bool[np.ndarray, "n"]:
     """Return which frames drive in the lane beyond a line; ``outwards_cm`` is the line's offset outwards."""
     line = np.interp(path.s_frames_cm, path.s_cm, outwards_cm, period=path.period_cm)
     beyond = (sign * path.offsets_cm - line) / lane_cm
     return (beyond > _VISITS[0]) & (beyond < _VISITS[1])
 
 
-def _is_line(
-    markings: Markings, line_cm: Float[np.ndarray, "m"], visits: Bool[np.ndarray, "n"], lane_cm: float
-) -> bool:
+def _is_line(markings: Markings, line_cm: Samples, visits: Bool[np.ndarray, "n"], lane_cm: float) -> bool:
     """Whether it is a painted line rather than clutter: enough of it, in runs rather than specks."""
     path, settings = markings.path, markings.settings
     shortest = max(2, int(_SPECK * lane_cm / path.step_cm))
@@ -247,9 +243,7 @@ def _profile_along(
     return edge_profile(path, edges, cell, half, 0.25 * camera_height_cm, settings.min_side)
 
 
-def _without_bulges(
-    path: Path, line_cm: Float[np.ndarray, "m"], centre_cm: Float[np.ndarray, "m"], lane_cm: float
-) -> Float[np.ndarray, "m"]:
+def _without_bulges(path: Path, line_cm: Samples, centre_cm: Samples, lane_cm: float) -> Samples:
     """Drop short sections that bulge out of the line before and after them.
 
     Where a line is hidden or worn away, another strip on the floor may have been followed instead.

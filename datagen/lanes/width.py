@@ -8,11 +8,10 @@ half is its lane; if it drives on the middle line or changes sides often, its la
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.follow import Markings, TraceSettings
-from datagen.lanes.path import Path
+from datagen.lanes.path import Path, Samples
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.errors import TrackingLostError
 
@@ -83,7 +82,7 @@ def find_lane_width(markings: Markings, driven: int, camera_height_cm: float) ->
     return float(widths[best])
 
 
-def _has_middle_line(markings: Markings, middle_cm: Float[np.ndarray, "m"], whole_cm: float) -> bool:
+def _has_middle_line(markings: Markings, middle_cm: Samples, whole_cm: float) -> bool:
     """Whether three lines run along the road."""
     band_cm = (max(_HALF) - 0.5) * whole_cm
     left, left_lane, middle, right_lane, right = (
@@ -93,7 +92,7 @@ def _has_middle_line(markings: Markings, middle_cm: Float[np.ndarray, "m"], whol
     return min(left, middle, right) >= _CLEAR * max(left_lane, right_lane)
 
 
-def _keeps_to_a_half(path: Path, middle_cm: Float[np.ndarray, "m"], whole_cm: float) -> bool:
+def _keeps_to_a_half(path: Path, middle_cm: Samples, whole_cm: float) -> bool:
     """Whether the car is most of the time in the same half of the road, in its direction of travel."""
     middle = np.interp(path.s_frames_cm, path.s_cm, middle_cm, period=path.period_cm)
     offset = path.offsets_cm - middle

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.quality.residuals import REFERENCE_WIDTH, BorderSamples, ResidualSettings, border_samples
+from datagen.quality.residuals import REFERENCE_WIDTH, BorderSamples, border_samples
 from datagen.slam.view import mapping_range
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.geometry.poses import path_lengths
@@ -55,7 +55,6 @@ def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
             drive_map.meta.tape_cm,
             drive_map.camera_at(k),
             table.keep,
-            ResidualSettings(),
         )
         samples = samples.select(samples.ahead_cm < _REACH_CM)
         counts[i] = len(samples.residual_px) >= _MIN_VIEW

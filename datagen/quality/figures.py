@@ -112,9 +112,7 @@ def free_lane_cm(parts: list[MappedSegment]) -> float | None:
 
 
 def contradicted_share(
-    contradicted: Bool[np.ndarray, "n 2"],
-    known: Bool[np.ndarray, "n 2"],
-    deleted: Bool[np.ndarray, "n"],
+    contradicted: Bool[np.ndarray, "n 2"], known: Bool[np.ndarray, "n 2"], deleted: Bool[np.ndarray, "n"]
 ) -> float:
     """Share of the frames' lines that the images contradict.
 
@@ -131,10 +129,7 @@ def contradicted_share(
 
 
 def map_evidence(
-    drive_map: DriveMap,
-    figures: dict[str, Any],
-    deleted: Bool[np.ndarray, "n"],
-    free_cm: float | None,
+    drive_map: DriveMap, figures: dict[str, Any], deleted: Bool[np.ndarray, "n"], free_cm: float | None
 ) -> MapEvidence:
     """Collect the evidence for the verdict.
 

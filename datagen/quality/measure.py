@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.quality.residuals import BorderSamples, ResidualSettings, border_samples, join_samples, summarise
+from datagen.quality.residuals import (
+    BANDS_CM,
+    GATE_PX,
+    BorderSamples,
+    border_samples,
+    join_samples,
+    summarise,
+)
 from datagen.slam.view import mapping_range
 from lanenet.data.maps.mapped_drive import (
     DELETED,
@@ -95,7 +102,7 @@ class MapQuality:
         return dict(counts.most_common())
 
 
-def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
+def measure_map(mapped: MappedDrive) -> MapQuality:
     """Compare the map's lines with its held-out frames, and find which frames get labels."""
     drive_map, drive = mapped.drive_map, mapped.drive
     camera = drive_map.camera
@@ -108,11 +115,9 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
         image = drive.image(int(mapped.rows[k]))
         edges: EdgePixels = find_edges(image, mapped.perception.edges, table.keep, table.scale)
         lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
-        samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep, settings))
+        samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep))
         left = lines.without(np.array([False, True]))
-        chance.append(
-            border_samples(edges, left, tape_cm, nodded, table.keep, settings, aside_cm=0.5 * lane_cm)
-        )
+        chance.append(border_samples(edges, left, tape_cm, nodded, table.keep, aside_cm=0.5 * lane_cm))
     window = BirdseyeWindow()
     status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
     points = np.full((len(mapped.rows), N_POINTS), np.nan)
@@ -127,7 +132,7 @@ def measure_map(mapped: MappedDrive, settings: ResidualSettings) -> MapQuality:
     return MapQuality(rows, samples, join_samples(chance), status, points, in_window)
 
 
-def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings) -> dict[str, Any]:
+def quality_figures(quality: MapQuality, width: int) -> dict[str, Any]:
     """Return the report's figures: residuals by line and distance, coverage, and labelled shares."""
     every, near = join_samples(quality.samples), quality.near
     chance = quality.chance.select(quality.chance.ahead_cm < VERDICT_REACH_CM)
@@ -138,7 +143,7 @@ def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings)
             f"{low:g}-{high:g} cm": summarise(
                 part.select((part.ahead_cm >= low) & (part.ahead_cm < high))
             ).as_dict(width)
-            for low, high in pairwise(settings.bands_cm)
+            for low, high in pairwise(BANDS_CM)
         }
         within = part.select(part.ahead_cm < VERDICT_REACH_CM)
         lines[side] = {f"0-{VERDICT_REACH_CM:g} cm": summarise(within).as_dict(width), "bands": bands}
@@ -149,7 +154,7 @@ def quality_figures(quality: MapQuality, width: int, settings: ResidualSettings)
             "frames": len(quality.samples),
             "what": "edges of these frames had no say in the lines; their poses come from the chain",
             "reach_cm": VERDICT_REACH_CM,
-            "gate_px_at_160": settings.gate_px,
+            "gate_px_at_160": GATE_PX,
             "both_lines": summarise(near).as_dict(width),
             "coverage_by_chance": summarise(chance).coverage,
             "lines": lines,

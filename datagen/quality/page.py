@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from string import Template
 from typing import Any
 
@@ -91,28 +91,28 @@ def report_page(
             f"an edge. In the middle of the lane it is {_percent(chance)}: by chance, or because of paint."
         ),
         _table(residual_rows(held, drive.width)),
-        _png(plots.residual_plot(quality, drive.width, settings.max_sd_px, settings.max_p95_px)),
+        _plot(plots.residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
         *(
-            f"<h3>{sheet.title.capitalize()} held-out frames</h3>{_jpeg(sheet.picture)}"
-            for sheet in contact_sheets(mapped, quality)
+            f"<h3>{title.capitalize()} held-out frames</h3>{_jpeg(sheet)}"
+            for title, sheet in contact_sheets(mapped, quality).items()
         ),
         _section("Labels"),
         _table(share_rows(figures["labelled"])),
-        _png(plots.frames_plot(quality, drive, drive_map, drive.width)),
+        _plot(plots.frames_plot, quality, drive, drive_map, drive.width),
         _section("Map"),
         _note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
         _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
         _section("Path and loops"),
         _table(loop_rows(figures["segments_mapped"])),
-        _png(plots.trajectory_plot(mapped, opened_poses)),
+        _plot(plots.trajectory_plot, mapped, opened_poses),
         _section("Camera and scale"),
         _table(camera_rows(drive_map.camera, figures.get("calibration"))),
         _table(scale_rows(drive_map.meta)),
         _list(verdict.remarks),
         _section("Steering and speed"),
-        _png(plots.steering_plot(mapped, fits))
+        _plot(plots.steering_plot, mapped, fits)
         or _note("There is no steering command, or it does not explain the path."),
-        _png(plots.speed_plot(mapped)),
+        _plot(plots.speed_plot, mapped),
     ]
     return _PAGE.substitute(
         title=html.escape(f"Map of {drive.name}"),
@@ -145,7 +145,12 @@ def _table(rows: list[Row]) -> str:
     return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
 
 
-def _png(png: bytes | None) -> str:
+def _plot(draw: Callable[..., bytes | None], *args: Any) -> str:
+    """Inline a plot; nothing without Matplotlib."""
+    try:
+        png = draw(*args)
+    except ImportError:
+        return ""
     return "" if png is None else _inline(png, "png")
 
 

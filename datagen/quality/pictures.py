@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -179,23 +178,15 @@ def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int
     return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))
 
 
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """A sheet of held-out frames: its title and its picture."""
-
-    title: str
-    picture: UInt8[np.ndarray, "h w 3"]
-
-
-def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> list[Sheet]:
-    """Draw the best, median and worst held-out frames, each with its lines and its median residual.
+def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
+    """Draw sheets of the best, median and worst held-out frames, with their lines and median residuals.
 
     A frame without residuals counts as worst: the map expects a line there that is not seen.
     """
     medians = quality.frame_median_px
     order = np.argsort(np.nan_to_num(medians, nan=np.inf), kind="stable")
     if not order.size:
-        return []
+        return {}
     count = min(_TILES, max(1, len(order) // 3))
     middle = (len(order) - count) // 2
     picks = {
@@ -203,7 +194,7 @@ def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> list[Sheet]:
         "median": order[middle : middle + count],
         "worst": order[::-1][:count],
     }
-    return [Sheet(name, _sheet(mapped, quality, medians, rows)) for name, rows in picks.items()]
+    return {title: _sheet(mapped, quality, medians, rows) for title, rows in picks.items()}
 
 
 def _sheet(

@@ -1,4 +1,4 @@
-"""Plots of the report page, as PNG; None without Matplotlib."""
+"""Plots of the report page, as PNG; they raise ImportError without Matplotlib."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ _COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
 _BIN_CM = 5.0
 
 
-def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]] | None:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        return None
+def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]]:
+    """Make a figure with panels one below the other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     # Without pyplot, which selects a window system and keeps global state.
     figure = Figure(figsize=(width, height), dpi=110)
     FigureCanvasAgg(figure)
@@ -49,12 +48,9 @@ def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]
     return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
 
 
-def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes | None:
+def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes:
     """Driven path before and after the loops were closed."""
-    made = _figure(6.5, 5.0)
-    if made is None:
-        return None
-    figure, (axes,) = made
+    figure, (axes,) = _figure(6.5, 5.0)
     drive_map = mapped.drive_map
     for poses, style, name in (
         (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
@@ -70,12 +66,9 @@ def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"])
     return _png(figure)
 
 
-def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes | None:
+def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes:
     """Residuals and coverage over the distance ahead, by line."""
-    made = _figure(6.5, 4.6, 2)
-    if made is None:
-        return None
-    figure, (axes, below) = made
+    figure, (axes, below) = _figure(6.5, 4.6, 2)
     every = join_samples(quality.samples)
     scale = REFERENCE_WIDTH / width
     edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
@@ -105,12 +98,9 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
     return _png(figure)
 
 
-def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes | None:
+def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
     """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
-    made = _figure(6.5, 3.8, 2)
-    if made is None:
-        return None
-    figure, (axes, strip) = made
+    figure, (axes, strip) = _figure(6.5, 3.8, 2)
     axes.plot(
         drive_map.frames[quality.held_out],
         quality.frame_median_px * REFERENCE_WIDTH / width,
@@ -133,15 +123,12 @@ def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: i
 
 
 def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
-    """Curvature of the driven path over the steering command, with a fitted line."""
+    """Curvature of the driven path over the steering command, with a fitted line; None without a fit."""
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
     if turn is None or not any(fits):
         return None
-    made = _figure(6.5, 3.6)
-    if made is None:
-        return None
-    figure, (axes,) = made
+    figure, (axes,) = _figure(6.5, 3.6)
     for segment, fit in enumerate(fits):
         part = np.flatnonzero(drive_map.segment == segment)
         if fit is None or len(part) < 3:
@@ -172,13 +159,10 @@ def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes 
     return _png(figure)
 
 
-def speed_plot(mapped: MappedDrive) -> bytes | None:
+def speed_plot(mapped: MappedDrive) -> bytes:
     """Step length of each frame, with the commanded speed or throttle."""
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
-    made = _figure(6.5, 2.8)
-    if made is None:
-        return None
-    figure, (axes,) = made
+    figure, (axes,) = _figure(6.5, 2.8)
     step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
     # A step across a break was not driven by the car.
     step[mapped.starts[1:]] = np.nan

@@ -13,9 +13,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numba import njit
-from pydantic import Field
 
-from lanenet.config import Settings
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
@@ -23,22 +21,15 @@ from lanenet.perception.edges.canny import EdgePixels
 
 #: Image width to which pixels are converted so that drives can be compared: that of Donkeycar images.
 REFERENCE_WIDTH = 160.0
-
-
-class ResidualSettings(Settings):
-    """How borders are compared with edges; pixels are those of an image 160 px wide.
-
-    Attributes:
-        gate_px: Largest distance of an edge from its border. Chosen: eight times the residuals of good maps.
-        min_agreement: Least cosine between the gradients of edge and border: 37 degrees, for blur and noise.
-        step_cm: Distance of the samples along a border.
-        bands_cm: Limits of the distance bands ahead of the front axle: the label rows and beyond.
-    """
-
-    gate_px: float = Field(default=4.0, gt=0.0)
-    min_agreement: float = Field(default=0.8, gt=0.0, lt=1.0)
-    step_cm: float = Field(default=1.0, gt=0.0)
-    bands_cm: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 90.0)
+#: Largest distance of an edge from its border, in pixels of such an image. Chosen: eight times the residuals
+#: of good maps.
+GATE_PX = 4.0
+#: Least cosine between the gradients of edge and border. Chosen: 37 degrees, for blur and noise.
+_MIN_AGREEMENT = 0.8
+#: Distance of the samples along a border. Chosen: finer than a pixel at the far end of the bands.
+_STEP_CM = 1.0
+#: Limits of the distance bands ahead of the front axle: the label rows and beyond.
+BANDS_CM = (0.0, 15.0, 30.0, 45.0, 90.0)
 
 
 @dataclass(frozen=True)
@@ -81,7 +72,6 @@ def border_samples(
     tape_cm: float,
     camera: Camera,
     keep: UInt8[np.ndarray, "h w"],
-    settings: ResidualSettings,
     aside_cm: float = 0.0,
 ) -> BorderSamples:
     """Measure the distance of a frame's edges from the borders that its lines predict.
@@ -92,12 +82,11 @@ def border_samples(
         tape_cm: Width of a marking that has no measured width.
         camera: Camera with the tilt of the frame.
         keep: Nonzero where the image shows road.
-        settings: Gate and sampling.
         aside_cm: Shift both lines to the right by this, off their markings.
     """
     parts = []
     for i, line in enumerate((lines.left_cm, lines.right_cm)):
-        at, across = _along(line, settings)
+        at, across = _along(line)
         at = at + aside_cm * across
         marking_cm = lines.marking_cm(i, tape_cm)
         for border in (-0.5, 0.5):
@@ -105,14 +94,12 @@ def border_samples(
             place = at + border * marking_cm * across
             uv, gradient = _in_image(place, -np.sign(border) * across, camera)
             seen = _in_view(uv, gradient, keep)
-            residual = _nearest(edges, uv[seen], gradient[seen], camera.width / REFERENCE_WIDTH, settings)
+            residual = _nearest(edges, uv[seen], gradient[seen], camera.width / REFERENCE_WIDTH)
             parts.append(BorderSamples(np.full(int(seen.sum()), SIDES[i] == "right"), at[seen, 1], residual))
     return join_samples(parts)
 
 
-def _along(
-    line_cm: Float[np.ndarray, "k 2"], settings: ResidualSettings
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+def _along(line_cm: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
     """Sample a polyline evenly within the bands; return points and unit vectors to its right."""
     step = np.diff(line_cm, axis=0)
     length = np.linalg.norm(step, axis=1)
@@ -121,13 +108,13 @@ def _along(
     # The spacing continues from one segment to the next, so that short segments get their share of samples.
     offset = 0.0
     for k in np.flatnonzero(good):
-        s = np.arange(offset, length[k], settings.step_cm)
-        offset = (s[-1] + settings.step_cm if s.size else offset) - length[k]
+        s = np.arange(offset, length[k], _STEP_CM)
+        offset = (s[-1] + _STEP_CM if s.size else offset) - length[k]
         direction = step[k] / length[k]
         places.append(line_cm[k] + s[:, None] * direction)
         across.append(np.tile([direction[1], -direction[0]], (len(s), 1)))
     at, right = np.concatenate(places), np.concatenate(across)
-    inside = (at[:, 1] >= settings.bands_cm[0]) & (at[:, 1] < settings.bands_cm[-1])
+    inside = (at[:, 1] >= BANDS_CM[0]) & (at[:, 1] < BANDS_CM[-1])
     return at[inside], right[inside]
 
 
@@ -159,15 +146,11 @@ def _in_view(
 
 
 def _nearest(
-    edges: EdgePixels,
-    uv: Float[np.ndarray, "m 2"],
-    gradient: Float[np.ndarray, "m 2"],
-    scale: float,
-    settings: ResidualSettings,
+    edges: EdgePixels, uv: Float[np.ndarray, "m 2"], gradient: Float[np.ndarray, "m 2"], scale: float
 ) -> Float[np.ndarray, "m"]:
     """Signed distance along the gradient to the closest edge across the border; NaN without one."""
     found = np.full(len(uv), np.nan)
-    _meet(edges.uv_px, edges.normals, uv, gradient, settings.min_agreement, settings.gate_px * scale, found)
+    _meet(edges.uv_px, edges.normals, uv, gradient, _MIN_AGREEMENT, GATE_PX * scale, found)
     return found
 
 

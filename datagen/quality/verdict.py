@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -127,36 +128,30 @@ class Verdict:
     remarks: tuple[str, ...]
 
 
-#: One check's grade, with its reason.
-_Finding = tuple[Grade, str]
+#: The grades of one check, with their reasons; none if the map is good.
+_Findings = Iterator[tuple[Grade, str]]
 
 
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
-    found = [
-        *_residuals(evidence, settings),
-        *_labelled(evidence, settings),
-        *_contradicted(evidence, settings),
-        *_camera(evidence, settings),
-        *_lane_width(evidence, settings),
-    ]
-    grade: Grade = max((grade for grade, _ in found), key=_ORDER.index, default="good")
-    if grade == "good":
+    checks = (_residuals, _labelled, _contradicted, _camera, _lane_width)
+    found = [finding for check in checks for finding in check(evidence, settings)]
+    # The worst first.
+    found.sort(key=lambda finding: -_ORDER.index(finding[0]))
+    reasons = [reason for _, reason in found]
+    if not found:
         sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
         reasons = [
             f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; "
             f"{_percent(evidence.labelled_share)} of the frames have labels"
         ]
-    else:
-        # The worst first.
-        reasons = [text for _, text in sorted(found, key=lambda item: -_ORDER.index(item[0]))]
     remarks = []
     if evidence.found_lane_cm is None:
         remarks.append(
             f"the lane width of {evidence.given_lane_cm:g} cm is the one thing that sets the scale: if it is "
             "wrong, every length is wrong by the same share, and no check here can show it"
         )
-    return Verdict(grade, tuple(reasons), tuple(remarks))
+    return Verdict(found[0][0] if found else "good", tuple(reasons), tuple(remarks))
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:
@@ -170,128 +165,91 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def _residuals(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
+def _residuals(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.coverage != e.coverage:
-        return [("usable", "no frame was held out that shows the lines, so the map could not be checked")]
+        yield "usable", "no frame was held out that shows the lines, so the map could not be checked"
+        return
     if not e.coverage > 0.0:
-        return [("reject", "no edge was found where the map expects the borders of its lines")]
-    found = [finding for side, line in e.lines.items() for finding in _line(side, line, s)]
+        yield "reject", "no edge was found where the map expects the borders of its lines"
+        return
+    for side, line in e.lines.items():
+        yield from _line(side, line, s)
     if e.p95_px > s.max_p95_px:
-        found.append(
-            (
-                "usable",
-                f"residual on held-out frames: p95 {e.p95_px:.2f} px, expected {s.max_p95_px:g} at most",
-            )
-        )
+        p95 = f"residual on held-out frames: p95 {e.p95_px:.2f} px"
+        yield "usable", f"{p95}, expected {s.max_p95_px:g} at most"
     if e.coverage < s.min_coverage:
+        met = f"{_percent(e.coverage)} of the lines' borders in view met an edge"
         grade: Grade = "usable" if e.coverage >= s.min_coverage / s.usable else "reject"
-        found.append(
-            (
-                grade,
-                f"{_percent(e.coverage)} of the lines' borders in view met an edge, expected "
-                f"{_percent(s.min_coverage)} at least",
-            )
-        )
-    return found
+        yield grade, f"{met}, expected {_percent(s.min_coverage)} at least"
 
 
-def _line(side: str, line: LineEvidence, s: VerdictSettings) -> list[_Finding]:
+def _line(side: str, line: LineEvidence, s: VerdictSettings) -> _Findings:
     """Judge one line by its residuals; its coverage says little, since dashes and worn lines lower it."""
     if line.samples < s.min_samples:
-        return [
-            (
-                "usable",
-                f"held-out frames show {line.samples} places of the {side} line, expected {s.min_samples} at "
-                "least to check it",
-            )
-        ]
+        shown = f"held-out frames show {line.samples} places of the {side} line"
+        yield "usable", f"{shown}, expected {s.min_samples} at least to check it"
+        return
     if not line.coverage > 0.0:
-        return [("reject", f"no edge was found where the map expects the borders of its {side} line")]
-    found: list[_Finding] = []
+        yield "reject", f"no edge was found where the map expects the borders of its {side} line"
+        return
     what = f"residual of the {side} line on held-out frames"
     grade = _bounded(line.robust_sd_px, s.max_sd_px, s)
     if grade != "good":
-        found.append(
-            (grade, f"{what}: robust sd {line.robust_sd_px:.2f} px, expected {s.max_sd_px:g} at most")
-        )
-    if line.p95_px > s.usable * s.max_p95_px:
-        bound = s.usable * s.max_p95_px
-        found.append(("usable", f"{what}: p95 {line.p95_px:.2f} px, expected {bound:g} at most for one line"))
-    return found
+        yield grade, f"{what}: robust sd {line.robust_sd_px:.2f} px, expected {s.max_sd_px:g} at most"
+    bound = s.usable * s.max_p95_px
+    if line.p95_px > bound:
+        yield "usable", f"{what}: p95 {line.p95_px:.2f} px, expected {bound:g} at most for one line"
 
 
-def _labelled(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
-    found: list[_Finding] = []
-    causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
+def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    expected = f"have labels, expected {_percent(s.min_labelled)}"
     grade = _bounded(1.0 - e.labelled_share, 1.0 - s.min_labelled, s)
     if grade != "good":
-        labelled = f"{_percent(e.labelled_share)} of the frames have labels"
-        found.append((grade, f"{labelled}, expected {_percent(s.min_labelled)} ({causes})"))
-    return found + [
-        (
-            "usable",
-            f"{_percent(share)} of the {side} line's points in the window have labels, expected "
-            f"{_percent(s.min_labelled)} at least (frames: {_percent(e.labelled_share)})",
-        )
-        for side, share in e.point_shares.items()
-        if share < s.min_labelled
-    ]
+        causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
+        yield grade, f"{_percent(e.labelled_share)} of the frames {expected} ({causes})"
+    for side, share in e.point_shares.items():
+        if share < s.min_labelled:
+            points = f"{_percent(share)} of the {side} line's points in the window"
+            yield "usable", f"{points} {expected} (frames: {_percent(e.labelled_share)})"
 
 
-def _contradicted(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
+def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
     grade = _bounded(e.contradicted_share, s.max_contradicted, s)
-    if grade == "good":
-        return []
-    return [
-        (
-            grade,
-            f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map, "
-            f"expected {_percent(s.max_contradicted)} at most",
-        )
-    ]
+    if grade != "good":
+        share = f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map"
+        yield grade, f"{share}, expected {_percent(s.max_contradicted)} at most"
 
 
-def _camera(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
-    found: list[_Finding] = []
+def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.closure_across_heights is not None and e.closure_across_heights > s.max_closure_heights:
-        found.append(
-            (
-                _bounded(e.closure_across_heights, s.max_closure_heights, s),
-                f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights, "
-                f"expected {s.max_closure_heights:g} at most",
-            )
-        )
+        error = f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights"
+        grade = _bounded(e.closure_across_heights, s.max_closure_heights, s)
+        yield grade, f"{error}, expected {s.max_closure_heights:g} at most"
     if e.camera_known:
-        return found
+        return
     if not e.revisits:
         sigma = e.sigma["focal"]
-        found.append(
-            (
-                max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
-                "the camera was found from the drive, but no place was seen twice, so its focal length is "
-                f"only a guess, here within {_percent(sigma)}: drive two laps of a closed road, the second "
-                "along the same path, or calibrate the camera and give it",
-            )
+        yield (
+            max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
+            "the camera was found from the drive, but no place was seen twice, so its focal length is only a "
+            f"guess, here within {_percent(sigma)}: drive two laps of a closed road, the second along the "
+            "same path, or calibrate the camera and give it",
         )
     elif (sigma := e.sigma.get("focal", 0.0)) > s.max_focal_sigma:
         grade = _bounded(sigma, s.max_focal_sigma, s)
-        found.append((grade, f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %"))
+        yield grade, f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %"
     if (sigma := e.sigma.get("pitch", 0.0)) > s.max_pitch_sigma_rad:
         grade = _bounded(sigma, s.max_pitch_sigma_rad, s)
-        found.append((grade, f"the drive leaves the camera's pitch open by {sigma:.3f} rad"))
-    return found
+        yield grade, f"the drive leaves the camera's pitch open by {sigma:.3f} rad"
 
 
-def _lane_width(e: MapEvidence, s: VerdictSettings) -> list[_Finding]:
+def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.found_lane_cm is None:
-        return []
+        return
     ratio = max(e.found_lane_cm / e.given_lane_cm, e.given_lane_cm / e.found_lane_cm)
-    if ratio <= 1.0 + s.lane_mismatch:
-        return []
-    return [
-        (
+    if ratio > 1.0 + s.lane_mismatch:
+        yield (
             "usable" if ratio <= 1.0 + s.lane_reject else "reject",
             f"the lane measures {e.found_lane_cm:.0f} cm with this camera, but {e.given_lane_cm:g} cm was "
             "given: either the lane width or the camera's height is wrong",
         )
-    ]

@@ -30,7 +30,8 @@ _EDGES_FORMAT = "lanenet-edges/2"
 _REPORT_FORMAT = "lanenet-map-report/1"
 #: The resolved settings of the mapping, in the map's folder.
 SETTINGS_NAME = "settings.yaml"
-#: Columns of ``poses.csv``: the images around a frame contradict its left, its right line.
+#: Columns of ``poses.csv``; the last ones say that images contradict the left, the right line.
+_POSE, _TILT = ("x_cm", "y_cm", "heading_rad"), ("pitch_rad", "roll_rad")
 _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
 
 
@@ -131,15 +132,12 @@ def write_map(
     columns = {
         "frame": m.frames,
         "t_s": m.t_s,
-        "x_cm": m.poses[:, 0],
-        "y_cm": m.poses[:, 1],
-        "heading_rad": m.poses[:, 2],
+        **dict(zip(_POSE, m.poses.T, strict=True)),
         "lap": m.lap,
         "segment": m.segment,
         "s_cm": m.s_cm,
         "match": m.match,
-        "pitch_rad": m.tilt_rad[:, 0],
-        "roll_rad": m.tilt_rad[:, 1],
+        **dict(zip(_TILT, m.tilt_rad.T, strict=True)),
         "held_out": m.held_out,
         **dict(zip(_CONTRADICTED, m.contradicted.T, strict=True)),
     }
@@ -193,17 +191,9 @@ def read_map(folder: Path) -> DriveMap:
     table = read_csv(
         folder / "poses.csv",
         {
-            "frame": ColumnSpec("int"),
-            "t_s": ColumnSpec(),
-            "x_cm": ColumnSpec(),
-            "y_cm": ColumnSpec(),
-            "heading_rad": ColumnSpec(),
-            "lap": ColumnSpec("int"),
-            "segment": ColumnSpec("int"),
-            "s_cm": ColumnSpec(),
+            **{name: ColumnSpec("int") for name in ("frame", "lap", "segment")},
+            **{name: ColumnSpec() for name in ("t_s", *_POSE, "s_cm", *_TILT)},
             "match": ColumnSpec(allow_empty=True),
-            "pitch_rad": ColumnSpec(),
-            "roll_rad": ColumnSpec(),
             **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
         },
         error=MapFormatError,
@@ -213,13 +203,13 @@ def read_map(folder: Path) -> DriveMap:
         camera=read_camera(folder / "camera.yaml"),
         frames=table["frame"],
         t_s=table["t_s"],
-        poses=np.stack([table["x_cm"], table["y_cm"], table["heading_rad"]], axis=1),
+        poses=np.stack([table[name] for name in _POSE], axis=1),
         lap=table["lap"],
         segment=table["segment"],
         s_cm=table["s_cm"],
         match=table["match"],
         lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
-        tilt_rad=np.stack([table["pitch_rad"], table["roll_rad"]], axis=1),
+        tilt_rad=np.stack([table[name] for name in _TILT], axis=1),
         held_out=table["held_out"] > 0,
         contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
 from lanenet.data.maps.mapped_drive import label_frame, open_mapped_drive
@@ -63,21 +63,20 @@ class LabelledFrames:
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         if not rows.size:
             raise LabelFormatError(f"{self.name}: no frame from {first} to {last}")
-        start = int(rows[0])
         return replace(
             self,
             frames=self.frames[rows],
             starts=self.starts[rows],
             points_cm=self.points_cm[rows],
-            image=partial(_image_from, self.image, start),
+            image=partial(_image_at, self.image, rows),
         )
 
 
-def _image_from(
-    whole: Callable[[int], UInt8[np.ndarray, "h w 3"]], start: int, i: int
+def _image_at(
+    read: Callable[[int], UInt8[np.ndarray, "h w 3"]], rows: Int[np.ndarray, "n"], i: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Read frame i of a selection that begins at ``start``; at module level, so that it can be pickled."""
-    return whole(start + i)
+    """Read the image of row ``rows[i]``; at module level, so that it can be pickled."""
+    return read(int(rows[i]))
 
 
 def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> LabelledFrames:
@@ -153,10 +152,5 @@ def read_map_frames(
         frames=drive_map.frames,
         starts=mapped.starts,
         points_cm=points,
-        image=partial(_image_of_row, drive, rows),
+        image=partial(_image_at, drive.image, rows),
     )
-
-
-def _image_of_row(drive: Drive, rows: Int[np.ndarray, "n"], i: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Read frame i of a map; at module level, so that it can be pickled."""
-    return drive.image(int(rows[i]))

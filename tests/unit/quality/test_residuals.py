@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from datagen.quality.residuals import (
     BorderSamples,
-    ResidualSettings,
     border_samples,
     join_samples,
     summarise,
@@ -31,7 +30,6 @@ CAMERA = Camera(
 )
 TAPE_CM = 3.0
 KEEP = np.full((120, 160), 255, np.uint8)
-SETTINGS = ResidualSettings()
 
 
 def lane(bend_per_cm: float = 0.0) -> FrameLines:
@@ -64,7 +62,7 @@ def edges_of(lines: FrameLines, shift_px: float = 0.0, tape_cm: float = TAPE_CM)
 
 
 def measure(edges: EdgePixels, lines: FrameLines, **changes: float):
-    return border_samples(edges, lines, TAPE_CM, CAMERA, KEEP, SETTINGS, **changes)
+    return border_samples(edges, lines, TAPE_CM, CAMERA, KEEP, **changes)
 
 
 @pytest.mark.parametrize("bend_per_cm", [0.0, 0.006, -0.006])
@@ -111,7 +109,7 @@ def test_a_line_in_the_empty_middle_of_the_lane_meets_nothing():
 def test_only_what_the_frame_shows_counts():
     keep = KEEP.copy()
     keep[:, :80] = 0
-    found = border_samples(edges_of(lane()), lane(), TAPE_CM, CAMERA, keep, SETTINGS)
+    found = border_samples(edges_of(lane()), lane(), TAPE_CM, CAMERA, keep)
     assert found.right.all() and len(found.right) > 50
     unsupported = FrameLines(np.full((5, 2), np.nan), np.full((5, 2), np.nan), np.full(6, np.nan))
     assert len(measure(edges_of(lane()), unsupported).right) == 0
@@ -121,7 +119,7 @@ def test_the_tilt_of_the_frame_matters():
     edges = edges_of(lane())
     m = CAMERA.mounting
     nodded = CAMERA.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.01)
-    found = border_samples(edges, lane(), TAPE_CM, nodded, KEEP, SETTINGS)
+    found = border_samples(edges, lane(), TAPE_CM, nodded, KEEP)
     assert summarise(found).robust_sd_px > 0.3
 
 
