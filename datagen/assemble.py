@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.lanes.mapped import MappedSegment
+from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.changes import with_known_scale

@@ -11,7 +11,7 @@ from datagen.prepare import PreparedDrive
 from datagen.quality.agreement import contradicted_lines
 from datagen.quality.figures import free_lane_cm, map_evidence, map_figures, map_notes
 from datagen.quality.measure import MapQuality, measure_map, quality_figures
-from datagen.quality.residuals import REFERENCE_WIDTH, ResidualSettings, summarise
+from datagen.quality.residuals import REFERENCE_WIDTH, summarise
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text
@@ -63,9 +63,9 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
     drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
-    quality = measure_map(replace(mapped, drive_map=drive_map), ResidualSettings())
+    quality = measure_map(replace(mapped, drive_map=drive_map))
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
-    figures |= quality_figures(quality, drive.width, ResidualSettings())
+    figures |= quality_figures(quality, drive.width)
     labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
     notes.append(f"{labelled}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, camera_figures | figures, drive.deleted[assembled.rows], free_cm)

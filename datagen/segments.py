@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from datagen.lanes.find import find_lane
-from datagen.lanes.mapped import MappedSegment, check_lane
+from datagen.lanes.find import MappedSegment, check_lane, find_lane
 from datagen.prepare import PreparedDrive, check_edges
 from datagen.slam.camera.self_calibration import find_camera
 from datagen.slam.join import frames_text
@@ -126,7 +125,7 @@ def fit_lanes(
         rows, lane_cm = segment.rows, prepared.known_lane_cm
         try:
             one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit)
-            check_lane([one], drive)
+            check_lane(one, drive)
         except (TrackingLostError, CalibrationError) as error:
             left_out.append(Refused(rows, error))
         else:

@@ -2,21 +2,60 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.follow import TraceSettings
-from datagen.lanes.mapped import MappedSegment
 from datagen.lanes.path import lap_path, without_frames
 from datagen.lanes.profile import without_crossings
 from datagen.lanes.scale import STEP_HEIGHTS, edges_beside
-from datagen.lanes.trace import trace_adjacent, trace_known_lane, trace_lane
+from datagen.lanes.trace import (
+    LEAST_SEEN,
+    MAYBE_LINE,
+    TracedLane,
+    trace_adjacent,
+    trace_known_lane,
+    trace_lane,
+)
 from datagen.slam.segment import SolvedSegment
+from lanenet.data.drives import Drive
+from lanenet.data.maps.line import LaneLine
+from lanenet.errors import TrackingLostError
+from lanenet.geometry.lane import SIDES
 
 #: Lane widths ahead of a frame up to which its edges count in any case: in a wide lane the further line only
 #: comes into view a lane's width ahead, the far line of the next lane another half of one.
 _OWN_LANE_REACH, _NEXT_LANE_REACH = 1.2, 1.6
+#: Share of the path above which a line is certain. Chosen: interruptions and worn places take a tenth at
+#: most.
+_WHOLE_LINE = 0.9
+
+
+@dataclass(frozen=True)
+class MappedSegment:
+    """A segment with its lane, in the scale of its camera.
+
+    Attributes:
+        solved: Poses and scans.
+        s_frames_cm: Position of each frame along the driven path.
+        lane: The traced lane.
+        lines: Its two lines, then those of adjacent lanes.
+        free_lane_cm: Lane width found without the given one, if it fits better; else None.
+    """
+
+    solved: SolvedSegment
+    s_frames_cm: Float[np.ndarray, "n"]
+    lane: TracedLane
+    lines: list[LaneLine]
+    free_lane_cm: float | None = None
+
+    @property
+    def rows(self) -> Int[np.ndarray, "n"]:
+        """Its frames, as positions in the drive."""
+        return self.solved.rows
 
 
 def find_lane(
@@ -56,3 +95,24 @@ def find_lane(
     lane = trace_adjacent(path, beside, lane, height, trace)
     lines = fit_lines(path, edges, lane, height, fit, beside)
     return MappedSegment(segment, path.s_frames_cm, lane, lines, free_cm)
+
+
+def check_lane(segment: MappedSegment, drive: Drive) -> None:
+    """Refuse a segment in which one of the lines is hardly seen.
+
+    Raises:
+        TrackingLostError: Names the share of the path along which each line was seen.
+    """
+    share: dict[str, float] = {
+        line.side: float(line.supported(segment.s_frames_cm).mean())
+        for line in segment.lines
+        if line.rank == 0
+    }
+    if min(share.values()) >= LEAST_SEEN:
+        return
+    found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the path" for side in SIDES)
+    most = max(share.values())
+    what = "no line" if most < MAYBE_LINE else "one line only" if most > _WHOLE_LINE else "one line at most"
+    raise TrackingLostError(
+        f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * LEAST_SEEN:.0f} % for each"
+    )

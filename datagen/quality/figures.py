@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from datagen.lanes.mapped import MappedSegment
+from datagen.lanes.find import MappedSegment
 from datagen.quality.verdict import LineEvidence, MapEvidence
 from datagen.slam.loops.pose_graph import missed_by
 from lanenet.data.maps.folder import DriveMap

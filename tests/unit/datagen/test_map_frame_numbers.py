@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.lanes.mapped import MappedSegment
+from datagen.lanes.find import MappedSegment
 from datagen.lanes.trace import TracedLane
 from datagen.quality.figures import map_edges
 from datagen.slam.adjustment.adjust import BundleResult

@@ -10,7 +10,7 @@ import pytest
 
 from datagen import pipeline, prepare
 from datagen import segments as drive_segments
-from datagen.lanes.mapped import MappedSegment
+from datagen.lanes.find import MappedSegment
 from datagen.lanes.trace import TracedLane
 from datagen.segments import LanesOfDrive
 from datagen.settings import MapSettings
