@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from datagen.quality.figures import Report
 from datagen.quality.page import PAGE_NAME
@@ -24,18 +23,15 @@ from lanenet.data.maps.mapped_drive import (
     CONTRADICTED,
     DELETED,
     NO_LINE,
-    NOT_TO_LABEL,
     UNCERTAIN,
-    MappedDrive,
-    label_frame,
+    label_frames,
     labelled_points,
     open_mapped_drive,
-    points_in_window,
     points_text,
 )
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS, POINT_NAMES
+from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
 
 _REPORT_FORMAT = "lanenet-label-report/1"
@@ -58,7 +54,7 @@ def label_map(
 ) -> Report:
     """Project a map's lines into each frame; write the label set, its report and a contact sheet.
 
-    Which frames and points have labels is decided by :func:`label_frame`.
+    Which frames and points have labels is decided by :func:`lanenet.data.maps.mapped_drive.label_frame`.
 
     Args:
         map_folder: Folder that :func:`map_drive` wrote.
@@ -79,10 +75,26 @@ def label_map(
         refuse_rejected(map_folder, drive_map)
     perception = mapped.perception.with_colours(colour_weight)
     window = BirdseyeWindow() if window is None else window
-    found = _label_frames(mapped, window, RoadEdgeExtractor(drive_map.camera, perception), progress)
-    rows = found.rows
+    found = label_frames(mapped, window)
+    left_out = {
+        reason: found.reasons.count(reason)
+        for reason in (DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE)
+    }
+    rows = np.array([k for k, reason in enumerate(found.reasons) if not reason], dtype=np.int64)
     if not rows.size:
-        raise TrackingLostError(f"{map_folder}: no frame can be labelled ({found.left_out})")
+        raise TrackingLostError(f"{map_folder}: no frame can be labelled ({left_out})")
+    extractor = RoadEdgeExtractor(drive_map.camera, perception)
+    edges, lines, residuals = [], [], []
+    for k in rows.tolist():
+        if progress is not None:
+            progress(k + 1, len(drive_map.frames))
+        seen = found.lines[k]
+        assert seen is not None
+        road = extractor.extract(mapped.drive.image(int(mapped.rows[k])))
+        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
+        lines.append((seen.left_cm, seen.right_cm))
+        residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
+    residual_cm = np.array(residuals)
     labels = LabelSet(
         meta=LabelMeta(
             window=window,
@@ -100,18 +112,19 @@ def label_map(
         t_s=drive_map.t_s[rows],
         lap=drive_map.lap[rows],
         poses=drive_map.poses[rows],
-        points_cm=found.points_cm,
-        edges=found.edges,
-        lines=found.lines,
-        quality=np.exp(-np.nan_to_num(found.residual_cm, nan=2.0)),
+        points_cm=found.points_cm[rows],
+        edges=edges,
+        lines=lines,
+        quality=np.exp(-np.nan_to_num(residual_cm, nan=2.0)),
         divides=drive_map.lanes.divides[rows],
     )
     mapped_frames = len(drive_map.frames)
-    report = label_report(labels, found.residual_cm, mapped_frames, found.left_out, found.point_shares)
+    shares = labelled_points(found.points_cm, found.in_window)
+    report = label_report(labels, residual_cm, mapped_frames, left_out, shares)
     write_labels(out, labels)
     write_json(out.with_suffix(".json"), report)
     if pictures:
-        order = np.argsort(np.nan_to_num(found.residual_cm, nan=9.0))
+        order = np.argsort(np.nan_to_num(residual_cm, nan=9.0))
         middle = len(order) // 2
         half = _SHOWN // 2
         picks = np.concatenate([order[:_SHOWN], order[middle - half : middle + half], order[-_SHOWN:]])
@@ -120,65 +133,12 @@ def label_map(
     residual = report["residual_cm"]
     text = [
         f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",
-        points_text(found.point_shares),
-        *(f"{count} frames left out: {reason}" for reason, count in found.left_out.items() if count),
+        points_text(shares),
+        *(f"{count} frames left out: {reason}" for reason, count in left_out.items() if count),
         f"distance of markings from the projected lines: {residual['median']:.2f} cm (median), "
         f"{residual['p95']:.2f} cm (p95)",
     ]
     return Report(tuple(text), report)
-
-
-@dataclass(frozen=True, eq=False)
-class _LabelledRows:
-    """The labelled frames of a map.
-
-    Attributes:
-        rows: Their positions in the map.
-        edges: Edge points and normals of each, as in :class:`LabelSet`.
-        lines: Lines of each, as in :class:`LabelSet`.
-        points_cm: Six labels of each.
-        residual_cm: Residual of each, see :func:`frame_residual_cm`.
-        left_out: Number of the other frames, by reason.
-        point_shares: See :func:`labelled_points`.
-    """
-
-    rows: Int[np.ndarray, "n"]
-    edges: list[Float[np.ndarray, "_ 4"]]
-    lines: list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]
-    points_cm: Float[np.ndarray, "n 6"]
-    residual_cm: Float[np.ndarray, "n"]
-    left_out: dict[str, int]
-    point_shares: dict[str, float]
-
-
-def _label_frames(
-    mapped: MappedDrive, window: BirdseyeWindow, extractor: RoadEdgeExtractor, progress: Progress | None
-) -> _LabelledRows:
-    drive_map = mapped.drive_map
-    n = len(drive_map.frames)
-    rows: list[int] = []
-    edges, lines, residuals = [], [], []
-    left_out = dict.fromkeys((DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE), 0)
-    points = np.full((n, N_POINTS), np.nan)
-    in_window = np.zeros(points.shape, dtype=bool)
-    for k in range(n):
-        if progress is not None:
-            progress(k + 1, n)
-        labelled = label_frame(mapped, k, window)
-        if labelled not in NOT_TO_LABEL:
-            in_window[k] = points_in_window(drive_map, k, window)
-        if isinstance(labelled, str):
-            left_out[labelled] += 1
-            continue
-        seen, points[k] = labelled
-        road = extractor.extract(mapped.drive.image(int(mapped.rows[k])))
-        rows.append(k)
-        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
-        lines.append((seen.left_cm, seen.right_cm))
-        residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
-    kept = np.array(rows, dtype=np.int64)
-    shares = labelled_points(points, in_window)
-    return _LabelledRows(kept, edges, lines, points[kept], np.array(residuals), left_out, shares)
 
 
 def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, tape_cm: float) -> float:

@@ -28,13 +28,12 @@ from lanenet.data.maps.mapped_drive import (
     DELETED,
     NOT_TO_LABEL,
     MappedDrive,
-    label_frame,
+    label_frames,
     labelled_points,
     lines_at,
-    points_in_window,
 )
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import N_POINTS, SIDES
+from lanenet.geometry.lane import SIDES
 from lanenet.perception.edges.canny import EdgePixels, find_edges
 from lanenet.perception.edges.road import RoadTable
 
@@ -118,18 +117,11 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
         samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep))
         left = lines.without(np.array([False, True]))
         chance.append(border_samples(edges, left, tape_cm, nodded, table.keep, aside_cm=0.5 * lane_cm))
-    window = BirdseyeWindow()
     status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
-    points = np.full((len(mapped.rows), N_POINTS), np.nan)
-    in_window = np.zeros(points.shape, dtype=bool)
-    for k, row in enumerate(mapped.rows.tolist()):
-        labelled = label_frame(mapped, k, window)
-        status[row] = labelled if isinstance(labelled, str) else LABELLED
-        if not isinstance(labelled, str):
-            points[k] = labelled[1]
-        if labelled not in NOT_TO_LABEL:
-            in_window[k] = points_in_window(drive_map, k, window)
-    return MapQuality(rows, samples, join_samples(chance), status, points, in_window)
+    labels = label_frames(mapped, BirdseyeWindow())
+    for row, reason in zip(mapped.rows.tolist(), labels.reasons, strict=True):
+        status[row] = reason or LABELLED
+    return MapQuality(rows, samples, join_samples(chance), status, labels.points_cm, labels.in_window)
 
 
 def quality_figures(quality: MapQuality, width: int) -> dict[str, Any]:

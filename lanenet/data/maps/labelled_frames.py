@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
-from lanenet.data.maps.mapped_drive import label_frame, open_mapped_drive
+from lanenet.data.maps.mapped_drive import label_frames, open_mapped_drive
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import N_POINTS, POINT_NAMES
+from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.edges.road import PerceptionSettings
 
 
@@ -137,11 +137,6 @@ def read_map_frames(
     mapped = open_mapped_drive(map_folder, drive_path)
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     window = BirdseyeWindow() if window is None else window
-    points = np.full((len(rows), N_POINTS), np.nan)
-    for k in range(len(rows)):
-        labelled = label_frame(mapped, k, window)
-        if not isinstance(labelled, str):
-            points[k] = labelled[1]
     return LabelledFrames(
         name=str(map_folder),
         reference="map",
@@ -151,6 +146,6 @@ def read_map_frames(
         perception=mapped.perception,
         frames=drive_map.frames,
         starts=mapped.starts,
-        points_cm=points,
+        points_cm=label_frames(mapped, window).points_cm,
         image=partial(_image_at, drive.image, rows),
     )

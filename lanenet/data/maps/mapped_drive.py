@@ -139,6 +139,40 @@ def label_frame(
     return (seen, visible) if np.isfinite(visible).any() else CONTRADICTED
 
 
+@dataclass(frozen=True, eq=False)
+class MapLabels:
+    """The labels of a map's frames.
+
+    Attributes:
+        reasons: Why a frame has no labels; empty if it has some.
+        lines: Lane of each frame; None if it has no labels.
+        points_cm: Six labels of each frame; NaN where masked.
+        in_window: Which points a complete map would label; none of frames that are not to be labelled.
+    """
+
+    reasons: list[str]
+    lines: list[FrameLines | None]
+    points_cm: Float[np.ndarray, "n 6"]
+    in_window: Bool[np.ndarray, "n 6"]
+
+
+def label_frames(mapped: MappedDrive, window: BirdseyeWindow) -> MapLabels:
+    """Label every frame of a map, see :func:`label_frame` and :func:`points_in_window`."""
+    n = len(mapped.rows)
+    reasons, points_cm = [""] * n, np.full((n, N_POINTS), np.nan)
+    lines: list[FrameLines | None] = [None] * n
+    in_window = np.zeros(points_cm.shape, dtype=bool)
+    for k in range(n):
+        labelled = label_frame(mapped, k, window)
+        if isinstance(labelled, str):
+            reasons[k] = labelled
+        else:
+            lines[k], points_cm[k] = labelled
+        if reasons[k] not in NOT_TO_LABEL:
+            in_window[k] = points_in_window(mapped.drive_map, k, window)
+    return MapLabels(reasons, lines, points_cm, in_window)
+
+
 def points_in_window(drive_map: DriveMap, k: int, window: BirdseyeWindow) -> Bool[np.ndarray, "6"]:
     """Find which of the six points of the map's k-th frame a complete map would label.
 
