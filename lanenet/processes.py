@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -50,7 +51,7 @@ def run_jobs(
         return results
     # Spawned, because forking a process that has started torch's or OpenCV's threads can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_take_one_core) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_process) as pool:
         names = {pool.submit(work, job): name for name, job in jobs}
         try:
             for done, future in enumerate(as_completed(names), start=1):
@@ -68,9 +69,11 @@ def run_jobs(
     return [future.result() for future in names]
 
 
-def _take_one_core() -> None:
+def prepare_process() -> None:
+    """Make a worker process leave the cores to its siblings, and end at once at Ctrl-C."""
     import cv2
 
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     cv2.setNumThreads(1)
 
 
@@ -79,7 +82,7 @@ def _out_of_memory(name: str, workers: int) -> LanenetError:
 
 
 def _fewer(workers: int) -> str:
-    return f"run fewer processes at a time (now {workers}; training takes data.workers, or one per core)"
+    return f"run fewer at a time (now {workers}: --workers; training takes data.workers, or one per core)"
 
 
 def _died(names: dict[Future[ResultT], str], workers: int) -> LanenetError:
@@ -87,8 +90,8 @@ def _died(names: dict[Future[ResultT], str], workers: int) -> LanenetError:
     unfinished = [name for future, name in names.items() if _has_failed(future)]
     running = " or ".join(unfinished[:workers])
     return LanenetError(
-        f"{running}: its process was killed, most often because memory ran out; {_fewer(workers)}. Finished "
-        "drives are kept: run the command again"
+        f"{running}: its process was killed, most often because memory ran out; {_fewer(workers)}. What "
+        "is finished is kept: run the command again"
     )
 
 

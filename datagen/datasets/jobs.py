@@ -17,8 +17,9 @@ from datagen.datasets.settings import DataSettings, RecordedSettings
 from datagen.datasets.splits import split_recording
 from datagen.labels.truth import truth_labels
 from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive
-from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
+from datagen.world.world import SimulationSettings
 from lanenet.data.files import write_text
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError

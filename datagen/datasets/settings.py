@@ -9,8 +9,8 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from datagen.settings import MapSettings
-from datagen.world.car.rig import CameraSettings
-from datagen.world.simulate import SimulationSettings
+from datagen.world.car.camera import CameraSettings
+from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.perception.edges.road import COLOUR_WEIGHT, PerceptionSettings

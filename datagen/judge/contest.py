@@ -1,78 +1,30 @@
-"""All runs of a contest: over processes, and taken up again where they were stopped.
+"""All runs of a contest, driven by several processes; finished runs are kept and not driven again.
 
-Finished runs on disk: a JSON file with the result, and a CSV file with the trajectory.
+A finished run on disk is a JSON file with the result and a CSV file with the trajectory.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
-from datagen.world.simulate import prepare_process
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.data.files import write_json
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
-from lanenet.errors import ConfigError, LanenetError
+from lanenet.errors import ConfigError
+from lanenet.processes import run_jobs
 
-_NUMBERS = ("t_s", "x_cm", "y_cm", "s_cm", "offset_cm", "steering_rad")
+#: Of the runs; raise it when the same settings give other results.
+_VERSION = 2
+_NUMBERS = ("s_cm", "offset_cm", "steering_rad")
 _FLAGS = ("answered", "over", "put_back")
-
-
-def write_run(path: Path, key: str, result: RunResult, trajectory: Trajectory) -> None:
-    """Write a finished run.
-
-    Args:
-        path: The JSON file; the trajectory lies beside it.
-        key: Stands for all that the run depends on.
-        result: The run.
-        trajectory: The run frame by frame.
-    """
-    columns: dict[str, Any] = {"t_s": trajectory.t_s}
-    columns |= {"x_cm": trajectory.xy_cm[:, 0], "y_cm": trajectory.xy_cm[:, 1]}
-    columns |= {name: getattr(trajectory, name) for name in (*_NUMBERS[3:], *_FLAGS)}
-    write_csv(path.with_suffix(".csv"), columns)
-    # Last: a run without it is driven again.
-    write_json(path, {"key": key, **asdict(result)})
-
-
-def read_run(path: Path, key: str) -> RunResult | None:
-    """Read a finished run; None if there is none, or it was driven under other settings."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data.pop("key") != key or not path.with_suffix(".csv").is_file():
-            return None
-        return RunResult(**data)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not there, or not what was written
-        return None
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """Read the trajectory beside a run's JSON file.
-
-    Raises:
-        DriveFormatError: If it cannot be read.
-    """
-    specs = {name: ColumnSpec() for name in _NUMBERS} | {name: ColumnSpec("int") for name in _FLAGS}
-    columns = read_csv(path.with_suffix(".csv"), specs)
-    return Trajectory(
-        xy_cm=np.stack([columns["x_cm"], columns["y_cm"]], axis=1),
-        **{name: columns[name] for name in ("t_s", "s_cm", "offset_cm", "steering_rad")},
-        **{name: columns[name] == 1 for name in _FLAGS},
-    )
-
-
-_VERSION = 2  # of the runs; raise it when the same settings give other results
 
 
 @dataclass(frozen=True)
@@ -97,7 +49,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Stands for all that the run depends on; how many other runs there are is not part of it."""
+        """Hash of all that the run depends on, which does not include how many other runs there are."""
         contest = self.settings.model_dump(mode="json", exclude={"seed", "count", "tracks", "simulation"})
         parts = [_VERSION, contest, self.simulation.model_dump(mode="json")]
         text = json.dumps([*parts, self.entrant.name, self.entrant.identity], sort_keys=True)
@@ -113,7 +65,7 @@ def judge(
 ) -> list[RunResult]:
     """Let every entrant drive every road.
 
-    Each run is written to ``out/runs`` when it is finished; a run that lies there, driven under the same
+    Each run is written to ``out/runs`` when it is finished; a run that is there, driven under the same
     settings, is not driven again.
 
     Args:
@@ -128,33 +80,29 @@ def judge(
 
     Raises:
         ConfigError: If two entrants have one name, or there is no such road.
-        LanenetError: What the first failing run raised, or if a process ends before its time.
+        LanenetError: What the first failing run raised, or if a process dies.
     """
     jobs = contest_jobs(settings, entrants, out)
     results = {job.path: result for job in jobs if (result := read_run(job.path, job.key)) is not None}
-    open_jobs = [job for job in jobs if job.path not in results]
+    missing = [(job.path.stem, job) for job in jobs if job.path not in results]
+    kept = len(results)
 
-    def count(path: Path | None = None, result: RunResult | None = None) -> None:
-        if path is not None and result is not None:
-            results[path] = result
+    def show(done: int, _: int) -> None:
         if progress is not None:
-            progress(len(results), len(jobs))
+            progress(kept + done, len(jobs))
 
-    count()
-    if workers <= 1 or len(open_jobs) <= 1:
-        for job in open_jobs:
-            count(job.path, run_job(job))
-    else:
-        _run_in_pool(open_jobs, workers, count)
+    show(0, 0)
+    driven = run_jobs(run_job, missing, workers, show)
+    results |= {job.path: result for (_, job), result in zip(missing, driven, strict=True)}
     return [results[job.path] for job in jobs]
 
 
 def contest_jobs(settings: JudgeSettings, entrants: Sequence[Entrant], out: Path) -> list[Job]:
-    """Return all runs of a contest; each road is tried out, so that bad settings are refused at once.
+    """Return all runs of a contest; a road of each kind is drawn, so that bad settings are refused at once.
 
     Raises:
-        ConfigError: If two entrants have one name, one has neither eyes nor the truth, or there is no such
-            road.
+        ConfigError: If two entrants have one name, one has neither a detector nor the truth, or there is no
+            such road.
     """
     names = [entrant.name for entrant in entrants]
     if len(set(names)) < len(names):
@@ -174,23 +122,49 @@ def contest_jobs(settings: JudgeSettings, entrants: Sequence[Entrant], out: Path
 
 
 def run_job(job: Job) -> RunResult:
-    """Drive one run and write it; runs in a process of its own, or in this one."""
+    """Drive one run and write it; in any process."""
     result, trajectory = drive_run(job.settings, job.simulation, job.entrant, job.kind, job.number)
     write_run(job.path, job.key, result, trajectory)
     return result
 
 
-def _run_in_pool(jobs: Sequence[Job], workers: int, count: Callable[[Path, RunResult], None]) -> None:
-    # Spawned, because forking a process that has started OpenCV's or onnxruntime's threads can hang.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, prepare_process) as pool:
-        futures = {pool.submit(run_job, job): job for job in jobs}
-        try:
-            for future in as_completed(futures):
-                count(futures[future].path, future.result())
-        except BrokenProcessPool:
-            raise LanenetError(
-                "a process of the contest ended; finished runs are kept, the same command goes on from there"
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+def write_run(path: Path, key: str, result: RunResult, trajectory: Trajectory) -> None:
+    """Write a finished run.
+
+    Args:
+        path: The JSON file; the trajectory goes beside it.
+        key: See :attr:`Job.key`.
+        result: The run.
+        trajectory: The run frame by frame.
+    """
+    x_cm, y_cm = trajectory.xy_cm.T
+    columns = {name: getattr(trajectory, name) for name in (*_NUMBERS, *_FLAGS)}
+    write_csv(path.with_suffix(".csv"), {"t_s": trajectory.t_s, "x_cm": x_cm, "y_cm": y_cm, **columns})
+    # Last: a run without it is driven again.
+    write_json(path, {"key": key, **asdict(result)})
+
+
+def read_run(path: Path, key: str) -> RunResult | None:
+    """Read a finished run; None if there is none, or it was driven under other settings."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data.pop("key") != key or not path.with_suffix(".csv").is_file():
+            return None
+        return RunResult(**data)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # missing, or not what was written
+        return None
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read the trajectory beside a run's JSON file.
+
+    Raises:
+        DriveFormatError: If it cannot be read.
+    """
+    specs = {name: ColumnSpec() for name in ("t_s", "x_cm", "y_cm", *_NUMBERS)}
+    columns = read_csv(path.with_suffix(".csv"), specs | {name: ColumnSpec("int") for name in _FLAGS})
+    return Trajectory(
+        xy_cm=np.stack([columns["x_cm"], columns["y_cm"]], axis=1),
+        **{name: columns[name] for name in ("t_s", *_NUMBERS)},
+        **{name: columns[name] == 1 for name in _FLAGS},
+    )

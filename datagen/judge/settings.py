@@ -10,7 +10,7 @@ from pydantic import Field
 
 from datagen.world.car.driver import DriverSettings
 from datagen.world.car.pilot import PilotSettings
-from datagen.world.road.track import TrackSettings, load_track_settings, preset, preset_names
+from datagen.world.road.track_settings import TrackSettings, load_track_settings, preset, preset_names
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.errors import ConfigError, did_you_mean

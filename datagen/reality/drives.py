@@ -12,7 +12,6 @@ from pydantic import Field
 
 from datagen.reality.measure import MeasuredDrive, measure_frames
 from datagen.world.driving import scripted_states
-from datagen.world.simulate import prepare_process
 from datagen.world.variety import camera_like, first_world, vary_simulation
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
@@ -20,6 +19,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.processes import prepare_process
 
 
 class RealitySettings(Settings):

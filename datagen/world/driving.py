@@ -1,7 +1,4 @@
-"""A car driven by what its pilot sees: draw, look, steer, drive on.
-
-Driving: poses, commands and truth, frame by frame; whoever steers needs images, or does not.
-"""
+"""A simulated car on its road, frame by frame: driven by its script, or by a pilot who sees the images."""
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from datagen.world.car.driver import place_on_track
 from datagen.world.car.pilot import LostLane, Pilot, PilotSettings, Sight
+from datagen.world.render.renderer import Renderer
 from datagen.world.render.sensor import as_jpeg
 from datagen.world.world import World
 from lanenet.geometry.frames import map_from_car
@@ -21,14 +19,14 @@ from lanenet.geometry.frames import map_from_car
 
 @dataclass(frozen=True, eq=False)
 class DriveState:
-    """The car at the moment of a frame, and what it is told then.
+    """The car at the moment of a frame, and its command.
 
     Attributes:
         frame: Number, from 0.
         t_s: Time since the start.
         pose: True rear-axle centre x, y and heading (unwrapped), frame map.
         true_speed_cm_s: True speed.
-        yaw_rate_rad_s: True rate of turn, positive left.
+        yaw_rate_rad_s: True yaw rate, positive left.
         points_cm: True six points of the label contract, frame car.
         speed_cm_s: Commanded speed from this frame to the next.
         steering_rad: Commanded steering, positive left.
@@ -44,21 +42,26 @@ class DriveState:
     steering_rad: float
 
 
+def draw_state(renderer: Renderer, state: DriveState) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the frame of a drive at which the car is in this state."""
+    return renderer.render(state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s)
+
+
 def scripted_states(world: World) -> Iterator[DriveState]:
-    """Let the driver drive through a world that has just been built; it can be driven through once."""
+    """Let the driver drive through a world that has just been built; once only."""
+    car, driver, rate_hz = world.car, world.driver, world.settings.rate_hz
     for frame in range(world.settings.frames):
-        t_s = frame / world.settings.rate_hz
-        pose, moving = world.car.pose, (world.car.speed_cm_s, world.car.yaw_rate_rad_s)
-        speed_cm_s, steering_rad = obeyed(world, *world.driver.command(pose, t_s))
-        points_cm = world.track.truth(
-            pose, world.settings.car.wheelbase_cm, world.driver.s_cm, world.driver.lane_cm(pose)
-        )
-        yield DriveState(frame, t_s, pose, *moving, points_cm, speed_cm_s, steering_rad)
-        world.car.step(speed_cm_s, steering_rad, 1.0 / world.settings.rate_hz)
+        t_s = frame / rate_hz
+        pose, motion = car.pose, (car.speed_cm_s, car.yaw_rate_rad_s)
+        command = transmitted(world, *driver.command(pose, t_s))
+        wheelbase_cm = world.settings.car.wheelbase_cm
+        points_cm = world.track.truth(pose, wheelbase_cm, driver.s_cm, driver.lane_cm(pose))
+        yield DriveState(frame, t_s, pose, *motion, points_cm, *command)
+        car.step(*command, 1.0 / rate_hz)
 
 
-def obeyed(world: World, speed_cm_s: float, steering_rad: float) -> tuple[float, float]:
-    """What arrives at the car of a command: with throttle and angle, no more than they can say."""
+def transmitted(world: World, speed_cm_s: float, steering_rad: float) -> tuple[float, float]:
+    """Return what arrives at the car of a command: throttle and angle are limited to -1 to 1."""
     donkey = world.donkey
     if donkey is None:
         return speed_cm_s, steering_rad
@@ -68,22 +71,15 @@ def obeyed(world: World, speed_cm_s: float, steering_rad: float) -> tuple[float,
     )
 
 
-def recorded_commands(world: World, speed_cm_s: float, steering_rad: float) -> dict[str, float]:
-    """Return the columns of a recording for a command: what was told, never what the car did."""
-    if world.donkey is None:
-        return {"speed_cm_s": speed_cm_s, "steering_rad": steering_rad}
-    return {"throttle": world.donkey.throttle(speed_cm_s), "angle": world.donkey.angle(steering_rad)}
-
-
 @dataclass(frozen=True, eq=False)
 class LoopFrame:
     """One frame of a closed-loop drive.
 
     Attributes:
-        state: The car, and what it is told.
+        state: The car and its command.
         image_bgr: As drawn; None when the pilot needs no image.
         answered: Whether the pilot had an answer.
-        s_cm: Way of the front axle along the road, counted on over the laps.
+        s_cm: Distance of the front axle along the road, counted on over the laps.
         offset_cm: Of the front axle's middle from the lane's centre, left positive.
     """
 
@@ -98,7 +94,7 @@ class ClosedLoop:
     """Drives a world that has just been built; every frame is one call of :meth:`next_frame`.
 
     Attributes:
-        s_cm: Way of the front axle along the road, counted on over the laps.
+        s_cm: Distance of the front axle along the road, counted on over the laps.
     """
 
     def __init__(
@@ -112,7 +108,7 @@ class ClosedLoop:
         """Set out.
 
         Args:
-            world: Its own driver is not asked.
+            world: Its own driver does not steer.
             pilot: Who steers.
             settings: What happens when the lane is lost.
             speed_cm_s: Commanded speed.
@@ -122,40 +118,34 @@ class ClosedLoop:
         self._world, self._pilot, self._speed_cm_s = world, pilot, speed_cm_s
         self._lost = LostLane(settings, world.settings.rate_hz)
         self._jpeg_quality = jpeg_quality
-        self._frame, self._told = 0, (0.0, 0.0)
-        self._wheelbase_cm = world.settings.car.wheelbase_cm
+        self._frame, self._command = 0, (0.0, 0.0)
         self.s_cm = world.driver.s_cm
         world.car.place(world.car.pose, speed_cm_s)
 
     def next_frame(self) -> LoopFrame:
-        """Look and decide; then let the car drive on until the next frame."""
+        """Draw, let the pilot decide, and let the car drive on until the next frame."""
         world, car, frame = self._world, self._world.car, self._frame
-        pose, moving = car.pose, (car.speed_cm_s, car.yaw_rate_rad_s)
-        front_cm = map_from_car(np.zeros((1, 2)), pose, self._wheelbase_cm)[0]
+        wheelbase_cm, interval_s = world.settings.car.wheelbase_cm, 1.0 / world.settings.rate_hz
+        pose, motion, t_s = car.pose, (car.speed_cm_s, car.yaw_rate_rad_s), frame * interval_s
+        front_cm = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
         self.s_cm, offset_cm = place_on_track(world.track, front_cm, self.s_cm)
-        image = None
+        image = seen = None
         if self._pilot.needs_image:
-            image = world.renderer.render(pose, frame, *moving)
-        seen = image if image is None or self._jpeg_quality is None else as_jpeg(image, self._jpeg_quality)
-        interval_s = 1.0 / world.settings.rate_hz
-        t_s = frame * interval_s
-        wished_rad = self._pilot.steer(Sight(seen, pose, self.s_cm, t_s, *self._told))
-        speed_cm_s, steering_rad = obeyed(world, *self._lost.command(wished_rad, self._speed_cm_s))
-        points_cm = world.track.truth(pose, self._wheelbase_cm, self.s_cm)
-        self._told = (speed_cm_s, steering_rad)
-        state = DriveState(frame, t_s, pose, *moving, points_cm, speed_cm_s, steering_rad)
-        car.step(speed_cm_s, steering_rad, interval_s)
+            image = seen = world.renderer.render(pose, frame, *motion)
+            if self._jpeg_quality is not None:
+                seen = as_jpeg(image, self._jpeg_quality)
+        wanted_rad = self._pilot.steer(Sight(seen, pose, self.s_cm, t_s, *self._command))
+        self._command = transmitted(world, *self._lost.command(wanted_rad, self._speed_cm_s))
+        points_cm = world.track.truth(pose, wheelbase_cm, self.s_cm)
+        state = DriveState(frame, t_s, pose, *motion, points_cm, *self._command)
+        car.step(*self._command, interval_s)
         self._frame += 1
-        return LoopFrame(state, image, math.isfinite(wished_rad), self.s_cm, offset_cm)
+        return LoopFrame(state, image, math.isfinite(wanted_rad), self.s_cm, offset_cm)
 
     def put_back(self, ahead_cm: float = 0.0) -> None:
-        """Lift the car to the middle of the lane; the pilot starts anew.
-
-        Args:
-            ahead_cm: How much further along the road than where it is now.
-        """
+        """Put the car back in the middle of the lane, ``ahead_cm`` further along; the pilot starts anew."""
         self.s_cm += ahead_cm
         self._world.car.place(self._world.driver.pose_at(self.s_cm), self._speed_cm_s)
-        self._told = (0.0, 0.0)
+        self._command = (0.0, 0.0)
         self._pilot.reset()
         self._lost.reset()

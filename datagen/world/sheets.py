@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.car.rig import CameraSettings
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance
 from datagen.world.render.ground import PixelGround
-from datagen.world.render.look import LookSettings
 from datagen.world.render.renderer import Renderer
+from datagen.world.road.build import random_track
 from datagen.world.road.furniture import FurnitureRates
-from datagen.world.road.track import Track, TrackSettings, preset, preset_names, random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import TrackSettings, preset, preset_names
 from datagen.world.world import SimulationSettings, assemble_world, resolve_length
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
@@ -50,7 +52,7 @@ class Effect:
 
     Attributes:
         name: Its title.
-        look: Keys of :class:`LookSettings`.
+        look: Keys of :class:`Appearance`.
         furniture_per_m: Rate of each kind of furniture; 0: none.
         frame: Number of the frame, for what varies with time.
         speed: Speed and turning as multiples of a frame's usual ones.
@@ -214,7 +216,7 @@ def _effect_sheet(name: str, progress: Progress | None) -> Image:
         for effect in effects:
             track = tracks[effect.furniture_per_m]
             floor = {} if settings.floor_bgr is None else {"floor_bgr": settings.floor_bgr}
-            look = check_settings(LookSettings, {**_DULL, **floor, **effect.look}, effect.name)
+            look = check_settings(Appearance, {**_DULL, **floor, **effect.look}, effect.name)
             renderer = Renderer(camera, track, look, np.random.default_rng(row), ground)
             pose, yaw_rate = _pose_at(track, s_cm, camera)
             frame = renderer.render(pose, effect.frame, _SPEED_CM_S * effect.speed, yaw_rate * effect.speed)

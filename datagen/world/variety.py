@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.world.car.camera import CameraSettings, sees_lane
 from datagen.world.car.car import CarSettings
 from datagen.world.car.driver import DriverSettings, shortest_excursion_spacing_cm, shortest_lane_change_cm
-from datagen.world.car.rig import CameraSettings, sees_lane
 from datagen.world.road.track_settings import TrackSettings, preset
 from datagen.world.world import START_CM, SimulationSettings, World, build_world
 from lanenet.errors import ConfigError

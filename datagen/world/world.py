@@ -11,12 +11,14 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import Car, CarSettings, DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.car.driver import Driver, DriverSettings
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings, random_look
+from datagen.world.render.appearance import Appearance, random_appearance
 from datagen.world.render.renderer import Renderer
-from datagen.world.road.track import Track, TrackSettings, check_drivable, random_track
+from datagen.world.road.build import check_drivable, random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import LOOP_CM, TrackSettings
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
@@ -24,7 +26,6 @@ from lanenet.geometry.camera import Camera
 #: Place of the rear axle along an open road at the start.
 START_CM = 40.0
 _SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
-_LOOP_CM = 1200.0
 _STEERING_RESERVE = 1.2
 
 
@@ -52,7 +53,7 @@ class SimulationSettings(Settings):
     track: TrackSettings = TrackSettings()
     car: CarSettings = CarSettings()
     driver: DriverSettings = DriverSettings()
-    look: LookSettings = LookSettings()
+    look: Appearance = Appearance()
     random_look: bool = True
     recording: Literal["commands", "donkeycar"] = "commands"
     donkey: DonkeySettings = DonkeySettings()
@@ -121,7 +122,7 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
     if settings.track.floor_bgr is not None and "floor_bgr" not in look.model_fields_set:
         look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})
     if settings.random_look:
-        look = random_look(look, look_rng, tuple(marking.colour_bgr for marking in track.markings))
+        look = random_appearance(look, look_rng, tuple(marking.colour_bgr for marking in track.markings))
     donkey = draw_donkey(settings.donkey, donkey_rng, _needed_steering_rad(settings, track))
     settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
     camera = settings.camera.build(settings.car.wheelbase_cm)
@@ -158,7 +159,7 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     needed_cm = float(np.ceil(START_CM + way_cm + car.wheelbase_cm + _SIGHT_CM))
     length_cm = settings.track.length_cm
     if length_cm is None:
-        length_cm = _LOOP_CM if settings.track.closed else needed_cm
+        length_cm = LOOP_CM if settings.track.closed else needed_cm
     elif length_cm < needed_cm and not settings.track.closed:
         # The pieces of a file have the length that they have.
         advice = "drive fewer frames" if settings.track.pieces else "leave length_cm out to have it chosen"

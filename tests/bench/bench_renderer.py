@@ -27,12 +27,15 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings
-from datagen.world.render.renderer import PixelGround, Renderer
-from datagen.world.road.track import Track, TrackSettings, random_track
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance
+from datagen.world.render.ground import PixelGround
+from datagen.world.render.renderer import Renderer
+from datagen.world.road.build import random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import TrackSettings
 
-EVERY_EFFECT = LookSettings(
+EVERY_EFFECT = Appearance(
     floor="asphalt", texture_level=8.0, verge_bgr=(120.0, 140.0, 60.0), joint_u_cm=30.0, joint_v_cm=30.0,
     line_wear=0.5, lamps_per_m=0.7, clutter_per_m=2.5, wall_level=30.0, vignetting=0.4, blur_px=1.0,
     noise_level=4.0, jpeg_quality=80, objects_per_m=1.0, objects_on_road=0.2, shadows_per_m=0.4,
@@ -43,7 +46,7 @@ EVERY_EFFECT = LookSettings(
 NO_THINGS = EVERY_EFFECT.model_copy(
     update={"lamps_per_m": 0.0, "clutter_per_m": 0.0, "objects_per_m": 0.0, "shadows_per_m": 0.0}
 )
-LOOKS = {"plain": LookSettings(), "no things": NO_THINGS, "every effect": EVERY_EFFECT}
+LOOKS = {"plain": Appearance(), "no things": NO_THINGS, "every effect": EVERY_EFFECT}
 LENGTHS_CM = (1000.0, 20000.0)
 SPEED_CM_S, YAW_RATE_RAD_S, INTERVAL_S = 60.0, 0.5, 0.05
 PLACES, BLOCK = 4, 10  # places on a road, and frames in a row at each
@@ -118,7 +121,6 @@ def measure(seeds: int) -> list[dict[str, float | str]]:
 def held_mb(renderer: Renderer) -> float:
     """Return the size of all arrays that a renderer holds but for the camera's rays, [MB]."""
     shared = {id(array) for array in _arrays(renderer._ground, set())}
-    shared.add(id(renderer._rays.base))
     sizes = {}
     for array in _arrays(vars(renderer), set()):
         base = array if array.base is None else array.base

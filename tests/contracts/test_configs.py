@@ -18,13 +18,13 @@ def read_training_run(path: Path) -> Any:
 
 
 def read_simulation(path: Path) -> Any:
-    from datagen.world.simulate import SimulationSettings
+    from datagen.world.world import SimulationSettings
 
     return load_settings(SimulationSettings, path)
 
 
 def read_track(path: Path) -> Any:
-    from datagen.world.road.track import load_track
+    from synthetic_roads import load_track
 
     return load_track(path)
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.pilot import PilotSettings, Sight
-from datagen.world.car.rig import CameraSettings
 from datagen.world.driving import ClosedLoop
-from datagen.world.road.track import TrackSettings
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
 from lanenet.control.controller import ControlSettings, LaneController

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from datagen.labels.truth import truth_labels
-from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.data.drives import open_drive

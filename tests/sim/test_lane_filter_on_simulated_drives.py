@@ -6,8 +6,9 @@ import logging
 
 import numpy as np
 import pytest
+from synthetic_roads import frames_of
 
-from datagen.world.simulate import SimulationSettings, build_world, frames_of
+from datagen.world.world import SimulationSettings, build_world
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.lane_filter.detector import PAPER, LaneFilter, LaneFilterSettings
 

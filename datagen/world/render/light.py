@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
 
-from datagen.world.compiled import compiled_bare
-from datagen.world.render.ground import NOT_FLOOR, TILE
+from datagen.world.render.compiled import (
+    AT_X,
+    AT_Y,
+    COS,
+    FLOOR_NUMBERS,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    NOT_FLOOR,
+    SIN,
+    TILE,
+    X,
+    Y,
+    compiled_bare,
+)
 
-_LAMP_REACH = 3.46  # distance, in widths, at which a lamp's glow ends
+#: Further columns of shadows and of mirrored lamps, whose half length and width are those of the glow.
+SOFTNESS, DEPTH = 6, 7
+GLOW = 6
+#: Distance, in widths, at which a lamp's glow ends: there (1 - r^2 / reach^2)^6 is closest to exp(-r^2 / 2).
+_LAMP_REACH = 3.46
+
+
+class Lights(NamedTuple):
+    """Light on the floor of one frame.
+
+    Attributes:
+        shadows: Place, direction, half size, softness of the border, depth.
+        lamps: Mirror images: place, direction, widths along and across, brightness.
+        lamp_edge: How hard the lamps' border is, from 1 on.
+    """
+
+    shadows: Float[np.ndarray, "s 8"]
+    lamps: Float[np.ndarray, "m 7"]
+    lamp_edge: float
 
 
 def moved(rows: Float[np.ndarray, "n k"], frame: int) -> Float[np.ndarray, "n k"]:
@@ -61,38 +91,38 @@ def mirror_lamps(
 
 @compiled_bare
 @no_type_check
-def light_tile(out, width, top, left, box, numbers, level, origin, lights, buffer):
+def light_tile(canvas, ground, view, top, left, box, numbers, lights, buffer):
     """Darken and brighten every pixel of a tile that sees the floor, in place.
 
     Args:
-        out: Image as rows of pixels, float32.
-        width: Pixels per row, filled up.
-        top: See :func:`datagen.world.render.ground.cast_tile`.
-        left: See there.
+        canvas: Painted in place.
+        ground: The camera's rays.
+        view: The frame.
+        top: First row of the tile.
+        left: First pixel of its rows.
         box: See :func:`datagen.world.render.ground.bound_tile`.
         numbers: See :func:`datagen.world.render.ground.cast_tile`.
-        level: See there.
-        origin: Rear-axle centre x and y.
-        lights: Shadows: x, y, cos and sin of the direction, half length, half width, softness, depth; lamps,
-            see :func:`mirror_lamps`; how hard the lamps' border is, from 1 on.
+        lights: Shadows and lamps.
         buffer: Two float32 per pixel of a tile.
     """
     f = np.float32
-    shadows, lamps, lamp_edge = lights
+    shadows, lamps = lights.shadows, lights.lamps
     dark, bright = buffer[: TILE * TILE], buffer[TILE * TILE :]
     low_x, low_y, high_x, high_y = box
     middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
     half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
-    rows = min(TILE, level.shape[0] // width - top)
+    rows = min(TILE, ground.height - top)
     touched = False
     for q in range(shadows.shape[0] + lamps.shape[0]):
         is_shadow = q < shadows.shape[0]
         thing = shadows[q] if is_shadow else lamps[q - shadows.shape[0]]
-        c, s = thing[2], thing[3]
-        x, y = middle_x - (thing[0] - origin[0]), middle_y - (thing[1] - origin[1])
-        soft = thing[6]
-        reach_a = thing[4] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[4]
-        reach_b = thing[5] + 0.5 * soft if is_shadow else _LAMP_REACH * thing[5]
+        c, s = thing[COS], thing[SIN]
+        x0, y0 = thing[X] - view.pose[0], thing[Y] - view.pose[1]
+        x, y = middle_x - x0, middle_y - y0
+        reach_a, reach_b = _LAMP_REACH * thing[HALF_LENGTH], _LAMP_REACH * thing[HALF_WIDTH]
+        if is_shadow:
+            soft = thing[SOFTNESS]
+            reach_a, reach_b = thing[HALF_LENGTH] + 0.5 * soft, thing[HALF_WIDTH] + 0.5 * soft
         if abs(x * c + y * s) > reach_a + half_x * abs(c) + half_y * abs(s):
             continue
         if abs(y * c - x * s) > reach_b + half_x * abs(s) + half_y * abs(c):
@@ -101,24 +131,25 @@ def light_tile(out, width, top, left, box, numbers, level, origin, lights, buffe
             dark[:], bright[:] = 0.0, 0.0
             touched = True
         # Plain float32 loops over a row: the compiler takes many pixels at a time.
-        x0, y0, c, s = f(thing[0] - origin[0]), f(thing[1] - origin[1]), f(c), f(s)
+        x0, y0, c, s = f(x0), f(y0), f(c), f(s)
         if is_shadow:
-            reach_a, reach_b, per_soft, depth = f(reach_a), f(reach_b), f(1.0 / soft), f(thing[7])
+            reach_a, reach_b, per_soft, depth = f(reach_a), f(reach_b), f(1.0 / soft), f(thing[DEPTH])
             for r in range(rows):
-                n, row = numbers[8 * TILE * r :], dark[r * TILE :]
+                n, row = numbers[FLOOR_NUMBERS * r :], dark[r * TILE :]
                 for k in range(TILE):
-                    x, y = n[k] - x0, n[TILE + k] - y0
+                    x, y = n[AT_X + k] - x0, n[AT_Y + k] - y0
                     a = min(max((reach_a - abs(x * c + y * s)) * per_soft, f(0.0)), f(1.0))
                     b = min(max((reach_b - abs(y * c - x * s)) * per_soft, f(0.0)), f(1.0))
                     share = depth * a * a * (f(3.0) - f(2.0) * a) * b * b * (f(3.0) - f(2.0) * b)
                     # Shadows of one light do not add up.
                     row[k] = max(row[k], share)
         else:
-            per_a, per_b, glow, edge = f(1.0 / thing[4]), f(1.0 / thing[5]), f(thing[6]), f(lamp_edge)
+            per_a, per_b = f(1.0 / thing[HALF_LENGTH]), f(1.0 / thing[HALF_WIDTH])
+            glow, edge = f(thing[GLOW]), f(lights.lamp_edge)
             for r in range(rows):
-                n, row = numbers[8 * TILE * r :], bright[r * TILE :]
+                n, row = numbers[FLOOR_NUMBERS * r :], bright[r * TILE :]
                 for k in range(TILE):
-                    x, y = n[k] - x0, n[TILE + k] - y0
+                    x, y = n[AT_X + k] - x0, n[AT_Y + k] - y0
                     a, b = (x * c + y * s) * per_a, (y * c - x * s) * per_b
                     # Close to exp(-r^2 / 2), and it ends.
                     fade = max(f(1.0) - (a * a + b * b) * f(1.0 / _LAMP_REACH**2), f(0.0))
@@ -127,13 +158,9 @@ def light_tile(out, width, top, left, box, numbers, level, origin, lights, buffe
     if not touched:
         return
     for r in range(rows):
-        i = (top + r) * width + left
-        seen, colours, shade, glow = (
-            level[i : i + TILE],
-            out[i : i + TILE],
-            dark[r * TILE :],
-            bright[r * TILE :],
-        )
+        i = (top + r) * ground.stride + left
+        seen, colours = canvas.level[i : i + TILE], canvas.light[i : i + TILE]
+        shade, glow = dark[r * TILE :], bright[r * TILE :]
         for k in range(TILE):
             if seen[k] != NOT_FLOOR:
                 keep, add = f(1.0) - shade[k], glow[k]

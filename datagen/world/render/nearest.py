@@ -13,7 +13,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.world.compiled import compiled
+from datagen.world.render.compiled import compiled
 from datagen.world.road.track import Track
 
 _GRID_CELL_CM = 2.0

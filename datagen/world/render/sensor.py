@@ -1,4 +1,7 @@
-"""From light to the image: gains that drift and step, noise, rounding; and the room behind the floor."""
+"""From light to the image: gains that drift and step, noise, rounding; and the room behind the floor.
+
+What varies from frame to frame is a random function of the frame's number: any frame can be asked for.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,48 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
-from datagen.world.compiled import compiled, compiled_bare
-from datagen.world.render.ground import NOT_FLOOR, TILE
+from datagen.world.render.compiled import NOT_FLOOR, TILE, compiled, compiled_bare
 
-_BLOCK = 3 * 256  # values; a multiple of three, so that channels keep their place in it
+#: Values that are developed together: a multiple of three, so that channels keep their place, of 3 kB in all.
+_BLOCK = 3 * 256
+#: Sines in a wandering value; chosen: enough that no period is noticed in a drive.
+_WAVES = 5
+
+
+class Wander:
+    """Smooth, with unit variance: a few sines of random period and phase."""
+
+    def __init__(
+        self, count: int, shortest_frames: float, longest_frames: float, rng: np.random.Generator
+    ) -> None:
+        """Draw ``count`` independent functions whose waves last between so many frames."""
+        # Log-uniform: slow and quick movements alike.
+        exponent = rng.uniform(np.log(shortest_frames), np.log(longest_frames), (count, _WAVES))
+        self._pace = 2.0 * np.pi / np.exp(exponent)
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, (count, _WAVES))
+
+    def at(self, frame: int) -> Float[np.ndarray, "count"]:
+        """Return the values at a frame."""
+        return np.asarray(np.sqrt(2.0 / _WAVES) * np.sin(self._pace * frame + self._phase).sum(axis=1))
+
+
+class Steps:
+    """Constant for a while, then another value, with unit variance."""
+
+    def __init__(self, count: int, every_frames: float, rng: np.random.Generator) -> None:
+        """Draw ``count`` functions that all step at the same frames, every ``every_frames``."""
+        self._count, self._every = count, every_frames
+        self._seed, self._phase = int(rng.integers(2**62)), float(rng.random())
+        self._last: tuple[int, Float[np.ndarray, "count"]] | None = None  # neighbouring frames share it
+
+    def at(self, frame: int) -> Float[np.ndarray, "count"]:
+        """Return the values at a frame."""
+        block = int(np.floor(frame / self._every + self._phase))
+        if self._last is None or self._last[0] != block:
+            self._last = (block, np.random.default_rng((self._seed, block)).standard_normal(self._count))
+        return self._last[1]
 
 
 def corner_falloff(height: int, width: int, vignetting: float) -> Float32[np.ndarray, "values"]:
@@ -29,19 +68,14 @@ def as_jpeg(image_bgr: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nda
 
 @compiled_bare
 @no_type_check
-def paint_room(out, level, azimuths, elevations, toward, heading, tilt, turn, room, buffers):
+def paint_room(canvas, ground, view, room, buffers):
     """Paint every pixel that sees the walls.
 
     Args:
-        out: Image as rows of pixels, float32, filled in place.
-        level: See :func:`datagen.world.render.ground.cast_tile`: pixels that see the floor are left out.
-        azimuths: Of each pixel's ray, from straight ahead, left positive; NaN where the lens sees nothing.
-        elevations: Of each pixel's ray, from the foot of the wall.
-        toward: Cosine and sine of the azimuths.
-        heading: Of the car.
-        tilt: How far the camera shakes up (at the front) and to the right, small angles.
-        turn: By how much the car turns during the exposure.
-        room: Colours by elevation (0..90 degrees) and azimuth, filled up to four values.
+        canvas: Painted in place, except for pixels whose level says that they see the floor.
+        ground: The camera's rays.
+        view: The frame.
+        room: Colours by elevation (0 to 90 degrees) and azimuth, padded to four values.
         buffers: For a row of ``TILE`` pixels: two int32, four float32 and another four float32 per pixel.
     """
     f = np.float32
@@ -49,13 +83,15 @@ def paint_room(out, level, azimuths, elevations, toward, heading, tilt, turn, ro
     texels = room.reshape(-1)
     cells, weights, colours = buffers
     per_rad, per_elevation = f(columns / (2.0 * np.pi)), f(rows / (0.5 * np.pi))
-    up, right, heading, last = f(tilt[0]), f(tilt[1]), f(heading % (2.0 * np.pi)), f(rows - 1.001)
+    up, right, last = f(view.tilt[0]), f(view.tilt[1]), f(rows - 1.001)
+    heading, turn = f(view.pose[2] % (2.0 * np.pi)), view.turn_rad
     taps = 1 + min(int(abs(turn) * per_rad), 7)
     share, around, none = f(1.0 / taps), f(columns), f(0.0)
-    for start in range(0, level.shape[0], TILE):
-        seen, azimuth = level[start : start + TILE], azimuths[start : start + TILE]
-        elevation, out_row = elevations[start : start + TILE], out[start : start + TILE]
-        ahead, aside = toward[0, start : start + TILE], toward[1, start : start + TILE]
+    for start in range(0, canvas.level.shape[0], TILE):
+        stop = start + TILE
+        seen, light = canvas.level[start:stop], canvas.light[start:stop]
+        azimuth, elevation = ground.azimuth_rad[start:stop], ground.elevation_rad[start:stop]
+        ahead, aside = ground.toward[0, start:stop], ground.toward[1, start:stop]
         walls = np.uint8(0)
         for j in range(TILE):
             walls |= np.uint8(seen[j] == NOT_FLOOR)
@@ -95,7 +131,7 @@ def paint_room(out, level, azimuths, elevations, toward, heading, tilt, turn, ro
         for j in range(TILE):
             if seen[j] == NOT_FLOOR and np.isfinite(azimuth[j]):
                 for k in range(3):
-                    out_row[j, k] = colours[4 * j + k] * share
+                    light[j, k] = colours[4 * j + k] * share
 
 
 @compiled

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from datagen.world.road.one_of import OneOf
-from datagen.world.road.road import Bgr, Side
+from datagen.world.road.track import Bgr, Side
 from lanenet.config import Settings
 
 Colour = Literal["white", "yellow", "orange", "red", "black"]

@@ -25,7 +25,7 @@ from datagen.world.road.furniture import (
     Zebra,
     extent_cm,
 )
-from datagen.world.road.road import Bgr, Side, Track
+from datagen.world.road.track import Bgr, Side, Track
 from lanenet.errors import ConfigError
 
 _LINE_STOP_CM = 5.0  # stop bars of side roads are twice as thick as lines, but wide lines stay as they are

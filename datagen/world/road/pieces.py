@@ -6,21 +6,17 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from datagen.world.road.centre_line import CentreLine
+from datagen.world.road.centre_line import CentreLine, Section, end_of, sample_sections
 from datagen.world.road.one_of import OneOf
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 
 Turn = Literal["left", "right"]
-#: Length, [cm], and curvature at its start and end, [1/cm], positive left; linear in between.
-Stretch = tuple[float, float, float]
 
-_SAMPLE_CM = 1.0
-_GAP_CM, _GAP_DEG = 5.0, 3.0  # how far the ends of a loop may miss each other
-_SPREAD_ROUNDS = 8
+#: How far the ends of a loop may miss each other: what hand-written lengths and angles leave.
+_GAP_CM, _GAP_DEG = 5.0, 3.0
 
 
 class StraightPiece(Settings):
@@ -38,7 +34,7 @@ class ArcPiece(Settings):
 
 
 class ClothoidPiece(Settings):
-    """A bend whose curvature changes evenly; a radius left out stands for straight on.
+    """A bend whose curvature changes evenly; a radius that is left out is infinite.
 
     Attributes:
         length_cm: Along the centre line.
@@ -83,8 +79,8 @@ class Piece(OneOf):
     clothoid: ClothoidPiece | None = None
     s_bend: SBendPiece | None = None
 
-    def stretches(self) -> list[Stretch]:
-        """Return its stretches of evenly changing curvature."""
+    def sections(self) -> list[Section]:
+        """Return its sections of evenly changing curvature."""
         piece = self.value
         if isinstance(piece, StraightPiece):
             return [(piece.length_cm, 0.0, 0.0)]
@@ -113,7 +109,7 @@ class Piece(OneOf):
 
 def length_of(pieces: Sequence[Piece]) -> float:
     """Return the length of the centre line, [cm]."""
-    return float(sum(stretch[0] for piece in pieces for stretch in piece.stretches()))
+    return float(sum(section[0] for piece in pieces for section in piece.sections()))
 
 
 def lay_out(pieces: Sequence[Piece], closed: bool, where: str) -> CentreLine:
@@ -124,86 +120,20 @@ def lay_out(pieces: Sequence[Piece], closed: bool, where: str) -> CentreLine:
     Args:
         pieces: The pieces in the direction of travel.
         closed: Whether the end joins the start.
-        where: Named in the error.
+        where: What errors call the road.
 
     Raises:
         ConfigError: If a loop does not close, with the gap in cm and degrees.
     """
-    stretches = [stretch for piece in pieces for stretch in piece.stretches()]
-    if not closed:
-        return sample_stretches(stretches, closed=False)
-    heading, end = _ends(stretches)
+    sections = [section for piece in pieces for section in piece.sections()]
+    heading, end = end_of(sections)
     laps = 1.0 if heading > 0.0 else -1.0
     turn_deg = float(np.rad2deg(heading - laps * 2.0 * np.pi))
     gap_cm = float(abs(end))
-    if gap_cm > _GAP_CM or abs(turn_deg) > _GAP_DEG:
+    if closed and (gap_cm > _GAP_CM or abs(turn_deg) > _GAP_DEG):
         raise ConfigError(
             f"{where}: pieces: a closed road whose end misses its start by {gap_cm:.1f} cm "
             f"({end.real:+.1f} along, {end.imag:+.1f} left) and {turn_deg:+.1f} degrees, expected at most "
             f"{_GAP_CM:g} cm and {_GAP_DEG:g} degrees; change the pieces, or set closed: false"
         )
-    return sample_stretches(stretches, closed=True)
-
-
-def sample_stretches(stretches: Sequence[Stretch], closed: bool) -> CentreLine:
-    """Draw a road about every centimetre; what a loop misses its start by is spread over all of it."""
-    knots, k0, k1, is_sample = _knots(stretches)
-    bend = np.zeros(len(knots))
-    heading, z = _integrate(knots, k0, k1)
-    for _ in range(_SPREAD_ROUNDS if closed else 0):
-        gap = np.array([2.0 * np.pi * np.sign(heading[-1]) - heading[-1], -z[-1].real, -z[-1].imag])
-        if np.max(np.abs(gap)) < 1e-10:
-            break
-        # The least additional curvature that closes the gap is linear in position: turning by 1 at z moves
-        # the end by i (end - z).
-        basis = np.stack([np.ones(len(z)), z.real - z.real.mean(), z.imag - z.imag.mean()])
-        weight = np.gradient(knots)
-        lever = 1j * (z[-1] - z)
-        effect = np.stack([np.ones(len(z)), lever.real, lever.imag])
-        bend = bend + np.linalg.solve((effect * weight) @ basis.T, gap) @ basis
-        heading, z = _integrate(knots, k0 + bend[:-1], k1 + bend[1:])
-    # The curvature at a joint is that of the piece that begins there.
-    curvature = np.append(k0, k1[-1]) + bend
-    last = -1 if closed else None
-    at = np.flatnonzero(is_sample)[:last]
-    xy = np.stack([z.real, z.imag], axis=1)[at]
-    return CentreLine(xy, heading[at], curvature[at], float(knots[-1]) / (is_sample.sum() - 1))
-
-
-def _knots(
-    stretches: Sequence[Stretch],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "m"], Float[np.ndarray, "m"], np.ndarray]:
-    """Samples and joints, the curvature at both ends of what lies between them, and which are samples."""
-    length, start, end = np.array(stretches).T
-    ends = np.cumsum(length)
-    samples = np.linspace(0.0, ends[-1], max(8, round(ends[-1] / _SAMPLE_CM)) + 1)
-    step = samples[1]
-    joints = ends[:-1]
-    joints = joints[np.abs(joints / step - np.rint(joints / step)) * step > 1e-9]
-    knots = np.concatenate([samples, joints])
-    order = np.argsort(knots, kind="stable")
-    is_sample = (np.arange(len(knots)) < len(samples))[order]
-    knots = knots[order]
-    middle = 0.5 * (knots[1:] + knots[:-1])
-    piece = np.minimum(np.searchsorted(ends, middle), len(ends) - 1)
-    slope = (end - start) / length
-    along0, along1 = (side - (ends - length)[piece] for side in (knots[:-1], knots[1:]))
-    return knots, start[piece] + slope[piece] * along0, start[piece] + slope[piece] * along1, is_sample
-
-
-def _integrate(
-    knots: Float[np.ndarray, "n"], k0: Float[np.ndarray, "m"], k1: Float[np.ndarray, "m"]
-) -> tuple[Float[np.ndarray, "n"], np.ndarray]:
-    """Heading and position (complex) at each knot; Simpson's rule in between."""
-    h = np.diff(knots)
-    heading = np.concatenate([[0.0], np.cumsum(0.5 * (k0 + k1) * h)])
-    middle = heading[:-1] + (3.0 * k0 + k1) * h / 8.0
-    steps = np.exp(1j * heading[:-1]) + 4.0 * np.exp(1j * middle) + np.exp(1j * heading[1:])
-    return heading, np.concatenate([[0.0], np.cumsum(steps * h / 6.0)])
-
-
-def _ends(stretches: Sequence[Stretch]) -> tuple[float, complex]:
-    """Heading and position at the end of a road."""
-    knots, k0, k1, _ = _knots(stretches)
-    heading, z = _integrate(knots, k0, k1)
-    return float(heading[-1]), complex(z[-1])
+    return sample_sections(sections, closed)

@@ -1,284 +1,350 @@
-"""Roads, from files, from presets or drawn at random; what a drive's settings stand for."""
+"""The road of a synthetic drive: one object that is painted and that gives the ground truth.
+
+Its lines are painted in sections: intervals along the road.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from datagen.world.road.centre_line import CentreLine, check_slack_cm, comes_near_itself, open_centre_line
-from datagen.world.road.furniture import COLOURS, Colour
-from datagen.world.road.furniture_layout import Painted, listed_furniture, random_furniture
-from datagen.world.road.pieces import lay_out, length_of
-from datagen.world.road.random_loop import closed_centre_line
-from datagen.world.road.road import (
-    Bgr,
-    Marking,
-    Side,
-    Track,
-    cut,
-    interrupt,
-    paint_dashes,
-    paint_solid,
-    wear_off,
-)
-from datagen.world.road.track_settings import (
-    LineName,
-    MarkingSettings,
-    TrackSettings,
-    load_track_settings,
-    preset,
-    preset_names,
-)
-from lanenet.errors import ConfigError
+from lanenet.geometry.frames import car_from_map, map_from_car
+from lanenet.geometry.lane import rows_of_polyline
+from lanenet.geometry.poses import arc_chord
 
-__all__ = [
-    "Bgr",
-    "Marking",
-    "MarkingSettings",
-    "Side",
-    "Track",
-    "TrackSettings",
-    "check_drivable",
-    "load_track",
-    "load_track_settings",
-    "preset",
-    "preset_names",
-    "random_track",
-]
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+Bgr = tuple[float, float, float]
 
-_CLEARANCE_LANES = 0.5  # between the outer lines of two stretches of a random road
-_LENGTH_CM = 1200.0
+#: Section of the lines that is given around the car: what labels and pictures of them need.
+_BEHIND_CM, _AHEAD_CM = 60.0, 150.0
+#: Shortest random interruption of a line.
+_MIN_INTERRUPTION_CM = 10.0
+#: Mean length of what flakes off a worn line; chosen: about the width of the tape.
+_FLAKE_CM = 1.5
 
 
-def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
-    """Build the road that settings stand for, and draw what they leave open.
+@dataclass(frozen=True, eq=False)
+class Marking:
+    """One painted line, parallel to the centre line.
+
+    Attributes:
+        offset_cm: Of its middle, left of the centre line positive.
+        width_cm: Of the tape.
+        colour_bgr: Nominal colour, 0..255.
+        painted_cm: Start and end of each painted section along the centre line, ascending.
+    """
+
+    offset_cm: float
+    width_cm: float
+    colour_bgr: Bgr
+    painted_cm: Float[np.ndarray, "k 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A road: the centre line of the driven lane and the markings beside it.
+
+    Attributes:
+        s_cm: Distance along the centre line, evenly spaced, about 1 cm.
+        xy_cm: Centre line, frame map.
+        heading_rad: Direction of travel, unwrapped.
+        curvature_per_cm: Positive to the left.
+        closed: Whether the last sample is followed by the first.
+        lane_width_cm: Of the driven lane, between the middles of its two lines.
+        markings: What is painted along the road.
+        boxes: Painted rectangles (stop lines, bars, arrows, side roads, bays): x, y, cos and sin of the
+            direction, half length, half width, blue, green, red; frame map.
+        oncoming_cm: Offset of the middle of the oncoming lane, left positive; None on a road of one lane.
+    """
+
+    s_cm: Float[np.ndarray, "n"]
+    xy_cm: Float[np.ndarray, "n 2"]
+    heading_rad: Float[np.ndarray, "n"]
+    curvature_per_cm: Float[np.ndarray, "n"]
+    closed: bool
+    lane_width_cm: float
+    markings: tuple[Marking, ...]
+    boxes: Float[np.ndarray, "b 9"] = field(default_factory=lambda: np.empty((0, 9)))
+    oncoming_cm: float | None = None
+
+    @property
+    def step_cm(self) -> float:
+        """Distance between samples, [cm]."""
+        return float(self.s_cm[1] - self.s_cm[0])
+
+    @property
+    def length_cm(self) -> float:
+        """Length of the centre line, [cm]; of a loop, once around."""
+        return float(self.s_cm[-1]) + (self.step_cm if self.closed else 0.0)
+
+    @property
+    def middle_cm(self) -> float:
+        """Offset of the middle of the whole road from the centre line of the driven lane, left positive."""
+        return 0.5 * (self.oncoming_cm or 0.0)
+
+    @property
+    def half_width_cm(self) -> float:
+        """Half the width of the whole road, between the middles of its outer lines."""
+        return 0.5 * (self.lane_width_cm + abs(self.oncoming_cm or 0.0))
+
+    def line_offset_cm(self, side: Side) -> float:
+        """Offset of a line of the driven lane, left positive, [cm]."""
+        return 0.5 * self.lane_width_cm if side == "left" else -0.5 * self.lane_width_cm
+
+    def beside(
+        self, index: Int[np.ndarray, "m"], offset_cm: float | Float[np.ndarray, "m"]
+    ) -> Float[np.ndarray, "m 2"]:
+        """Return points beside the given samples, [cm], frame map; offsets are left positive."""
+        heading, offset_cm = self.heading_rad[index], np.asarray(offset_cm)[..., None]
+        return self.xy_cm[index] + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+
+    def curvature(self, s_cm: float) -> float:
+        """Return the curvature of the centre line at a place, [1/cm], positive left."""
+        return float(self.curvature_per_cm[self._nearest_sample(s_cm)[1]])
+
+    def point(self, s_cm: float, offset_cm: float = 0.0) -> tuple[Float[np.ndarray, "2"], float]:
+        """Return the point at a distance along the road and the road's heading there, [cm], [rad], frame map.
+
+        A loop takes any distance, over any number of laps; an open road continues beyond its ends along the
+        circle of its last sample.
+        """
+        lap, i = self._nearest_sample(s_cm)
+        along_cm = s_cm - lap * self.length_cm - float(self.s_cm[i])
+        turn = float(self.curvature_per_cm[i]) * along_cm
+        heading = float(self.heading_rad[i]) + turn
+        xy_cm = self.xy_cm[i] + arc_chord(float(self.heading_rad[i]), along_cm, turn)
+        return xy_cm + offset_cm * np.array([-np.sin(heading), np.cos(heading)]), heading
+
+    def points(
+        self, s_cm: Float[np.ndarray, "m"], offset_cm: float = 0.0
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+        """Return many points at once; see :meth:`point`."""
+        i = np.rint(s_cm / self.step_cm).astype(int)
+        index = i % len(self.s_cm) if self.closed else np.clip(i, 0, len(self.s_cm) - 1)
+        along_cm = s_cm - (i if self.closed else index) * self.step_cm
+        turn = self.curvature_per_cm[index] * along_cm
+        heading = self.heading_rad[index] + turn
+        xy_cm = self.xy_cm[index] + arc_chord(self.heading_rad[index], along_cm, turn)
+        return xy_cm + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1), heading
+
+    def nearest(
+        self, xy_cm: Float[np.ndarray, "2"], near_s_cm: float | None = None, reach_cm: float = 60.0
+    ) -> tuple[float, float]:
+        """Find a point's place along the road.
+
+        Args:
+            xy_cm: The point, [cm], frame map.
+            near_s_cm: Search only within ``reach_cm`` of this distance along the road.
+            reach_cm: Half the length of that section.
+
+        Returns:
+            Distance along the centre line and offset from it (left positive), [cm]. Beyond the ends of an
+            open road both continue along the circle of its last sample.
+        """
+        if near_s_cm is None:
+            index = np.arange(len(self.s_cm))
+        else:
+            index = self._samples(near_s_cm - reach_cm, near_s_cm + reach_cm)
+        i = index[np.argmin(np.sum((self.xy_cm[index] - xy_cm) ** 2, axis=1))]
+        (dx, dy), k = xy_cm - self.xy_cm[i], float(self.curvature_per_cm[i])
+        c, s = np.cos(self.heading_rad[i]), np.sin(self.heading_rad[i])
+        ahead, left = dx * c + dy * s, -dx * s + dy * c
+        # The foot of the perpendicular on the circle through the sample, not on the polyline and its corners.
+        inward = 1.0 - k * left
+        along_cm = np.arctan2(k * ahead, inward) / k if abs(k) > 1e-9 else ahead
+        offset_cm = (2.0 * left - k * (ahead**2 + left**2)) / (1.0 + np.hypot(k * ahead, inward))
+        return float(self.s_cm[i] + along_cm), float(offset_cm)
+
+    def lines_car(
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+        """Return the left and right line around the car, [cm], frame car, in the direction of travel.
+
+        Only the section from 60 cm behind the front axle to 150 cm ahead along the road, so that no other
+        section of the road answers.
+
+        Args:
+            pose: Rear-axle centre x, y and heading, frame map.
+            wheelbase_cm: Distance between the axles.
+            near_s_cm: Roughly where along the road the car is, if it may have left its lane.
+            lane_cm: Offset of the lane whose lines are wanted, left positive; 0 for the driven one.
+        """
+        front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
+        s_cm, _ = self.nearest(front, near_s_cm)
+        index = self._samples(s_cm - _BEHIND_CM, s_cm + _AHEAD_CM)
+        left, right = (self.beside(index, self.line_offset_cm(side) + lane_cm) for side in SIDES)
+        return car_from_map(left, pose, wheelbase_cm), car_from_map(right, pose, wheelbase_cm)
+
+    def truth(
+        self,
+        pose: Float[np.ndarray, "3"],
+        wheelbase_cm: float,
+        near_s_cm: float | None = None,
+        lane_cm: float = 0.0,
+    ) -> Float[np.ndarray, "6"]:
+        """Return the six points of the label contract, [cm], frame car; NaN where a line misses a row.
+
+        The points follow the road, also where its paint is interrupted; arguments as :meth:`lines_car`.
+        """
+        left, right = self.lines_car(pose, wheelbase_cm, near_s_cm, lane_cm)
+        return np.concatenate([rows_of_polyline(left), rows_of_polyline(right)])
+
+    def reversed(self) -> Track:
+        """Return the road in the opposite direction: on two lanes the other lane, with the same paint."""
+        offset_cm = self.oncoming_cm or 0.0
+        end = [self.length_cm] if self.closed else []
+        s_cm = np.append(self.s_cm, end)
+        # The other lane is longer in one bend and shorter in the next.
+        per_cm = np.append(self.curvature_per_cm, self.curvature_per_cm[: len(end)])
+        along_cm = length_beside(s_cm, per_cm, offset_cm)
+        length_cm = float(along_cm[-1])
+        n = len(s_cm) - 1 if offset_cm == 0.0 else max(2, round(length_cm / self.step_cm))
+        new_s_cm = np.arange(n if self.closed else n + 1) * (length_cm / n)
+        places_cm = np.interp(length_cm - new_s_cm, along_cm, s_cm)
+        xy_cm, heading_rad = self.points(places_cm, offset_cm)
+        curvature = np.interp(places_cm, s_cm, per_cm)
+        return replace(
+            self,
+            s_cm=new_s_cm,
+            xy_cm=xy_cm,
+            heading_rad=np.unwrap(heading_rad + np.pi),
+            curvature_per_cm=-curvature / (1.0 - offset_cm * curvature),
+            markings=tuple(
+                replace(
+                    m,
+                    offset_cm=offset_cm - m.offset_cm,
+                    painted_cm=length_cm - np.interp(m.painted_cm[::-1, ::-1], s_cm, along_cm),
+                )
+                for m in self.markings
+            ),
+        )
+
+    def _nearest_sample(self, s_cm: float) -> tuple[int, int]:
+        """Lap and sample nearest to a distance along the road."""
+        n, i = len(self.s_cm), round(s_cm / self.step_cm)
+        return divmod(i, n) if self.closed else (0, min(max(i, 0), n - 1))
+
+    def _samples(self, from_cm: float, to_cm: float) -> Int[np.ndarray, "m"]:
+        """Indices of a section in the direction of travel; cut at the ends of an open road."""
+        first, last = int(np.floor(from_cm / self.step_cm)), int(np.ceil(to_cm / self.step_cm))
+        n = len(self.s_cm)
+        if self.closed:
+            return np.arange(first, min(last, first + n - 1) + 1) % n
+        # Never empty: beyond an end the last two samples stand for the road.
+        first = min(max(first, 0), n - 2)
+        return np.arange(first, min(max(last, first + 1), n - 1) + 1)
+
+
+def length_beside(
+    s_cm: Float[np.ndarray, "n"], curvature_per_cm: Float[np.ndarray, "n"], offset_cm: float
+) -> Float[np.ndarray, "n"]:
+    """Return the length up to each sample of a line beside the centre line: shorter inside bends, [cm]."""
+    scale = 1.0 - offset_cm * curvature_per_cm
+    return np.concatenate([[0.0], np.cumsum(0.5 * (scale[1:] + scale[:-1]) * np.diff(s_cm))])
+
+
+def paint_dashes(
+    length_cm: float, closed: bool, dash_cm: float, gap_cm: float, phase: float
+) -> Float[np.ndarray, "k 2"]:
+    """Return the painted sections of a dashed line.
 
     Args:
-        settings: What is fixed; ``length_cm`` None means 1200 cm here.
-        rng: Source of randomness; shape, markings, interruptions, wear and furniture draw from children of
-            their own.
+        length_cm: Length of the road.
+        closed: On a loop the period is scaled a little, so that a whole number of dashes fits.
+        dash_cm: Painted length.
+        gap_cm: Unpainted length.
+        phase: Where the pattern starts, 0..1 of a period.
 
     Returns:
-        The road, from the origin of the map along +x.
-
-    Raises:
-        ConfigError: If the settings leave no road that keeps clear of itself, or the pieces or the furniture
-            do not fit.
+        Start and end of each dash within 0..length, [cm], ascending.
     """
-    # The order is part of the format: a new part of the road takes a new child at the end.
-    shape_rng, kind_rng, interruption_rng, wear_rng, furniture_rng = rng.spawn(5)
-    _check_widths(settings)
-    _check_radii(settings)
-    line = _centre_line(settings, shape_rng)
-    n = len(line.xy_cm)
-    track = Track(
-        s_cm=np.arange(n) * line.step_cm,
-        xy_cm=line.xy_cm,
-        heading_rad=line.heading_rad,
-        curvature_per_cm=line.curvature_per_cm,
-        closed=settings.closed,
-        lane_width_cm=settings.lane_width_cm,
-        markings=(),
-        oncoming_cm=settings.lane_width_cm if settings.lanes == 2 else None,
-    )
-    width_cm, items = settings.line_width_cm, settings.furniture
-    things = listed_furniture(track, items, width_cm, settings.origin)
-    # Of the same paint as the line on the right, except that a yellow road has white bars.
-    colour: Colour = "black" if settings.right.colour == "black" else "white"
-    middle = None if settings.middle is None or settings.middle.colour == "random" else settings.middle.colour
-    things += random_furniture(
-        track, settings.random_furniture, items, width_cm, colour, furniture_rng, middle
-    )
-    markings = [
-        marking
-        for name in settings.lines
-        for marking in _line(settings, name, track, kind_rng, interruption_rng, wear_rng)
-    ]
-    return replace(
-        track,
-        markings=tuple(_without_cuts(marking, things, track) for marking in markings),
-        boxes=np.concatenate([np.empty((0, 9)), *(thing.boxes for thing in things)]),
-    )
+    period_cm = dash_cm + gap_cm
+    if closed:
+        period_cm = length_cm / max(1, round(length_cm / period_cm))
+    start = (np.arange(int(length_cm / period_cm) + 2) + phase - 1.0) * period_cm
+    end = start + period_cm * dash_cm / (dash_cm + gap_cm)
+    return _without_slivers(np.clip(np.stack([start, end], axis=1), 0.0, length_cm))
 
 
-def load_track(path: Path, rng: np.random.Generator | None = None) -> Track:
-    """Read a road from a YAML file.
+def interrupt(
+    painted_cm: Float[np.ndarray, "k 2"],
+    length_cm: float,
+    per_m: float,
+    max_cm: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "m 2"]:
+    """Remove random sections of the paint.
 
     Args:
-        path: The file; its keys are those of :class:`TrackSettings`.
-        rng: Source of randomness for what the file leaves open; None stands for seed 0.
+        painted_cm: Painted sections, ascending.
+        length_cm: Length of the road.
+        per_m: Expected number of interruptions per metre.
+        max_cm: Longest interruption; the shortest is 10 cm.
+        rng: Source of randomness.
 
-    Raises:
-        ConfigError: Naming the file, the place in it, what was found and what was expected.
+    Returns:
+        What is left of the paint, ascending.
     """
-    return random_track(load_track_settings(path), np.random.default_rng(0) if rng is None else rng)
+    for _ in range(rng.poisson(per_m * length_cm / 100.0)):
+        start_cm = rng.uniform(0.0, length_cm)
+        painted_cm = cut(painted_cm, start_cm, start_cm + rng.uniform(_MIN_INTERRUPTION_CM, max_cm))
+    return painted_cm
 
 
-def check_drivable(
-    track: Track,
-    min_radius_cm: float,
-    settings: TrackSettings | None = None,
-    car: str = "the car",
-    backward: bool = False,
-) -> None:
-    """Refuse a road with bends that a car cannot turn.
+def wear_off(
+    painted_cm: Float[np.ndarray, "k 2"], length_cm: float, share: float, rng: np.random.Generator
+) -> Float[np.ndarray, "m 2"]:
+    """Let short sections flake off.
 
     Args:
-        track: The road, in the direction in which it is driven.
-        min_radius_cm: Of the car: wheelbase over the tangent of the largest steering angle.
-        settings: What the road was built from, whose file and piece the error names.
-        car: Named in the error.
-        backward: Whether the road is driven against the order of its pieces.
-
-    Raises:
-        ConfigError: With the tightest bend and its place.
+        painted_cm: Painted sections, ascending.
+        length_cm: Length of the road.
+        share: Of the paint that is lost, on average.
+        rng: Source of randomness.
     """
-    i = int(np.argmax(np.abs(track.curvature_per_cm)))
-    tightest = abs(float(track.curvature_per_cm[i]))
-    if tightest * min_radius_cm > 1.001:
-        where, s_cm = "track", float(track.s_cm[i])
-        place = f"at {s_cm:.0f} cm"
-        if settings is not None:
-            where = settings.origin
-            # The pieces are listed in the direction of the driven lane of the file.
-            if settings.pieces and abs(track.length_cm - length_of(settings.pieces)) < 1.0:
-                place = f"in {_piece_at(settings, track.length_cm - s_cm if backward else s_cm)}"
-        raise ConfigError(
-            f"{where}: found a bend of radius {1.0 / tightest:.1f} cm {place}, expected at least "
-            f"{min_radius_cm:.1f}, which is what {car} turns"
-        )
+    if share <= 0.0:
+        return painted_cm
+    n = int(2.0 * length_cm * share / _FLAKE_CM) + 20
+    lost = rng.exponential(_FLAKE_CM, n)
+    kept = rng.exponential(_FLAKE_CM * (1.0 - share) / share, n)
+    holes = np.cumsum(np.stack([kept, lost], axis=1).ravel()).reshape(-1, 2)
+    return subtract(painted_cm, holes[holes[:, 0] < length_cm])
 
 
-def _check_widths(settings: TrackSettings) -> None:
-    """Refuse lines that leave no lane between them."""
-    for name, (_, marking) in settings.lines.items():
-        width_cm = settings.line_width_cm if marking.width_cm is None else marking.width_cm
-        whole_cm = 2.0 * width_cm + marking.double_gap_cm if marking.kind == "double" else width_cm
-        if whole_cm >= settings.lane_width_cm:
-            raise ConfigError(
-                f"{settings.origin}: key '{name}': found a line {whole_cm:g} cm wide, expected less than the "
-                f"lane_width_cm {settings.lane_width_cm:g}"
-            )
+def cut(painted_cm: Float[np.ndarray, "k 2"], from_cm: float, to_cm: float) -> Float[np.ndarray, "m 2"]:
+    """Remove one section of the paint."""
+    before = np.stack([painted_cm[:, 0], np.minimum(painted_cm[:, 1], from_cm)], axis=1)
+    after = np.stack([np.maximum(painted_cm[:, 0], to_cm), painted_cm[:, 1]], axis=1)
+    left = _without_slivers(np.concatenate([before, after]))
+    return left[np.argsort(left[:, 0])]
 
 
-def _check_radii(settings: TrackSettings) -> None:
-    """Refuse bends whose inner line would have no radius left."""
-    width_cm, tape_cm = settings.lane_width_cm, settings.line_width_cm
-    if not settings.pieces:
-        if settings.min_radius_cm <= 0.5 * width_cm + tape_cm:
-            raise ConfigError(
-                f"{settings.origin}: min_radius_cm {settings.min_radius_cm:g} must exceed half the "
-                f"lane_width_cm {width_cm:g} and the line_width_cm {tape_cm:g}"
-            )
-        return
-    inside_cm = {"right": 0.5 * width_cm + tape_cm, "left": (settings.lanes - 0.5) * width_cm + tape_cm}
-    for number, piece in enumerate(settings.pieces):
-        for key, radius_cm, direction in piece.bends():
-            if radius_cm <= inside_cm[direction]:
-                raise ConfigError(
-                    f"{settings.origin}: key 'pieces.{number}.{piece.kind}.{key}': found {radius_cm:g}, "
-                    f"expected more than {inside_cm[direction]:g}: the road reaches that far to the "
-                    f"{direction} of its centre line"
-                )
+def subtract(
+    painted_cm: Float[np.ndarray, "k 2"], holes_cm: Float[np.ndarray, "h 2"]
+) -> Float[np.ndarray, "m 2"]:
+    """Remove many sections of the paint; both lists are ascending and without overlap."""
+    bounds = np.unique(np.concatenate([painted_cm.ravel(), holes_cm.ravel()]))
+    middle = 0.5 * (bounds[1:] + bounds[:-1])
+    keep = is_painted(painted_cm, middle) & ~is_painted(holes_cm, middle)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    return _without_slivers(bounds[edges].reshape(-1, 2))
 
 
-def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLine:
-    road_cm = settings.lanes * settings.lane_width_cm
-    middle_cm = 0.5 * (road_cm - settings.lane_width_cm)
-    if settings.pieces:
-        line = lay_out(settings.pieces, settings.closed, settings.origin)
-        found = comes_near_itself(
-            line, road_cm + settings.line_width_cm, settings.closed, middle_cm=middle_cm
-        )
-        if found is not None:
-            first, second, distance = found
-            least_cm = road_cm + settings.line_width_cm + check_slack_cm(line)
-            raise ConfigError(
-                f"{settings.origin}: pieces: the road meets itself: {_piece_at(settings, first)} and "
-                f"{_piece_at(settings, second)} come within {distance:.1f} cm of each other, expected at "
-                f"least {least_cm:.1f}: its width, and what the check leaves open"
-            )
-        return line
-    # The other lane must keep to the smallest radius as well, and it lies inside left bends.
-    radii_cm = (settings.min_radius_cm + 2.0 * middle_cm, settings.min_radius_cm)
-    separation_cm = road_cm + 2.0 * _CLEARANCE_LANES * 0.5 * settings.lane_width_cm
-    length_cm = _LENGTH_CM if settings.length_cm is None else settings.length_cm
-    if settings.closed:
-        return closed_centre_line(length_cm, radii_cm, separation_cm, middle_cm, rng)
-    return open_centre_line(length_cm, radii_cm, separation_cm, middle_cm, rng, settings.corners)
+def is_painted(painted_cm: Float[np.ndarray, "k 2"], s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+    """Tell for each distance along the road whether it lies on a painted section."""
+    if not len(painted_cm):
+        return np.zeros(len(s_cm), bool)
+    i = np.searchsorted(painted_cm[:, 0], s_cm, side="right") - 1
+    return (i >= 0) & (s_cm < painted_cm[np.maximum(i, 0), 1])
 
 
-def _piece_at(settings: TrackSettings, s_cm: float) -> str:
-    """Name the piece at a place along the road."""
-    ends_cm = np.cumsum([length_of([piece]) for piece in settings.pieces])
-    number = min(int(np.searchsorted(ends_cm, s_cm)), len(ends_cm) - 1)
-    piece = settings.pieces[number]
-    return f"pieces.{number} ({piece.kind}, at {s_cm:.0f} cm)"
-
-
-def _line(
-    settings: TrackSettings,
-    name: LineName,
-    track: Track,
-    kind_rng: np.random.Generator,
-    interruption_rng: np.random.Generator,
-    wear_rng: np.random.Generator,
-) -> Iterator[Marking]:
-    """Paint one line; a double one yields two."""
-    offset_cm, marking = settings.lines[name]
-    chance, colour_chance, phase = kind_rng.random(3)
-    dashed = marking.kind == "dashed" or (marking.kind == "random" and chance < 0.5)
-    colour = marking.colour
-    if colour == "random":
-        colour = "yellow" if colour_chance < 0.5 else "white"
-    length_cm = track.length_cm
-    painted_cm = paint_solid(length_cm)
-    if dashed:
-        start = float(phase) if marking.phase is None else marking.phase
-        painted_cm = _dashes(track, offset_cm, marking, start)
-    per_m = marking.interruptions_per_m
-    per_m = settings.interruptions_per_m if per_m is None else per_m
-    painted_cm = interrupt(painted_cm, length_cm, per_m, settings.max_interruption_cm, interruption_rng)
-    for start_cm, end_cm in marking.interruptions:
-        if end_cm > length_cm:
-            raise ConfigError(
-                f"{settings.origin}: key '{name}.interruptions': found one up to {end_cm:g} cm, but the road "
-                f"is {length_cm:.1f} cm long"
-            )
-        painted_cm = cut(painted_cm, start_cm, end_cm)
-    painted_cm = wear_off(painted_cm, length_cm, marking.wear, wear_rng.spawn(1)[0])
-    if marking.kind == "none":
-        return
-    width_cm = settings.line_width_cm if marking.width_cm is None else marking.width_cm
-    apart_cm = 0.5 * (width_cm + marking.double_gap_cm)
-    for shift_cm in (apart_cm, -apart_cm) if marking.kind == "double" else (0.0,):
-        yield Marking(offset_cm + shift_cm, width_cm, COLOURS[colour], painted_cm)
-
-
-def _dashes(
-    track: Track, offset_cm: float, marking: MarkingSettings, phase: float
-) -> Float[np.ndarray, "k 2"]:
-    """Dashes of even length along a line, which is shorter than the centre line on the inside of bends."""
-    closing = 1 if track.closed else 0
-    s_cm = np.append(track.s_cm, [track.length_cm][:closing])
-    stretch = 1.0 - offset_cm * np.append(track.curvature_per_cm, track.curvature_per_cm[:closing])
-    along_cm = np.concatenate([[0.0], np.cumsum(0.5 * (stretch[1:] + stretch[:-1]) * np.diff(s_cm))])
-    dashes = paint_dashes(float(along_cm[-1]), track.closed, marking.dash_cm, marking.gap_cm, phase)
-    return np.interp(dashes, along_cm, s_cm)
-
-
-def _without_cuts(marking: Marking, things: list[Painted], track: Track) -> Marking:
-    """Interrupt a line where something takes its place."""
-    painted_cm, lap_cm = marking.painted_cm, track.length_cm
-    for thing in things:
-        for offset_cm, start_cm, end_cm in thing.cuts:
-            if abs(offset_cm - marking.offset_cm) > 0.25 * track.lane_width_cm:
-                continue
-            # Over the seam of a loop it shows on both ends.
-            for shift_cm in (-lap_cm, 0.0, lap_cm) if track.closed else (0.0,):
-                painted_cm = cut(painted_cm, start_cm + shift_cm, end_cm + shift_cm)
-    return replace(marking, painted_cm=painted_cm)
+def _without_slivers(sections_cm: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "m 2"]:
+    return sections_cm[sections_cm[:, 1] - sections_cm[:, 0] > 1e-9]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from lanenet.data.files import write_json
 from lanenet.errors import DriveFormatError
 
 FORMAT = "lanenet-track/2"
-_OLDER = "lanenet-track/1"  # without boxes and oncoming lane
+_COLUMNS = ("s_cm", "xy_cm", "heading_rad", "curvature_per_cm")
 
 
 def write_track(path: Path, track: Track) -> None:
@@ -22,26 +23,15 @@ def write_track(path: Path, track: Track) -> None:
         "closed": track.closed,
         "lane_width_cm": track.lane_width_cm,
         "oncoming_cm": track.oncoming_cm,
-        "s_cm": track.s_cm,
-        "xy_cm": track.xy_cm,
-        "heading_rad": track.heading_rad,
-        "curvature_per_cm": track.curvature_per_cm,
-        "markings": [
-            {
-                "offset_cm": marking.offset_cm,
-                "width_cm": marking.width_cm,
-                "colour_bgr": marking.colour_bgr,
-                "painted_cm": marking.painted_cm,
-            }
-            for marking in track.markings
-        ],
+        **{name: getattr(track, name) for name in _COLUMNS},
+        "markings": [vars(marking) for marking in track.markings],
         "boxes": track.boxes,
     }
     write_json(path, data)
 
 
 def read_track(path: Path) -> Track:
-    """Read a track, of this version of the format or the one before.
+    """Read a track.
 
     Raises:
         DriveFormatError: If the file is missing, is not a track of this version, or its columns do not fit.
@@ -53,15 +43,11 @@ def read_track(path: Path) -> Track:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DriveFormatError(f"{path}: not valid JSON ({error})") from None
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
-    if found not in (FORMAT, _OLDER):
-        raise DriveFormatError(f"{path}: expected format {FORMAT!r} or {_OLDER!r}, found {found!r}")
-    if found == _OLDER:
-        data = {**data, "boxes": [], "oncoming_cm": None}
+    if found != FORMAT:
+        raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     try:
-        s_cm, heading_rad, curvature_per_cm = (
-            np.asarray(data[name], dtype=np.float64) for name in ("s_cm", "heading_rad", "curvature_per_cm")
-        )
-        xy_cm = np.asarray(data["xy_cm"], dtype=np.float64).reshape(-1, 2)
+        columns: dict[str, Any] = {name: np.asarray(data[name], dtype=np.float64) for name in _COLUMNS}
+        columns["xy_cm"] = columns["xy_cm"].reshape(-1, 2)
         markings = tuple(
             Marking(
                 float(m["offset_cm"]),
@@ -78,15 +64,13 @@ def read_track(path: Path) -> Track:
         raise DriveFormatError(f"{path}: key {error} is missing") from None
     except (TypeError, ValueError, IndexError) as error:
         raise DriveFormatError(f"{path}: not the numbers of a track ({error})") from None
-    columns = (s_cm, xy_cm, heading_rad, curvature_per_cm)
-    lengths = [len(column) if column.ndim else 0 for column in columns]
+    lengths = [len(column) if column.ndim else 0 for column in columns.values()]
     if min(lengths) < 2 or len(set(lengths)) > 1:
         raise DriveFormatError(
-            f"{path}: expected s_cm, xy_cm, heading_rad and curvature_per_cm of one length of at least 2, "
+            f"{path}: expected {', '.join(_COLUMNS)} of one length of at least 2, "
             f"found {', '.join(map(str, lengths))}"
         )
-    if not all(np.isfinite(column).all() for column in (*columns, boxes)):
+    if not all(np.isfinite(column).all() for column in (*columns.values(), boxes)):
         raise DriveFormatError(f"{path}: a number of the centre line or of a box is missing or not finite")
-    return Track(
-        s_cm, xy_cm, heading_rad, curvature_per_cm, closed, lane_width_cm, markings, boxes, oncoming_cm
-    )
+    rest: dict[str, Any] = {"closed": closed, "lane_width_cm": lane_width_cm, "oncoming_cm": oncoming_cm}
+    return Track(**columns, markings=markings, boxes=boxes, **rest)

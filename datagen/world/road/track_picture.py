@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.road.road import Bgr, Marking, Track
+from datagen.world.road.track import Bgr, Marking, Track
 
 _FLOOR: Bgr = (80.0, 80.0, 80.0)
 _CAR: Bgr = (60.0, 160.0, 60.0)

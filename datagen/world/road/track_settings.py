@@ -17,6 +17,9 @@ from lanenet.errors import ConfigError, did_you_mean
 
 LineName = Literal["left", "right", "middle", "far"]
 
+#: Length of a road that is given none; chosen: twenty seconds at 60 cm/s.
+LOOP_CM = 1200.0
+
 
 class MarkingSettings(Settings):
     """How one line of the road is painted.
@@ -29,9 +32,9 @@ class MarkingSettings(Settings):
         phase: Where the pattern starts, in periods; None: at random.
         width_cm: Of the tape; None: the road's ``line_width_cm``.
         double_gap_cm: Between the two tapes of a double line.
-        wear: Share of the paint that has flaked off, in short stretches.
-        interruptions: Stretches without paint, from and to along the centre line, [cm].
-        interruptions_per_m: More of them at random; None: the road's ``interruptions_per_m``.
+        wear: Share of the paint that has flaked off, in short sections.
+        interruptions: Sections without paint, from and to along the centre line, [cm].
+        interruptions_per_m: Random ones in addition; None: the road's ``interruptions_per_m``.
     """
 
     kind: Literal["solid", "dashed", "double", "none", "random"] = "solid"
@@ -46,7 +49,7 @@ class MarkingSettings(Settings):
     interruptions_per_m: float | None = Field(default=None, ge=0.0)
 
     @model_validator(mode="after")
-    def _stretches_run_forwards(self) -> MarkingSettings:
+    def _interruptions_run_forwards(self) -> MarkingSettings:
         for start, end in self.interruptions:
             if not 0.0 <= start < end:
                 raise ValueError(
@@ -78,11 +81,11 @@ class TrackSettings(Settings):
         right: Line on the right.
         middle: Line between two lanes.
         far: Left line of a road with two lanes.
-        interruptions_per_m: Stretches where paint is missing, for each line.
-        max_interruption_cm: Longest such stretch.
+        interruptions_per_m: Sections where paint is missing, for each line.
+        max_interruption_cm: Longest such section.
         pieces: The road in the direction of travel; none: a random road.
         furniture: Things on the road.
-        random_furniture: More of them at random.
+        random_furniture: Random ones in addition.
         floor_bgr: Colour of the floor that belongs to this road; None: any.
     """
 
@@ -210,7 +213,7 @@ def load_track_settings(path: Path, above: tuple[Path, ...] = ()) -> TrackSettin
 def _with_base(
     data: dict[str, Any], origin: str = "track", above: tuple[Path, ...] = ()
 ) -> tuple[dict[str, Any], str]:
-    """Put the keys of a file or preset below the given ones, and tell where they come from."""
+    """Put the given keys over those of a file or preset; return them and their origin."""
     name, file = data.get("preset"), data.get("file")
     if name is not None and file is not None:
         raise ConfigError(f"found preset {name!r} and file '{file}', expected one of them")
@@ -238,7 +241,7 @@ def _with_length(data: dict[str, Any], origin: str) -> dict[str, Any]:
     try:
         pieces = [Piece.model_validate(piece) for piece in data["pieces"]]
     except (TypeError, ValueError):
-        return data  # the schema says what is wrong with them
+        return data  # the schema will report what is wrong with them
     length_cm = length_of(pieces)
     given = data.get("length_cm")
     if isinstance(given, (int, float)) and abs(given - length_cm) > 1e-6 * length_cm:

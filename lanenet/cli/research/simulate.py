@@ -29,7 +29,8 @@ def simulate(
     model: ModelOption = None,
 ) -> None:
     """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
-    from datagen.world.simulate import SimulationSettings, simulate_drive
+    from datagen.world.simulate import simulate_drive
+    from datagen.world.world import SimulationSettings
 
     settings = load_settings(SimulationSettings, config, overrides)
     if model is not None and detector is None:

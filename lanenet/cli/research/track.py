@@ -27,8 +27,9 @@ def track(
     """Check a road and draw it from above."""
     import numpy as np
 
-    from datagen.world.road.track import load_track_settings, preset, preset_names, random_track
+    from datagen.world.road.build import random_track
     from datagen.world.road.track_picture import draw_track, picture_scale
+    from datagen.world.road.track_settings import load_track_settings, preset, preset_names
     from lanenet.data.files import write_bytes
     from lanenet.data.parquet import png_bytes
 

@@ -221,7 +221,7 @@ def test_label_hands_on_its_arguments(asked: Asked) -> None:
 
 
 def test_overrides_replace_settings_of_the_file(tmp_path: Path) -> None:
-    from datagen.world.simulate import SimulationSettings
+    from datagen.world.world import SimulationSettings
 
     config = tmp_path / "drive.yaml"
     config.write_text(f"seed: {SimulationSettings().seed + 1}\n")

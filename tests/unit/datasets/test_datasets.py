@@ -17,7 +17,7 @@ from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
 from datagen.datasets.settings import DataSettings, RecordedSettings, SyntheticSettings
 from datagen.datasets.splits import split_along_time
 from datagen.prepare import MapRequest
-from datagen.world.simulate import SimulationSettings
+from datagen.world.world import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow

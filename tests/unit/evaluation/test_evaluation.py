@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.car.camera import CameraSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
 from lanenet.data.files import json_text
 from lanenet.data.maps.labelled_frames import read_truth_frames
 from lanenet.errors import DriveFormatError

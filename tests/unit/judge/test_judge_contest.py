@@ -16,8 +16,9 @@ from datagen.judge.pictures import COLOURS_BGR, draw_top_view
 from datagen.judge.report import summarise, tables, write_report
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings
-from datagen.world.car.rig import CameraSettings
-from datagen.world.road.track import TrackSettings, random_track
+from datagen.world.car.camera import CameraSettings
+from datagen.world.road.build import random_track
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli.app import app
 from lanenet.cli.research.entrants import NamedDetector

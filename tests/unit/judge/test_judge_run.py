@@ -20,8 +20,9 @@ from datagen.judge.run import (
     wheel_offsets_cm,
 )
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
-from datagen.world.car.rig import CameraSettings
-from datagen.world.road.track import Track, TrackSettings
+from datagen.world.car.camera import CameraSettings
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings
 from lanenet.errors import ConfigError
 from lanenet.perception.estimate import LaneEstimate
@@ -95,7 +96,7 @@ def test_turning_the_world_leaves_the_wheels_where_they_are(offset_cm, heading, 
     pose = np.array([150.0, offset_cm, heading])
     c, s = np.cos(turn), np.sin(turn)
     moved = np.array([c * pose[0] - s * pose[1] + 5.0, s * pose[0] + c * pose[1] - 9.0, heading + turn])
-    there = _straight().moved(np.array([5.0, -9.0, turn]))
+    there = move_track(_straight(), np.array([5.0, -9.0, turn]))
     np.testing.assert_allclose(
         wheel_offsets_cm(there, moved, 26.0, 16.0, 150.0),
         wheel_offsets_cm(_straight(), pose, 26.0, 16.0, 150.0),

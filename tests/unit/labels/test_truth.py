@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from datagen.labels.truth import truth_labels
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.driver import DriverSettings
-from datagen.world.car.rig import CameraSettings
 from datagen.world.road.track_settings import TrackSettings
-from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
 from lanenet.data.drives import read_truth
 from lanenet.data.label_set import write_labels
 from lanenet.evaluation.answers import Compared

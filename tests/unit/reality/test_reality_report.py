@@ -15,9 +15,9 @@ from datagen.reality.measure import MeasuredDrive, at_nominal_height
 from datagen.reality.pictures import histograms, sheet
 from datagen.reality.report import compare, nearest_synthetic, summary, table, write_report
 from datagen.reality.statistics import STATISTICS
-from datagen.world.car.rig import CameraSettings
-from datagen.world.simulate import SimulationSettings, simulate_drive
-from datagen.world.world import assemble_world
+from datagen.world.car.camera import CameraSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings, assemble_world
 from lanenet.cli.app import app
 
 CAMERA = at_nominal_height(CameraSettings(width=64, height=48).build(26.0))

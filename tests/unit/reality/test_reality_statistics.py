@@ -10,7 +10,7 @@ import pytest
 
 from datagen.reality.measure import HEIGHT_CM, at_nominal_height, measure_frames
 from datagen.reality.statistics import STATISTICS, chain_points, drive_statistics, edge_statistics
-from datagen.world.car.rig import CameraSettings
+from datagen.world.car.camera import CameraSettings
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 CAMERA = at_nominal_height(CameraSettings(width=160, height=120, pitch_down_rad=0.6).build(26.0))

@@ -17,7 +17,8 @@ from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
 from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps
-from datagen.world.simulate import SimulationSettings, simulate_drive
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import TrackingLostError

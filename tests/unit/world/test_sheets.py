@@ -10,10 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from datagen.world import sheets
-from datagen.world.render.look import LookSettings
+from datagen.world.render.appearance import Appearance
 from datagen.world.render.objects import place_objects
+from datagen.world.road.build import random_track
 from datagen.world.road.furniture import COLOURS, Furniture, Junction
-from datagen.world.road.track import TrackSettings, preset, preset_names, random_track
+from datagen.world.road.track_settings import TrackSettings, preset, preset_names
 from datagen.world.sheets import EFFECT_SHEETS, Effect, draw_sheet, encode_sheet, sheet_names
 from lanenet.cli.app import app
 from lanenet.errors import ConfigError
@@ -81,7 +82,7 @@ def test_the_verb_writes_what_is_asked_for(small_sheets: None, tmp_path) -> None
 @pytest.mark.parametrize("seed", range(3))
 def test_no_two_things_stand_in_each_other(seed: int) -> None:
     track = random_track(TrackSettings(closed=True, length_cm=1200.0), np.random.default_rng(seed))
-    look = LookSettings(objects_per_m=6.0)
+    look = Appearance(objects_per_m=6.0)
     solids = place_objects(track, look, *np.random.default_rng(seed).spawn(2)).solids
     assert len(solids) > 40
 
@@ -105,7 +106,7 @@ def test_a_thing_without_room_leaves_the_others_as_they_are(monkeypatch: pytest.
 
     def rows() -> set[bytes]:
         rngs = np.random.default_rng(0).spawn(2)
-        return {row.tobytes() for row in place_objects(track, LookSettings(objects_per_m=6.0), *rngs).solids}
+        return {row.tobytes() for row in place_objects(track, Appearance(objects_per_m=6.0), *rngs).solids}
 
     apart = rows()
     monkeypatch.setattr("datagen.world.render.objects._overlap", lambda one, other: False)

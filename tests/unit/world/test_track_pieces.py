@@ -9,17 +9,12 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic_roads import load_track
 
+from datagen.world.road.build import check_drivable, random_track
 from datagen.world.road.pieces import Piece, lay_out, length_of
-from datagen.world.road.track import (
-    TrackSettings,
-    check_drivable,
-    load_track,
-    preset,
-    preset_names,
-    random_track,
-)
-from datagen.world.simulate import SimulationSettings, build_world
+from datagen.world.road.track_settings import TrackSettings, preset, preset_names
+from datagen.world.world import SimulationSettings, build_world
 from lanenet.config import check_settings, dump_settings
 from lanenet.errors import ConfigError
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.pilot import (
     DetectorPilot,
     DriverPilot,
@@ -18,10 +19,9 @@ from datagen.world.car.pilot import (
     TruePointsPilot,
     control_settings,
 )
-from datagen.world.car.rig import CameraSettings
 from datagen.world.driving import ClosedLoop
-from datagen.world.render.look import LookSettings
-from datagen.world.road.track import TrackSettings
+from datagen.world.render.appearance import Appearance
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings, World, assemble_world
 from lanenet.control.controller import ControlSettings, LaneController
@@ -176,7 +176,7 @@ def test_putting_back_resets_the_detector_and_keeps_the_place():
 def test_the_pilot_sees_what_the_file_holds(tmp_path: Path):
     detector = Recorder(_lane(0.0))
     settings = SimulationSettings(
-        seed=1, frames=5, camera=SMALL, random_look=False, look=LookSettings(noise_level=6.0, jpeg_quality=60)
+        seed=1, frames=5, camera=SMALL, random_look=False, look=Appearance(noise_level=6.0, jpeg_quality=60)
     )
     out = simulate_drive(settings, tmp_path / "d", pilot=lambda world: DetectorPilot(detector, _control()))
     drive = open_drive(out)

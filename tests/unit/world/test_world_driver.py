@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.car.driver import (
     DriverSettings,
@@ -15,9 +16,8 @@ from datagen.world.car.driver import (
     shortest_excursion_spacing_cm,
     shortest_lane_change_cm,
 )
-from datagen.world.car.rig import CameraSettings
 from datagen.world.driving import scripted_states
-from datagen.world.road.track import TrackSettings
+from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
 from lanenet.data.drives import open_drive

@@ -7,17 +7,21 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from synthetic_roads import drive_frames
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.bare_floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
-from datagen.world.render.ground import FAR, NOT_FLOOR, TEXTURE_SIDE, TILE, row_poses, shake_rotation
-from datagen.world.render.look import LookSettings, random_look
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance, random_appearance
+from datagen.world.render.compiled import FAR, NOT_FLOOR, TILE
+from datagen.world.render.floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
+from datagen.world.render.ground import TEXTURE_SIDE, PixelGround, row_poses, shake_rotation
 from datagen.world.render.nearest import Nearby
-from datagen.world.render.renderer import PixelGround, Renderer
-from datagen.world.render.scene import Steps, Wander
+from datagen.world.render.renderer import Renderer
+from datagen.world.render.sensor import Steps, Wander
 from datagen.world.render.textures import PATTERN_BGR, floor_pattern, level_starts, pack_levels
-from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
-from datagen.world.simulate import SimulationSettings, drive_frames
+from datagen.world.road.build import random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import MarkingSettings, TrackSettings
+from datagen.world.world import SimulationSettings
 
 CAMERA = CameraSettings().build(26.0)
 GROUND = PixelGround.of(CAMERA)
@@ -38,7 +42,7 @@ EFFECTS = {
     "shake_pitch_rad": {"shake_pitch_rad": 0.02},
     "shake_roll_rad": {"shake_roll_rad": 0.02},
 } | {f"floor_{kind}": {"floor": kind, "texture_level": 8.0} for kind in PATTERN_BGR}
-ALL = LookSettings(
+ALL = Appearance(
     floor="wood", texture_level=8.0, line_wear=0.5, lamps_per_m=1.0, clutter_per_m=3.0, wall_level=30.0,
     vignetting=0.3, blur_px=0.8, noise_level=4.0, jpeg_quality=80, verge_bgr=(150.0, 120.0, 40.0),
     objects_per_m=2.0, shadows_per_m=1.0, exposure_drift=0.2, exposure_step=0.2, white_balance_drift=0.1,
@@ -48,7 +52,7 @@ ALL = LookSettings(
 
 def _renderer(track: Track = TRACK, camera=CAMERA, **look: object) -> Renderer:
     ground = GROUND if camera is CAMERA else None
-    return Renderer(camera, track, LookSettings(**look), np.random.default_rng(7), ground)
+    return Renderer(camera, track, Appearance(**look), np.random.default_rng(7), ground)
 
 
 def _pose(s_cm: float = 150.0, offset_cm: float = 0.0) -> np.ndarray:
@@ -268,15 +272,15 @@ def test_nearby_misses_nothing_in_sight_at_any_length():
 def test_dark_paint_gets_a_light_floor():
     black, white = (25.0, 25.0, 25.0), (235.0, 235.0, 235.0)
     for seed in range(40):
-        free = random_look(LookSettings(), np.random.default_rng(seed))
-        only_black = random_look(LookSettings(), np.random.default_rng(seed), (black,))
-        both = random_look(LookSettings(), np.random.default_rng(seed), (black, white))
+        free = random_appearance(Appearance(), np.random.default_rng(seed))
+        only_black = random_appearance(Appearance(), np.random.default_rng(seed), (black,))
+        both = random_appearance(Appearance(), np.random.default_rng(seed), (black, white))
         assert np.mean(only_black.floor_bgr) - 25.0 >= 55.0
         assert np.mean(both.floor_bgr) - 25.0 >= 55.0 and 235.0 - np.mean(both.floor_bgr) >= 55.0
         # Paint has a say in how light the floor is and how dull the paint, and in nothing else.
         paint = {"line_brightness": free.line_brightness}
         assert only_black.model_copy(update={"floor_bgr": free.floor_bgr, **paint}) == free
-        only_white = random_look(LookSettings(), np.random.default_rng(seed), (white,))
+        only_white = random_appearance(Appearance(), np.random.default_rng(seed), (white,))
         assert only_white.model_copy(update=paint) == free
 
 

@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic_roads import line_xy, mirror_track, move_track
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.coverage import box_share, painted_share
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance, random_appearance
+from datagen.world.render.compiled import edge_share, painted_share
 from datagen.world.render.floor import locate
+from datagen.world.render.ground import PixelGround
 from datagen.world.render.light import mirror_lamps
-from datagen.world.render.look import LookSettings, random_look
-from datagen.world.render.renderer import PixelGround, Renderer
+from datagen.world.render.renderer import Renderer
 from datagen.world.render.scene import build_scene
-from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.road.build import random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import MarkingSettings, TrackSettings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map
@@ -45,7 +49,7 @@ def _road(seed: int) -> Track:
 
 
 def _renderer(track: Track, **look: object) -> Renderer:
-    return Renderer(CAMERA, track, LookSettings(**look), np.random.default_rng(7), GROUND)
+    return Renderer(CAMERA, track, Appearance(**look), np.random.default_rng(7), GROUND)
 
 
 def _pose(track: Track, s_cm: float, offset_cm: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
@@ -124,7 +128,7 @@ def test_pinhole_and_tilted_cameras_are_met_too():
         height_cm=14.0, pitch_down_rad=0.4, roll_rad=0.05, yaw_rad=-0.04, right_of_centre_cm=1.5,
     )  # fmt: skip
     camera, track = rig.build(20.0), _road(1)
-    renderer = Renderer(camera, track, LookSettings(), np.random.default_rng(0))
+    renderer = Renderer(camera, track, Appearance(), np.random.default_rng(0))
     errors: list[float] = []
     for s in (60.0, 150.0, 260.0, 350.0):
         pose = _pose(track, s)
@@ -144,19 +148,19 @@ def test_fisheye_spans_the_stated_field_of_view():
 
 
 @given(d=st.floats(-3.0, 3.0), a=st.floats(0.01, 2.0), b=st.floats(0.01, 2.0))
-def test_box_share_is_the_area_behind_an_edge(d, a, b):
+def test_edge_share_is_the_area_behind_an_edge(d, a, b):
     # The distance over the pixel is d + a u + b v with u, v in +-0.5: count a fine grid.
     u = (np.arange(100) + 0.5) / 100.0 - 0.5
     counted = np.mean(d + a * u[:, None] + b * u[None, :] > 0.0)
-    assert box_share(d, a, b) == pytest.approx(counted, abs=0.012)
-    assert box_share(d, a, b) == box_share(d, -b, a)
-    assert box_share(d, a, b) + box_share(-d, a, b) == pytest.approx(1.0)
+    assert edge_share(d, (a, b, 0.0)) == pytest.approx(counted, abs=0.012)
+    assert edge_share(d, (a, b, 0.0)) == edge_share(d, (-b, a, 0.0))
+    assert edge_share(d, (a, b, 0.0)) + edge_share(-d, (a, b, 0.0)) == pytest.approx(1.0)
 
 
 def test_dashes_are_painted_with_their_length():
     stretches = np.array([[10.0, 30.0], [50.0, 70.0], [90.0, 110.0]])
     s = np.arange(0.0, 120.0, 0.25)
-    share = np.array([painted_share(x, 0.8, 0.3, 0.0, stretches, 0, 3) for x in s])
+    share = np.array([painted_share(x, (0.8, 0.3, 0.0), stretches, 0, 3) for x in s])
     assert share.sum() * 0.25 == pytest.approx(60.0, abs=1e-6)
     assert share[s == 20.0] == 1.0 and share[s == 40.0] == 0.0 and share[s == 50.0] == pytest.approx(0.5)
 
@@ -174,7 +178,7 @@ def test_dashes_and_interruptions_appear_where_the_track_has_them():
         pose = _pose(track, 150.0)
         image = _renderer(track).render(pose)
         for side, marking in zip(("left", "right"), track.markings, strict=True):
-            line = car_from_map(track.line_xy(side)[150:240], pose, 26.0)
+            line = car_from_map(line_xy(track, side)[150:240], pose, 26.0)
             ends = marking.painted_cm.ravel()
             for s, (u, v) in zip(track.s_cm[150:240], CAMERA.project_ground(line), strict=True):
                 # Half a centimetre is more than a pixel here; ends of the paint are left out by 1.5 cm.
@@ -190,7 +194,7 @@ def test_dashes_and_interruptions_appear_where_the_track_has_them():
 def test_moving_the_world_moves_nothing_in_the_image():
     track = _road(2)
     pose = _pose(track, 150.0, 3.0)
-    moved = track.moved(np.array([120.0, -40.0, 1.3]))
+    moved = move_track(track, np.array([120.0, -40.0, 1.3]))
     c, s = np.cos(1.3), np.sin(1.3)
     there = np.array([c * pose[0] - s * pose[1] + 120.0, s * pose[0] + c * pose[1] - 40.0, pose[2] + 1.3])
     a, b = _renderer(track).render(pose).astype(int), _renderer(moved).render(there).astype(int)
@@ -201,7 +205,7 @@ def test_mirrored_road_gives_the_mirrored_image():
     track = _road(0)
     pose = _pose(track, 150.0, 3.0, 0.1)
     image = _renderer(track).render(pose)
-    mirrored = _renderer(track.mirrored()).render(pose * [1.0, -1.0, -1.0])
+    mirrored = _renderer(mirror_track(track)).render(pose * [1.0, -1.0, -1.0])
     floor = GROUND.floor & GROUND.floor[:, ::-1]
     assert np.abs(image.astype(int) - mirrored[:, ::-1].astype(int))[floor].max() <= 1
     assert (image[floor] > 150).any()
@@ -216,7 +220,7 @@ def test_loop_is_painted_without_a_seam():
         # The seam lies some 20 cm ahead of the front axle: paint is full on both sides and across.
         ahead = (np.arange(-15, 15) + len(track.s_cm)) % len(track.s_cm)
         for side in ("left", "right"):
-            line = CAMERA.project_ground(car_from_map(track.line_xy(side)[ahead], pose, 26.0))
+            line = CAMERA.project_ground(car_from_map(line_xy(track, side)[ahead], pose, 26.0))
             seen = np.rint(line).astype(int)
             assert ((seen > 0) & (seen < [319, 239])).all()
             assert min(image[v, u].min() for u, v in seen) == PAINT
@@ -285,7 +289,7 @@ def test_noise_depends_on_the_frame_and_not_on_the_order():
 
 def test_lamps_wander_as_a_mirror_would_have_it():
     track = _road(0)
-    lamps = build_scene(track, LookSettings(lamps_per_m=2.0), np.random.default_rng(7)).lamps
+    lamps = build_scene(track, Appearance(lamps_per_m=2.0), np.random.default_rng(7)).lamps
     pose = _pose(track, 200.0)
     # Equal angles: the ray through the spot, mirrored in the floor, meets the lamp.
     eye = np.array([*(pose[:2] + 24.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])), 20.0])
@@ -300,12 +304,12 @@ def test_lamps_wander_as_a_mirror_would_have_it():
 
 
 def test_random_looks_differ_keep_contrast_and_respect_fixed_values():
-    looks = [random_look(LookSettings(), np.random.default_rng(seed)) for seed in range(60)]
+    looks = [random_appearance(Appearance(), np.random.default_rng(seed)) for seed in range(60)]
     gray = [float(np.mean(look.floor_bgr)) for look in looks]
     assert min(gray) < 60.0 and max(gray) > 130.0
     for look, floor in zip(looks, gray, strict=True):
         assert PAINT * look.line_brightness - floor > 35.0
-    fixed = random_look(LookSettings(noise_level=0.0, blur_px=0.0), np.random.default_rng(5))
-    free = random_look(LookSettings(), np.random.default_rng(5))
+    fixed = random_appearance(Appearance(noise_level=0.0, blur_px=0.0), np.random.default_rng(5))
+    free = random_appearance(Appearance(), np.random.default_rng(5))
     assert (fixed.noise_level, fixed.blur_px) == (0.0, 0.0)
     assert fixed.model_copy(update={"noise_level": free.noise_level, "blur_px": free.blur_px}) == free

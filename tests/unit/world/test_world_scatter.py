@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings, random_look
-from datagen.world.render.objects import glints, prints, specks
-from datagen.world.render.renderer import PixelGround, Renderer
-from datagen.world.render.scene import build_scene
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance, random_appearance
+from datagen.world.render.ground import PixelGround
+from datagen.world.render.renderer import Renderer
+from datagen.world.render.scene import build_scene, glints, prints, specks
 from datagen.world.render.textures import cracks, stains
-from datagen.world.road.track import TrackSettings, random_track
+from datagen.world.road.build import random_track
+from datagen.world.road.track_settings import TrackSettings
 
 TRACK = random_track(TrackSettings(length_cm=900.0), np.random.default_rng(2))
 CAMERA = CameraSettings(width=160, height=120).build(26.0)
@@ -20,7 +21,7 @@ POSES = [np.array([*TRACK.point(s)[0], TRACK.point(s)[1]]) for s in (150.0, 300.
 
 
 def _frames(**look: object) -> np.ndarray:
-    renderer = Renderer(CAMERA, TRACK, LookSettings(**look), np.random.default_rng(4), GROUND)
+    renderer = Renderer(CAMERA, TRACK, Appearance(**look), np.random.default_rng(4), GROUND)
     return np.stack([renderer.render(pose, i) for i, pose in enumerate(POSES)])
 
 
@@ -46,7 +47,7 @@ def test_each_mark_shows_and_repeats(off, on):
 
 
 def test_one_part_of_the_scene_does_not_move_another():
-    look = LookSettings(texture_level=4.0, lamps_per_m=2.0, clutter_per_m=3.0, objects_per_m=2.0)
+    look = Appearance(texture_level=4.0, lamps_per_m=2.0, clutter_per_m=3.0, objects_per_m=2.0)
     marks = {"specks_per_m": 9.0, "prints_per_m": 3.0, "glints_per_m": 4.0, "stain_level": 20.0}
     plain = build_scene(TRACK, look, np.random.default_rng(1))
     more = build_scene(TRACK, look.model_copy(update=marks), np.random.default_rng(1))
@@ -93,7 +94,7 @@ def test_patterns_of_stains_and_cracks_are_shares():
 
 
 def test_random_looks_draw_marks_on_some_drives_only():
-    looks = [random_look(LookSettings(), np.random.default_rng(seed)) for seed in range(200)]
+    looks = [random_appearance(Appearance(), np.random.default_rng(seed)) for seed in range(200)]
     for name in ("specks_per_m", "stain_level", "crack_level", "prints_per_m", "glints_per_m"):
         share = np.mean([getattr(look, name) != 0.0 for look in looks])
         assert 0.15 < share < 0.65, name
@@ -104,10 +105,10 @@ def test_dull_paint_still_stands_out_from_the_floor():
     white, black = (230.0, 230.0, 230.0), (30.0, 30.0, 30.0)
     dull = 0
     for seed in range(200):
-        look = random_look(LookSettings(), np.random.default_rng(seed), (white,))
+        look = random_appearance(Appearance(), np.random.default_rng(seed), (white,))
         paint = 230.0 * look.line_brightness
         assert paint >= min(look.floor_bgr[1] + 45.0, 230.0 * 0.85) - 1e-6
         dull += look.line_brightness < 0.85
-        dark = random_look(LookSettings(), np.random.default_rng(seed), (black,))
+        dark = random_appearance(Appearance(), np.random.default_rng(seed), (black,))
         assert dark.line_brightness >= 0.85
     assert 40 < dull < 110

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from synthetic_roads import drive_frames, frames_of
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import CarSettings, advance
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings
-from datagen.world.road.track import TrackSettings
+from datagen.world.render.appearance import Appearance
 from datagen.world.road.track_file import read_track
-from datagen.world.simulate import SimulationSettings, build_world, drive_frames, frames_of, simulate_drive
+from datagen.world.road.track_settings import TrackSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings, build_world
 from lanenet.config import check_settings, load_settings
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import read_truth
@@ -49,7 +51,7 @@ def test_resolved_settings_give_the_same_drive():
 def test_the_look_does_not_change_the_truth():
     plain = list(drive_frames(_settings(seed=2, random_look=False)))
     rich = list(drive_frames(_settings(seed=2)))
-    loud = list(drive_frames(_settings(seed=2, look=LookSettings(noise_level=9.0, clutter_per_m=6.0))))
+    loud = list(drive_frames(_settings(seed=2, look=Appearance(noise_level=9.0, clutter_per_m=6.0))))
     for other in (rich, loud):
         np.testing.assert_array_equal(_stack(plain, "points_cm"), _stack(other, "points_cm"))
         np.testing.assert_array_equal(_stack(plain, "pose"), _stack(other, "pose"))
@@ -120,7 +122,7 @@ def test_a_loop_is_driven_more_than_once():
 
 
 def test_drive_on_disk(tmp_path):
-    settings = _settings(seed=8, look=LookSettings(jpeg_quality=70))
+    settings = _settings(seed=8, look=Appearance(jpeg_quality=70))
     calls: list[tuple[int, int]] = []
     out = simulate_drive(settings, tmp_path / "drive", lambda done, total: calls.append((done, total)))
     assert calls == [(k, 12) for k in range(1, 13)]

@@ -6,13 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance
 from datagen.world.render.nearest import Nearby
 from datagen.world.render.objects import place_objects
 from datagen.world.render.renderer import Renderer
 from datagen.world.render.solids import BOX, CONE, CYLINDER, SOLID_COLUMNS
-from datagen.world.road.track import TrackSettings, random_track
+from datagen.world.road.build import random_track
+from datagen.world.road.track_settings import TrackSettings
 from lanenet.geometry.camera import Camera
 
 TRACK = random_track(TrackSettings(length_cm=900.0), np.random.default_rng(2))
@@ -31,7 +32,7 @@ def _solid(ahead, right, half_a, half_b, bottom, top, shape, turn=0.3):
 
 
 def _render(camera: Camera, solids: list[list[float]], pose=POSE, motion=(0.0, 0.0), **look) -> np.ndarray:
-    renderer = Renderer(camera, TRACK, LookSettings(**look), np.random.default_rng(0))
+    renderer = Renderer(camera, TRACK, Appearance(**look), np.random.default_rng(0))
     rows = np.array(solids).reshape(-1, SOLID_COLUMNS + 4)
     renderer._solids = Nearby(rows, np.full(len(rows), 100.0), 450.0)
     return renderer.render(pose, 0, *motion)
@@ -151,7 +152,7 @@ def test_a_camera_that_looks_at_the_sky_or_at_its_feet_is_drawn(pitch_rad):
     camera = CameraSettings(
         width=50, height=37, field_of_view_rad=np.deg2rad(120.0), pitch_down_rad=pitch_rad
     ).build(26.0)
-    look = LookSettings(
+    look = Appearance(
         texture_level=5.0, clutter_per_m=3.0, objects_per_m=8.0, objects_on_road=0.5, shadows_per_m=3.0,
         lamps_per_m=3.0, shake_pitch_rad=0.2, shake_roll_rad=0.2, exposure_s=0.1, readout_s=0.1,
     )  # fmt: skip
@@ -167,7 +168,7 @@ def test_objects_leave_the_middle_of_the_lane_free_and_shadows_follow(closed):
     kinds = set()
     for seed in range(4):
         track = random_track(settings, np.random.default_rng(seed))
-        look = LookSettings(objects_per_m=4.0, objects_on_road=0.3)
+        look = Appearance(objects_per_m=4.0, objects_on_road=0.3)
         rngs = np.random.default_rng(seed).spawn(2)
         objects = place_objects(track, look, *rngs)
         assert len(objects.shadows) == len(objects.solids) > 30

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic_roads import line_xy, mirror_track, move_track
 
+from datagen.world.road.build import random_track
 from datagen.world.road.centre_line import comes_near_itself, integrate_curvature
-from datagen.world.road.road import interrupt, paint_dashes
-from datagen.world.road.track import Marking, MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.road.track import Marking, Track, interrupt, paint_dashes
 from datagen.world.road.track_file import read_track, write_track
+from datagen.world.road.track_settings import MarkingSettings, TrackSettings
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.lane import mirror_points
@@ -205,18 +207,19 @@ def test_mirrored_and_moved_worlds(closed):
         pose = np.array([*xy, heading + rng.uniform(-0.2, 0.2)])
         points = track.truth(pose, WHEELBASE_CM)
         assert np.isfinite(points).all()
-        mirrored = track.mirrored().truth(pose * [1.0, -1.0, -1.0], WHEELBASE_CM)
+        mirrored = mirror_track(track).truth(pose * [1.0, -1.0, -1.0], WHEELBASE_CM)
         np.testing.assert_allclose(mirrored, mirror_points(points), atol=1e-9)
         shift = np.array([310.0, -95.0, 2.1])
         c, sn = np.cos(2.1), np.sin(2.1)
         moved_pose = np.array([c * xy[0] - sn * xy[1] + 310.0, sn * xy[0] + c * xy[1] - 95.0, pose[2] + 2.1])
-        np.testing.assert_allclose(track.moved(shift).truth(moved_pose, WHEELBASE_CM), points, atol=1e-8)
+        there = move_track(track, shift).truth(moved_pose, WHEELBASE_CM)
+        np.testing.assert_allclose(there, points, atol=1e-8)
 
 
 def test_lane_lines_lie_half_a_lane_from_the_centre():
     track = _TRACKS[1, False]
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        line = track.line_xy(side)
+        line = line_xy(track, side)
         offsets = [track.nearest(line[i])[1] for i in range(0, len(line), 50)]
         np.testing.assert_allclose(offsets, sign * 20.0, atol=1e-6)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.world.car.rig import CameraSettings
-from datagen.world.render.look import LookSettings
+from datagen.world.car.camera import CameraSettings
+from datagen.world.render.appearance import Appearance
 from datagen.world.render.renderer import Renderer
-from datagen.world.road.track import MarkingSettings, Track, TrackSettings, random_track
+from datagen.world.road.build import random_track
+from datagen.world.road.track import Track
+from datagen.world.road.track_settings import MarkingSettings, TrackSettings
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map
 
@@ -73,7 +75,7 @@ def line_errors(camera: Camera, track: Track, seed: int, stops: tuple[float, ...
     The borders are the line of the truth moved by half the marking's width to either side, on the road: the
     image of a line's middle is not the middle of its image, by up to two pixels in a wide marking nearby.
     """
-    renderer = Renderer(camera, track, LookSettings(floor_bgr=(FLOOR,) * 3), np.random.default_rng(seed))
+    renderer = Renderer(camera, track, Appearance(floor_bgr=(FLOOR,) * 3), np.random.default_rng(seed))
     normal = np.stack([-np.sin(track.heading_rad), np.cos(track.heading_rad)], axis=1)
     errors: list[float] = []
     for s_cm in stops:

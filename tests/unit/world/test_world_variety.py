@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from datagen.world.car.camera import CameraSettings, line_in_bend_car, sees_lane
 from datagen.world.car.car import CarSettings
 from datagen.world.car.driver import Driver, DriverSettings
-from datagen.world.car.rig import CameraSettings, line_in_bend_car, sees_lane
-from datagen.world.road.track import random_track
+from datagen.world.road.build import random_track
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.variety import (
     camera_like,

@@ -16,7 +16,7 @@ _DULL_CONTRAST = 45.0  # between floor and paint that has lost its brightness
 _DULLEST = 0.6
 
 
-class LookSettings(Settings):
+class Appearance(Settings):
     """The look of one drive. Every effect is off by default; levels are in grey levels, 0..255.
 
     Attributes:
@@ -109,9 +109,9 @@ class LookSettings(Settings):
     crack_level: float = Field(default=0.0, ge=0.0, le=100.0)
 
 
-def random_look(
-    fixed: LookSettings, rng: np.random.Generator, paint_bgr: tuple[Bgr, ...] = ()
-) -> LookSettings:
+def random_appearance(
+    fixed: Appearance, rng: np.random.Generator, paint_bgr: tuple[Bgr, ...] = ()
+) -> Appearance:
     """Draw the look of a drive.
 
     Args:
@@ -149,7 +149,7 @@ def random_look(
     drawn |= _lightened(drawn, paint_bgr)
     drawn |= _dulled(drawn, paint_bgr, newer)
     kept = {name: getattr(fixed, name) for name in fixed.model_fields_set}
-    return LookSettings(**{**drawn, **kept})
+    return Appearance(**{**drawn, **kept})
 
 
 def _random_motion(rng: np.random.Generator) -> dict[str, Any]:
