@@ -1,1 +1,1 @@
-"""Closed-loop judging: detectors drive synthetic roads, and how they do is measured."""
+"""Closed-loop contests: detectors drive synthetic roads, and their runs are measured."""

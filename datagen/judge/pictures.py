@@ -1,4 +1,4 @@
-"""Top views: a road from above, with the way that each entrant drove."""
+"""Top views: a road from above, with the path that each entrant drove."""
 
 from __future__ import annotations
 
@@ -67,12 +67,13 @@ def draw_top_view(
     picture = np.full((height, width, 3), _GROUND_BGR, np.uint8)
     view = _View(np.array([low_cm[0], high_cm[1]]), scale, header_px)
     road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
-    points = view.fixed(_beside(track, 0.5 * (max(sides_cm) + min(sides_cm))))
+    middle_cm = track.beside(np.arange(len(track.s_cm)), 0.5 * (max(sides_cm) + min(sides_cm)))
+    points = view.fixed(middle_cm)
     cv2.polylines(picture, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, FIXED_BITS)
     _pave_furniture(picture, track, view)
     paint_track(picture, track, view.fixed)
     for index, (_, trajectory) in enumerate(runs):
-        # Later ones are thinner, so that those who drove the same way stay visible below.
+        # Later ones are thinner, so that equal paths below stay visible.
         thickness = min(2 + len(runs) - 1 - index, 7)
         _draw_run(picture, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, view)
     _draw_start(picture, track, max(sides_cm) + 18.0, view)
@@ -87,13 +88,8 @@ def draw_top_view(
     return picture
 
 
-def _beside(track: Track, offset_cm: float) -> Float[np.ndarray, "n 2"]:
-    normal = np.stack([-np.sin(track.heading_rad), np.cos(track.heading_rad)], axis=1)
-    return track.xy_cm + offset_cm * normal
-
-
 def _pave_furniture(picture: UInt8[np.ndarray, "h w 3"], track: Track, view: _View) -> None:
-    """Bays and side roads lie beside the road, where white paint needs something darker below it."""
+    """Draw the ground of bays and side roads, since white paint needs something darker below it."""
     paved = np.zeros(picture.shape[:2], np.uint8)
     for box in track.boxes:
         cv2.fillPoly(paved, [view.fixed(box_corners_cm(box, _BESIDE_PAINT_CM))], 255, cv2.LINE_8, FIXED_BITS)
@@ -114,9 +110,9 @@ def _draw_run(
     view: _View,
 ) -> None:
     points = view.fixed(trajectory.xy_cm)
-    for piece in np.split(points, np.flatnonzero(trajectory.put_back) + 1):
-        if len(piece):
-            cv2.polylines(picture, [piece], False, colour, thickness, cv2.LINE_AA, FIXED_BITS)
+    for section in np.split(points, np.flatnonzero(trajectory.put_back) + 1):
+        if len(section):
+            cv2.polylines(picture, [section], False, colour, thickness, cv2.LINE_AA, FIXED_BITS)
     begins = np.flatnonzero(trajectory.over & ~np.concatenate([[False], trajectory.over[:-1]]))
     for x, y in points[begins].tolist():
         cv2.circle(picture, (x, y), 5 << FIXED_BITS, colour, -1, cv2.LINE_AA, FIXED_BITS)

@@ -1,4 +1,4 @@
-"""The table of a contest: a row per kind of road and entrant, mean and worst over its runs."""
+"""Tables of a contest: a row per kind of road and entrant, mean and worst over its runs."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def tables(results: Sequence[RunResult]) -> dict[str, list[list[str]]]:
 
 
 def table_title(settings: JudgeSettings, kind: str) -> str:
-    """Say what was driven."""
+    """Return a line that says what was driven."""
     return (
         f"{kind}: {settings.count} roads, {settings.laps} laps at {settings.speed_cm_s:g} cm/s, "
         f"{settings.simulation.rate_hz:g} frames/s, {settings.pilot.law}, seed {settings.seed}; "

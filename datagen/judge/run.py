@@ -1,7 +1,4 @@
-"""One run: a detector drives one road, and is measured.
-
-Wheels and lines: when the car counts as having left its lane.
-"""
+"""One run: an entrant drives one road and is measured: wheels over a line, offsets, steering, answers."""
 
 from __future__ import annotations
 
@@ -28,6 +25,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 from lanenet.perception.estimate import Detector
 
+#: How far inside all wheels must be before the next departure counts; chosen: half a tape.
 _BACK_INSIDE_CM = 1.0
 
 
@@ -55,12 +53,12 @@ def wheel_offsets_cm(
 
 
 class DepartureCounter:
-    """Counts how often a wheel goes over the middle of a line; one way out and back is one departure.
+    """Counts how often a wheel crosses the middle of a line; out and back is one departure.
 
     Attributes:
         count: Departures so far.
-        over: Whether the car is out now: until all its wheels are 1 cm inside again, so that a wheel that
-            runs along the line does not count anew with every frame.
+        over: Whether the car is out: until all its wheels are 1 cm inside again, so that a wheel that runs
+            along the line does not count with every frame.
     """
 
     def __init__(self, lane_width_cm: float) -> None:
@@ -89,10 +87,14 @@ BuildDetector = Callable[[Camera, float, float | None], Detector]
 #: The scripted driver, who is given the true pose, and the steering law, given the true points.
 TRUTH, TRUE_POINTS = "truth", "true-points"
 
+#: A car that faces further away from the road has left the lane; chosen: no bend is driven at 70 degrees.
 _FACING_AWAY_RAD = 1.2
+#: A car that has not gone this far for ``stuck_s`` is stuck.
 _MOVED_CM = 5.0
+#: How far ahead a car that is stuck is put back: past what stopped it.
 _AHEAD_OF_STUCK_CM = 50.0
-_BEFORE_THE_END_CM = 60.0  # of an open road: further on there is not enough road to see
+#: An open road is driven to here before its end: further on there is not enough road in sight.
+_BEFORE_THE_END_CM = 60.0
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ class Entrant:
 
     Attributes:
         name: In tables and file names.
-        build: Makes its detector; None for those that are given the truth.
-        identity: Changes when its answers may change, beside what the settings say.
+        build: Makes its detector; None for those that get the ground truth.
+        identity: Hash of files that its answers depend on, beside the settings.
     """
 
     name: str
@@ -119,9 +121,9 @@ class RunResult:
         kind: Kind of road.
         number: Number of the road among its kind.
         seed: Of the world.
-        completed: Whether all the way was driven, put back or not.
+        completed: Whether the whole distance was driven, put back or not.
         ended: Why the run ended: ``completed``, ``left the lane``, ``stuck`` or ``out of time``.
-        laps: Driven; of an open road, its share.
+        laps: Driven; of an open road the driven share.
         departures: How often a wheel went over a line.
         put_backs: How often the car had to be put back.
         mean_offset_cm: Mean distance of the front axle's middle from the lane's centre.
@@ -161,7 +163,7 @@ class Trajectory:
     Attributes:
         t_s: Time since the start.
         xy_cm: Middle of the front axle, frame map.
-        s_cm: Its way along the road.
+        s_cm: Its distance along the road.
         offset_cm: Its offset from the lane's centre, left positive.
         steering_rad: Commanded steering.
         answered: Whether the detector had an answer.
@@ -194,7 +196,7 @@ def drive_run(
     world = assemble_world(simulation)
     loop = ClosedLoop(world, build_pilot(world, entrant, settings.pilot), settings.pilot, settings.speed_cm_s)
     referee = _Referee(settings, world, loop.s_cm)
-    most_frames = math.ceil(settings.slack * referee.way_cm / settings.speed_cm_s * simulation.rate_hz)
+    most_frames = math.ceil(settings.slack * referee.distance_cm / settings.speed_cm_s * simulation.rate_hz)
     ended = "out of time"
     for _ in range(most_frames):
         lost = referee.look(loop.next_frame())
@@ -232,8 +234,8 @@ class _Referee:
     """Watches a run: where the car is, whether its wheels are out, whether it is lost.
 
     Attributes:
-        way_cm: To be driven.
-        share: Of the way, driven so far.
+        distance_cm: To be driven.
+        share: Of the distance, driven so far.
         wheels: Counts the departures.
     """
 
@@ -242,16 +244,16 @@ class _Referee:
         self._wheelbase_cm = world.settings.car.wheelbase_cm
         length_cm = world.track.length_cm
         if world.track.closed:
-            self.way_cm = settings.laps * length_cm
+            self.distance_cm = settings.laps * length_cm
         else:
-            self.way_cm = max(length_cm - _BEFORE_THE_END_CM - start_cm, 1.0)
+            self.distance_cm = max(length_cm - _BEFORE_THE_END_CM - start_cm, 1.0)
         self.share = 0.0
         self.wheels = DepartureCounter(world.track.lane_width_cm)
         self._start_cm, self._moved_at_s, self._moved_to_cm = start_cm, 0.0, start_cm
         self._rows: list[list[float]] = []
 
     def look(self, frame: LoopFrame) -> str:
-        """Take a frame; return why the car is beyond recovery, or an empty text."""
+        """Take a frame; return why the car cannot recover, or an empty text."""
         state, settings, track = frame.state, self._settings, self._track
         over = self.wheels.update(
             wheel_offsets_cm(track, state.pose, self._wheelbase_cm, settings.track_width_cm, frame.s_cm)
@@ -260,7 +262,7 @@ class _Referee:
         flags = [float(frame.answered), float(over), 0.0]
         numbers = [state.t_s, *map(float, front_cm), frame.s_cm, frame.offset_cm, state.steering_rad]
         self._rows.append(numbers + flags)
-        self.share = min(max((frame.s_cm - self._start_cm) / self.way_cm, 0.0), 1.0)
+        self.share = min(max((frame.s_cm - self._start_cm) / self.distance_cm, 0.0), 1.0)
         if abs(frame.s_cm - self._moved_to_cm) > _MOVED_CM:
             self._moved_at_s, self._moved_to_cm = state.t_s, frame.s_cm
         away_rad = math.remainder(float(state.pose[2]) - track.point(frame.s_cm)[1], 2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""What is driven in a contest, how far and how fast, and what counts as lost."""
+"""Settings of a contest: what is driven, how far and how fast, and when a car is lost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from lanenet.errors import ConfigError, did_you_mean
 
 _FILE_ENDINGS = (".yaml", ".yml")
 _DRAWN = ("random", "open")
-_STREAM = 3  # of seeds; the drives of a training run take 0 to 2, so that its roads are never judged on
+#: Of seeds; the drives of a training run take 0 to 2, so that no road of a contest was trained on.
+_STREAM = 3
 
 
 class JudgeSettings(Settings):
@@ -25,18 +26,18 @@ class JudgeSettings(Settings):
 
     Attributes:
         seed: Every road's seed follows from this and its number; all detectors drive the same roads, with the
-            same look and the same errors of the car.
+            same appearance and the same errors of the car.
         tracks: ``random`` (loops), ``open`` (roads with two ends), names of presets, or track files.
-        count: Roads of each of these; a track file is one road in so many looks.
+        count: Roads of each kind; a track file is one road in this many appearances.
         laps: To be driven; an open road is driven once.
         speed_cm_s: Commanded speed.
         track_width_cm: Distance between the contact points of an axle's wheels.
-        off_lane_share: The car is beyond recovery when the middle of its front axle is further than this
-            share of the lane's width from the lane's centre, or when it faces more than 1.2 rad away.
-        put_back: Put it back then, and count that; otherwise the run ends.
-        stuck_s: A car that has not moved for so long is put back, or the run ends.
-        slack: A run ends after this many times the time that it should take.
-        pilot: From what is seen to the command.
+        off_lane_share: The car is lost when the middle of its front axle is further than this share of the
+            lane width from the lane's centre, or when it faces more than 1.2 rad away from the road.
+        put_back: Put a lost car back, and count that; otherwise the run ends.
+        stuck_s: A car that has not moved for this time is put back, or the run ends.
+        slack: A run ends after its nominal time times this.
+        pilot: From a lane estimate to the command.
         simulation: Rate, camera, car, look, and what random roads have in common; its seed, frames and driver
             are set here.
     """
@@ -78,7 +79,7 @@ def road_simulation(settings: JudgeSettings, index: int) -> SimulationSettings:
         ConfigError: If there is no such kind of road.
     """
     kind, number = settings.tracks[index // settings.count], index % settings.count
-    # The number alone decides the seed: another kind of road in the list leaves the others as they are.
+    # The number alone decides the seed: another kind of road in the list does not change the others.
     seed = int(np.random.SeedSequence([settings.seed, _STREAM, number]).generate_state(1)[0])
     driver = DriverSettings(speed_cm_s=settings.speed_cm_s, wander_cm=0.0)
     changes: dict[str, Any] = {"seed": seed, "track": _track_settings(kind, settings.simulation.track)}

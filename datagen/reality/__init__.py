@@ -1,1 +1,1 @@
-"""How far synthetic drives look like real ones: statistics of what a network would be given of both."""
+"""How much synthetic drives look like real ones: statistics of what a network would get of both."""

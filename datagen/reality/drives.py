@@ -1,25 +1,22 @@
-"""Random synthetic drives through cameras like those of real ones, drawn and measured over processes."""
+"""Random synthetic drives through cameras like those of real ones, drawn and measured by many processes."""
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 
 import numpy as np
 from pydantic import Field
 
-from datagen.reality.measure import MeasuredDrive, measure_frames
-from datagen.world.driving import scripted_states
+from datagen.reality.measure import MeasuredDrive, Sampling, measure_frames
+from datagen.world.driving import draw_state, scripted_states
 from datagen.world.variety import camera_like, first_world, vary_simulation
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
-from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.road import PerceptionSettings
-from lanenet.processes import prepare_process
+from lanenet.processes import run_jobs
 
 
 class RealitySettings(Settings):
@@ -29,9 +26,9 @@ class RealitySettings(Settings):
         seed: Every drive's seed follows from this and its number.
         count: Synthetic drives.
         frames: Frames that are drawn of each.
-        real_frames: Frames that are measured of a recorded drive, at most.
-        every: Only one frame of so many is drawn: neighbours show the same.
-        vary_camera: Draw each drive's camera near that of a real drive, by turns, and the car's
+        real_frames: Most frames that are measured of a recorded drive.
+        every: Only every so many frames one is drawn: neighbours show the same.
+        vary_camera: Draw each drive's camera near that of a real drive, which take turns, and the car's
             size; else ``simulation.camera`` and the car as it is.
         vary_road: Draw each drive's kind of road; else ``simulation.track``.
         vary_driver: Draw how each is driven; else ``simulation.driver``.
@@ -52,6 +49,10 @@ class RealitySettings(Settings):
     perception: PerceptionSettings = PerceptionSettings()
     window: BirdseyeWindow = BirdseyeWindow()
 
+    def sampling(self, most: int) -> Sampling:
+        """Return how a drive is measured on at most this many frames."""
+        return Sampling(most, self.perception, self.window)
+
 
 def drawn_simulation(settings: RealitySettings, cameras: Sequence[Camera], number: int) -> SimulationSettings:
     """Return the settings of one synthetic drive.
@@ -61,7 +62,7 @@ def drawn_simulation(settings: RealitySettings, cameras: Sequence[Camera], numbe
         cameras: Of the real drives.
         number: Of the synthetic drive.
     """
-    # The number alone decides: more drives leave the first ones as they are.
+    # The number alone decides: more drives do not change the first ones.
     simulation = settings.simulation.model_copy(update={"frames": (settings.frames - 1) * settings.every + 1})
     return vary_simulation(
         simulation,
@@ -80,20 +81,9 @@ def measure_synthetic(settings: RealitySettings, cameras: Sequence[Camera], numb
         ConfigError: If the settings leave no road.
     """
     world = first_world(drawn_simulation(settings, cameras, number))
-    states = list(scripted_states(world))[:: settings.every]
-    images = [
-        world.renderer.render(state.pose, state.frame, state.true_speed_cm_s, state.yaw_rate_rad_s)
-        for state in states
-    ]
-    return measure_frames(
-        f"synthetic_{number:03d}",
-        lambda i: images[i],
-        len(images),
-        world.camera,
-        settings.frames,
-        settings.perception,
-        settings.window,
-    )
+    images = [draw_state(world.renderer, s) for s in list(scripted_states(world))[:: settings.every]]
+    name, sampling = f"synthetic_{number:03d}", settings.sampling(settings.frames)
+    return measure_frames(name, images.__getitem__, len(images), world.camera, sampling)
 
 
 def measure_all_synthetic(
@@ -106,28 +96,7 @@ def measure_all_synthetic(
 
     Raises:
         ConfigError: See :func:`measure_synthetic`.
-        LanenetError: If a process ends before its time.
+        LanenetError: If a process dies.
     """
-    numbers, found = range(settings.count), []
-
-    def take(drive: MeasuredDrive) -> None:
-        found.append(drive)
-        if progress is not None:
-            progress(len(found), settings.count)
-
-    if workers <= 1 or settings.count == 1:
-        for number in numbers:
-            take(measure_synthetic(settings, cameras, number))
-        return found
-    # Spawned, because forking a process that has started OpenCV's threads can hang.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, settings.count), context, prepare_process) as pool:
-        futures = [pool.submit(measure_synthetic, settings, cameras, number) for number in numbers]
-        try:
-            for future in futures:
-                take(future.result())
-        except BrokenProcessPool:
-            raise LanenetError("a process that draws drives ended; is there enough memory?") from None
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return found
+    jobs = [(f"synthetic_{number:03d}", number) for number in range(settings.count)]
+    return run_jobs(partial(measure_synthetic, settings, cameras), jobs, workers, progress)

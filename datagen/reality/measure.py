@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import UInt8
 
-from datagen.reality.statistics import FrameFigures, drive_statistics, edge_statistics
+from datagen.reality.statistics import drive_statistics, edge_statistics
 from lanenet.data.drives import Drive
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -16,8 +16,24 @@ from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.road import PerceptionSettings, RoadTable
 from lanenet.perception.edges.static import find_static, spread_frames
 
-#: Height at which every camera is taken to be: real heights are rarely known, and a frame does not tell.
+#: Assumed height of every camera: real heights are rarely known, and a frame does not show them.
 HEIGHT_CM = 20.0
+_PERCEPTION, _WINDOW = PerceptionSettings(), BirdseyeWindow()
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a drive is measured.
+
+    Attributes:
+        most: Frames that are measured, evenly over the drive.
+        perception: How edges are found.
+        window: The network's window.
+    """
+
+    most: int
+    perception: PerceptionSettings = _PERCEPTION
+    window: BirdseyeWindow = _WINDOW
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,23 +55,12 @@ class MeasuredDrive:
     mask: UInt8[np.ndarray, "h w"] | None
 
 
-def at_nominal_height(camera: Camera) -> Camera:
-    """Return the camera at :data:`HEIGHT_CM`, with the origin of the car's frame below it."""
-    mounting = camera.mounting
-    return replace(
-        camera, mounting=Mounting(HEIGHT_CM, mounting.pitch_down_rad, mounting.roll_rad, mounting.yaw_rad)
-    )
-
-
 def measure_frames(
     name: str,
     read: Callable[[int], UInt8[np.ndarray, "h w *c"]],
     count: int,
     camera: Camera,
-    most: int,
-    perception: PerceptionSettings | None = None,
-    window: BirdseyeWindow | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    sampling: Sampling,
 ) -> MeasuredDrive:
     """Measure a drive.
 
@@ -64,38 +69,26 @@ def measure_frames(
         read: Returns the image of a frame by its place in the drive.
         count: Frames of the drive.
         camera: Its camera; only the direction in which it looks and the lens matter.
-        most: Frames to measure, evenly over the drive.
-        perception: How edges are found; None takes the defaults.
-        window: The network's window; None takes the default.
-        progress: Called with (frames done, frames).
+        sampling: How to measure it.
 
     Raises:
         CalibrationError: If the camera sees no road.
         DriveFormatError: If a frame cannot be read.
     """
-    perception = PerceptionSettings() if perception is None else perception
     camera = at_nominal_height(camera)
     mask = _car_mask(read, count)
-    table = RoadTable(camera, perception.range, mask)
-    figures: list[FrameFigures] = []
-    rows = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
-    for done, i in enumerate(rows.tolist(), start=1):
-        figures.append(edge_statistics(read(i), table, HEIGHT_CM, perception, window))
-        if progress is not None:
-            progress(done, len(rows))
+    table = RoadTable(camera, sampling.perception.range, mask)
+    rows = np.unique(np.linspace(0, count - 1, min(sampling.most, count)).round().astype(int))
+    figures = [
+        edge_statistics(read(i), table, HEIGHT_CM, sampling.perception, sampling.window)
+        for i in rows.tolist()
+    ]
     points = [frame.points for frame in figures]
     middle = int(rows[np.argsort(points, kind="stable")[len(points) // 2]])
     return MeasuredDrive(name, drive_statistics(figures), read(middle), camera, mask)
 
 
-def measure_drive(
-    drive: Drive,
-    camera: Camera,
-    most: int,
-    perception: PerceptionSettings | None = None,
-    window: BirdseyeWindow | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> MeasuredDrive:
+def measure_drive(drive: Drive, camera: Camera, sampling: Sampling) -> MeasuredDrive:
     """Measure a recorded drive, see :func:`measure_frames`.
 
     Raises:
@@ -106,7 +99,13 @@ def measure_drive(
             f"{drive.path}: images of {drive.width}x{drive.height} px, but its camera is calibrated for "
             f"{camera.width}x{camera.height}"
         )
-    return measure_frames(drive.name, drive.image, len(drive), camera, most, perception, window, progress)
+    return measure_frames(drive.name, drive.image, len(drive), camera, sampling)
+
+
+def at_nominal_height(camera: Camera) -> Camera:
+    """Return the camera at :data:`HEIGHT_CM`, with the origin of the car's frame below it."""
+    old = camera.mounting
+    return replace(camera, mounting=Mounting(HEIGHT_CM, old.pitch_down_rad, old.roll_rad, old.yaw_rad))
 
 
 def _car_mask(

@@ -17,12 +17,13 @@ from datagen.reality.statistics import STATISTICS
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 
-_TILE_PX = 240  # width of one picture of a sheet
+#: Width of one image of a sheet.
+_TILE_PX = 240
 _HEADER_PX, _GAP_PX = 20, 6
 _GROUND, _TEXT_BGR = 245, (20, 20, 20)
 _FIGURE_COLUMNS = 4
 
-#: Pictures of one call differ in size.
+#: Images and pictures of one call differ in size.
 Picture = UInt8[np.ndarray, "_ _ 3"]
 Image = UInt8[np.ndarray, "_ _ *_"]
 
@@ -44,23 +45,16 @@ def sheet(
         settings: How edges are found, and the window.
         beside: Synthetic drives beside each.
     """
-    rows = [
-        strip([drive, *nearest_synthetic(drive, synthetic, beside)], settings, _TILE_PX) for drive in real
-    ]
-    return _stacked(rows)
+    rows = [strip([drive, *nearest_synthetic(drive, synthetic, beside)], settings) for drive in real]
+    width = max(row.shape[1] for row in rows)
+    return np.vstack([_padded(row, _GAP_PX, width - row.shape[1]) for row in rows])
 
 
 def strip(drives: Sequence[MeasuredDrive], settings: RealitySettings, tile_px: int = _TILE_PX) -> Picture:
     """Draw drives side by side, as in :func:`sheet`."""
     columns = [_column(drive, settings, tile_px) for drive in drives]
     height = max(column.shape[0] for column in columns)
-    padded = [
-        cv2.copyMakeBorder(
-            column, 0, height - column.shape[0], 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(_GROUND,) * 3
-        )
-        for column in columns
-    ]
-    return np.hstack(padded)
+    return np.hstack([_padded(column, height - column.shape[0], _GAP_PX) for column in columns])
 
 
 def _column(drive: MeasuredDrive, settings: RealitySettings, tile_px: int) -> Picture:
@@ -79,20 +73,15 @@ def _column(drive: MeasuredDrive, settings: RealitySettings, tile_px: int) -> Pi
 def _scaled(image: Image, width_px: int) -> Picture:
     colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     size = (width_px, round(image.shape[0] * width_px / image.shape[1]))
-    # Single edge pixels survive being made smaller only in the mean.
+    # Downsampling by the mean keeps single edge pixels visible.
     kind = cv2.INTER_NEAREST if width_px >= image.shape[1] else cv2.INTER_AREA
     return np.asarray(cv2.resize(colour, size, interpolation=kind))
 
 
-def _stacked(rows: Sequence[Picture]) -> Picture:
-    width = max(row.shape[1] for row in rows)
-    return np.vstack(
-        [
-            cv2.copyMakeBorder(
-                row, 0, _GAP_PX, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(_GROUND,) * 3
-            )
-            for row in rows
-        ]
+def _padded(picture: Picture, below_px: int, right_px: int) -> Picture:
+    ground = (_GROUND,) * 3
+    return np.asarray(
+        cv2.copyMakeBorder(picture, 0, below_px, 0, right_px, cv2.BORDER_CONSTANT, value=ground)
     )
 
 
@@ -112,7 +101,7 @@ def histograms(
     except ImportError:
         return None
     lines = math.ceil(len(rows) / _FIGURE_COLUMNS)
-    # The figure is made without pyplot, which would pick a window system and keep global state.
+    # Without pyplot, which would choose a window system and keep global state.
     figure = Figure(figsize=(3.0 * _FIGURE_COLUMNS, 1.5 * lines + 0.5), dpi=90)
     FigureCanvasAgg(figure)
     for k, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""Real drives beside synthetic ones: in a table, as JSON, and which synthetic drives come nearest."""
+"""Real drives beside synthetic ones: a table, a JSON file, and the synthetic drives that are most alike."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Row:
 def compare(real: Sequence[MeasuredDrive], synthetic: Sequence[MeasuredDrive]) -> list[Row]:
     """Return a row per statistic.
 
-    A synthetic drive without a single point to tell from is left out of the statistics that need one.
+    A synthetic drive without edge points is left out of the statistics that need one.
 
     Args:
         real: Real drives.
@@ -70,7 +70,7 @@ def compare(real: Sequence[MeasuredDrive], synthetic: Sequence[MeasuredDrive]) -
 def nearest_synthetic(
     real: MeasuredDrive, synthetic: Sequence[MeasuredDrive], count: int
 ) -> list[MeasuredDrive]:
-    """Return the synthetic drives most like a real one: differences in standard deviations, all alike."""
+    """Return the synthetic drives most like a real one, by the mean square of standardised differences."""
     table = np.array([_values(drive) for drive in synthetic])
     deviation = np.nanstd(table, axis=0)
     off = (table - _values(real)) / np.where(deviation > 0.0, deviation, 1.0)
@@ -97,8 +97,8 @@ def summary(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
     lines = []
     for k, name in enumerate(names):
         out = [row.name for row in rows if not row.inside[k]]
-        told = f"; outside: {', '.join(out)}" if out else ""
-        lines.append(f"{name}: {len(rows) - len(out)} of {len(rows)} statistics inside{told}")
+        outside = f"; outside: {', '.join(out)}" if out else ""
+        lines.append(f"{name}: {len(rows) - len(out)} of {len(rows)} statistics inside{outside}")
     return lines
 
 

@@ -1,6 +1,6 @@
-"""Statistics of one frame's edge points, and of a drive; nothing in them needs truth or labels.
+"""Statistics of one frame's edge points, and of a drive; none of them needs ground truth or labels.
 
-Runs of edge points: neighbours in the picture that face the same way, chained.
+Edge points are chained to runs: neighbours in the image with the same direction.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.perception.edges.canny import EdgePixels, find_edges, to_gray
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges, RoadTable
 
-_REACH_PX = 2.0  # between neighbours: a pixel's diagonal, and sub-pixel shifts on either side
-_SAME_WAY = math.cos(math.radians(30.0))
+#: Distance of neighbours, at most: a pixel's diagonal, and sub-pixel shifts on either side.
+_REACH_PX = 2.0
+#: Angle between the directions of neighbours, at most; chosen: a bend passes, a corner does not.
+_SAME_DIRECTION = math.cos(math.radians(30.0))
+#: A run with fewer points, or shorter on the road, is clutter; chosen: half of a dash.
 _LEAST_POINTS = 6
 _LEAST_HEIGHTS = 0.5
 
@@ -41,10 +44,10 @@ class Runs:
     extent_cm: Float[np.ndarray, "k"]
 
     def are_short(self, camera_height_cm: float) -> Bool[np.ndarray, "k"]:
-        """Tell which runs are too short to be told from clutter.
+        """Tell which runs are too short to be distinguished from clutter.
 
-        These are runs of less than half a camera height on the road, or of fewer than six points. Ends of
-        dashes are among them, on real roads as on synthetic ones.
+        These are shorter than half a camera height on the road, or of fewer than six points. Ends of dashes
+        are among them, on real roads as on synthetic ones.
         """
         return (self.points < _LEAST_POINTS) | (self.extent_cm < _LEAST_HEIGHTS * camera_height_cm)
 
@@ -57,21 +60,21 @@ def chain_points(
 ) -> Runs:
     """Chain edge points to runs.
 
-    Two points belong together where they are within two pixels and their directions within 30 degrees, so
-    that a run ends at a corner, and the two edges of a thin line are two runs.
+    Two points are neighbours if they are within two pixels and their directions within 30 degrees. A run
+    ends at a corner, and the two edges of a thin line are two runs.
 
     Args:
         uv_px: Positions, frame image.
         normals: Unit gradients, image axes.
         road_cm: The same points on the road.
-        round_corners: Chain neighbours whatever their directions, so that an outline is one run.
+        round_corners: Ignore the directions, so that an outline is one run.
     """
     n = len(uv_px)
     if n == 0:
         return Runs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     pairs = cKDTree(uv_px).query_pairs(_REACH_PX, output_type="ndarray")
     if not round_corners:
-        pairs = pairs[np.einsum("ij,ij->i", normals[pairs[:, 0]], normals[pairs[:, 1]]) > _SAME_WAY]
+        pairs = pairs[np.einsum("ij,ij->i", normals[pairs[:, 0]], normals[pairs[:, 1]]) > _SAME_DIRECTION]
     a, b = pairs.T
     count, of_point = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
     order = np.argsort(of_point, kind="stable")
@@ -98,7 +101,10 @@ STATISTICS: dict[str, tuple[str, str]] = {
     "specks": ("", "short outlines per frame on all of the road that mapping looks at, directions aside"),
     "run_length_px": ("px", "length of the run that the median point is in"),
     "run_length_p90_px": ("px", "the same, 90th percentile"),
-    "direction_entropy": ("", "of the directions on the road, in 10 degree bins; 0: all one way, 1: even"),
+    "direction_entropy": (
+        "",
+        "of the directions on the road, in 10 degree bins; 0: all the same, 1: uniform",
+    ),
     "along_share": ("%", "points within 20 degrees of the frame's main direction"),
     "clutter_near": ("%", "points in short runs, of those up to 0.9 camera heights ahead"),
     "clutter_middle": ("%", "from 0.9 to 1.8"),
@@ -108,9 +114,11 @@ STATISTICS: dict[str, tuple[str, str]] = {
     "brightness": ("", "median grey level of the road"),
     "grain": ("", "standard deviation of the finest pattern and noise, grey levels"),
 }
+#: Of directions: 10 degrees each.
 _BINS = 18
 _ALONG_RAD = np.deg2rad(20.0)
-_SOFTEST = 0.97  # ratio of neighbouring slopes beyond which a blur is too wide to be told
+#: Ratio of neighbouring slopes beyond which a blur is too wide to be measured.
+_SOFTEST = 0.97
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,14 +163,14 @@ def edge_statistics(
     settings: PerceptionSettings | None = None,
     window: BirdseyeWindow | None = None,
 ) -> FrameFigures:
-    """Measure one frame on the edge points that a network is given of it.
+    """Measure one frame by the edge points that a network gets of it.
 
     Args:
         frame_bgr: The frame.
         table: From its pixels to the road.
-        camera_height_cm: Of the camera that the table was made for; distances are counted in it.
+        camera_height_cm: Of the camera that the table was made for; the unit of distances.
         settings: How edges are found; None takes the defaults.
-        window: The network's window, whose origin is taken to be below the camera; None takes the default.
+        window: The network's window, with its origin below the camera; None takes the default.
     """
     settings = PerceptionSettings() if settings is None else settings
     window = BirdseyeWindow() if window is None else window
@@ -201,11 +209,11 @@ def edge_statistics(
 def drive_statistics(frames: Sequence[FrameFigures]) -> dict[str, float]:
     """Sum up a drive: one number for each of :data:`STATISTICS`.
 
-    Shares and lengths of runs are over all points of the drive; the rest is of the median frame, or of the
-    mean one where it counts runs.
+    Shares and lengths of runs are over all points of the drive; counts of runs are means over the frames, all
+    others medians.
 
     Returns:
-        NaN where no frame has a point to tell from.
+        NaN where no frame has a point.
     """
     points = np.array([frame.points for frame in frames], dtype=np.float64)
     by_band = np.sum([frame.by_band for frame in frames], axis=0)
@@ -239,7 +247,7 @@ def drive_statistics(frames: Sequence[FrameFigures]) -> dict[str, float]:
 def _grain(deviations: Float[np.ndarray, "n"]) -> float:
     """Standard deviation from the smallest three quarters: markings and other edges do not count."""
     smallest = np.sort(deviations)[: max(1, 3 * len(deviations) // 4)]
-    # The mean of the smallest three quarters of the absolute values of normal numbers, of deviation 1.
+    # 0.5147: the same mean of standard normal numbers.
     return float(smallest.mean() / 0.5147)
 
 
@@ -272,22 +280,19 @@ def _directions(normals: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
 
 
 def _edge_profile(gray: UInt8[np.ndarray, "h w"], pixels: EdgePixels) -> tuple[float, float]:
-    """Slope at the edges, and the blur that makes neighbouring slopes as alike as they are.
+    """Slope at the edges, and the blur that follows from the ratio of neighbouring slopes.
 
     Source:
-        Of a step blurred by a Gaussian the slopes are a Gaussian: those one pixel off have the share
-        exp(-1 / (2 sigma^2)) of the middle one's. Checked in
-        ``tests/unit/reality/test_reality_statistics.py``.
+        The slopes of a step blurred by a Gaussian are a Gaussian: one pixel off they are the middle one
+        times exp(-1 / (2 sigma^2)). Checked in ``tests/unit/reality/test_reality_statistics.py``.
     """
     if not len(pixels.uv_px):
         return float("nan"), float("nan")
     offsets = np.array([-1.5, -0.5, 0.5, 1.5])
     at = pixels.uv_px[:, None, :] + offsets[None, :, None] * pixels.normals[:, None, :]
     u, v = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
-    levels = cv2.remap(
-        gray.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).astype(np.float64)
-    before, middle, after = np.diff(levels.reshape(-1, 4), axis=1).T
+    levels = cv2.remap(gray.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    before, middle, after = np.diff(levels.astype(np.float64).reshape(-1, 4), axis=1).T
     good = middle > 1.0
     if not good.any():
         return float("nan"), float("nan")

@@ -1,8 +1,8 @@
-"""Sheets of frames for the eye: every preset in random looks, every group of effects on several roads.
+"""Sheets of sample frames: every preset in random appearances, every group of effects on several roads.
 
-A sheet of a preset shows each frame with the true lines of the driven lane drawn over it, and the bird's-eye
-edges that perception makes of it. A sheet of effects shows one place per road, without the effects and with
-each of them, and the true lines nowhere, so that nothing hides the picture.
+A sheet of a preset shows each frame with the true lines of the driven lane, beside the bird's-eye edges that
+perception finds in it. A sheet of effects shows one place per road, without and with each effect; no lines
+are drawn over it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from datagen.world.render.renderer import Renderer
 from datagen.world.road.build import random_track
 from datagen.world.road.furniture import FurnitureRates
 from datagen.world.road.track import Track
+from datagen.world.road.track_picture import FIXED_BITS
 from datagen.world.road.track_settings import TrackSettings, preset, preset_names
 from datagen.world.world import SimulationSettings, assemble_world, resolve_length
 from lanenet.config import check_settings
@@ -35,14 +36,13 @@ Image = UInt8[np.ndarray, "_ _ 3"]
 Progress = Callable[[int, int], None]
 
 _SPEED_CM_S = 60.0
-_BEFORE_CM = 45.0  # from the front axle to the thing that a frame is to show
-_BESIDE_CM = 2.0
-_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
+#: From the front axle to the thing that a frame shows; and from the middle of the lane to the car.
+_BEFORE_CM, _BESIDE_CM = 45.0, 2.0
 _TRUTH_BGR: tuple[Bgr, Bgr] = ((255, 200, 0), (60, 60, 255))  # left, right
 _TEXT_BGR, _PAPER_BGR = (30, 30, 30), (245, 245, 245)
 _GAP_PX, _TITLE_PX = 4, 18
 _ROAD_COLUMNS, _ROAD_ROWS = 2, 4
-#: Quality of the JPEG files, and by how much they shrink where even the least quality is too large.
+#: Qualities of the JPEG files that are tried, and the factor on their size where all are too large.
 _QUALITIES, _SHRINK = (90, 80, 70, 60, 50, 42), 0.88
 
 
@@ -55,7 +55,7 @@ class Effect:
         look: Keys of :class:`Appearance`.
         furniture_per_m: Rate of each kind of furniture; 0: none.
         frame: Number of the frame, for what varies with time.
-        speed: Speed and turning as multiples of a frame's usual ones.
+        speed: Factor on speed and yaw rate.
     """
 
     name: str
@@ -70,6 +70,12 @@ _LAMPS: dict[str, Any] = {"lamps_per_m": 0.7, "lamp_level": 150.0}
 _THINGS: dict[str, Any] = {"objects_per_m": 3.0, "objects_on_road": 0.0, "shadow_depth": 0.45}
 
 
+_SHAKE: dict[str, Any] = {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02}
+_WOOD: dict[str, Any] = {
+    "texture_level": 7.0, "texture_scale_cm": 0.5, "texture_stretch": 12.0, "floor_bgr": (70, 100, 135)
+}  # fmt: skip
+
+
 def _floor(kind: str, **more: Any) -> Effect:
     return Effect(kind, {"floor": kind, **more})
 
@@ -81,13 +87,7 @@ EFFECT_SHEETS: dict[str, tuple[tuple[str, ...], tuple[Effect, ...]]] = {
         (
             Effect("plain", {"texture_level": 0.0}),
             _floor("asphalt", texture_level=9.0, texture_scale_cm=0.4, floor_bgr=(58, 56, 55)),
-            _floor(
-                "wood",
-                texture_level=7.0,
-                texture_scale_cm=0.5,
-                texture_stretch=12.0,
-                floor_bgr=(70, 100, 135),
-            ),
+            _floor("wood", **_WOOD),
             _floor("tile", texture_level=3.0, joint_u_cm=40.0, joint_v_cm=40.0, floor_bgr=(135, 130, 130)),
             _floor("carpet", texture_level=7.0, texture_scale_cm=0.4, floor_bgr=(95, 70, 60)),
             _floor("mat", texture_level=4.0, floor_bgr=(80, 80, 80), verge_bgr=(70, 120, 60)),
@@ -112,11 +112,8 @@ EFFECT_SHEETS: dict[str, tuple[tuple[str, ...], tuple[Effect, ...]]] = {
             Effect("at rest", speed=0.0),
             Effect("exposed for 25 ms", {"exposure_s": 0.025}, speed=2.0),
             Effect("read out in 30 ms", {"readout_s": 0.03}, speed=2.0),
-            Effect(
-                "shake, frame 7",
-                {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02},
-            ),
-            Effect("shake, frame 9", {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02}, frame=9),
+            Effect("shake, frame 7", _SHAKE),
+            Effect("shake, frame 9", _SHAKE, frame=9),
         ),
     ),
     "things": (
@@ -167,7 +164,7 @@ def draw_sheet(name: str, progress: Progress | None = None) -> Image:
 
 
 def encode_sheet(sheet: Image, max_bytes: int | None = None) -> bytes:
-    """Return a sheet as JPEG, of lower quality and then smaller until it fits."""
+    """Return a sheet as JPEG; to fit, its quality is lowered first, then its size."""
     while True:
         for quality in _QUALITIES:
             _, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -177,14 +174,14 @@ def encode_sheet(sheet: Image, max_bytes: int | None = None) -> bytes:
 
 
 def _road_sheet(name: str, progress: Progress | None) -> Image:
-    """A preset in several looks: frame with the true lines, and the edges from above."""
+    """A preset in several appearances: frame with the true lines, and the edges from above."""
     total = _ROAD_COLUMNS * _ROAD_ROWS
-    # Seeds of its own, so that no two presets show the same looks.
+    # Its own seeds, so that no two presets look the same.
     first = total * preset_names().index(name)
     tiles: list[Image] = []
     for seed in range(first, first + total):
         world = assemble_world(resolve_length(SimulationSettings(seed=seed, track=preset(name))))
-        # Every other frame faces something that is painted on the road, where there is anything.
+        # Every other frame faces something that is painted on the road, if there is anything.
         s_cm = _place(world.track, np.random.default_rng([seed, 1]), facing=seed % 2 == 0)
         pose, yaw_rate = _pose_at(world.track, s_cm, world.camera)
         frame = world.renderer.render(pose, seed, _SPEED_CM_S, yaw_rate)
@@ -211,7 +208,7 @@ def _effect_sheet(name: str, progress: Progress | None) -> Image:
             rate: random_track(_with_furniture(settings, rate), np.random.default_rng(row))
             for rate in {effect.furniture_per_m for effect in effects}
         }
-        # The richest road decides the place; furniture does not move the road.
+        # The road with most furniture decides the place; furniture does not move the road.
         s_cm = _place(tracks[max(tracks)], np.random.default_rng([row, 2]), facing=True)
         for effect in effects:
             track = tracks[effect.furniture_per_m]
@@ -233,7 +230,7 @@ def _with_furniture(settings: TrackSettings, per_m: float) -> TrackSettings:
 
 
 def _place(track: Track, rng: np.random.Generator, facing: bool) -> float:
-    """A place on the road; ``facing`` one that has something painted on the road ahead, if there is any."""
+    """A place on the road; if ``facing``, before something that is painted on the road, if there is any."""
     share, choice = rng.random(2)
     s_cm = share * track.length_cm
     if not facing or not len(track.boxes):
@@ -265,13 +262,13 @@ def _from_above(
 
 
 def _draw_line(image: Image, points_px: Float[np.ndarray, "n 2"], colour: Bgr) -> None:
-    """Draw a thin line between the points that lie in the picture or near it."""
+    """Draw a thin line between the points that lie in the image or near it."""
     limit = 2.0 * max(image.shape)
     with np.errstate(invalid="ignore"):
         seen = (np.abs(points_px) < limit).all(axis=1)
-    fixed = np.rint(np.where(seen[:, None], points_px, 0.0) * 2**_SHIFT).astype(np.int32)
+    fixed = np.rint(np.where(seen[:, None], points_px, 0.0) * 2**FIXED_BITS).astype(np.int32)
     for k in np.flatnonzero(seen[:-1] & seen[1:]):
-        cv2.line(image, fixed[k].tolist(), fixed[k + 1].tolist(), colour, 1, cv2.LINE_AA, _SHIFT)
+        cv2.line(image, fixed[k].tolist(), fixed[k + 1].tolist(), colour, 1, cv2.LINE_AA, FIXED_BITS)
 
 
 def _titled(tile: Image, title: str) -> Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from datagen.world.world import START_CM, SimulationSettings, World, build_world
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 
+#: Draws of camera and road until the camera sees the lane.
 _SIGHT_TRIES = 20
-#: Lateral acceleration that nobody exceeds in the tightest bend.
+#: Largest lateral acceleration in the tightest bend: 60 % of the simulated grip.
 _BEND_CM_S2 = 300.0
 #: Share of the drives on roads drawn from scratch; the others are on presets.
 _DRAWN_SHARE = 0.5
@@ -24,8 +26,9 @@ _DRAWN_SHARE = 0.5
 _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", "paper")
 #: Kinds of line between two lanes that are crossed.
 _CROSSED = ("dashed", "random")
-#: Nobody changes lanes sooner after the start.
+#: Earliest change of lanes after the start.
 _FIRST_CHANGE_CM = 30.0
+#: Seeds that are tried for a road.
 _TRIES = 8
 
 
@@ -34,30 +37,23 @@ def camera_like(camera: Camera) -> CameraSettings:
 
     The principal point goes to the middle of the image; a pinhole's fifth coefficient is left out.
     """
-    mounting, half_px = camera.mounting, 0.5 * camera.width
-    centre = np.array([[camera.K[0, 2] + half_px, camera.K[1, 2]]])
+    centre = np.array([[camera.K[0, 2] + 0.5 * camera.width, camera.K[1, 2]]])
     ray = camera.unproject(centre)[0]
-    half_rad = (
-        math.atan2(math.hypot(ray[0], ray[1]), ray[2]) if np.isfinite(ray).all() else camera.max_angle_rad
-    )
-    coefficients = [*map(float, camera.D[:4]), 0.0, 0.0, 0.0, 0.0]
+    seen = np.isfinite(ray).all()
+    half_rad = math.atan2(math.hypot(ray[0], ray[1]), ray[2]) if seen else camera.max_angle_rad
+    k1, k2, k3, k4 = (*map(float, camera.D[:4]), 0.0, 0.0, 0.0, 0.0)[:4]
     return CameraSettings(
         model=camera.model,
         width=camera.width,
         height=camera.height,
         field_of_view_rad=2.0 * half_rad,
-        distortion=(coefficients[0], coefficients[1], coefficients[2], coefficients[3]),
-        height_cm=mounting.height_cm,
-        pitch_down_rad=mounting.pitch_down_rad,
-        roll_rad=mounting.roll_rad,
-        yaw_rad=mounting.yaw_rad,
-        ahead_of_front_axle_cm=mounting.ahead_of_front_axle_cm,
-        right_of_centre_cm=mounting.right_of_centre_cm,
+        distortion=(k1, k2, k3, k4),
+        **asdict(camera.mounting),
     )
 
 
 def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSettings:
-    """Draw a camera near another: what differs between two cars built from the same parts.
+    """Draw a camera near another, as between two cars built from the same parts.
 
     Field of view within a tenth, pitch within 4 degrees, roll and yaw within 1.5, height 11 to 25 cm.
     """
@@ -75,7 +71,7 @@ def vary_camera(camera: CameraSettings, rng: np.random.Generator) -> CameraSetti
 
 
 def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
-    """Draw a car's size, whatever it was: wheelbases of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
+    """Draw a car's size: a wheelbase of 15 to 27 cm, wheels that turn by 27 to 35 degrees."""
     wheelbase, turn = rng.random(2)
     return car.model_copy(
         update={
@@ -86,7 +82,7 @@ def vary_car(car: CarSettings, rng: np.random.Generator) -> CarSettings:
 
 
 def tightest_bend_cm(car: CarSettings) -> float:
-    """Smallest radius that the front axle's middle can follow, with some left to correct."""
+    """Return the smallest radius that the middle of the front axle can follow, with a reserve of a tenth."""
     most_rad = car.max_steering_rad * min(1.0, car.steering_gain) - abs(car.steering_trim_rad)
     return 1.1 * car.wheelbase_cm / math.sin(most_rad)
 
@@ -94,11 +90,10 @@ def tightest_bend_cm(car: CarSettings) -> float:
 def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSettings:
     """Draw a kind of road: one of the presets, or tape laid out on a floor.
 
-    Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm;
-    the tightest bends have radii of 0.9 to 1.3 lane widths, and on one road of four up to 80 % of the pieces
-    are corners. Every other road has two lanes, on one of eight
-    the line on the right is dashed too, and from every other one up to a sixth of the tape has come off in
-    short stretches.
+    Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm.
+    The tightest bends have radii of 0.9 to 1.3 lane widths; on one road of four, 30 to 80 % of the pieces are
+    corners. Every other road has two lanes. On one of eight the line on the right is dashed too, and on every
+    other one up to a sixth of the tape has come off in short sections.
 
     Args:
         rng: Source of randomness.
@@ -130,11 +125,11 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
 def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> DriverSettings:
     """Draw who drives: 40 to 150 cm/s, off the middle by 8 to 30 % of the lane, every third one further.
 
-    People who drive by hand keep to no line: for stretches they have one wheel on a marking, or half of the
-    car beside the lane, at most 0.9 lane widths off the middle. Where there are two lanes and dashes between
-    them, or may be, every third one also changes between them, for the first time at any place from 30 cm on
-    at which half of the change is still within the drive. Nobody is faster than the tightest bend allows, and
-    no excursion and no change bends more sharply than the car can turn.
+    People who drive by hand keep to no line: for a while they have a wheel on a marking, or half of the car
+    beside the lane, at most 0.9 lane widths off the middle. If there are, or may be, dashes between two
+    lanes, every third driver also changes lanes, first at any place from 30 cm on where half of the change
+    is still within the drive. The speed is limited by the tightest bend, and excursions and changes of lane
+    by what the car can turn.
 
     Args:
         simulation: Road, car, and how long the drive is.
@@ -158,8 +153,8 @@ def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> Dri
         return driver
     change_cm = max(150.0, 3.5 * lane_cm, shortest_lane_change_cm(lane_cm, tightest_cm))
     start_cm = 0.0 if track.closed else START_CM + simulation.car.wheelbase_cm
-    way_cm = simulation.frames / simulation.rate_hz * speed_cm_s
-    latest_cm = max(_FIRST_CHANGE_CM, way_cm - 0.5 * change_cm)
+    distance_cm = simulation.frames / simulation.rate_hz * speed_cm_s
+    latest_cm = max(_FIRST_CHANGE_CM, distance_cm - 0.5 * change_cm)
     update = {
         "lane_change_cm": change_cm,
         "change_lanes_every_cm": change_cm * (1.2 + 0.8 * change),
@@ -179,12 +174,11 @@ def vary_simulation(
 ) -> SimulationSettings:
     """Draw one of many drives; its seed is the sequence's first number.
 
-    Camera and road are drawn until the camera sees the lane, for a while: with a lens that does not, nobody
-    would drive.
+    Camera and road are drawn up to 20 times, until the camera sees the lane.
 
     Args:
         simulation: What all drives share.
-        sequence: Decides everything that is drawn.
+        sequence: Seeds everything that is drawn.
         number: Of the drive; the cameras take turns.
         cameras: The drive's camera is drawn near one of these, and the car's size is drawn; none leaves the
             simulation's.
@@ -205,20 +199,16 @@ def vary_simulation(
     drawn = simulation.model_copy(update={"seed": seed, "camera": camera, "track": track, "car": car})
     if not driver:
         return drawn
-    who = vary_driver(drawn, driver_rng)
-    if who.change_lanes_every_cm is not None:
-        drawn = drawn.model_copy(update={"track": _dashed_between_lanes(track)})
-    return drawn.model_copy(update={"driver": who})
-
-
-def _dashed_between_lanes(track: TrackSettings) -> TrackSettings:
-    """Paint dashes where there may be some: the line between two lanes of a driver who changes them."""
-    assert track.middle is not None
-    return track.model_copy(update={"middle": track.middle.model_copy(update={"kind": "dashed"})})
+    style = vary_driver(drawn, driver_rng)
+    if style.change_lanes_every_cm is not None and track.middle is not None:
+        # Whoever changes lanes crosses dashes.
+        middle = track.middle.model_copy(update={"kind": "dashed"})
+        drawn = drawn.model_copy(update={"track": track.model_copy(update={"middle": middle})})
+    return drawn.model_copy(update={"driver": style})
 
 
 def first_world(simulation: SimulationSettings) -> World:
-    """Build a drive's world; where a random road finds no room for itself, that of one of the next seeds.
+    """Build a drive's world; if no random road is found, that of one of the next seeds.
 
     Raises:
         ConfigError: If several seeds leave no road.

@@ -1,4 +1,4 @@
-"""Everything that one drive's settings stand for: road, look, camera, car and driver."""
+"""What one drive's settings stand for: road, appearance, camera, car and driver."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import Car, CarSettings, DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.car.driver import Driver, DriverSettings
 from datagen.world.render.appearance import Appearance, random_appearance
+from datagen.world.render.ground import NEAR_CM
 from datagen.world.render.renderer import Renderer
 from datagen.world.road.build import check_drivable, random_track
 from datagen.world.road.track import Track
@@ -23,9 +24,11 @@ from lanenet.config import Settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 
-#: Place of the rear axle along an open road at the start.
+#: Place of the rear axle along an open road at the start: all wheels are on it, and the label rows as well.
 START_CM = 40.0
-_SIGHT_CM = 250.0  # road beyond the front axle at the end of the drive
+#: Road beyond the front axle at the end of the drive: as far as lines are drawn.
+_SIGHT_CM = NEAR_CM
+#: Full lock, at least, over what the tightest bend takes; chosen: some is left for corrections.
 _STEERING_RESERVE = 1.2
 
 
@@ -33,17 +36,17 @@ class SimulationSettings(Settings):
     """One synthetic drive.
 
     Attributes:
-        seed: Decides everything random: road, look, driver and car each draw from a child of their own.
+        seed: Of everything random: road, appearance, driver and car each draw from their own child.
         frames: Number of frames.
         rate_hz: Frames per second.
         camera: The camera.
         track: The road.
         car: The car and its errors.
         driver: How it is driven.
-        look: What the drive looks like.
-        random_look: Draw what ``look`` does not name.
+        look: The appearance of the drive.
+        random_look: Draw what ``look`` does not set.
         recording: ``commands`` records speed and steering; ``donkeycar`` throttle and angle only.
-        donkey: What those two do; recorded nowhere but in the resolved settings.
+        donkey: What throttle and angle do; recorded in the resolved settings only.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -61,10 +64,10 @@ class SimulationSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What a drive's settings stand for.
+    """A drive that can begin.
 
     Attributes:
-        settings: The same settings with the road's length and the look resolved; they give the same drive.
+        settings: The drive's settings with length and appearance resolved; they give the same drive.
         track: The road, in the direction in which it is driven.
         camera: The camera on the car.
         driver: At the start.
@@ -83,12 +86,12 @@ class World:
 
     @functools.cached_property
     def renderer(self) -> Renderer:
-        """Draws the frames; built when it is asked for, since poses alone do not need it."""
+        """Draws the frames; built on first use, since poses alone do not need it."""
         return self.build_renderer()
 
 
 def build_world(settings: SimulationSettings, compress: bool = True) -> World:
-    """Draw road, look, driver and car.
+    """Draw road, appearance, driver and car.
 
     Args:
         settings: The drive.
@@ -101,7 +104,7 @@ def build_world(settings: SimulationSettings, compress: bool = True) -> World:
 
 
 def assemble_world(settings: SimulationSettings, compress: bool = True) -> World:
-    """Build a world whose road is as long as it is, whatever the number of frames.
+    """Build a world without checking that its road is long enough for the number of frames.
 
     Args:
         settings: The drive.
@@ -138,7 +141,7 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
 
 
 def draw_track(settings: SimulationSettings) -> Track:
-    """Draw the road alone, as it is in the world of these settings.
+    """Draw the road alone, the same as in the world of these settings.
 
     Raises:
         ConfigError: If there is no such road.
@@ -147,21 +150,20 @@ def draw_track(settings: SimulationSettings) -> Track:
 
 
 def resolve_length(settings: SimulationSettings) -> SimulationSettings:
-    """Write out how long the road is.
+    """Return the settings with the length of the road set.
 
     Raises:
         ConfigError: If an open road is too short for the drive.
     """
     car, driver = settings.car, settings.driver
     per_frame_cm = driver.chosen_speed_cm_s(settings.rate_hz) / settings.rate_hz * car.speed_gain
-    # The car may be faster than it should be for a while; a tenth covers that, and the wandering.
-    way_cm = settings.frames * per_frame_cm * (1.1 + car.speed_noise + driver.speed_variation)
-    needed_cm = float(np.ceil(START_CM + way_cm + car.wheelbase_cm + _SIGHT_CM))
+    # A tenth more, for a car that is faster than commanded for a while, and for the wandering.
+    distance_cm = settings.frames * per_frame_cm * (1.1 + car.speed_noise + driver.speed_variation)
+    needed_cm = float(np.ceil(START_CM + distance_cm + car.wheelbase_cm + _SIGHT_CM))
     length_cm = settings.track.length_cm
     if length_cm is None:
         length_cm = LOOP_CM if settings.track.closed else needed_cm
     elif length_cm < needed_cm and not settings.track.closed:
-        # The pieces of a file have the length that they have.
         advice = "drive fewer frames" if settings.track.pieces else "leave length_cm out to have it chosen"
         raise ConfigError(
             f"{settings.track.origin}: length_cm {length_cm:g} is too short for {settings.frames} frames of "
@@ -172,7 +174,7 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
 
 
 def _needed_steering_rad(settings: SimulationSettings, track: Track) -> float:
-    """Steering that the tightest bend takes, with some left for corrections, up to what the servo gives."""
+    """Steering angle for the tightest bend, with a reserve, limited to what the servo gives."""
     car = settings.car
     bend_rad = math.atan(car.wheelbase_cm * float(np.max(np.abs(track.curvature_per_cm))))
     return min(_STEERING_RESERVE * bend_rad, car.max_steering_rad)
@@ -181,12 +183,14 @@ def _needed_steering_rad(settings: SimulationSettings, track: Track) -> float:
 def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
     track = random_track(settings.track, rng)
     car = settings.car
-    named = f"a car of wheelbase {car.wheelbase_cm:g} cm and {math.degrees(car.max_steering_rad):.0f} degrees"
+    car_text = (
+        f"a car of wheelbase {car.wheelbase_cm:g} cm and {math.degrees(car.max_steering_rad):.0f} degrees"
+    )
     min_radius_cm = car.wheelbase_cm / math.tan(car.max_steering_rad)
     if settings.driver.direction == "forward":
-        check_drivable(track, min_radius_cm, settings.track, named)
+        check_drivable(track, min_radius_cm, settings.track, car_text)
         return track
-    # On two lanes it is the other one that is driven, whose bends are others.
+    # On two lanes the other lane is driven, whose bends have other radii.
     track = track.reversed()
-    check_drivable(track, min_radius_cm, settings.track, named, backward=True)
+    check_drivable(track, min_radius_cm, settings.track, car_text, backward=True)
     return track

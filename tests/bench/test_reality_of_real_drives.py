@@ -37,7 +37,7 @@ def test_each_real_drive_lies_within_the_synthetic_spread(shared_data: Path) -> 
         pytest.skip(f"no {', '.join(missing)} in {shared_data}")
     settings, cameras = RealitySettings(count=100), [rough_camera(tub) for tub in TUBS]
     real = [
-        measure_drive(open_drive(shared_data / tub), camera, settings.real_frames)
+        measure_drive(open_drive(shared_data / tub), camera, settings.sampling(settings.real_frames))
         for tub, camera in zip(TUBS, cameras, strict=True)
     ]
     rows = compare(real, measure_all_synthetic(settings, cameras, workers=2))

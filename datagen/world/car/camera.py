@@ -1,11 +1,9 @@
-"""The camera of a simulated car as a few numbers; by default the one of Kozlowski et al. 2024.
-
-Whether a car can be driven by its camera: what of a road is in the picture.
-"""
+"""The camera of a simulated car (default: Kozlowski et al. 2024), and whether it sees enough of a road."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +16,14 @@ from lanenet.config import Settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import ROWS_CM
+
+#: On a straight, both lines must be in the image this far ahead of the front axle.
+_SEES_AHEAD_CM = max(ROWS_CM)
+#: In a bend, a section of one line must be, up to this far ahead: it still shows where the rows are.
+_BEND_AHEAD_CM = 1.5 * _SEES_AHEAD_CM
+#: Length of that section; chosen: about half a dash.
+_BEND_SECTION_CM = 10.0
+_STEP_CM = 0.5
 
 
 class CameraSettings(Settings):
@@ -55,14 +61,7 @@ class CameraSettings(Settings):
         Raises:
             ConfigError: If the lens model cannot span the field of view.
         """
-        mounting = Mounting(
-            height_cm=self.height_cm,
-            pitch_down_rad=self.pitch_down_rad,
-            roll_rad=self.roll_rad,
-            yaw_rad=self.yaw_rad,
-            ahead_of_front_axle_cm=self.ahead_of_front_axle_cm,
-            right_of_centre_cm=self.right_of_centre_cm,
-        )
+        mounting = Mounting(**{field.name: getattr(self, field.name) for field in fields(Mounting)})
         centre = np.array([0.5 * (self.width - 1), 0.5 * (self.height - 1)])
         K = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
         D = np.array(self.distortion)
@@ -73,40 +72,30 @@ class CameraSettings(Settings):
                 f"camera: field_of_view_rad {self.field_of_view_rad:.3f} is more than the {self.model} lens "
                 f"spans with this distortion ({2.0 * unit.max_angle_rad:.3f})"
             )
-        # With a focal length of one pixel, the edge of the field lies at the radius that the lens gives it.
+        # The radius of the edge of the field of view at a focal length of one pixel.
         edge = unit.project_rays(np.array([[np.sin(half_rad), 0.0, np.cos(half_rad)]]))[0, 0] - centre[0]
         focal_px = 0.5 * self.width / edge
-        K = np.array([[focal_px, 0.0, centre[0]], [0.0, focal_px, centre[1]], [0.0, 0.0, 1.0]])
-        return Camera(self.model, self.width, self.height, K, D, mounting, wheelbase_cm)
-
-
-#: On a straight both lines are in the picture so far ahead of the front axle.
-_SEES_AHEAD_CM = max(ROWS_CM)
-#: In a bend one line is, up to so far ahead of the front axle: from there it still tells where the rows are.
-_BEND_AHEAD_CM = 1.5 * _SEES_AHEAD_CM
-#: For so long a stretch.
-_BEND_STRETCH_CM = 10.0
-_STEP_CM = 0.5
+        return replace(unit, K=K * [[focal_px, 1.0, 1.0], [1.0, focal_px, 1.0], [1.0, 1.0, 1.0]])
 
 
 def sees_lane(camera: CameraSettings, track: TrackSettings, wheelbase_cm: float) -> bool:
-    """Whether a car in the middle of its lane has enough of it in the picture to be driven by.
+    """Tell whether the camera sees enough of the lane from the middle of it.
 
-    On a straight, both lines where the farthest label row crosses them. In the tightest bend, to either side,
-    10 cm of one of the lines between the front axle and 45 cm ahead of it, wherever its dashes are: a line
-    that may be dashed must be in the picture for its gap and 10 cm more.
+    That is, on a straight, both lines at the farthest label row. In the tightest bend, to either side: 10 cm
+    of one of the lines between the front axle and 45 cm ahead, wherever its dashes are. Of a line that may be
+    dashed, a section of 10 cm more than the gap must be in the image.
 
     Args:
         camera: On the car.
-        track: The road; no paint is taken to be worn or interrupted.
+        track: The road; worn or interrupted paint counts as whole.
         wheelbase_cm: Of the car.
     """
     built = camera.build(wheelbase_cm)
     half_cm, radius_cm = 0.5 * track.lane_width_cm, track.tightest_radius_cm
     if radius_cm <= half_cm:
-        return False  # there is no such road: the line inside would have no radius left
+        return False  # there is no such road: the inner line would have no radius left
     straight = np.array([[-half_cm, _SEES_AHEAD_CM], [half_cm, _SEES_AHEAD_CM]])
-    if not _in_picture(built, straight).all():
+    if not _in_image(built, straight).all():
         return False
     lines = [
         (offset_cm, _longest_gap_cm(marking))
@@ -115,8 +104,8 @@ def sees_lane(camera: CameraSettings, track: TrackSettings, wheelbase_cm: float)
     ]
     return all(
         any(
-            _stretch_cm(built, line_in_bend_car(side / radius_cm, offset_cm, wheelbase_cm))
-            >= gap_cm + _BEND_STRETCH_CM
+            _section_cm(built, line_in_bend_car(side / radius_cm, offset_cm, wheelbase_cm))
+            >= gap_cm + _BEND_SECTION_CM
             for offset_cm, gap_cm in lines
         )
         for side in (1.0, -1.0)
@@ -124,7 +113,7 @@ def sees_lane(camera: CameraSettings, track: TrackSettings, wheelbase_cm: float)
 
 
 def _longest_gap_cm(marking: MarkingSettings) -> float:
-    """Length without paint that a line has by its kind."""
+    """Longest section without paint of a line of this kind."""
     if marking.kind == "none":
         return math.inf
     return marking.gap_cm if marking.kind in ("dashed", "random") else 0.0
@@ -141,12 +130,12 @@ def line_in_bend_car(
         wheelbase_cm: Of the car.
 
     Returns:
-        Points every 0.5 cm along the line from the front axle's row on, up to 45 cm ahead or to where the
-        line turns away across the car's way, [cm], frame car.
+        Points every 0.5 cm along the line from the front axle on, up to 45 cm ahead or to where the line
+        runs at right angles to the car, [cm], frame car.
     """
     turned_rad = front_wheels_in_bend_rad(curvature_per_cm, wheelbase_cm)
     per_cm = curvature_per_cm / (1.0 - offset_cm * curvature_per_cm)  # of the line
-    # From where the line runs straight ahead of the front axle's middle, on either side of it.
+    # Counted from beside the middle of the front axle.
     reach_cm = 2.0 * (_BEND_AHEAD_CM + abs(offset_cm))
     along_cm = np.arange(-reach_cm, reach_cm, _STEP_CM)
     turn = per_cm * along_cm
@@ -158,15 +147,15 @@ def line_in_bend_car(
     return np.stack([-left, ahead], axis=1)[kept]
 
 
-def _stretch_cm(camera: Camera, line_car_cm: Float[np.ndarray, "n 2"]) -> float:
-    """Longest unbroken stretch in the picture of a line of evenly spaced points."""
-    hidden = ~_in_picture(camera, line_car_cm)
+def _section_cm(camera: Camera, line_car_cm: Float[np.ndarray, "n 2"]) -> float:
+    """Longest section without a break in the image, of a line of evenly spaced points."""
+    hidden = ~_in_image(camera, line_car_cm)
     breaks = np.flatnonzero(np.concatenate([[True], hidden, [True]]))
-    # So many points in a row span one step less.
+    # A run of points spans one step less than their number.
     return max(0.0, float(np.diff(breaks).max() - 2) * _STEP_CM)
 
 
-def _in_picture(camera: Camera, points_car_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+def _in_image(camera: Camera, points_car_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
     pixels = camera.project_ground(points_car_cm)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0.0) & (pixels <= np.array([camera.width - 1.0, camera.height - 1.0]))

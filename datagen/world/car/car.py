@@ -1,6 +1,6 @@
-"""A car that does not quite do what it is told: bicycle with a servo, a motor, slip and errors.
+"""A car that does not quite follow its commands: bicycle model with servo, motor, slip and errors.
 
-Commands as Donkeycar records them: angle and throttle from -1 to 1, with gains that nobody wrote down.
+Also Donkeycar's commands: angle and throttle from -1 to 1, with gains that nobody wrote down.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ from pydantic import Field
 
 from lanenet.config import Settings
 
-_NOISE_TIME_S = 0.7  # how long a deviation of speed or steering lasts
-_STEP_S = 0.01  # longest step of the motion; the deviations are drawn once per step
+#: Correlation time of the deviations of speed and steering; chosen: uneven floor and play, over half a metre.
+_NOISE_TIME_S = 0.7
+#: Longest step of the motion; the deviations are drawn once per step.
+_STEP_S = 0.01
 _SAME_TIME_S = 1e-9
-_MOST_TURNED = 0.9  # sine of the front wheels' angle in a bend that no car could turn
+#: Largest sine of the front wheels' angle, in bends that no car could turn.
+_MOST_TURNED = 0.9
 
 
 class CarSettings(Settings):
@@ -28,16 +31,16 @@ class CarSettings(Settings):
         wheelbase_cm: Distance between the axles.
         max_steering_rad: Where the servo stops.
         steering_gain: Angle of the wheels per commanded angle.
-        steering_trim_rad: Angle of the wheels when told to go straight.
+        steering_trim_rad: Angle of the wheels at the command 0.
         servo_rate_rad_s: How fast the servo turns.
         delay_s: Time between a command and its effect.
         speed_gain: Speed per commanded speed.
         speed_lag_s: Time constant with which the speed follows.
         speed_noise: Standard deviation of the relative deviation of speed, which varies slowly.
         steering_noise_rad: Standard deviation of the deviation of the wheels, which varies slowly.
-        understeer_speed_cm_s: Characteristic speed: at it the car turns half as tightly as its wheels point.
-            None: it turns as they point at any speed.
-        grip_cm_s2: Largest lateral acceleration; beyond it the car slides on along a wider circle.
+        understeer_speed_cm_s: Characteristic speed, at which the curvature is half of the kinematic one.
+            None: no understeer.
+        grip_cm_s2: Largest lateral acceleration; beyond it the car slides along a wider circle.
         rear_slip_rad_s2_per_cm: Angle by which the rear axle slides outwards, per lateral acceleration.
     """
 
@@ -63,7 +66,7 @@ def advance(
 
     Args:
         pose: Rear-axle centre x, y and heading, [cm], [cm], [rad], frame map.
-        distance_cm: Way of the rear axle, positive forwards.
+        distance_cm: Of the rear axle, positive forwards.
         steering_rad: Angle of the front wheels, positive left.
         wheelbase_cm: Distance between the axles.
 
@@ -83,9 +86,9 @@ def advance_along(
 
     Args:
         pose: Rear-axle centre x, y and heading, [cm], [cm], [rad], frame map.
-        distance_cm: Way of the rear axle, positive forwards.
-        curvature_per_cm: Turn per way, positive left.
-        slip_rad: Angle from the way to the heading: positive where the rear axle slides to the right.
+        distance_cm: Of the rear axle, positive forwards.
+        curvature_per_cm: Positive left.
+        slip_rad: From the direction of motion to the heading: positive if the rear axle slides to the right.
 
     Returns:
         The new pose; the heading is not wrapped.
@@ -98,12 +101,12 @@ def advance_along(
 
 
 def front_wheels_in_bend_rad(curvature_per_cm: float, wheelbase_cm: float) -> float:
-    """Return where the front wheels point from the heading of a car whose front axle follows a bend.
+    """Return the angle of the front wheels of a car whose front axle follows a bend.
 
-    The rear axle runs further inside, so that the car is turned outwards against the bend at its front axle.
+    The rear axle runs further inside, so that the heading points outwards of the bend at the front axle.
 
     Args:
-        curvature_per_cm: Of the front axle's way, positive left.
+        curvature_per_cm: Of the front axle's path, positive left.
         wheelbase_cm: Distance between the axles.
 
     Returns:
@@ -137,8 +140,8 @@ def driven_curvature_per_cm(wheels_rad: float, speed_cm_s: float, settings: CarS
 class Car:
     """State of a simulated car.
 
-    It moves in steps of at most 10 ms, and its deviations are drawn on that clock: the frame rate decides
-    when it is told what, and nothing else.
+    It moves in steps of at most 10 ms, and its deviations are drawn once per step: the frame rate decides
+    nothing but when commands arrive.
 
     Attributes:
         settings: The car.
@@ -155,19 +158,19 @@ class Car:
         self._ticks, self._t_s = 0, 0.0
         self.place(pose)
 
-    def place(self, pose: Float[np.ndarray, "3"], told_cm_s: float | None = None) -> None:
-        """Lift the car to a pose; what it was told before is forgotten.
+    def place(self, pose: Float[np.ndarray, "3"], commanded_cm_s: float | None = None) -> None:
+        """Put the car at a pose; earlier commands are forgotten.
 
         Args:
             pose: Rear-axle centre x, y and heading, frame map.
-            told_cm_s: Commanded speed with which it rolls, wheels ahead, until a command arrives; None: that
-                of the next command.
+            commanded_cm_s: Speed command that it follows, wheels straight, until a command arrives; None:
+                that of the next command.
         """
         self.pose = np.array(pose, dtype=np.float64)
         self.wheels_rad = self.settings.steering_trim_rad
         self._pending: deque[tuple[float, float, float]] = deque()
-        self._told: tuple[float, float] | None = None if told_cm_s is None else (told_cm_s, 0.0)
-        self._motor_cm_s = 0.0 if told_cm_s is None else told_cm_s * self.settings.speed_gain
+        self._command: tuple[float, float] | None = None if commanded_cm_s is None else (commanded_cm_s, 0.0)
+        self._motor_cm_s = 0.0 if commanded_cm_s is None else commanded_cm_s * self.settings.speed_gain
 
     @property
     def speed_cm_s(self) -> float:
@@ -176,7 +179,7 @@ class Car:
 
     @property
     def yaw_rate_rad_s(self) -> float:
-        """True rate of turn at this moment, positive left."""
+        """True yaw rate at this moment, positive left."""
         return self.speed_cm_s * self._curvature_per_cm(self.wheels_rad)
 
     def step(self, speed_cm_s: float, steering_rad: float, interval_s: float) -> Float[np.ndarray, "3"]:
@@ -190,46 +193,46 @@ class Car:
         Returns:
             The new pose.
         """
-        if self._told is None:
-            # Until the first command arrives, the car rolls as it will with that command.
-            self._told = (speed_cm_s, 0.0)
+        if self._command is None:
+            # Until the first command takes effect, the car keeps the speed of that command.
+            self._command = (speed_cm_s, 0.0)
             self._motor_cm_s = speed_cm_s * self.settings.speed_gain
         self._pending.append((self._t_s + self.settings.delay_s, speed_cm_s, steering_rad))
         end_s = self._t_s + interval_s
         while self._t_s < end_s - _SAME_TIME_S:
             while self._pending and self._pending[0][0] <= self._t_s + _SAME_TIME_S:
-                self._told = self._pending.popleft()[1:]
+                self._command = self._pending.popleft()[1:]
             if self._ticks * _STEP_S <= self._t_s + _SAME_TIME_S:
                 self._drift()
                 self._ticks += 1
             until_s = min(end_s, self._ticks * _STEP_S)
             if self._pending:
                 until_s = min(until_s, self._pending[0][0])
-            self._move(*self._told, until_s - self._t_s)
+            self._move(*self._command, until_s - self._t_s)
             self._t_s = until_s
         return self.pose
 
     def _move(self, speed_cm_s: float, steering_rad: float, step_s: float) -> None:
-        """Let servo, motor and car go on for a short while."""
+        """Move servo, motor and car by one step."""
         car = self.settings
         wanted = car.steering_gain * steering_rad + car.steering_trim_rad
         wanted = min(max(wanted, -car.max_steering_rad), car.max_steering_rad)
         swing = car.servo_rate_rad_s * step_s
         before_rad = self.wheels_rad
         self.wheels_rad += min(max(wanted - before_rad, -swing), swing)
-        # The servo turns evenly and may arrive before the step is over.
+        # The servo turns at a constant rate and may arrive before the step ends.
         turned_rad = self.wheels_rad - before_rad
         mean_rad = self.wheels_rad - 0.5 * turned_rad * abs(turned_rad) / swing
         target_cm_s, before_cm_s = speed_cm_s * car.speed_gain, self._motor_cm_s
         kept = math.exp(-step_s / car.speed_lag_s) if car.speed_lag_s > 0.0 else 0.0
         self._motor_cm_s = target_cm_s + kept * (before_cm_s - target_cm_s)
-        # Way of the motor over the step: the mean of the exponential.
-        way_cm = target_cm_s * step_s + (before_cm_s - target_cm_s) * car.speed_lag_s * (1.0 - kept)
-        way_cm *= 1.0 + car.speed_noise * self._speed_noise
-        speed = way_cm / step_s
+        # The integral of the exponential over the step.
+        distance_cm = target_cm_s * step_s + (before_cm_s - target_cm_s) * car.speed_lag_s * (1.0 - kept)
+        distance_cm *= 1.0 + car.speed_noise * self._speed_noise
+        speed = distance_cm / step_s
         curvature = self._curvature_per_cm(mean_rad, speed)
         slip_rad = car.rear_slip_rad_s2_per_cm * speed * speed * curvature
-        self.pose = advance_along(self.pose, way_cm, curvature, slip_rad)
+        self.pose = advance_along(self.pose, distance_cm, curvature, slip_rad)
 
     def _curvature_per_cm(self, wheels_rad: float, speed_cm_s: float | None = None) -> float:
         wheels_rad += self.settings.steering_noise_rad * self._steering_noise
@@ -237,15 +240,18 @@ class Car:
         return driven_curvature_per_cm(wheels_rad, speed_cm_s, self.settings)
 
     def _drift(self) -> None:
-        """Let both deviations wander with unit variance (Ornstein-Uhlenbeck)."""
+        """Draw both deviations anew, as Ornstein-Uhlenbeck processes of unit variance."""
         keep = math.exp(-_STEP_S / _NOISE_TIME_S)
         fresh = math.sqrt(1.0 - keep * keep)
-        self._speed_noise = keep * self._speed_noise + fresh * float(self._speed_rng.standard_normal())
-        self._steering_noise = keep * self._steering_noise + fresh * float(
-            self._steering_rng.standard_normal()
+        speed, steering = (
+            float(self._speed_rng.standard_normal()),
+            float(self._steering_rng.standard_normal()),
         )
+        self._speed_noise = keep * self._speed_noise + fresh * speed
+        self._steering_noise = keep * self._steering_noise + fresh * steering
 
 
+#: Of the drawn values; chosen: from a linear to a clearly bent curve.
 _RANGES: dict[str, tuple[float, float]] = {
     "full_steering_rad": (0.3, 0.45),
     "angle_deadband": (0.0, 0.06),
@@ -257,7 +263,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 
 class DonkeySettings(Settings):
-    """How a Donkeycar turns its commands into motion; what is None is drawn for each drive.
+    """How a Donkeycar turns its commands into motion; values that are None are drawn for each drive.
 
     Attributes:
         full_steering_rad: Steering at the angle -1.
@@ -279,12 +285,12 @@ class DonkeySettings(Settings):
 def draw_donkey(
     settings: DonkeySettings, rng: np.random.Generator, needed_steering_rad: float = 0.0
 ) -> DonkeySettings:
-    """Fill in what is None; all values are drawn, so that fixing one does not move another.
+    """Draw the values that are None. All are drawn, so that setting one does not change another.
 
     Args:
         settings: Values that are set stay.
         rng: Source of randomness.
-        needed_steering_rad: What the road asks for; a drawn full lock is no less.
+        needed_steering_rad: For the tightest bend of the road; a drawn full lock is no less.
     """
     values: dict[str, Any] = {}
     for name, (low, high) in _RANGES.items():
@@ -296,10 +302,10 @@ def draw_donkey(
 
 
 class DonkeyCommands:
-    """Both directions between angle and throttle, and steering and speed, of one car."""
+    """Conversion between angle and throttle, and steering and speed, of one car, both ways."""
 
     def __init__(self, settings: DonkeySettings) -> None:
-        """Take a car whose values are all drawn.
+        """Take settings without None.
 
         Raises:
             ValueError: If one is None.
@@ -311,7 +317,7 @@ class DonkeyCommands:
         self._angle, self._throttle = (angle_dead, angle_exponent), (dead, exponent)
 
     def angle(self, steering_rad: float) -> float:
-        """Return the angle (-1 = left) that asks for a steering; at the stop for more than the car can."""
+        """Return the angle (-1 = left) that asks for a steering; limited to -1 to 1."""
         return -_asked(steering_rad / self._full_rad, *self._angle)
 
     def throttle(self, speed_cm_s: float) -> float:

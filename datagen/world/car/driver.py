@@ -1,7 +1,4 @@
-"""A scripted driver with perfect sight: leads the front axle along a line of its choice in the lane.
-
-What a scripted driver is after: where in the lane, and how fast.
-"""
+"""A scripted driver who knows the true pose and leads the front axle along a path of its own in the lane."""
 
 from __future__ import annotations
 
@@ -17,12 +14,21 @@ from datagen.world.road.track import Track
 from lanenet.config import Settings
 from lanenet.geometry.frames import map_from_car
 
+#: Sines in offset and speed; chosen: no period is noticed.
 _WAVES = 4
-_EXCURSIONS = 64  # drawn ahead; a longer drive repeats them
-_EXCURSION_SHARE = 0.7  # of their spacing: the rest is driven where the driver would be anyway
+#: Number of excursions that are drawn; a longer drive repeats them.
+_EXCURSIONS = 64
+#: Share of their spacing that excursions take; the rest is driven near the middle; chosen.
+_EXCURSION_SHARE = 0.7
 _SPEED_WAVE_CM = (100.0, 500.0)
+#: Per frame (Kozlowski et al. 2024: 6 cm/s, an image per cm).
 _CRAWL_CM = 1.0
 _SPEED_CM_S = {"wander": 60.0, "recover": 60.0, "fast": 100.0}
+#: Aim distances that it takes to learn the trim of the steering, its limit, and the largest offset from the
+#: path at which it is learned; chosen: slower than the driver's own corrections.
+_TRIM_AFTER = 5.0
+_MOST_TRIM_RAD = 0.15
+_TRIM_WITHIN_CM = 5.0
 
 
 class DriverSettings(Settings):
@@ -35,17 +41,17 @@ class DriverSettings(Settings):
         speed_cm_s: Commanded speed; None: the style's, 60 cm/s but for ``crawl`` and ``fast``.
         speed_variation: Largest relative change of speed, which varies slowly.
         pauses_per_m: Stops, per metre of road.
-        pause_s: How long the car is told to stand.
-        aim_ahead_cm: Distance ahead of the front axle of the point that the front wheels are turned to.
-        wander_cm: Largest offset from the middle of the lane that the driver aims for.
+        pause_s: How long the car is commanded to stand.
+        aim_ahead_cm: Distance from the front axle to the aim point.
+        wander_cm: Largest offset of the path from the middle of the lane.
         shortest_wander_cm: Shortest wave of the wandering.
         longest_wander_cm: Longest wave.
         recover_cm: Largest excursion to one side with the style ``recover``; the smallest is half of it.
         recover_every_cm: From one excursion to the next.
-        change_lanes_every_cm: On a road with two lanes, way from one change to the next; the car then
-            drives in the other lane, against its traffic. None: it keeps its lane.
+        change_lanes_every_cm: On a road with two lanes, distance from one change to the next; every second
+            section is driven in the oncoming lane. None: the car keeps its lane.
         first_change_cm: Where along the road the first change begins; None: at ``change_lanes_every_cm``.
-        lane_change_cm: Way that a change takes.
+        lane_change_cm: Length of a change.
     """
 
     style: Literal["wander", "recover", "crawl", "fast"] = "wander"
@@ -101,7 +107,8 @@ def shortest_excursion_spacing_cm(height_cm: float, radius_cm: float) -> float:
     """Return the smallest ``recover_every_cm`` at which no excursion bends more sharply than a circle.
 
     Args:
-        height_cm: Of the excursion: height sin^2(pi u / L) over its way L, sharpest at both ends and the top.
+        height_cm: Of the excursion: height sin^2(pi u / L) over its length L, sharpest at both ends and the
+            top.
         radius_cm: Of the circle.
     """
     return math.sqrt(2.0 * math.pi**2 * height_cm * radius_cm) / _EXCURSION_SHARE
@@ -153,7 +160,7 @@ class Script:
         self._pause_at_cm: float | None = None
 
     def offset_cm(self, s_cm: float) -> float:
-        """Offset that the driver aims for at a place along the road, left positive, [cm]."""
+        """Offset of the path at a place along the road, left positive, [cm]."""
         offset_cm = float(np.sum(self._amplitudes_cm * np.sin(self._waves * s_cm + self._phases)))
         if self.settings.style == "recover":
             number, share = divmod(s_cm / self.settings.recover_every_cm, 1.0)
@@ -163,28 +170,28 @@ class Script:
         return offset_cm + self._lane_cm(s_cm)
 
     def _lane_cm(self, s_cm: float) -> float:
-        """Middle of the lane that the driver aims for, and on the way from one to the other between them."""
+        """Offset of the lane's middle, and during a change of the path from one lane to the other."""
         every_cm, first_cm = self.settings.change_lanes_every_cm, self.settings.first_change_cm
         if every_cm is None:
             return 0.0
         first_cm = every_cm if first_cm is None else first_cm
         if s_cm < first_cm:
             return 0.0
-        # Counted from where the change before the first would have begun.
+        # Counted from one spacing before the first change.
         number, since_cm = divmod(s_cm - (first_cm - every_cm), every_cm)
         share = min(since_cm / self.settings.lane_change_cm, 1.0)
         gone = share * share * (3.0 - 2.0 * share)
         return self.other_lane_cm * (gone if number % 2.0 else 1.0 - gone)
 
     def slope(self, s_cm: float) -> float:
-        """Change of the offset per way along the road."""
+        """Change of the offset per distance along the road."""
         return self.offset_cm(s_cm + 0.5) - self.offset_cm(s_cm - 0.5)
 
     def speed_cm_s(self, s_cm: float, t_s: float) -> float:
-        """Commanded speed at a place and time; to be asked in the order of time, since pauses take their own.
+        """Commanded speed at a place and time, to be called in the order of time, because of the pauses.
 
         Args:
-            s_cm: Way along the road.
+            s_cm: Distance along the road.
             t_s: Time since the start.
         """
         driver = self.settings
@@ -203,18 +210,11 @@ class Script:
         return float(self._pause_rng.exponential(100.0 / self.settings.pauses_per_m))
 
 
-__all__ = ["Driver", "DriverSettings", "Script"]
-
-_TRIM_AFTER = 5.0  # aim distances that it takes to learn what the steering is off by
-_MOST_TRIM_RAD = 0.15
-_TRIM_WITHIN_CM = 5.0
-
-
 class Driver:
-    """Turns the front wheels to the line's direction and a little towards the line.
+    """Turns the front wheels into the direction of the path and a little towards it.
 
-    The front axle goes where its wheels point, so that this follows bends without cutting them. The wheels
-    answer late: the driver steers for the place where the car will be by then. What the steering is off by is
+    The front axle goes where its wheels point, so that bends are not cut. Because of the delay, the driver
+    steers for the place where the car will be when the command takes effect. The trim of the steering is
     learned from the offset that remains.
 
     Source:
@@ -251,7 +251,7 @@ class Driver:
         Args:
             s_cm: Place of the front axle along the road.
             offset_cm: Its offset from the centre line, left positive.
-            slope: Change of that offset per way.
+            slope: Change of that offset per distance.
         """
         front_cm, road_rad = self.track.point(s_cm, offset_cm)
         curvature = self.track.point(s_cm + 1.0)[1] - road_rad
@@ -266,7 +266,7 @@ class Driver:
         return self._speed_cm_s, steering_rad
 
     def steer(self, pose: Float[np.ndarray, "3"]) -> float:
-        """Return the steering command at a pose, [rad], positive left; keeps count of the way driven."""
+        """Return the steering command at a pose, [rad], positive left; updates the place along the road."""
         before_cm = self.s_cm
         self.s_cm, _ = self._place(pose)
         ahead = advance(
@@ -275,7 +275,7 @@ class Driver:
         s_cm, offset_cm = self._place(ahead)
         off_cm = offset_cm - self.script.offset_cm(s_cm)
         if abs(off_cm) < _TRIM_WITHIN_CM:
-            # The learned share is what the wheels do by themselves: to the left where the car drifts left.
+            # The trim is what the wheels do by themselves: to the left if the car drifts to the left.
             share = off_cm / self._aim_ahead_cm * (self.s_cm - before_cm) / (_TRIM_AFTER * self._aim_ahead_cm)
             self._trim_rad = min(max(self._trim_rad + share, -_MOST_TRIM_RAD), _MOST_TRIM_RAD)
         direction = self.track.point(s_cm)[1] + math.atan(self.script.slope(s_cm))
@@ -295,7 +295,7 @@ class Driver:
         return other_cm if self._place(pose)[1] / other_cm > 0.5 else 0.0
 
     def _place(self, pose: Float[np.ndarray, "3"]) -> tuple[float, float]:
-        """Way along the road, over all laps, and offset of the front axle at a pose."""
+        """Distance along the road, over all laps, and offset of the front axle at a pose."""
         front = map_from_car(np.zeros((1, 2)), pose, self._wheelbase_cm)[0]
         return place_on_track(self.track, front, self.s_cm)
 
@@ -306,10 +306,10 @@ def place_on_track(track: Track, xy_cm: Float[np.ndarray, "2"], near_s_cm: float
     Args:
         track: The road.
         xy_cm: The point, [cm], frame map.
-        near_s_cm: Way along the road that the point is near, any number of laps.
+        near_s_cm: Distance along the road that the point is near, over any number of laps.
 
     Returns:
-        Way along the road, and offset from its centre line (left positive), [cm].
+        Distance along the road, and offset from its centre line (left positive), [cm].
     """
     s_cm, offset_cm = track.nearest(xy_cm, near_s_cm=near_s_cm)
     if track.closed:

@@ -1,4 +1,4 @@
-"""Whoever steers in closed loop: a detector with the car's own controller, the truth, the scripted driver."""
+"""Pilots steer in closed loop: a detector with the car's controller, the true points, the scripted driver."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class PilotSettings(Settings):
             ``own`` follows the detector's own steering target.
         look_ahead_cm: Distance of the aim point ahead of the front axle.
         smoothing: Of a detector's points over the frames, as on the car; the own target is not smoothed.
-        keep_s: How long the last steering stays when the lane is lost.
-        then: Afterwards the wheels go straight, or the car stops, until the lane is found again.
+        keep_s: How long the last steering is kept when the lane is lost.
+        then: Afterwards, until the lane is found again: wheels straight, or stop.
     """
 
     law: Literal["pure-pursuit", "proportional", "own"] = "proportional"
@@ -40,11 +40,11 @@ class PilotSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a pilot may look at in one frame.
+    """What a pilot gets in one frame.
 
     Attributes:
         image_bgr: What the camera sees; None for a pilot that needs no image.
-        pose: True rear-axle centre x, y and heading, frame map; for pilots that are given the truth.
+        pose: True rear-axle centre x, y and heading, frame map.
         s_cm: True place of the front axle along the road.
         t_s: Time of the frame.
         speed_cm_s: Commanded speed since the frame before; 0 for the first one.
@@ -61,7 +61,7 @@ class Sight:
 
 @runtime_checkable
 class Pilot(Protocol):
-    """Answers with a steering; it may keep state from frame to frame.
+    """Steers, and may keep state from frame to frame.
 
     Attributes:
         needs_image: Whether frames have to be drawn for it.
@@ -70,7 +70,7 @@ class Pilot(Protocol):
     needs_image: bool
 
     def steer(self, sight: Sight) -> float:
-        """Return the wished steering, [rad], positive left; NaN without an answer."""
+        """Return the wanted steering, [rad], positive left; NaN without an answer."""
         ...
 
     def reset(self) -> None:
@@ -88,7 +88,7 @@ class DetectorPilot:
         self._detector, self._controller = detector, LaneController(control)
 
     def steer(self, sight: Sight) -> float:
-        """See :class:`Pilot`; the truth is not looked at, and the speed is not the pilot's to choose.
+        """See :class:`Pilot`; uses the image only; the speed that the controller wants is ignored.
 
         Raises:
             ValueError: If there is no image.
@@ -105,7 +105,7 @@ class DetectorPilot:
 
 
 class TruePointsPilot:
-    """Steers by the true points: what is left to be wrong is the steering law."""
+    """Steers by the true points: errors that remain are those of the steering law."""
 
     needs_image = False
 
@@ -123,7 +123,7 @@ class TruePointsPilot:
 
 
 class DriverPilot:
-    """The scripted driver, who is given the true pose; its speed is that of its settings."""
+    """The scripted driver, who gets the true pose."""
 
     needs_image = False
 
@@ -136,27 +136,27 @@ class DriverPilot:
         return self._driver.command(sight.pose, 0.0)[1]
 
     def reset(self) -> None:
-        """Do nothing: what the driver has learned of the car stays true."""
+        """Do nothing: what the driver has learned of the car stays valid."""
 
 
 class LostLane:
-    """What is commanded when the pilot has no answer: the last steering for a while, then a rule."""
+    """The command when the pilot has no answer: the last steering for a while, then a rule."""
 
     def __init__(self, settings: PilotSettings, rate_hz: float) -> None:
         """Start without any steering to keep."""
         self._settings, self._keep_frames = settings, round(settings.keep_s * rate_hz)
         self._kept_rad, self._missed = 0.0, 0
 
-    def command(self, wished_rad: float, speed_cm_s: float) -> tuple[float, float]:
-        """Return commanded speed and steering for what the pilot wishes.
+    def command(self, wanted_rad: float, speed_cm_s: float) -> tuple[float, float]:
+        """Return commanded speed and steering.
 
         Args:
-            wished_rad: Steering, NaN without an answer.
+            wanted_rad: The pilot's steering, NaN without an answer.
             speed_cm_s: Speed while the lane is known.
         """
-        if math.isfinite(wished_rad):
-            self._kept_rad, self._missed = wished_rad, 0
-            return speed_cm_s, wished_rad
+        if math.isfinite(wanted_rad):
+            self._kept_rad, self._missed = wanted_rad, 0
+            return speed_cm_s, wanted_rad
         self._missed += 1
         if self._missed <= self._keep_frames:
             return speed_cm_s, self._kept_rad

@@ -1,4 +1,4 @@
-"""What a synthetic drive looks like: floor, light, camera; none of it changes the truth."""
+"""What a synthetic drive looks like: floor, light, camera; none of it changes the ground truth."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from datagen.world.render.textures import FloorKind
 from lanenet.config import Settings
 
 Bgr = tuple[float, float, float]
-_CONTRAST = 60.0  # grey levels between floor and paint, at least
-_DULL_CONTRAST = 45.0  # between floor and paint that has lost its brightness
+#: Least difference between floor and fresh paint, in grey levels; chosen: clear at the loudest noise.
+_CONTRAST = 60.0
+#: The same for dull paint, and the least factor on the brightness of paint: these include the thin tape
+#: of ``garage_tape`` (docs/reality.md).
+_DULL_CONTRAST = 45.0
 _DULLEST = 0.6
 
 
 class Appearance(Settings):
-    """The look of one drive. Every effect is off by default; levels are in grey levels, 0..255.
+    """The appearance of one drive. Every effect is off by default; levels are grey levels, 0..255.
 
     Attributes:
         floor: What the floor is made of, which decides the kind of its pattern.
@@ -25,7 +28,7 @@ class Appearance(Settings):
         verge_bgr: Colour beyond the outermost lines, as of a printed mat; None: that of the floor.
         texture_level: Standard deviation of the floor's pattern.
         texture_scale_cm: Size of its finest grains.
-        texture_stretch: How much longer than wide the grains are (wood).
+        texture_stretch: Ratio of length to width of the grains (wood).
         joint_u_cm: Distance of tile joints or planks in one direction; 0: none.
         joint_v_cm: The same in the other direction.
         joint_level: How much darker the joints are.
@@ -33,8 +36,8 @@ class Appearance(Settings):
         line_wear: 0: fresh; 1: about half of the paint is worn off, in patches.
         lamps_per_m: Lamps mirrored in the floor, per metre of road.
         lamp_level: Brightness of their middle.
-        lamp_streak: How much longer than a mirror's the lamps' images are, as on an uneven floor.
-        lamp_edge: How hard their border is; 1: as soft as can be.
+        lamp_streak: Length of the lamps' images, over that in an even mirror, as on an uneven floor.
+        lamp_edge: How hard their border is; 1: softest.
         clutter_per_m: Tape, paper and other things on the floor, per metre of road.
         wall_level: Contrast of the room around; 0: an even wall.
         exposure: Factor on all colours.
@@ -44,9 +47,9 @@ class Appearance(Settings):
         noise_level: Standard deviation of the sensor's noise.
         jpeg_quality: Quality with which the camera compresses; None: not at all.
         objects_per_m: Boxes, cones, walls, people's legs and cars beside the road, per metre of road.
-        objects_on_road: Share of them that stand partly on the road, clear of the middle of the lane.
+        objects_on_road: Share of them that stand partly on the road, but not in the middle of the lane.
         shadows_per_m: Shadows of people who walk about, per metre of road.
-        shadow_depth: Share of the light that shadows take, those of objects too.
+        shadow_depth: Share of the light that shadows take, also those of objects.
         exposure_drift: Standard deviation of the exposure's slow drift, as a logarithm.
         exposure_step: Standard deviation of its steps, as a logarithm.
         white_balance_drift: Standard deviation of the white balance's slow drift, as a logarithm.
@@ -60,8 +63,8 @@ class Appearance(Settings):
         glints_per_m: Windows and lights far around, mirrored in the floor ahead, per metre of road.
         specks_per_m: Crumbs, chips and drops on the floor, per metre of road.
         prints_per_m: Figures printed or painted beside the road, clear of its lines, per metre of road.
-        stain_level: How much brighter (or darker, below 0) stains of the floor are; it needs a pattern, which
-            is to say a texture_level above 0, and so do cracks.
+        stain_level: How much brighter (or darker, below 0) stains of the floor are; stains and cracks need a
+            texture_level above 0.
         crack_level: How much darker cracks of the floor are.
     """
 
@@ -112,17 +115,17 @@ class Appearance(Settings):
 def random_appearance(
     fixed: Appearance, rng: np.random.Generator, paint_bgr: tuple[Bgr, ...] = ()
 ) -> Appearance:
-    """Draw the look of a drive.
+    """Draw the appearance of a drive.
 
     Args:
-        fixed: Values that were set in so many words stay; all others are drawn. They are drawn all the same,
-            so that fixing one does not move another.
+        fixed: Values that are set explicitly stay. They are drawn all the same, so that setting one does not
+            change another.
         rng: Source of randomness.
         paint_bgr: Colours of the road's markings; where they are dark, the floor is drawn light. Without any,
             the paint is taken to be light.
 
     Returns:
-        A look with every value set.
+        An appearance with every value set.
     """
     drawn: dict[str, Any] = {
         **_random_floor(rng),
@@ -132,16 +135,16 @@ def random_appearance(
         "lamp_level": rng.uniform(40.0, 190.0),
         "clutter_per_m": max(0.0, rng.uniform(-0.5, 4.0)),
         "wall_level": rng.uniform(10.0, 45.0),
-        # Cameras that choose the exposure themselves make dark floors gray.
+        # Automatic exposure makes dark floors gray.
         "exposure": float(np.exp(rng.uniform(np.log(0.7), np.log(1.45)))),
         "white_balance": tuple(float(v) for v in rng.uniform(0.9, 1.1, 3)),
         "vignetting": rng.uniform(0.0, 0.5),
         "blur_px": rng.uniform(0.0, 1.2),
-        # Even in the logarithm: in good light most cameras show hardly any noise.
+        # Log-uniform: in good light most cameras show hardly any noise.
         "noise_level": float(np.exp(rng.uniform(np.log(0.4), np.log(7.0)))),
         "jpeg_quality": int(rng.integers(60, 96)),
     }
-    # What came later draws from a child of its own, so that the draws above stay as they were.
+    # Each group has its own child, so that none changes the draws of another.
     later = rng.spawn(1)[0]
     drawn |= _random_motion(later) | _random_surroundings(later) | _other_floor(later)
     newer = rng.spawn(1)[0]
@@ -153,7 +156,7 @@ def random_appearance(
 
 
 def _random_motion(rng: np.random.Generator) -> dict[str, Any]:
-    """Exposure, read-out, shake and drift, up to those of a cheap camera on a bumpy floor."""
+    """Exposure, read-out, shake and drift, up to those of a cheap camera on an uneven floor."""
     return {
         "exposure_s": float(np.exp(rng.uniform(np.log(0.002), np.log(0.025)))),
         "readout_s": rng.uniform(0.0, 0.03),
@@ -199,17 +202,17 @@ def _random_marks(drawn: dict[str, Any], rng: np.random.Generator) -> dict[str, 
 
 
 def _dulled(drawn: dict[str, Any], paint_bgr: tuple[Bgr, ...], rng: np.random.Generator) -> dict[str, Any]:
-    """Make the paint of every other drive duller, as thin or dirty tape is, but never hard to see."""
+    """Make the paint of every other drive duller, like thin or dirty tape, but never hard to see."""
     dull = max(0.0, rng.uniform(-1.0, 1.0))
     paint = min((colour[1] for colour in paint_bgr), default=225.0)
     least = max(_DULLEST, (drawn["floor_bgr"][1] + _DULL_CONTRAST) / max(paint, 1.0))
     brightness = drawn["line_brightness"]
-    # Dark paint, or a light floor, leaves no room for it.
+    # Dark paint or a light floor leaves no room for that.
     return {"line_brightness": brightness - dull * max(0.0, brightness - least)}
 
 
 def _other_floor(rng: np.random.Generator) -> dict[str, Any]:
-    """On two drives of five a carpet, a printed mat or grass instead; carpet and grass are no mirrors."""
+    """On two drives of five a carpet, a printed mat or grass; carpet and grass hardly mirror lamps."""
     kind, brightness, tint, texture = rng.random(4)
     hue = rng.uniform(0.75, 1.25, 3)
     verge = rng.uniform(40.0, 180.0, 3)
@@ -233,7 +236,7 @@ def _other_floor(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _lightened(drawn: dict[str, Any], paint_bgr: tuple[Bgr, ...]) -> dict[str, Any]:
-    """Make the floor lighter where some of the paint would not stand out from it.
+    """Make the floor lighter if some of the paint would have too little contrast.
 
     Dark paint needs a light floor; with dark and light paint on one road, the floor goes in between.
     """

@@ -1,9 +1,7 @@
-"""Where to start looking for a point's place along the road: a grid of nearest samples.
+"""What lies near the car, at a cost that does not grow with the length of the road.
 
-The grid comes in square blocks, filled when the car comes near them and kept for a while: a road of 200 m
-needs hardly more memory than one of 10 m. The renderer gets the blocks around the car, as one array.
-
-What lies near a place, at a cost that does not grow with the length of the road.
+The nearest samples of the centre line come from a grid in square blocks, which are filled when the car comes
+near and kept for a while: a road of 200 m needs hardly more memory than one of 10 m.
 """
 
 from __future__ import annotations
@@ -16,17 +14,23 @@ from jaxtyping import Float, Int
 from datagen.world.render.compiled import compiled
 from datagen.world.road.track import Track
 
+#: Two samples of the centre line; the search from there takes a step or two.
 _GRID_CELL_CM = 2.0
-_GRID_MARGIN_CM = 10.0  # around the markings, for pixels that reach over from outside
+#: Around the markings, for pixels that reach over them from outside.
+_GRID_MARGIN_CM = 10.0
 _BLOCK_CELLS = 128
-_MAX_BLOCKS = 32  # some more than lie around a car
+#: Some more than lie around a car.
+_MAX_BLOCKS = 32
+#: Cells of :class:`Nearby`, and how many are kept: as many as a car passes in 100 m.
+_CELL_CM = 200.0
+_MAX_CELLS = 64
 
 
 class NearestGrid:
     """The nearest sample of the centre line for places near a road."""
 
     def __init__(self, track: Track) -> None:
-        """Find which blocks each stretch of a road touches."""
+        """Find which blocks each sample of a road touches."""
         #: How far from the centre line it answers.
         self.reach_cm = _GRID_MARGIN_CM + max(
             (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
@@ -36,11 +40,6 @@ class NearestGrid:
         self._samples = self._samples_by_block(track)
         self._blocks: dict[tuple[int, int], Int[np.ndarray, "b b"]] = {}
         self._window: tuple[tuple[int, ...], Int[np.ndarray, "r c"]] | None = None
-
-    @property
-    def blocks(self) -> int:
-        """How many blocks the road touches."""
-        return len(self._samples)
 
     def around(
         self, low_cm: Float[np.ndarray, "2"], high_cm: Float[np.ndarray, "2"]
@@ -58,7 +57,7 @@ class NearestGrid:
         first = np.floor((low_cm - self._low) / size_cm).astype(int)
         last = np.floor((high_cm - self._low) / size_cm).astype(int)
         key = (int(first[0]), int(first[1]), int(last[0]), int(last[1]))
-        # The car stays among the same blocks for many frames.
+        # The blocks around the car stay the same for many frames.
         if self._window is None or self._window[0] != key:
             self._window = key, self._join(*key)
         return self._window[1], np.array([*(self._low + first * size_cm), _GRID_CELL_CM])
@@ -88,7 +87,7 @@ class NearestGrid:
         return block
 
     def _samples_by_block(self, track: Track) -> dict[tuple[int, int], Int[np.ndarray, "samples"]]:
-        """Return for each block that the road touches which samples of the centre line it may answer with."""
+        """Return for each block that the road touches the samples of the centre line near it."""
         size_cm = _BLOCK_CELLS * _GRID_CELL_CM
         low = np.floor((track.xy_cm - self.reach_cm - self._low) / size_cm).astype(int)
         high = np.floor((track.xy_cm + self.reach_cm - self._low) / size_cm).astype(int)
@@ -119,12 +118,8 @@ def _fill_grid(nodes_xy, index, origin_x, origin_y, cell, reach, best, grid):
                     grid[row, column] = i
 
 
-_CELL_CM = 200.0
-_MAX_CELLS = 64
-
-
 class Nearby:
-    """Rows of a table by the place where the car is; neighbouring frames share the answer."""
+    """Rows of a table near the car; neighbouring frames share the answer."""
 
     def __init__(
         self, rows: Float[np.ndarray, "n k"], reaches_cm: Float[np.ndarray, "n"], sight_cm: float
@@ -140,7 +135,7 @@ class Nearby:
         self._cells: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     def at(self, x_cm: float, y_cm: float) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m"]]:
-        """Return all rows that reach into sight of a place, and some more, in the table's order; reaches."""
+        """Return the rows that may be in sight from a place, in the table's order, and their reaches."""
         cell = (int(np.floor(x_cm / _CELL_CM)), int(np.floor(y_cm / _CELL_CM)))
         found = self._cells.get(cell)
         if found is None:

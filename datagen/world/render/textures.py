@@ -23,13 +23,14 @@ PATTERN_BGR: dict[str, tuple[float, float, float]] = {
     "grass": (0.5, 1.25, 0.8),
 }
 _CELLS = TEXTURE_SIDE
+#: Largest deviation of a pattern, in standard deviations: no single spot is as bright as paint.
 _MAX_DEVIATION = 6.0
 
 Cells = Float[np.ndarray, "n n"]
 
 
 def noise(scale_cm: float, stretch: float, rng: np.random.Generator) -> Cells:
-    """Noise with equal power per octave from the grain size to 50 cm, filtered by Fourier transform."""
+    """Return noise with equal power per octave from the grain size to 50 cm, of unit variance."""
     f = np.fft.fftfreq(_CELLS, TEXTURE_CELL_CM)
     fu, fv = np.meshgrid(f * stretch, f)
     frequency = np.hypot(fu, fv)
@@ -86,7 +87,7 @@ def level_starts() -> Int[np.ndarray, "starts"]:
 
 
 def pack_levels(pattern: Cells) -> Float32[np.ndarray, "packed"]:
-    """Blur a periodic pattern more from level to level, with half the cells each time, into one row."""
+    """Blur a periodic pattern more from level to level, halve the cells each time, and join all levels."""
     f = np.fft.fftfreq(_CELLS, TEXTURE_CELL_CM)
     fu, fv = np.meshgrid(f, f)
     spectrum = np.fft.fft2(pattern)
@@ -120,7 +121,7 @@ def _cracks(count: int, width: float, level: float, rng: np.random.Generator) ->
 def _wrapped_line(
     cells: Float32[np.ndarray, "n n"], path: Float[np.ndarray, "k 2"], level: float, width: int
 ) -> None:
-    """Draw a line of cells that goes on at the other side where it leaves the pattern."""
+    """Draw a line that continues at the opposite side where it leaves the pattern."""
     low = np.floor(path.min(axis=0) / _CELLS).astype(int)
     high = np.floor(path.max(axis=0) / _CELLS).astype(int)
     for i in range(low[0], high[0] + 1):
@@ -130,7 +131,7 @@ def _wrapped_line(
 
 
 def _planks(rng: np.random.Generator) -> Cells:
-    """Boards of one width and many lengths, each with a tone of its own, and dark joints between them."""
+    """Boards of one width and many lengths, each with its own tone, and dark joints between them."""
     cells = np.zeros((_CELLS, _CELLS))
     rows = int(rng.integers(18, 32))
     edges = np.linspace(0, _CELLS, rows + 1).astype(int)
@@ -149,10 +150,8 @@ def _weave(rng: np.random.Generator) -> Cells:
     v, u = np.mgrid[0:_CELLS, 0:_CELLS]
     waves = 2 ** int(rng.integers(2, 5))
     phase = 2.0 * np.pi * waves / _CELLS
-    stripes = (
-        np.sign(np.sin(phase * u)) if rng.random() < 0.5 else np.sign(np.cos(phase * u) + np.cos(phase * v))
-    )
-    return np.asarray(stripes * (rng.uniform(0.4, 1.2) if rng.random() < 0.5 else 0.0))
+    wave = np.sin(phase * u) if rng.random() < 0.5 else np.cos(phase * u) + np.cos(phase * v)
+    return np.asarray(np.sign(wave) * (rng.uniform(0.4, 1.2) if rng.random() < 0.5 else 0.0))
 
 
 def _wrinkles(rng: np.random.Generator) -> Cells:
@@ -166,7 +165,7 @@ def _wrinkles(rng: np.random.Generator) -> Cells:
         )
         _wrapped_line(cells, path, 3.0, 4)
         _wrapped_line(cells, path + 5.0 * np.array([-np.sin(angle), np.cos(angle)]), -3.0, 4)
-    # Wrapped, so that the blur of a fold at the edge goes on at the other side.
+    # Wrapped, so that the blur of a fold continues at the opposite side.
     framed = cv2.copyMakeBorder(cells, 16, 16, 16, 16, cv2.BORDER_WRAP)
     return cv2.GaussianBlur(framed, (0, 0), 3.0)[16:-16, 16:-16].astype(np.float64)
 

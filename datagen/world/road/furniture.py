@@ -1,4 +1,4 @@
-"""What is painted on a road besides its lines: stop lines, crossings, arrows, junctions, parking bays."""
+"""Settings of road furniture, which is painted: stop lines, crossings, arrows, junctions, parking bays."""
 
 from __future__ import annotations
 

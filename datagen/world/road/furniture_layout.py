@@ -1,6 +1,6 @@
-"""Which things stand on a road: those that are listed, checked, and random ones where there is room.
+"""Road furniture in place: what settings list, checked, and random things where there is room.
 
-Rectangles of paint for each thing on the road, and the lines that it interrupts.
+Each thing is a set of painted rectangles and the lines that it interrupts.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,17 +28,29 @@ from datagen.world.road.furniture import (
 from datagen.world.road.track import Bgr, Side, Track
 from lanenet.errors import ConfigError
 
-_LINE_STOP_CM = 5.0  # stop bars of side roads are twice as thick as lines, but wide lines stay as they are
-_CORNER_STEP_RAD = 0.2  # arc per strip of tape; at 15 cm radius a strip leaves the arc by 0.02 cm
+#: Stop bars of side roads are twice as thick as lines, up to this; wide lines are not made thicker.
+_LINE_STOP_CM = 5.0
+#: Arc per strip of tape; at 15 cm radius a strip leaves the arc by 0.07 cm.
+_CORNER_STEP_RAD = 0.2
+#: Random things: places that are tried for each; least distance along the road and beside it; chosen.
+_TRIES = 15
+_APART_CM = 30.0
+_BESIDE_CM = 10.0
+#: Spacing of the points whose distances are compared.
+_OUTLINE_CM = 5.0
+#: How far the end of a random crossing's bar may lie beside its bend: about a line's width.
+_BAR_BESIDE_CM = 2.0
+#: How much the road may turn over a junction, whose lines are straight.
+_BEND_RAD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """What one thing needs.
+    """The paint of one thing.
 
     Attributes:
         boxes: Rectangles, see ``Track.boxes``.
-        cuts: Offset of the line, start and end along the road of what is not painted, [cm].
+        cuts: Interruptions of lines: offset of the line, start and end along the road, [cm].
     """
 
     boxes: Float[np.ndarray, "b 9"]
@@ -92,7 +104,7 @@ class _Strips:
     def strip(
         self, start: tuple[float, float], end: tuple[float, float], width_cm: float, overlap_cm: float = 0.0
     ) -> None:
-        """Lay a strip of tape from point to point, longer by ``overlap_cm`` in all."""
+        """Add a strip of tape from point to point, longer by ``overlap_cm`` in total."""
         dx, dy = end[0] - start[0], end[1] - start[1]
         middle = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
         self.box(*middle, float(np.arctan2(dy, dx)), float(np.hypot(dx, dy)) + overlap_cm, width_cm)
@@ -119,7 +131,7 @@ def _zebra(track: Track, zebra: Zebra) -> Painted:
     n = max(1, int((width_cm - zebra.gap_cm) / period_cm))
     for y_cm in (np.arange(n) - 0.5 * (n - 1)) * period_cm + track.middle_cm:
         strips.box(0.0, float(y_cm), 0.0, zebra.length_cm, zebra.bar_cm)
-    # The bars take the place of the line between the lanes.
+    # The bars replace the line between the lanes.
     half_cm = 0.5 * zebra.length_cm
     cuts = ((track.middle_cm, zebra.at_cm - half_cm, zebra.at_cm + half_cm),) if track.oncoming_cm else ()
     return Painted(strips.boxes, cuts)
@@ -193,15 +205,11 @@ def _parking(track: Track, parking: Parking, line_width_cm: float) -> Painted:
     line_cm = outer_offset_cm(track, parking.side)
     back_cm = line_cm + sign * parking.depth_cm
     places = parking.at_cm + (np.arange(parking.bays + 1) - 0.5 * parking.bays) * parking.bay_cm
-    # In the map, since the row follows the road: each separator is straight, each back edge a chord.
-    boxes = []
-    ends = [track.point(float(s), back_cm)[0] for s in places]
-    for s, end in zip(places, ends, strict=True):
-        start = track.point(float(s), line_cm)[0]
-        boxes.append(_strip_row(start, end, line_width_cm, COLOURS[parking.colour]))
-    for start, end in pairwise(ends):
-        boxes.append(_strip_row(start, end, line_width_cm, COLOURS[parking.colour]))
-    return Painted(np.array(boxes).reshape(-1, 9))
+    # In the frame map, since the row follows the road: separators are straight, back edges are chords.
+    starts, ends = ([track.point(float(s), side_cm)[0] for s in places] for side_cm in (line_cm, back_cm))
+    strips = [*zip(starts, ends, strict=True), *pairwise(ends)]
+    colour = COLOURS[parking.colour]
+    return Painted(np.array([_strip_row(start, end, line_width_cm, colour) for start, end in strips]))
 
 
 def _strip_row(
@@ -213,21 +221,13 @@ def _strip_row(
     return [*middle, *(along / length), 0.5 * length, 0.5 * width_cm, *colour_bgr]
 
 
-_TRIES = 15
-_APART_CM = 30.0  # least gap between random things along the road
-_BESIDE_CM = 10.0  # and beside it
-_OUTLINE_CM = 5.0  # spacing of the points that are compared
-_BAR_BESIDE_CM = 2.0  # how far the end of a random crossing's bar may lie beside the bend that it is on
-_BEND_RAD = 0.1  # how much the road may turn over a junction
-
-
 def listed_furniture(
     track: Track, items: Sequence[Furniture], line_width_cm: float, where: str
 ) -> list[Painted]:
     """Paint what a file lists.
 
     Raises:
-        ConfigError: If something lies beyond the end, on a bend that it does not fit, or on another stretch
+        ConfigError: If something lies beyond the end, on a bend that it does not fit, or on another section
             of the road; with its place in the list.
     """
     result = []
@@ -252,7 +252,7 @@ def random_furniture(
     rng: np.random.Generator,
     middle_colour: Colour | None = None,
 ) -> list[Painted]:
-    """Draw things where there is room; what finds none is left out.
+    """Draw things where there is room; what finds no room is left out.
 
     Args:
         track: The road.
@@ -267,17 +267,11 @@ def random_furniture(
         "junction": {"stop_colour": rates.junction_stop_colour, "middle_colour": middle_colour}
     }
     occupied = [(item.value.at_cm, extent_cm(item)) for item in taken]
-    # Side roads and bays may meet beside the road, also where their mouths are far apart along it.
+    # Side roads and bays may meet beside the road even if they are far apart along it.
     outlines = [_outline(paint_furniture(track, item, line_width_cm).boxes) for item in taken]
     result = []
     # The order is part of the format: the widest things first, new kinds at the end.
-    kinds: tuple[Literal["junction", "parking", "zebra", "stop_line", "arrow"], ...] = (
-        "junction",
-        "parking",
-        "zebra",
-        "stop_line",
-        "arrow",
-    )
+    kinds = ("junction", "parking", "zebra", "stop_line", "arrow")
     for kind, kind_rng in zip(kinds, rng.spawn(len(kinds)), strict=True):
         expected = getattr(rates, f"{kind}_per_m") * track.length_cm / 100.0
         for _ in range(kind_rng.poisson(expected)):
@@ -285,7 +279,7 @@ def random_furniture(
                 at_cm = float(kind_rng.uniform(0.0, track.length_cm))
                 thing = _random_thing(track, kind, at_cm, kind_rng)
                 thing = thing.model_copy(update={"colour": colour, **colours.get(kind, {})})
-                item = Furniture(**{kind: thing})
+                item = Furniture.model_validate({kind: thing})
                 if not _is_free(track, item, occupied) or _misplaced(track, item) is not None:
                     continue
                 if kind == "zebra" and _leaves_the_bend(track, item):
@@ -355,7 +349,7 @@ def _is_free(track: Track, item: Furniture, occupied: Sequence[tuple[float, floa
 
 
 def _misplaced(track: Track, item: Furniture) -> str | None:
-    """What is wrong with the place along the road; None where nothing is."""
+    """What is wrong with the place along the road, or None."""
     at_cm, half_cm = item.value.at_cm, 0.5 * extent_cm(item)
     last_cm = track.length_cm - (0.0 if track.closed else half_cm)
     first_cm = 0.0 if track.closed else half_cm
@@ -385,7 +379,7 @@ def _misplaced(track: Track, item: Furniture) -> str | None:
 
 
 def _on_the_road(track: Track, item: Furniture, painted: Painted) -> str | None:
-    """Whether something beside the road lies on another stretch of it."""
+    """What is wrong if something beside the road lies on another section of it, or None."""
     if item.junction is None and item.parking is None:
         return None
     outer = _outline(painted.boxes)
@@ -393,15 +387,14 @@ def _on_the_road(track: Track, item: Furniture, painted: Painted) -> str | None:
     if track.closed:
         gap = np.minimum(gap, track.length_cm - gap)
     reach = track.half_width_cm + 2.0
-    # What is beside the thing itself is its own stretch; corner and half the road for what is left of a bend.
+    # The section beside the thing itself does not count, nor, for bends, some more of the road around it.
     others = np.flatnonzero(gap > 0.5 * extent_cm(item) + 2.0 * reach)[::3]
-    normal = np.stack([-np.sin(track.heading_rad[others]), np.cos(track.heading_rad[others])], axis=1)
-    middle = track.xy_cm[others] + track.middle_cm * normal
+    middle = track.beside(others, track.middle_cm)
     for i in range(0, len(middle), 4096):
         d = np.linalg.norm(outer[:, None] - middle[None, i : i + 4096], axis=2)
         if d.min() < reach:
             s_cm = track.s_cm[others[i + int(d.min(axis=0).argmin())]]
-            return f"it lies on another stretch of the road, at {s_cm:.0f} cm; make it shorter or move it"
+            return f"it lies on another section of the road, at {s_cm:.0f} cm; make it shorter or move it"
     return None
 
 

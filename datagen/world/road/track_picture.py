@@ -1,4 +1,4 @@
-"""A road from above, for the eye."""
+"""Pictures of a road from above."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _FLOOR: Bgr = (80.0, 80.0, 80.0)
 _CAR: Bgr = (60.0, 160.0, 60.0)
 _MARGIN_CM = 25.0
 _STEP_CM = 8.0  # of the polygons that stand for bent tape; their sides leave a radius of 60 cm by 0.13 cm
-FIXED_BITS = 4  # OpenCV draws at sixteenths of a pixel
+#: OpenCV draws at sixteenths of a pixel.
+FIXED_BITS = 4
 _LARGEST_PX = 20_000
 
 

@@ -73,8 +73,7 @@ def reality(
             found = []
             for k, (drive, lens) in enumerate(zip(chosen, cameras, strict=True)):
                 progress(stage, k, len(chosen))
-                most = settings.real_frames
-                found.append(measure_drive(drive, lens, most, settings.perception, settings.window))
+                found.append(measure_drive(drive, lens, settings.sampling(settings.real_frames)))
             progress(stage, len(chosen), len(chosen))
             return found
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.reality.measure import HEIGHT_CM, at_nominal_height, measure_frames
+from datagen.reality.measure import HEIGHT_CM, Sampling, at_nominal_height, measure_frames
 from datagen.reality.statistics import STATISTICS, chain_points, drive_statistics, edge_statistics
 from datagen.world.car.camera import CameraSettings
 from lanenet.perception.edges.road import RangeSettings, RoadTable
@@ -129,9 +129,10 @@ def test_runs_end_at_corners_and_keep_a_lines_edges_apart():
 def test_the_height_of_the_camera_does_not_matter():
     frames = [_line(10.0 + k) for k in range(6)]
     low, high = (
-        measure_frames("d", frames.__getitem__, 6, CAMERA.with_mounting(height_cm=h), 6) for h in (9.0, 31.0)
+        measure_frames("d", frames.__getitem__, 6, CAMERA.with_mounting(height_cm=h), Sampling(6))
+        for h in (9.0, 31.0)
     )
     assert low.statistics == high.statistics
     assert low.camera.mounting.height_cm == HEIGHT_CM and low.mask is None
     placed = replace(CAMERA, mounting=replace(CAMERA.mounting, ahead_of_front_axle_cm=7.0))
-    assert measure_frames("d", frames.__getitem__, 6, placed, 6).statistics == low.statistics
+    assert measure_frames("d", frames.__getitem__, 6, placed, Sampling(6)).statistics == low.statistics

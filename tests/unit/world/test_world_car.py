@@ -130,7 +130,7 @@ def test_a_delay_need_not_be_whole_frames():
 
 def test_speed_follows_with_its_time_constant():
     car = Car(_exact(speed_lag_s=0.2), np.zeros(3), np.random.default_rng(0))
-    car.place(np.zeros(3), told_cm_s=0.0)
+    car.place(np.zeros(3), commanded_cm_s=0.0)
     for _ in range(8):
         car.step(60.0, 0.0, 0.05)
     # x(t) = v (t - T (1 - exp(-t / T))), v(t) = v (1 - exp(-t / T)), at t = 2 T.
@@ -176,7 +176,7 @@ def test_a_car_put_back_forgets_its_commands():
     for _ in range(10):
         car.step(60.0, 0.4, 0.05)
     assert car.wheels_rad > 0.3
-    car.place(np.array([5.0, 6.0, 1.0]), told_cm_s=60.0)
+    car.place(np.array([5.0, 6.0, 1.0]), commanded_cm_s=60.0)
     for _ in range(3):
         pose = car.step(60.0, 0.4, 0.05)
     np.testing.assert_allclose(pose, [5.0 + 9.0 * np.cos(1.0), 6.0 + 9.0 * np.sin(1.0), 1.0])

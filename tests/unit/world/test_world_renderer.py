@@ -235,7 +235,7 @@ def test_place_along_the_road_agrees_with_the_track():
         for s, offset in zip(rng.uniform(2.0, 898.0, 200), rng.uniform(-25.0, 25.0, 200), strict=True):
             xy, heading = track.point(s, offset)
             guess = (int(s / track.step_cm) + int(rng.integers(-3, 4))) % len(track.s_cm)
-            found = locate(xy[0], xy[1], renderer._road[0], closed, guess)
+            found = locate(xy[0], xy[1], renderer._road.nodes, closed, guess)
             near = (found[0] - s + 450.0) % 900.0 - 450.0 if closed else found[0] - s
             assert abs(near) < 0.01
             assert found[1] == pytest.approx(offset, abs=0.005)
