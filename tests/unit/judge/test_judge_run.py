@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic_roads import move_track
 
 from datagen.datasets.jobs import SyntheticJob
 from datagen.datasets.settings import DataSettings, SyntheticSettings
