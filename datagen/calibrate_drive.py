@@ -220,7 +220,8 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
     _check_count(recorded, len(recorded), "frames")
     try:
         check_moving(recorded)
-        moving = following_frames(recorded, notes)
+        moving, found = following_frames(recorded)
+        notes += found
         _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
         segments = split_segments(moving)
     except TrackingLostError as error:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from datagen.quality.measure import held_out_frames
 from datagen.settings import MapSettings, with_wheelbase
-from datagen.slam.odometry.stillness import following_frames, small_picture
+from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.recording import ImageSource
@@ -96,7 +96,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     recorded = keep_images(open_drive(request.drive_path))
     check_moving(recorded)
     notes = list(recorded.problems)
-    drive = following_frames(recorded, notes)
+    drive, found = following_frames(recorded)
     segments = split_segments(drive)
     # Deleted frames get no labels; where the car leaves the road, they show nothing of the lines.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
@@ -105,7 +105,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     settings, hidden = hide_bumper(drive, settings)
     if known is not None:
         check_size(known, drive, request.camera_path)
-    notes += [*nominal, *hidden]
+    notes += [*found, *nominal, *hidden]
     return PreparedDrive(request, drive, segments, held_out, settings, known, tuple(notes))
 
 
@@ -232,7 +232,7 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
 
 def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:
     """Block means of a frame relative to its brightness: suppresses noise and flicker."""
-    small = small_picture(drive, k).astype(np.float64)
+    small = shrink_image(drive.image(k)).astype(np.float64)
     return (small - small.mean()).ravel()
 
 

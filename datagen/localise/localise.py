@@ -1,4 +1,4 @@
-"""Localise a car as it drives: poses are written while frames come, a map is drawn, memory stays bounded."""
+"""Localise a car as it drives: poses are written as frames come, a map is drawn, memory stays bounded."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
+import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from datagen.localise.live_filter import LiveLocaliser, LivePose, Moment, StartSettings
-from datagen.localise.picture import LiveCanvas
-from datagen.quality.pictures import write_png
+from datagen.localise.live_filter import LiveFrame, LiveLocaliser, LivePose, StartSettings
+from datagen.quality.pictures import draw_metre, write_png
 from datagen.settings import MapSettings
 from datagen.slam.commands import SteeringFit
 from lanenet.data.files import atomic_file, check_destination
@@ -25,8 +26,16 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 
 HEADER = "frame,t_s,x_cm,y_cm,heading_rad,segment,match,spread_cm\n"
-_TIMED = 2000  # frames of which the times are kept
-_DRAWN_HEIGHTS = 3.0  # edges further away blur the picture
+#: Frames whose times are kept: enough for a 99th percentile.
+_TIMED = 2000
+#: Edges further away than this, in camera heights, would blur the picture.
+_DRAWN_HEIGHTS = 3.0
+#: Side of a pixel of the picture at first, [cm]: a quarter of a narrow tape; empty rim of the picture.
+_FINEST_CM, _MARGIN_PX = 0.5, 40
+#: Colours of the picture: number of hues, frames that share one, and the value of the driven path.
+_HUES, _FRAMES_PER_HUE, _DRIVEN = 150, 4, 255
+#: Width and height of the canvas: 12 m at the finest, in 5.8 MB.
+_CANVAS_PX = 2400
 
 
 @dataclass(frozen=True)
@@ -39,18 +48,18 @@ class LiveReport:
         picture: The longest segment from above.
         frames: Frames taken in.
         poses: Poses written.
-        segments: Stretches without an interruption that gave poses.
+        segments: Segments that gave poses.
         unreadable: Frames without an image.
         standing: Frames in which the car stood.
-        dropped: Frames of stretches too short to find a speed in.
-        factor: Usual distance factor (see :class:`datagen.slam.filter.motion.MotionModel`).
-        speed_known: Whether the factor is the gain of a recorded speed, and not a way per frame in cm.
+        dropped: Frames of segments too short to find a typical step in.
+        factor: Typical distance factor (see :class:`datagen.slam.filter.motion.MotionModel`).
+        speed_known: Whether the factor is the gain of a recorded speed, not a step length in cm.
         steering: How the car answered to the steering; None where that was not found.
         match: Median matched share of a frame's edges.
-        median_ms: Median time of edges and filter together per frame, over the last frames.
-        p99_ms: 99th percentile of it.
+        median_ms: Median time per frame of edges and filter together, over the last frames.
+        p99_ms: Its 99th percentile.
         map_mb: Memory of the filter's map.
-        process_mb: Most memory that the process has taken; None where the system does not tell.
+        process_mb: Peak memory of the process; None where the system does not tell.
     """
 
     out: Path
@@ -73,7 +82,7 @@ class LiveReport:
 
 
 def localise(
-    moments: Iterable[Moment],
+    frames: Iterable[LiveFrame],
     camera: Camera,
     settings: MapSettings,
     out: Path,
@@ -82,10 +91,10 @@ def localise(
 ) -> LiveReport:
     """Localise a car frame by frame with the particle filter alone.
 
-    Each pose is on disk when its frame has been seen. Ctrl-C ends the drive, and not the program.
+    Each pose is on disk when its frame has been seen. Ctrl-C ends the drive, not the program.
 
     Args:
-        moments: Frames as they come: a recording (:func:`datagen.localise.live_filter.moments_of`) or a
+        frames: Frames as they come: a recording (:func:`datagen.localise.live_filter.live_frames`) or a
             camera.
         camera: Camera of the frames.
         settings: Settings of perception, filter and motion.
@@ -94,7 +103,7 @@ def localise(
         progress: Called with the number of frames taken in.
 
     Raises:
-        TrackingLostError: If no stretch of the drive was long enough to find the speed in.
+        TrackingLostError: If no segment was long enough to find the typical step in.
         DriveFormatError: If time goes back.
         CalibrationError: If the images are not of the camera's size.
         LanenetError: If a file cannot be written.
@@ -103,9 +112,9 @@ def localise(
     trajectory, picture = out.with_suffix(".tum"), out.with_suffix(".png")
     for path in (out, trajectory, picture):
         check_destination(path)
-    # The picture shows the longest segment: that one, and the one being driven, are kept.
+    # The picture shows the longest segment: that one and the one being driven are kept.
     longest = drawn = LiveCanvas()
-    segment = frames = count = 0
+    segment = taken = count = 0
     times_s: deque[float] = deque(maxlen=_TIMED)
     matches: deque[float] = deque(maxlen=_TIMED)
     segments, speed_known = set[int](), False
@@ -132,17 +141,17 @@ def localise(
             count += len(poses)
 
         try:
-            for moment in moments:
+            for frame in frames:
                 begun_s = time.perf_counter()
-                poses = localiser.take(moment)
+                poses = localiser.take(frame)
                 if len(poses) == 1:
-                    # A burst at the start is not what a frame costs.
+                    # The burst at the start is not what a frame costs.
                     times_s.append(time.perf_counter() - begun_s)
                 keep(poses)
-                frames += 1
-                speed_known = moment.commands.speed_cm_s is not None
+                taken += 1
+                speed_known = frame.commands.speed_cm_s is not None
                 if progress is not None:
-                    progress(frames)
+                    progress(taken)
         except KeyboardInterrupt:
             pass
         keep(localiser.finish())
@@ -153,23 +162,23 @@ def localise(
         (1e3 * float(np.percentile(times_s, q)) for q in (50, 99)) if times_s else (float("nan"),) * 2
     )
     return LiveReport(
-        out,
-        trajectory,
-        picture,
-        frames,
-        count,
-        len(segments),
-        localiser.unreadable,
-        localiser.standing,
-        localiser.dropped,
-        localiser.factor,
-        speed_known,
-        localiser.steering,
-        float(np.median(matches)) if matches else float("nan"),
-        median_ms,
-        p99_ms,
-        localiser.map_bytes / 1e6,
-        process_mb(),
+        out=out,
+        trajectory=trajectory,
+        picture=picture,
+        frames=taken,
+        poses=count,
+        segments=len(segments),
+        unreadable=localiser.unreadable,
+        standing=localiser.standing,
+        dropped=localiser.dropped,
+        factor=localiser.factor,
+        speed_known=speed_known,
+        steering=localiser.steering,
+        match=float(np.median(matches)) if matches else float("nan"),
+        median_ms=median_ms,
+        p99_ms=p99_ms,
+        map_mb=localiser.map_bytes / 1e6,
+        process_mb=process_mb(),
     )
 
 
@@ -208,7 +217,7 @@ class _PoseLog:
 
 
 def process_mb() -> float | None:
-    """Most memory that this process has taken so far; None where the system does not tell."""
+    """Peak memory of this process so far; None where the system does not tell."""
     try:
         import resource
     except ImportError:  # Windows
@@ -216,3 +225,72 @@ def process_mb() -> float | None:
     peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     # In bytes on macOS, in KiB on Linux.
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024.0 / 1e6
+
+
+class LiveCanvas:
+    """A map from above of one segment: edges (hue = time, repeating) and the driven path (white).
+
+    Where the car leaves the canvas, its pixels become twice as coarse, so that its memory does not grow.
+
+    Attributes:
+        frames: How many frames were drawn.
+        cm_per_px: Side of a pixel.
+    """
+
+    def __init__(self, size_px: int = _CANVAS_PX) -> None:
+        self.frames, self.cm_per_px = 0, _FINEST_CM
+        self._pixels: UInt8[np.ndarray, "s s"] = np.zeros((size_px, size_px), np.uint8)
+        #: Corners of what was drawn, and the canvas's own lower one, frame map.
+        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
+        self._corner = np.zeros(2)
+        self._car: Float[np.ndarray, "1 2"] | None = None
+
+    def add(self, edges_map_cm: Float[np.ndarray, "m 2"], car_cm: Float[np.ndarray, "2"]) -> None:
+        """Draw a frame's edges and the path to its pose, [cm], frame map."""
+        before = car_cm[None] if self._car is None else self._car
+        self._car = car_cm[None]
+        steps = int(np.abs(self._car - before).max() / self.cm_per_px) + 2
+        path = before + np.linspace(0.0, 1.0, steps)[:, None] * (self._car - before)
+        self._make_room(np.concatenate([edges_map_cm, path]))
+        self._plot(edges_map_cm, 1 + self.frames // _FRAMES_PER_HUE % _HUES)
+        self._plot(path, _DRIVEN)
+        self.frames += 1
+
+    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return what was drawn, with a scale bar of a metre."""
+        colours = np.full((256, 1, 3), 24, np.uint8)
+        hues = np.stack([np.arange(_HUES), np.full(_HUES, 200), np.full(_HUES, 200)], axis=1)
+        colours[1 : 1 + _HUES] = cv2.cvtColor(hues[:, None].astype(np.uint8), cv2.COLOR_HSV2BGR)
+        colours[_DRIVEN] = 255
+        used = self._pixels
+        if self.frames:
+            low, high = (((c - self._corner) / self.cm_per_px).astype(int) for c in (self._low, self._high))
+            used = used[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        # y grows upwards on the map.
+        indices = np.pad(used[::-1], _MARGIN_PX)
+        image = np.ascontiguousarray(colours[indices, 0])
+        draw_metre(image, 1.0 / self.cm_per_px)
+        return image
+
+    def _plot(self, points_cm: Float[np.ndarray, "m 2"], value: int) -> None:
+        column, row = ((points_cm - self._corner) / self.cm_per_px).astype(int).T
+        self._pixels[row, column] = np.maximum(self._pixels[row, column], value) if value < 255 else value
+
+    def _make_room(self, points_cm: Float[np.ndarray, "m 2"]) -> None:
+        """Move or coarsen the canvas so that the points fit on it."""
+        self._low = np.minimum(self._low, points_cm.min(axis=0))
+        self._high = np.maximum(self._high, points_cm.max(axis=0))
+        size = len(self._pixels)
+        extent = self._high - self._corner
+        if self.frames and (self._low >= self._corner).all() and (extent < size * self.cm_per_px).all():
+            return
+        row, column = np.nonzero(self._pixels)
+        drawn = self._corner + (np.stack([column, row], axis=1) + 0.5) * self.cm_per_px
+        values = self._pixels[row, column]
+        # With room on all sides, so that this is rare.
+        while 1.25 * (self._high - self._low).max() >= size * self.cm_per_px:
+            self.cm_per_px *= 2.0
+        self._corner = 0.5 * (self._low + self._high - size * self.cm_per_px)
+        self._pixels[:] = 0
+        column, row = ((drawn - self._corner) / self.cm_per_px).astype(int).T
+        np.maximum.at(self._pixels, (row, column), values)

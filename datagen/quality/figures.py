@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 
 from datagen.lanes.find import MappedSegment
 from datagen.quality.verdict import LineEvidence, MapEvidence
-from datagen.slam.loops.pose_graph import missed_by
+from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import known_lines
 from lanenet.geometry.camera import Camera
@@ -65,7 +65,7 @@ def map_figures(
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
-        residual = np.abs(missed_by(solved.poses, solved.revisits))
+        residual = np.abs(revisit_residuals(solved.poses, solved.revisits))
         segments.append(
             {
                 "first_frame": int(numbers[part.rows[0]]),

@@ -18,15 +18,15 @@ from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, adjust
 from datagen.slam.commands import commands_of, joined_commands
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import keyframe_pairs
-from datagen.slam.loops.mutual import AGREE_HEIGHTS, AGREE_RAD, AGREE_WAY, separate_places
-from datagen.slam.loops.places import (
+from datagen.slam.loops.consistency import AGREE_HEIGHTS, AGREE_RAD, AGREE_SHARE, count_places
+from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
+from datagen.slam.loops.revisits import (
     Revisit,
-    alike,
     diagonal_mean,
     match_places,
+    similarities,
     thumbnails,
 )
-from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.segment import MAX_MISFIT, MAX_MISSED, SolvedSegment
 from datagen.slam.settings import SlamSettings
@@ -142,7 +142,7 @@ class _Pair:
         base, other = self.both
         later = [r.later - self.first for r in shared.revisits]
         path = path_lengths(other.poses)
-        if separate_places(path[later], self.height) < self.settings.revisits.min_revisits:
+        if count_places(path[later], self.height) < self.settings.revisits.min_revisits:
             return None
         # The loop closures of either map, beside what they share.
         own = [replace(r, earlier=r.earlier + self.first, later=r.later + self.first) for r in other.revisits]
@@ -192,9 +192,9 @@ class _Pair:
             start = BundleEstimate(poses, tilt, self.camera)
             bundle = adjust(observed, start, settings, rng, (), held + loops)
             poses, tilt = bundle.poses, bundle.tilt
-            inliers = borne_out(poses, revisits, self.height)
+            inliers = inlier_revisits(poses, revisits, self.height)
             loops = loop_pairs(inliers, len(poses), breaks)
-            loops += side_by_side(poses, self.height, self.settings.revisits)
+            loops += neighbouring_laps(poses, self.height, self.settings.revisits)
         return bundle
 
     def in_order_of_the_drive(
@@ -230,13 +230,13 @@ def _alike_frames(
     """Pairs of frames, one of either segment, that look alike, each the other's most similar one.
 
     Args:
-        base: Thumbnails of the first segment, see :func:`datagen.slam.loops.places.thumbnails`.
+        base: Thumbnails of the first segment, see :func:`datagen.slam.loops.revisits.thumbnails`.
         other: Likewise of the second, whose frames count on from those of the first.
         min_similarity: Correlation of the thumbnails, averaged over a few frames.
         max_pairs: Pairs at most, spread over the second segment.
     """
     first = len(base)
-    similarity = diagonal_mean(alike(base, other))
+    similarity = diagonal_mean(similarities(base, other))
     # What surrounds the last frames of one segment must not be taken from the other one.
     inner = similarity[: max(first - _EDGE, 0)]
     if not inner.size:
@@ -274,7 +274,7 @@ def _agreeing(poses: Float[np.ndarray, "n 3"], first: int, found: list[Revisit],
         for r in found:
             seen = relative_pose(poses[r.earlier], carried[r.later - first]) - r.relative
             between = abs(path[r.later - first] - path[one.later - first])
-            near = float(np.hypot(seen[0], seen[1])) < AGREE_HEIGHTS * height_cm + AGREE_WAY * between
+            near = float(np.hypot(seen[0], seen[1])) < AGREE_HEIGHTS * height_cm + AGREE_SHARE * between
             if near and abs(float(wrap_angle(seen[2:])[0])) < AGREE_RAD:
                 turns = carried[r.later - first, 2] - poses[r.earlier, 2] - r.relative[2]
                 kept.append(replace(r, turns=round(turns / (2.0 * np.pi))))

@@ -21,15 +21,9 @@ from datagen.slam.keyframes import (
     poses_between,
     values_between,
 )
-from datagen.slam.loops.mutual import with_supported, without_contradicted
-from datagen.slam.loops.places import (
-    Revisit,
-    consistent_revisits,
-    match_places,
-    propose_revisits,
-    thumbnails,
-)
-from datagen.slam.loops.pose_graph import borne_out, close_loops, loop_pairs, side_by_side
+from datagen.slam.loops.consistency import consistent_revisits, with_supported, without_contradicted
+from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
+from datagen.slam.loops.revisits import Revisit, match_places, propose_revisits, thumbnails
 from datagen.slam.odometry.scans import Progress, Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
@@ -193,8 +187,8 @@ class SegmentSolver:
         pairs = keyframe_pairs(keys, settings.bundle.lags)
         if revisits:
             # Revisits that the keyframes' map contradicts would pull again.
-            inliers = borne_out(poses, revisits, height)
-            pairs += loop_pairs(inliers, len(drive)) + side_by_side(poses, height, settings.revisits)
+            inliers = inlier_revisits(poses, revisits, height)
+            pairs += loop_pairs(inliers, len(drive)) + neighbouring_laps(poses, height, settings.revisits)
         start = BundleEstimate(poses, values_between(solved.bundle.tilt, keys, steps), camera)
         bundle = adjust(road.observed(commands), start, settings.bundle, self.rng, (), pairs)
         opened, t = poses_between(solved.open_poses, keys, steps), solved.trajectory
@@ -301,7 +295,7 @@ class _DenseSegment:
 
     def without_outliers(self, opened: BundleResult, closure: _Closure) -> _Closure:
         """Close the loops again without the revisits that the adjusted map contradicts: they still pull."""
-        inliers = borne_out(closure.bundle.poses, closure.revisits, self.height)
+        inliers = inlier_revisits(closure.bundle.poses, closure.revisits, self.height)
         if self.revisit_settings.min_revisits <= len(inliers) < len(closure.revisits):
             return self.close_with(inliers, closure.drift_rad_per_cm, opened) or closure
         return closure
@@ -312,9 +306,9 @@ class _DenseSegment:
         for _ in range(_MAX_CAMERA_ROUNDS):
             road = view_road(drive, bundle.camera, self.solver.settings)
             before = bundle.camera.K[0, 0]
-            inliers = borne_out(bundle.poses, closure.revisits, self.height)
+            inliers = inlier_revisits(bundle.poses, closure.revisits, self.height)
             loops = loop_pairs(inliers, len(drive))
-            loops += side_by_side(bundle.poses, self.height, self.revisit_settings)
+            loops += neighbouring_laps(bundle.poses, self.height, self.revisit_settings)
             bundle = self.adjust(road.observed(self.seen.commands), bundle, CAMERA_NAMES, loops)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.places import RevisitSettings
+from datagen.slam.loops.revisits import RevisitSettings
 from datagen.slam.odometry.image_pairs import OdometrySettings
 from lanenet.config import Settings
 from lanenet.perception.edges.road import PerceptionSettings

@@ -42,9 +42,7 @@ def track(
     height = camera.mounting.height_cm
     compared = None if progress is None else lambda k, _: progress(k, 2 * n)
     far_rad = far_turns(seen.drive, camera)
-    evidence = Evidence(
-        seen.pictures, commands.distance_cm, commands.speed_known, height, compared, far_rad, seen.usual
-    )
+    evidence = Evidence(seen.pictures, seen.usual, compared, far_rad)
     odometry = evidence.motion()
     steering = fit_steering(odometry.poses, commands, height)
     if steering is not None and commands.turn is not None:
@@ -57,7 +55,7 @@ def track(
 
 def motion_about(odometry: Odometry, settings: MotionSettings, camera_height_cm: float) -> MotionModel:
     """Motion model of a car that does nearly what the odometry says."""
-    s, steps_cm = settings, odometry.ways_cm
+    s, steps_cm = settings, odometry.steps_cm
     moving = steps_cm > 0.0
     return MotionModel(
         distance_cm=steps_cm,

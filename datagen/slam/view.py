@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from datagen.slam.adjustment.adjust import Observations
 from datagen.slam.commands import CommandedMotion
 from datagen.slam.keyframes import interleaved_rows
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import UsualWay, usual_way
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import TypicalStep, typical_step
 from datagen.slam.odometry.reflections import without_reflections
 from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
 from datagen.slam.settings import SlamSettings
@@ -103,8 +103,8 @@ class SegmentView:
     commands: CommandedMotion
     road: RoadView
     scans: Scans
-    pictures: Pictures
-    usual: UsualWay
+    pictures: ImagePairs
+    usual: TypicalStep
 
     @property
     def steps_heights(self) -> Float[np.ndarray, "n"]:
@@ -131,6 +131,6 @@ def view_segment(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
             f"road; mapping needs {_LEAST_POINTS}"
         )
-    pictures = Pictures(road.edges, camera, settings.odometry, rng)
-    usual = usual_way(pictures, commands.distance_cm, commands.speed_known, camera.mounting.height_cm)
+    pictures = ImagePairs(road.edges, camera, settings.odometry, rng)
+    usual = typical_step(pictures, commands.distance_cm, commands.speed_known)
     return SegmentView(drive, camera, commands, road, scans, pictures, usual)

@@ -16,16 +16,11 @@ import time
 
 import numpy as np
 
-from datagen.slam.filter.dp_slam import (
-    FilterSettings,
-    ParticleFilter,
-    effective_number,
-    reweigh,
-    systematic_resample,
-)
+from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter
 from datagen.slam.filter.field import DirectionField
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.odometry.scans import Scans, condense, pack_scans
+from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
+from datagen.slam.odometry.scans import Scan, Scans, condense, pack_scans
 from lanenet.geometry.frames import car_from_map, map_from_car, map_from_car_directions
 from lanenet.perception.edges.road import RoadEdges
 
@@ -90,25 +85,21 @@ class SharedField:
         self.field = DirectionField.empty(0.04 * HEIGHT_CM, 1024, settings.memory_frames)
         self.frame = 0
 
-    def step(
-        self, points: np.ndarray, normals: np.ndarray, trust: np.ndarray, motion: MotionModel, k: int
-    ) -> None:
+    def step(self, scan: Scan, motion: MotionModel, k: int) -> None:
         """Predict, weigh, resample, map."""
-        scored = condense(
-            points, normals, trust, self.settings.patch_heights * HEIGHT_CM, self.settings.max_points
-        )
+        scored = condense(scan, self.settings.patch_heights * HEIGHT_CM, self.settings.max_points)
         if self.frame > 0:
             motion.predict(self.states, k, self.rng)
-            scores = self.field.score(self.states[:, :3], WHEELBASE_CM, *scored, self.frame)
+            scores = self.field.score(self.states[:, :3], WHEELBASE_CM, scored, self.frame)
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
         pose = self.weights @ self.states[:, :3]
         if effective_number(self.weights) < self.settings.resample_below * len(self.weights):
-            self.states = self.states[systematic_resample(self.weights, self.rng)]
+            self.states = self.states[systematic_resample(self.weights, self.rng.random())]
             self.weights = np.full(len(self.weights), 1.0 / len(self.weights))
         self.field.insert(
-            map_from_car(points, pose, WHEELBASE_CM),
-            map_from_car_directions(normals, pose[2]),
-            trust,
+            map_from_car(scan.points_cm, pose, WHEELBASE_CM),
+            map_from_car_directions(scan.normals, pose[2]),
+            scan.weights,
             self.frame,
         )
         self.frame += 1
@@ -140,9 +131,9 @@ def measure(frames: int) -> list[dict[str, float | str]]:
         for name, one in filters.items():
             for frame in range(start, min(start + BLOCK, frames)):
                 k = frame % lap
-                rows = scans.frame(k)
+                scan = scans.scan(k)
                 begun, begun_cpu = time.perf_counter(), time.thread_time()
-                one.step(scans.points_cm[rows], scans.normals[rows], scans.weights[rows], motion, k)
+                one.step(scan, motion, k)
                 wall_s[name].append(time.perf_counter() - begun)
                 cpu_s[name].append(time.thread_time() - begun_cpu)
     # From frame 400 on everything is compiled and the map is filled; as many frames around each place.
@@ -163,7 +154,9 @@ def measure(frames: int) -> list[dict[str, float | str]]:
             "map_mb": round(one.bytes / 1e6 if isinstance(one, SharedField) else one.map.bytes / 1e6, 1),
         }
         if isinstance(one, ParticleFilter):
-            row["pages_used_share"] = round(1.0 - int(one.map.pages.free[1]) / len(one.map.pages.used), 3)
+            row["pages_used_share"] = round(
+                1.0 - int(one.map.arrays.pages.free[1]) / len(one.map.arrays.pages.used), 3
+            )
             row["forced_frames"] = one.map.forced
         rows_out.append(row)
     return rows_out

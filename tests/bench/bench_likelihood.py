@@ -24,8 +24,8 @@ from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
 from datagen.slam.commands import commands_of, fit_steering
 from datagen.slam.filter.dp_slam import Trajectory, run_filter
-from datagen.slam.odometry.image_pairs import Pictures
-from datagen.slam.odometry.odometry import Evidence
+from datagen.slam.odometry.image_pairs import ImagePairs
+from datagen.slam.odometry.odometry import Evidence, typical_step
 from datagen.slam.view import view_road
 from lanenet.config import load_settings
 from lanenet.data.drives import read_truth
@@ -88,13 +88,14 @@ def filtered(mapped: MappedDrive, rows: np.ndarray, settings: MapSettings) -> tu
     scans = road.scans(camera)
     commands, height = commands_of(drive, camera.wheelbase_cm), camera.mounting.height_cm
     rng = np.random.default_rng(settings.seed)
-    pictures = Pictures(road.edges, camera, settings.odometry, rng)
-    evidence = Evidence(pictures, commands.distance_cm, commands.speed_known, height)
+    pictures = ImagePairs(road.edges, camera, settings.odometry, rng)
+    typical = typical_step(pictures, commands.distance_cm, commands.speed_known)
+    evidence = Evidence(pictures, typical)
     fit = fit_steering(evidence.motion().poses, commands, height)
     predicted = None
     if fit is not None and commands.turn is not None:
         predicted = fit.curvature_per_cm(commands.turn)
-    motion = live_motion(commands, predicted, evidence.usual.factor, height)
+    motion = live_motion(commands, predicted, typical.factor, height)
     begun = time.process_time()
     trajectory = run_filter(scans, motion, settings.filter, height, camera.wheelbase_cm, rng)
     return trajectory, 1e3 * (time.process_time() - begun) / len(drive)

@@ -148,7 +148,7 @@ def judge(name: str, settings: SimulationSettings, folder: Path, known: bool) ->
     true_points[true_lines(drive, truth, settings.car.wheelbase_cm)[1]] = np.nan
     miss_cm = frames.points_cm - true_points[index]
     # A frame that counts and was not mapped is one without labels; repeated ones and pauses do not count.
-    counted = np.unique(np.concatenate([following_frames(open_drive(drive), []).frames, index]))
+    counted = np.unique(np.concatenate([following_frames(open_drive(drive))[0].frames, index]))
     labelable = np.isfinite(true_points[counted]).sum()
     row["labelled"] = round(float(np.isfinite(miss_cm).sum() / max(labelable, 1)), 4)
     for k, y_cm in enumerate(ROWS_CM):

@@ -34,7 +34,7 @@ STAGES: list[tuple[ModuleType | type, str]] = [
     (segment.SegmentSolver, "solve"),
     (view, "edges_of_drive"),
     (view, "without_reflections"),
-    (view, "usual_way"),
+    (view, "typical_step"),
     (view, "scans_of"),
     (track, "Evidence"),
     (track, "run_filter"),

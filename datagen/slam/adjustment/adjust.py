@@ -1,7 +1,12 @@
-"""Bundle adjustment: all poses, each frame's tilt and the camera together, residuals in pixels.
+"""Bundle adjustment of all poses, each frame's tilt and the camera, with residuals in pixels.
 
-An edge point of one frame, moved over the road into another frame, must lie on an edge of that frame. The
-distance across that edge is the residual; in pixels, because in centimetres the best scene is a small one.
+An edge point of one frame is moved over the road into another frame, where it must lie on an edge. Its
+distance across that edge is the residual. It is taken in pixels: in cm the cost falls as the scene shrinks.
+
+Source:
+    Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment: a modern synthesis":
+    Levenberg-Marquardt steps, a robust loss, and the camera eliminated last (Schur complement). Poses and
+    camera are fitted to road edges instead of to points in space.
 """
 
 from __future__ import annotations
@@ -12,15 +17,24 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.slam.adjustment.problem import BundleProblem, Observations
-from datagen.slam.adjustment.state import CAMERA_NAMES, BundleEstimate, BundleSettings, start_state
+from datagen.slam.adjustment.problem import BundleProblem
+from datagen.slam.adjustment.state import (
+    CAMERA_NAMES,
+    BundleEstimate,
+    BundleSettings,
+    BundleState,
+    Observations,
+)
 from lanenet.geometry.camera import Camera
 
 __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "Observations", "adjust"]
 
-#: Share added to the diagonal. A drive bends as a whole by next to nothing in any one frame: with 1e-4 an
-#: error of every turn alike is still there after all rounds.
+#: Share of the diagonal that is added to it. A bend of the whole drive hardly changes any one frame's
+#: residuals: with 1e-4, an error that all turns have in common was still there after all rounds.
 _DAMPING = 1e-8
+#: Relative fall of the cost at which a round ends early. Chosen: it only saves
+#: steps that change little.
+_CONVERGED = 1e-5
 
 
 @dataclass(frozen=True)
@@ -29,10 +43,10 @@ class BundleResult(BundleEstimate):
 
     Attributes:
         sigma: Standard deviation of each of the camera's numbers (see ``CAMERA_NAMES``; focal relative); 0
-            of those that stayed.
+            for those that were held.
         residual_px: Residuals of the last round.
-        misfit: Mean robust loss over all points that were moved; one that met no edge counts as if it had
-            met one at the rim of its search. The lower, the better the frames agree.
+        misfit: Mean robust loss over all compared points; one without an edge counts as if it had met one at
+            the rim of its search. The lower, the better the frames agree.
         pairs: Number of pairs of frames.
     """
 
@@ -72,10 +86,8 @@ def adjust(
     Returns:
         The adjusted drive.
     """
-    camera = start.camera
-    problem = BundleProblem(observed, camera, settings, rng, free, loops, prior_camera)
-    height = camera.mounting.height_cm
-    state = start_state(start)
+    problem = BundleProblem(observed, start.camera, settings, rng, free, loops, prior_camera)
+    state = BundleState.at(start)
     for gate_px in settings.gates_px:
         links = problem.associate(state, gate_px)
         damping = _DAMPING
@@ -84,23 +96,24 @@ def adjust(
             trial = state.moved(now.step(damping), problem.free)
             new = problem.equations(trial, links)
             if new.cost < now.cost:
-                done = now.cost - new.cost < 1e-5 * now.cost
+                converged = now.cost - new.cost < _CONVERGED * now.cost
                 state, now = trial, new
                 damping = max(damping * 0.3, 0.01 * _DAMPING)
-                if done:
+                if converged:
                     break
             else:
                 damping *= 100.0
     sigma = np.zeros(len(CAMERA_NAMES))
     sigma[problem.free] = now.camera_sigma()
     residual_px = now.residual_px
-    lost = problem.moved_points - len(residual_px)
-    at_rim, seen = (np.log1p((v / settings.cauchy_px) ** 2) for v in (gate_px, residual_px))
-    misfit = (lost * at_rim + float(np.nansum(seen))) / max(problem.moved_points, 1)
+    unmatched = problem.compared - len(residual_px)
+    at_rim, matched = (np.log1p((v / settings.cauchy_px) ** 2) for v in (gate_px, residual_px))
+    misfit = (unmatched * at_rim + float(np.nansum(matched))) / max(problem.compared, 1)
+    height = start.camera.mounting.height_cm
     return BundleResult(
         poses=state.poses * [height, height, 1.0],
         tilt=state.tilt,
-        camera=state.camera_like(camera),
+        camera=state.camera_like(start.camera),
         sigma=dict(zip(CAMERA_NAMES, sigma.tolist(), strict=True)),
         residual_px=residual_px[np.isfinite(residual_px)],
         misfit=float(misfit),

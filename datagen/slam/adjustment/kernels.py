@@ -1,34 +1,75 @@
-"""Inner loops of the bundle adjustment: points on the road, nearest edges, normal equations.
+"""Inner loops of the bundle adjustment: points on the road, nearest edges, residuals and Jacobians.
 
-Lengths are in camera heights. A camera over a flat road is a pair of arrays, ``lens`` and ``mount``.
+Lengths are in camera heights. A camera is two vectors here: ``lens`` = fx, fy, cx, cy, D (five numbers), and
+``mount`` = pitch, roll, yaw, camera ahead of the rear axle, camera left of the middle. Per frame, with its
+tilt, the mount becomes a ``view`` (see :func:`set_view`).
 
-Lengths are in camera heights. A camera is two vectors here: ``lens`` = fx, fy, cx, cy, D (five numbers) and
-``mount`` = pitch, roll, yaw, camera ahead of the rear axle, camera left of the middle; the kernels take the
-mount as a ``view`` (see :func:`set_view`).
-
-numba's cache notices a change of the file that a function stands in, and not of one that it calls into: after
-a change here delete ``datagen/slam/__pycache__``.
+numba's cache notices a change of the file that a function is in, but not of one that it calls into: after a
+change here delete ``datagen/slam/adjustment/__pycache__``.
 """
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
+from jaxtyping import Float, Int
 from numba import njit
 
-#: Numbers of the camera that can be adjusted: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
+#: Adjustable numbers of the camera: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
 N_CAMERA = 8
+#: Where pitch and roll stand among the camera's numbers; each frame adds its own.
+_PITCH, _ROLL = 4, 5
+#: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
+N_FRAME = 5
 #: Length of a view.
 N_VIEW = 8
-_NEWTON_STEPS = 8
-_CONVERGED = 1e-13
+#: Newton steps that undo a lens, and the step, [rad], at which they end. Four or five are enough for lenses
+#: up to 170 degrees; the rest is margin.
+_NEWTON_STEPS, _CONVERGED = 8, 1e-13
+#: Points whose edge would be wider than this in the other image, relative to their own, are not compared.
+#: Chosen: the sigma of their residual would be 2.9 times that of an edge.
+_MAX_STRETCH = 4.0
+#: Least cosine of the angle between a moved edge and the edge that it meets: 37 degrees. Chosen: wide enough
+#: for the error of the first poses, too narrow for the other side of a tape.
+_LEAST_COSINE = 0.8
+
+
+class Pixels(NamedTuple):
+    """Edge pixels of all frames.
+
+    Attributes:
+        starts: First pixel of each frame, and one behind the last.
+        uv: Pixels.
+        normals: Unit gradients in the image.
+    """
+
+    starts: Int[np.ndarray, "n1"]
+    uv: Float[np.ndarray, "m 2"]
+    normals: Float[np.ndarray, "m 2"]
+
+
+class Links(NamedTuple):
+    """Which point meets which edge, sorted by pair of frames.
+
+    Attributes:
+        point: Compared points.
+        edge: The edge that each meets.
+        pair: The pair of frames.
+        sigma: Sigma of each residual, relative to that of an edge in its own image. A far edge is a wide band
+            where the road is near.
+    """
+
+    point: Int[np.ndarray, "r"]
+    edge: Int[np.ndarray, "r"]
+    pair: Int[np.ndarray, "r"]
+    sigma: Float[np.ndarray, "r"]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def set_view(mount, pitch_more, roll_more, view):
-    """Fill a view: cosine and sine of pitch, roll and yaw in one frame, then lever and left."""
+    """Fill a view: cosine and sine of one frame's pitch, roll and yaw, then the camera ahead and left."""
     pitch, roll = mount[0] + pitch_more, mount[1] + roll_more
     view[0], view[1] = np.cos(pitch), np.sin(pitch)
     view[2], view[3] = np.cos(roll), np.sin(roll)
@@ -39,7 +80,7 @@ def set_view(mount, pitch_more, roll_more, view):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def lift_pixel(fisheye, lens, view, u, v):
-    """Road point (ahead of the rear axle, left) of a pixel; the ray must meet the road, or both are NaN."""
+    """Road point of a pixel (ahead of the rear axle, left); NaN where its ray does not meet the road."""
     mx, my = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
     k1, k2, k3, k4, k5 = lens[4], lens[5], lens[6], lens[7], lens[8]
     if fisheye:
@@ -64,7 +105,7 @@ def lift_pixel(fisheye, lens, view, u, v):
             dy = k3 * (r2 + 2.0 * y * y) + 2.0 * k4 * x * y
             x, y = (mx - dx) / radial, (my - dy) / radial
         z = 1.0
-    # Undo roll, then pitch; camera y down and z ahead become up and ahead; then yaw.
+    # Undo roll, then pitch (camera y and z become down and ahead), then yaw.
     x, y = view[2] * x - view[3] * y, view[3] * x + view[2] * y
     down, ahead = view[0] * y + view[1] * z, view[0] * z - view[1] * y
     if down <= 1e-6:
@@ -76,10 +117,10 @@ def lift_pixel(fisheye, lens, view, u, v):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _distorted(fisheye, lens, x, y, z):
-    """A point of the camera's frame in the image, before focal length and centre; NaN behind a pinhole.
+    """Project a point of the camera's frame, before focal length and centre; NaN behind a pinhole.
 
     Returns:
-        The two numbers; the slopes of the first by x, y and z; those of the second; both slopes by k1.
+        Both image coordinates; derivatives of the first by x, y and z; those of the second; both by k1.
     """
     k1, k2, k3, k4, k5 = lens[4], lens[5], lens[6], lens[7], lens[8]
     if fisheye:
@@ -88,7 +129,7 @@ def _distorted(fisheye, lens, x, y, z):
         theta = np.arctan2(r, z)
         t2 = theta * theta
         slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-        # Radius in the image per radius in the camera's frame, and how that changes; on the axis 1 / z.
+        # Image radius per radius in the camera's frame, and its derivatives; 1 / z on the axis.
         s, bend, by_k1 = 1.0 / z, 0.0, 0.0
         if r > 1e-9:
             s = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
@@ -124,7 +165,7 @@ def _distorted(fisheye, lens, x, y, z):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _in_camera(view, forward, left):
-    """A road point in the camera's frame, turned by yaw, pitch and roll; one camera height below it."""
+    """A road point in the camera's frame, and before pitch and roll; it lies one camera height below."""
     a, b = forward - view[6], left - view[7]
     ahead, right = a * view[4] + b * view[5], a * view[5] - b * view[4]
     down, z = view[0] - view[1] * ahead, view[1] + view[0] * ahead
@@ -143,8 +184,8 @@ def project_point(fisheye, lens, view, forward, left):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def project_with_slopes(fisheye, lens, view, forward, left, by):
-    """Pixel of a road point, and its slopes.
+def project_with_jacobian(fisheye, lens, view, forward, left, by):
+    """Pixel of a road point, and its Jacobian.
 
     Args:
         fisheye: Lens model.
@@ -152,7 +193,7 @@ def project_with_slopes(fisheye, lens, view, forward, left, by):
         view: See :func:`set_view`.
         forward: Ahead of the rear axle.
         left: Of the middle.
-        by: 2 x (2 + ``N_CAMERA``), filled: slopes of u and of v by forward and left, then by the camera's
+        by: Filled, 2 x (2 + ``N_CAMERA``): derivatives of u and v by forward and left, then by the camera's
             numbers.
     """
     cp, sp, cr, sr, cy, sy = view[0], view[1], view[2], view[3], view[4], view[5]
@@ -161,7 +202,7 @@ def project_with_slopes(fisheye, lens, view, forward, left, by):
     for k in range(2):
         scale = lens[k]
         g_x, g_y, g_z = scale * seen[2 + 3 * k], scale * seen[3 + 3 * k], scale * seen[4 + 3 * k]
-        # By a point ahead and to the right of the lens; both tilts move what is below the lens.
+        # By the point ahead and to the right of the lens; pitch and roll also move what is below it.
         g_down = sr * g_x + cr * g_y
         g_ahead, g_right = cp * g_z - sp * g_down, cr * g_x - sr * g_y
         by[k, 0] = g_ahead * cy + g_right * sy
@@ -177,41 +218,29 @@ def project_with_slopes(fisheye, lens, view, forward, left, by):
     return lens[2] + lens[0] * seen[0], lens[3] + lens[1] * seen[1]
 
 
-#: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
-N_FRAME = 5
-#: Where pitch and roll stand among the camera's numbers: a frame has its own.
-_PITCH, _ROLL = 4, 5
-#: Points that would be drawn out more than this, across their edge, are not moved.
-_MAX_STRETCH = 4.0
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_by, out_normal):
-    """Lift pixels to the road, with derivatives.
+def lift_points(state, points, out, out_by, out_half):
+    """Lift pixels to the road, with Jacobians.
 
     Args:
-        fisheye: Lens model.
-        lens: See the module.
-        mount: See the module.
-        tilt: Pitch and roll of each frame beyond the camera's.
-        point_starts: First pixel of each frame, and one behind the last.
-        uv: Pixels.
-        normals: Unit gradients in the image.
-        out: (ahead, left) of each pixel.
-        out_by: Their derivatives by the camera's numbers.
-        out_normal: A point of the road half a pixel further along the gradient.
+        state: See :class:`datagen.slam.adjustment.state.BundleState`.
+        points: Pixels of all frames.
+        out: Filled: road point of each pixel (ahead, left).
+        out_by: Filled: derivatives by the camera's numbers.
+        out_half: Filled: road point half a pixel further along the gradient.
     """
+    lens, tilt, uv, normals = state.lens, state.tilt, points.uv, points.normals
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
-    for k in range(point_starts.shape[0] - 1):
-        set_view(mount, tilt[k, 0], tilt[k, 1], view)
-        for p in range(point_starts[k], point_starts[k + 1]):
-            a, b = lift_pixel(fisheye, lens, view, uv[p, 0], uv[p, 1])
+    for k in range(points.starts.shape[0] - 1):
+        set_view(state.mount, tilt[k, 0], tilt[k, 1], view)
+        for p in range(points.starts[k], points.starts[k + 1]):
+            a, b = lift_pixel(state.fisheye, lens, view, uv[p, 0], uv[p, 1])
             out[p, 0], out[p, 1] = a, b
             u, v = uv[p, 0] + 0.5 * normals[p, 0], uv[p, 1] + 0.5 * normals[p, 1]
-            out_normal[p, 0], out_normal[p, 1] = lift_pixel(fisheye, lens, view, u, v)
-            # The point moves so that its pixel stays.
-            project_with_slopes(fisheye, lens, view, a, b, by)
+            out_half[p, 0], out_half[p, 1] = lift_pixel(state.fisheye, lens, view, u, v)
+            # Implicit differentiation: the road point moves so that its pixel stays.
+            project_with_jacobian(state.fisheye, lens, view, a, b, by)
             per_area = 1.0 / (by[0, 0] * by[1, 1] - by[0, 1] * by[1, 0])
             for c in range(N_CAMERA):
                 du, dv = by[0, 2 + c], by[1, 2 + c]
@@ -222,7 +251,7 @@ def lift_points(fisheye, lens, mount, tilt, point_starts, uv, normals, out, out_
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _first_row(edge_uv, start, stop, v):
-    """First edge of a frame, whose edges stand in the order of their rows, at or below row v."""
+    """First edge of a frame at or below row v; the edges are sorted by row."""
     while start < stop:
         middle = (start + stop) // 2
         if edge_uv[middle, 1] < v:
@@ -234,64 +263,53 @@ def _first_row(edge_uv, start, stop, v):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def associate(
-    fisheye,
-    lens,
-    mount,
-    tilt,
-    poses,
-    pairs,
-    point_starts,
-    lifted,
-    lifted_normal,
-    edge_starts,
-    edge_uv,
-    edge_normals,
-    gate_px,
-    min_dot,
-    inner,
-    in_view,
-    matched,
-    out_point,
-    out_edge,
-    out_pair,
-    out_sigma,
-):
-    """Find for every point of frame i the nearest edge of frame j that brightens the same way.
+def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, in_view, matched, links):
+    """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
 
-    The edges of each frame stand in the order of their rows. Only what falls into ``inner`` looks for an
-    edge: at the rim of what is seen, a point whose edge lies beyond would take one on this side for it, all
-    along the rim, and what is seen would seem to stay. ``out_sigma`` is the standard deviation of the
-    residual to come, in that of an edge's place in its own picture: an edge seen far ahead is a wide band
-    where the road is near. ``in_view`` and ``matched`` count how often each point fell into ``inner`` of the
-    other picture, and met an edge there.
+    The edges of each frame are sorted by row. Only points that fall into ``inner`` get an edge: beyond the
+    rim of the visible road, a point would be matched to another edge on this side of it, all along the rim,
+    and the road would seem to stand still.
+
+    Args:
+        state: See :class:`datagen.slam.adjustment.state.BundleState`.
+        pairs: Pairs of frames, i and j.
+        points: Compared pixels.
+        lifted: Road point of each, see :func:`lift_points`.
+        lifted_half: The same half a pixel further along the gradient.
+        edges: Edges of all frames.
+        gate_px: Search radius.
+        inner: Pixels in which points get an edge.
+        in_view: Counts in how many frames each point fell into ``inner``.
+        matched: Counts in how many of them it met an edge.
+        links: Filled from the front.
 
     Returns:
-        Number of associations written.
+        Number of links.
     """
+    poses, tilt, edge_uv, edge_normals = state.poses, state.tilt, edges.uv, edges.normals
     view = np.empty(N_VIEW)
     height, width = inner.shape
     count = 0
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
-        set_view(mount, tilt[j, 0], tilt[j, 1], view)
+        set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
         ci, si = np.cos(poses[i, 2]), np.sin(poses[i, 2])
         cj, sj = np.cos(poses[j, 2]), np.sin(poses[j, 2])
-        for p in range(point_starts[i], point_starts[i + 1]):
+        for p in range(points.starts[i], points.starts[i + 1]):
             u = v = nu = nv = np.nan
             for end in range(2):
-                a = lifted[p, 0] if end == 0 else lifted_normal[p, 0]
-                b = lifted[p, 1] if end == 0 else lifted_normal[p, 1]
+                a = lifted[p, 0] if end == 0 else lifted_half[p, 0]
+                b = lifted[p, 1] if end == 0 else lifted_half[p, 1]
                 dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
                 dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
                 forward, left = cj * dx + sj * dy, cj * dy - sj * dx
-                u1, v1 = project_point(fisheye, lens, view, forward, left)
+                u1, v1 = project_point(state.fisheye, state.lens, view, forward, left)
                 if end == 0:
                     u, v = u1, v1
                 else:
                     nu, nv = u1 - u, v1 - v
             length = np.sqrt(nu * nu + nv * nv)
-            # The moved point is half a pixel long: how uncertain its place in the other picture is.
+            # Half a pixel became this long: so uncertain is the place of the point in the other image.
             stretch = 2.0 * length
             if not 1e-9 < stretch < _MAX_STRETCH:
                 continue
@@ -302,17 +320,18 @@ def associate(
             in_view[p] += 1
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
-            q, stop = _first_row(edge_uv, edge_starts[j], edge_starts[j + 1], v - gate_px), edge_starts[j + 1]
+            stop = edges.starts[j + 1]
+            q = _first_row(edge_uv, edges.starts[j], stop, v - gate_px)
             while q < stop and edge_uv[q, 1] <= v + gate_px:
                 du, dv = edge_uv[q, 0] - u, edge_uv[q, 1] - v
                 d = du * du + dv * dv
-                if d < best and edge_normals[q, 0] * nu + edge_normals[q, 1] * nv > min_dot:
+                if d < best and edge_normals[q, 0] * nu + edge_normals[q, 1] * nv > _LEAST_COSINE:
                     best, chosen = d, q
                 q += 1
             if chosen >= 0:
                 matched[p] += 1
-                out_point[count], out_edge[count], out_pair[count] = p, chosen, k
-                out_sigma[count] = np.sqrt(0.5 * (1.0 + stretch * stretch))
+                links.point[count], links.edge[count], links.pair[count] = p, chosen, k
+                links.sigma[count] = np.sqrt(0.5 * (1.0 + stretch * stretch))
                 count += 1
     return count
 
@@ -320,60 +339,59 @@ def associate(
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def accumulate(
-    fisheye,
-    lens,
-    mount,
-    tilt,
-    poses,
-    pairs,
-    pair_starts,
-    points,
-    edges,
-    lifted,
-    lifted_by,
-    edge_uv,
-    edge_normals,
-    link_sigma,
-    point_weight,
-    cauchy_px,
-    blocks,
-    rhs,
-    residual,
+    state, pairs, edges, lifted, lifted_by, links, point_weight, cauchy_px, blocks, descents, residual
 ):
-    """Sum the normal equations of all point-to-line residuals, a block per pair of frames.
+    """Add up the normal equations of all point-to-line residuals, a block per pair of frames.
 
-    The unknowns of a block are frame i (x, y, heading, pitch, roll), frame j, and the camera.
+    The residual e of a link is the distance of the moved point from its edge, along the edge's gradient, with
+    the Cauchy loss: weight w = 1 / (1 + (e / (sigma c))^2). The unknowns of a block are frame i (x, y,
+    heading, pitch, roll), frame j, and the camera.
+
+    Args:
+        state: See :class:`datagen.slam.adjustment.state.BundleState`.
+        pairs: Pairs of frames, i and j.
+        edges: Edges of all frames.
+        lifted: Road point of each compared pixel.
+        lifted_by: Its Jacobian by the camera's numbers.
+        links: Which point meets which edge.
+        point_weight: Inverse variance of each compared pixel.
+        cauchy_px: Scale c of the loss.
+        blocks: Filled: J^T W J of each pair.
+        descents: Filled: -J^T W e of each pair.
+        residual: Filled: e of each link; NaN where the point is behind the camera.
 
     Returns:
         Robust cost.
     """
+    poses, tilt, edge_uv, edge_normals = state.poses, state.tilt, edges.uv, edges.normals
+    starts = np.searchsorted(links.pair, np.arange(pairs.shape[0] + 1))
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
     n = jac.shape[0]
     cost = 0.0
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
-        set_view(mount, tilt[j, 0], tilt[j, 1], view)
+        set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
         ci, si = np.cos(poses[i, 2]), np.sin(poses[i, 2])
         cj, sj = np.cos(poses[j, 2]), np.sin(poses[j, 2])
-        for r in range(pair_starts[k], pair_starts[k + 1]):
-            p, q = points[r], edges[r]
+        for r in range(starts[k], starts[k + 1]):
+            p, q, sigma = links.point[r], links.edge[r], links.sigma[r]
             a, b = lifted[p, 0], lifted[p, 1]
             dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
             dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
             forward, left = cj * dx + sj * dy, cj * dy - sj * dx
-            u, v = project_with_slopes(fisheye, lens, view, forward, left, by)
+            u, v = project_with_jacobian(state.fisheye, state.lens, view, forward, left, by)
             nu, nv = edge_normals[q, 0], edge_normals[q, 1]
             e = (u - edge_uv[q, 0]) * nu + (v - edge_uv[q, 1]) * nv
             if not np.isfinite(e):
                 residual[r] = np.nan
                 continue
             residual[r] = e
-            s = e / (link_sigma[r] * cauchy_px)
+            s = e / (sigma * cauchy_px)
             cost += 0.5 * point_weight[p] * cauchy_px * cauchy_px * np.log1p(s * s)
-            w = point_weight[p] / ((1.0 + s * s) * link_sigma[r] * link_sigma[r])
+            w = point_weight[p] / ((1.0 + s * s) * sigma * sigma)
             g_f, g_l = nu * by[0, 0] + nv * by[1, 0], nu * by[0, 1] + nv * by[1, 1]
-            # By a point of the map, and by the point in the frame i.
+            # By the point in the map, and by the point in frame i.
             g_x, g_y = g_f * cj - g_l * sj, g_f * sj + g_l * cj
             g_a, g_b = g_x * ci + g_y * si, g_y * ci - g_x * si
             jac[0], jac[1] = g_x, g_y
@@ -390,7 +408,7 @@ def accumulate(
                     jac[4], jac[9] = through, direct
             for row in range(n):
                 wj = w * jac[row]
-                rhs[k, row] -= wj * e
+                descents[k, row] -= wj * e
                 for column in range(row + 1):
                     blocks[k, row, column] += wj * jac[column]
         for row in range(n):

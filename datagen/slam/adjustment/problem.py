@@ -1,8 +1,8 @@
-"""The residuals of the bundle adjustment: which points are moved into which frames, and what they miss.
+"""The least-squares problem of the bundle adjustment: residuals, priors and normal equations.
 
-What the bundle adjustment believes without looking at the pictures: level frames, a car that rolls.
-
-The normal equations of the bundle adjustment: a sparse matrix of the frames, bordered by the camera.
+The unknowns are five numbers per frame (x, y, heading, pitch, roll) and the camera's free numbers. With
+residuals e, Jacobian J and weights W, a step solves H dx = -g, where H = J^T W J and g = J^T W e. H has a
+sparse block of the frames, bordered by a few dense columns of the camera.
 """
 
 from __future__ import annotations
@@ -13,120 +13,52 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.sparse import bsr_matrix, coo_matrix, csc_matrix, diags
+from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import SuperLU, splu
 
-from datagen.slam.adjustment.kernels import N_CAMERA, N_FRAME, accumulate, associate, lift_points
-from datagen.slam.adjustment.state import CAMERA_NAMES, BundleSettings, BundleState
+from datagen.slam.adjustment.kernels import (
+    N_CAMERA,
+    N_FRAME,
+    Links,
+    Pixels,
+    accumulate,
+    associate,
+    lift_points,
+)
+from datagen.slam.adjustment.state import CAMERA_NAMES, BundleSettings, BundleState, Observations
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
 
-#: Shorter commanded ways than this, 1 where they are usual, count as this one.
-_LEAST_WAY = 0.1
+#: Shares of its frames in which a point meets an edge by chance, and in which it is taken for a mark on the
+#: road; weight of a point below the first. Chosen between noise, which meets an edge now and then, and marks,
+#: which meet one in nearly every image (tests/unit/slam/test_bundle.py); not zero, so that the system stays
+#: determined.
+_CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
+#: Trust in a point that is in view of fewer than two frames, whose share says little. Chosen between the two.
+_TRUST_ONCE = 0.3
+#: Margin at the rim of the pixels in which edges are looked for, [px] for images 160 px wide: edges are found
+#: with a kernel that reaches one pixel further.
+_RIM_PX = 1.0
+#: Image width for which settings in pixels are given: that of a Donkeycar tub.
+_REFERENCE_WIDTH = 160.0
+#: Commanded steps that are shorter than this share of the typical one count as this long: a car that hardly
+#: moves says little about its gain.
+_LEAST_STEP = 0.1
+#: Sigma of the first pose, which only fixes the map: far below anything that is measured.
+_FIXED_SIGMA = 1e-6
 
-
-def frame_priors(
-    state: BundleState,
-    settings: BundleSettings,
-    joined: Int[np.ndarray, "m"],
-    expected: Float[np.ndarray, "n"],
-    recorded: bool = False,
-) -> tuple[float, csc_matrix, Float[np.ndarray, "u"]]:
-    """Cost, normal matrix and downhill slope of the priors of all frames.
-
-    Args:
-        state: Where.
-        settings: Standard deviations.
-        joined: Frames that the next one follows.
-        expected: Commanded way from the frame before, 1 where it is usual.
-        recorded: Whether these come from a recorded speed; else they only say how ways change.
-    """
-    s, n = settings, len(state.poses)
-    rows: list[np.ndarray] = []
-    columns: list[np.ndarray] = []
-    values: list[np.ndarray] = []
-    errors: list[np.ndarray] = []
-    count = 0
-
-    def add(error: np.ndarray, sigma: float, *terms: tuple[np.ndarray, np.ndarray]) -> None:
-        nonlocal count
-        errors.append(error / sigma)
-        for column, derivative in terms:
-            rows.append(count + np.arange(len(error)))
-            columns.append(column)
-            values.append(np.broadcast_to(derivative, error.shape) / sigma)
-        count += len(error)
-
-    frames = N_FRAME * np.arange(n)
-    for offset, (value, sigma) in enumerate(
-        zip(state.tilt.T, (s.frame_pitch, s.frame_roll), strict=True), start=3
-    ):
-        add(value, sigma, (frames + offset, np.ones(n)))
-    i, j = joined, joined + 1
-    c, si = np.cos(state.poses[i, 2]), np.sin(state.poses[i, 2])
-    dx, dy = (state.poses[j] - state.poses[i])[:, :2].T
-    turn = state.poses[j, 2] - state.poses[i, 2]
-    ahead, left = c * dx + si * dy, c * dy - si * dx
-    half = 0.5 * turn
-    # On an arc the rear axle moves along the heading at half of the turn.
-    xi, yi, ti, xj, yj, tj = (N_FRAME * k + d for k in (i, j) for d in (0, 1, 2))
-    along = np.cos(half) * ahead + np.sin(half) * left
-    across = np.cos(half) * left - np.sin(half) * ahead
-    cm, sm = np.cos(state.poses[i, 2] + half), np.sin(state.poses[i, 2] + half)
-    one = np.ones(len(i))
-    add(across, s.slip, (xi, sm), (yi, -cm), (xj, -sm), (yj, cm), (ti, -0.5 * along), (tj, -0.5 * along))
-    follows = np.flatnonzero(j[:-1] == i[1:])
-    a, b = follows, follows + 1
-    # Ways in proportion to what was commanded; where the car was told to stand, its way is left alone.
-    per = np.where(expected[j] > 0.0, 1.0 / np.maximum(expected[j], _LEAST_WAY), 0.0)
-    per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
-    add(
-        per_b * along[b] - per_a * along[a],
-        s.speed_change,
-        (xj[b], per_b * cm[b]),
-        (yj[b], per_b * sm[b]),
-        (xi[b], -per_b * cm[b] - per_a * cm[a]),
-        (yi[b], -per_b * sm[b] - per_a * sm[a]),
-        (xi[a], per_a * cm[a]),
-        (yi[a], per_a * sm[a]),
-        *((k, 0.5 * per_b * across[b]) for k in (ti[b], tj[b])),
-        *((k, -0.5 * per_a * across[a]) for k in (ti[a], tj[a])),
-    )
-    # Of a car that hardly moves the recorded speed says little of the way.
-    told = np.flatnonzero(expected[j] >= _LEAST_WAY) if recorded else np.zeros(0, np.int64)
-    if told.size:
-        # Of the gain the ways themselves are asked: what all have in common is left to the pictures.
-        usual = max(float(np.median(per[told] * along[told])), 1e-6)
-        by = per[told] / usual
-        add(
-            by * along[told] - 1.0,
-            s.recorded_speed,
-            (xj[told], by * cm[told]),
-            (yj[told], by * sm[told]),
-            (xi[told], -by * cm[told]),
-            (yi[told], -by * sm[told]),
-            *((k[told], 0.5 * by * across[told]) for k in (ti, tj)),
-        )
-    add(turn[b] - turn[a], s.turn_change, (tj[b], one[b]), (ti[b], -2.0 * one[b]), (ti[a], one[a]))
-    # The first pose stays.
-    add(np.zeros(3), 1e-6, (np.arange(3), np.ones(3)))
-    e = np.concatenate(errors)
-    jac = coo_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(count, N_FRAME * n)
-    ).tocsc()
-    return 0.5 * float(e @ e), (jac.T @ jac).tocsc(), -(jac.T @ e)
+_Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Normal equations about a state.
+    """Normal equations at a state.
 
     Attributes:
         cost: Robust cost there, priors included.
-        frames: Between the frames' numbers.
-        border: Between the frames' numbers and those of the camera that are free.
-        camera: Between the latter.
-        rhs: Downhill slope of the cost, frames first.
+        frames: H between the frames' numbers.
+        border: H between the frames' numbers and the camera's free ones.
+        camera: H between the camera's free numbers.
+        descent: -g, frames first.
         residual_px: Residual of each link; NaN where it has none.
     """
 
@@ -134,27 +66,27 @@ class Equations:
     frames: csc_matrix
     border: Float[np.ndarray, "u f"]
     camera: Float[np.ndarray, "f f"]
-    rhs: Float[np.ndarray, "v"]
+    descent: Float[np.ndarray, "v"]
     residual_px: Float[np.ndarray, "r"]
 
     def step(self, damping: float) -> Float[np.ndarray, "v"]:
-        """Solve with the camera's few dense columns eliminated last.
+        """Solve for a Levenberg-Marquardt step; the camera is eliminated last, by its Schur complement.
 
         Args:
-            damping: Share added to the diagonal.
+            damping: Share of the diagonal that is added to it.
         """
         count = len(self.border)
         frames = (self.frames + damping * diags(self.frames.diagonal())).tocsc()
-        reduced = _factorised(frames).solve(np.column_stack([self.rhs[:count], self.border]))
+        reduced = _factorised(frames).solve(np.column_stack([self.descent[:count], self.border]))
         if not self.border.shape[1]:
             return np.asarray(reduced[:, 0])
         camera = self.camera + damping * np.diag(np.diag(self.camera))
         schur = camera - self.border.T @ reduced[:, 1:]
-        found = np.linalg.solve(schur, self.rhs[count:] - self.border.T @ reduced[:, 0])
+        found = np.linalg.solve(schur, self.descent[count:] - self.border.T @ reduced[:, 0])
         return np.concatenate([reduced[:, 0] - reduced[:, 1:] @ found, found])
 
     def camera_sigma(self) -> Float[np.ndarray, "f"]:
-        """Standard deviations of the camera's free numbers when all else is free, too."""
+        """Sigmas of the camera's free numbers, with all other unknowns free too."""
         if not self.border.shape[1]:
             return np.zeros(0)
         schur = self.camera - self.border.T @ _factorised(self.frames).solve(self.border)
@@ -162,94 +94,20 @@ class Equations:
 
 
 def _factorised(matrix: csc_matrix) -> SuperLU:
-    """Factors of a positive definite matrix: no pivoting, and an order that suits symmetry."""
+    """Factorise a positive definite matrix: no pivoting, and an order that suits symmetry."""
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-class FramePattern:
-    """Where the blocks of pairs of frames go in the matrix; found once, since the pairs stay."""
-
-    def __init__(self, pairs: Int[np.ndarray, "p 2"], frames: int) -> None:
-        i, j = pairs.T
-        # In the order of a pair's quarters: (i, i), (i, j), (j, i), (j, j); every frame has its diagonal.
-        each = np.arange(frames)
-        row = np.concatenate([np.stack([i, i, j, j], axis=1).ravel(), each])
-        column = np.concatenate([np.stack([i, j, i, j], axis=1).ravel(), each])
-        places, slot = np.unique(row * frames + column, return_inverse=True)
-        self._order = np.argsort(slot[: 4 * len(pairs)], kind="stable")
-        sorted_slot = slot[self._order]
-        self._first = np.flatnonzero(np.diff(sorted_slot, prepend=-1))
-        self._filled = sorted_slot[self._first]
-        size = N_FRAME * N_FRAME
-        numbered = np.arange(len(places) * size).reshape(-1, N_FRAME, N_FRAME)
-        starts = np.searchsorted(places // frames, np.arange(frames + 1))
-        # Numbers counted from 1, since a conversion may drop zeros.
-        blocks = bsr_matrix((numbered + 1.0, places % frames, starts), shape=(N_FRAME * frames,) * 2).tocsc()
-        blocks.sort_indices()
-        self._at = blocks.data.astype(np.int64) - 1
-        self._indices, self._starts, self._shape = blocks.indices, blocks.indptr, blocks.shape
-        self._blocks = len(places)
-
-    def matrix(self, blocks: Float[np.ndarray, "p 10 10"]) -> csc_matrix:
-        """Sum the pairs' blocks into the matrix."""
-        count = len(blocks)
-        quarters = blocks.reshape(count, 2, N_FRAME, 2, N_FRAME).transpose(0, 1, 3, 2, 4)
-        quarters = quarters.reshape(4 * count, N_FRAME, N_FRAME)
-        summed = np.zeros((self._blocks, N_FRAME, N_FRAME))
-        if count:
-            summed[self._filled] = np.add.reduceat(quarters[self._order], self._first, axis=0)
-        return csc_matrix((summed.ravel()[self._at], self._indices, self._starts), shape=self._shape)
-
-
-#: Shares of pictures in which a point meets an edge by chance, and in which one of the road does.
-_CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
-#: Cosine of the angle by which a moved edge and the one that it meets may differ.
-_LEAST_COSINE = 0.8
-#: Pixels from the rim of what is seen, in images of 160 px, over which a point may be misplaced beyond it.
-_RIM_PX = 1.0
-
-_Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
-
-
-@dataclass(frozen=True)
-class Links:
-    """Which point meets which edge, sorted by pair.
-
-    Attributes:
-        point: Moved points.
-        edge: The edge that each meets.
-        sigma: Standard deviation of each residual, in that of an edge's place in its own picture.
-        pair_starts: First link of each pair of frames, and one behind the last.
-    """
-
-    point: Int[np.ndarray, "r"]
-    edge: Int[np.ndarray, "r"]
-    sigma: Float[np.ndarray, "r"]
-    pair_starts: Int[np.ndarray, "p1"]
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What the frames of a drive show, and what was commanded: the same for every adjustment of them.
-
-    Attributes:
-        edges: Edge pixels per frame, only such that see the road.
-        keep: Pixels in which edges were looked for; None for all.
-        relative_steps: Commanded step length to each frame, 1 where it is typical; None for
-            steps of equal length.
-        speed_recorded: Whether these come from a recorded speed.
-        breaks: Frames that do not follow the one before them; None for one segment.
-    """
-
-    edges: Sequence[EdgePixels]
-    keep: UInt8[np.ndarray, "h w"] | None = None
-    relative_steps: Float[np.ndarray, "n"] | None = None
-    speed_recorded: bool = False
-    breaks: Bool[np.ndarray, "n"] | None = None
-
-
 class BundleProblem:
-    """Points, edges and pairs of frames, which stay; see :func:`datagen.slam.adjustment.adjust.adjust`."""
+    """Points, edges and pairs of frames, which stay; see :func:`datagen.slam.adjustment.adjust.adjust`.
+
+    Attributes:
+        pairs: Pairs of frames; points of the first are moved into the second.
+        points: Pixels that are compared.
+        edges: All edges, those of each frame sorted by row, as the kernels search them.
+        compared: Number of comparisons: points times pairs.
+        free: Which of the camera's numbers may change.
+    """
 
     def __init__(
         self,
@@ -261,146 +119,170 @@ class BundleProblem:
         loops: Sequence[tuple[int, int]] = (),
         prior_camera: Camera | None = None,
     ) -> None:
-        edges, breaks = observed.edges, observed.breaks
-        self.settings, self.camera, self.n = settings, camera, len(edges)
+        self.settings, self.observed, self.frames = settings, observed, len(observed.edges)
+        self.scale = camera.width / _REFERENCE_WIDTH
         self.prior_camera = camera if prior_camera is None else prior_camera
-        self.fisheye = camera.model == "fisheye"
         self.free = np.array([name in free for name in CAMERA_NAMES])
-        counts = np.array([len(e.uv_px) for e in edges])
-        self.edge_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        edge_uv = np.concatenate([e.uv_px for e in edges]).astype(np.float64)
-        edge_normals = np.concatenate([e.normals for e in edges]).astype(np.float64)
+        counts = np.array([len(e.uv_px) for e in observed.edges])
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        uv = np.concatenate([e.uv_px for e in observed.edges]).astype(np.float64)
+        normals = np.concatenate([e.normals for e in observed.edges]).astype(np.float64)
         chosen = [
             start + np.sort(rng.choice(count, min(count, settings.points), replace=False))
-            for start, count in zip(self.edge_starts[:-1], counts, strict=True)
+            for start, count in zip(starts[:-1], counts, strict=True)
         ]
-        self.point_starts = np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64)
+        point_starts = np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64)
         index = np.concatenate(chosen)
-        self.uv, self.normals = edge_uv[index], edge_normals[index]
-        # In the order of their rows, in which the kernels look for them.
-        by_row = np.lexsort((edge_uv[:, 1], np.repeat(np.arange(self.n), counts)))
-        self.edge_uv, self.edge_normals = edge_uv[by_row], edge_normals[by_row]
-        segment = np.zeros(self.n, int) if breaks is None else np.cumsum(breaks)
+        self.points = Pixels(point_starts, uv[index], normals[index])
+        by_row = np.lexsort((uv[:, 1], np.repeat(np.arange(self.frames), counts)))
+        self.edges = Pixels(starts, uv[by_row], normals[by_row])
+        breaks = observed.breaks
+        segment = np.zeros(self.frames, int) if breaks is None else np.cumsum(breaks)
         self.pairs = _pairs(settings.lags, segment, loops, rng)
+        #: Unknowns of the two frames of each pair.
+        self.unknowns = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
         self.inner = inner_pixels(camera, observed.keep)
-        self.moved_points = int(np.diff(self.point_starts)[self.pairs[:, 0]].sum())
+        self.compared = int(np.diff(point_starts)[self.pairs[:, 0]].sum())
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
-        self.weight = np.full(len(self.uv), 1.0 / settings.pixel_sigma**2)
-        self.recorded = observed.speed_recorded
-        steps = observed.relative_steps
-        self.expected = np.ones(self.n) if steps is None else steps
+        self.weight = np.full(len(index), 1.0 / settings.pixel_sigma**2)
         self._lifted: tuple[BundleState, _Lifted] | None = None
-        self.pattern = FramePattern(self.pairs, self.n)
-        scale = camera.width / 160.0
-        s = settings
-        self.camera_sigmas = np.array(
-            [s.focal, s.centre_px * scale, s.centre_px * scale, s.k1, s.pitch, s.roll, s.yaw, s.lever]
-        )
+        s, centre = settings, settings.centre_px * self.scale
+        self.camera_sigmas = np.array([s.focal, centre, centre, s.k1, s.pitch, s.roll, s.yaw, s.lever])
 
     def lift(self, state: BundleState) -> _Lifted:
-        """Points on the road, their slopes by the camera, and points half a pixel across each edge."""
+        """Lift the compared points to the road.
+
+        Returns:
+            The points (ahead of the rear axle, left); their Jacobian by the camera's numbers; and points half
+            a pixel further along the gradient.
+        """
         if self._lifted is not None and self._lifted[0] is state:
-            # Edges are looked for, and residuals taken, from the same state.
+            # Association and residuals start from the same state.
             return self._lifted[1]
-        out, normal = np.empty((len(self.uv), 2)), np.empty((len(self.uv), 2))
-        by = np.empty((len(self.uv), N_CAMERA, 2))
-        lift_points(
-            self.fisheye,
-            state.lens,
-            state.mount,
-            state.tilt,
-            self.point_starts,
-            self.uv,
-            self.normals,
-            out,
-            by,
-            normal,
-        )
-        self._lifted = state, (out, by, normal)
-        return out, by, normal
+        count = len(self.points.uv)
+        lifted = np.empty((count, 2)), np.empty((count, N_CAMERA, 2)), np.empty((count, 2))
+        lift_points(state, self.points, *lifted)
+        self._lifted = state, lifted
+        return lifted
 
     def associate(self, state: BundleState, gate_px: float) -> Links:
-        """Let every moved point look for its edge, and weigh the points by how often they find one."""
-        lifted, _, normal = self.lift(state)
-        point, edge, pair = (np.empty(self.moved_points, np.int64) for _ in range(3))
-        sigma = np.empty(self.moved_points)
-        in_view, matched = np.zeros(len(self.uv), np.int64), np.zeros(len(self.uv), np.int64)
-        count = associate(
-            self.fisheye,
-            state.lens,
-            state.mount,
-            state.tilt,
-            state.poses,
-            self.pairs,
-            self.point_starts,
-            lifted,
-            normal,
-            self.edge_starts,
-            self.edge_uv,
-            self.edge_normals,
-            gate_px * self.camera.width / 160.0,
-            _LEAST_COSINE,
-            self.inner,
-            in_view,
-            matched,
-            point,
-            edge,
-            pair,
-            sigma,
+        """Find the nearest edge of every compared point, and weigh the points by how often they have one."""
+        lifted, _, half_px = self.lift(state)
+        links = Links(
+            *(np.empty(self.compared, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64))
         )
+        in_view, matched = (np.zeros(len(self.points.uv), np.int64) for _ in range(2))
+        count = associate(
+            state, self.pairs, self.points, lifted, half_px, self.edges,
+            gate_px * self.scale, self.inner, in_view, matched, links,
+        )  # fmt: skip
         self.weight = point_trust(in_view, matched) / self.settings.pixel_sigma**2
-        starts = np.searchsorted(pair[:count], np.arange(len(self.pairs) + 1))
-        return Links(point[:count], edge[:count], sigma[:count], starts.astype(np.int64))
+        return Links(*(column[:count] for column in links))
 
     def equations(self, state: BundleState, links: Links) -> Equations:
-        """Normal equations of all residuals and priors."""
-        lifted, by, _ = self.lift(state)
-        size = 2 * N_FRAME + N_CAMERA
-        blocks, rhs = np.zeros((len(self.pairs), size, size)), np.zeros((len(self.pairs), size))
+        """Build the normal equations of all residuals and priors."""
+        lifted, lifted_by, _ = self.lift(state)
+        both, count = 2 * N_FRAME, N_FRAME * self.frames
+        blocks = np.zeros((len(self.pairs), both + N_CAMERA, both + N_CAMERA))
+        descents = np.zeros((len(self.pairs), both + N_CAMERA))
         residual_px = np.empty(len(links.point))
         cost = accumulate(
-            self.fisheye,
-            state.lens,
-            state.mount,
-            state.tilt,
-            state.poses,
-            self.pairs,
-            links.pair_starts,
-            links.point,
-            links.edge,
-            lifted,
-            by,
-            self.edge_uv,
-            self.edge_normals,
-            links.sigma,
-            self.weight,
-            self.settings.cauchy_px,
-            blocks,
-            rhs,
-            residual_px,
-        )
-        both, count = 2 * N_FRAME, N_FRAME * self.n
-        where = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).ravel()
+            state, self.pairs, self.edges, lifted, lifted_by, links,
+            self.weight, self.settings.cauchy_px, blocks, descents, residual_px,
+        )  # fmt: skip
+        prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.joined, self.observed)
+        at, free = self.unknowns.ravel(), self.free
         border = [
-            np.bincount(where, blocks[:, :both, both + k].ravel(), minlength=count)
-            for k in np.flatnonzero(self.free)
+            np.bincount(at, blocks[:, :both, both + k].ravel(), minlength=count) for k in np.flatnonzero(free)
         ]
-        prior_cost, prior, downhill = frame_priors(
-            state, self.settings, self.joined, self.expected, self.recorded
-        )
-        off = (state.camera_off(self.prior_camera) / self.camera_sigmas)[self.free]
-        camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(self.free, self.free)]
-        camera_rhs = rhs[:, both:].sum(axis=0)[self.free] - off / self.camera_sigmas[self.free]
+        off = (state.camera_minus(self.prior_camera) / self.camera_sigmas)[free]
+        camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(free, free)]
+        camera_descent = descents[:, both:].sum(axis=0)[free] - off / self.camera_sigmas[free]
+        frames_descent = np.bincount(at, descents[:, :both].ravel(), minlength=count) + prior_descent
         return Equations(
             cost=cost + prior_cost + 0.5 * float(off @ off),
-            frames=(self.pattern.matrix(blocks[:, :both, :both]) + prior).tocsc(),
+            frames=(sum_blocks(self.unknowns, blocks[:, :both, :both], count) + prior).tocsc(),
             border=np.stack(border, axis=1) if border else np.empty((count, 0)),
-            camera=camera + np.diag(self.camera_sigmas[self.free] ** -2.0),
-            rhs=np.concatenate(
-                [np.bincount(where, rhs[:, :both].ravel(), minlength=count) + downhill, camera_rhs]
-            ),
+            camera=camera + np.diag(self.camera_sigmas[free] ** -2.0),
+            descent=np.concatenate([frames_descent, camera_descent]),
             residual_px=residual_px,
         )
+
+
+def sum_blocks(unknowns: Int[np.ndarray, "p k"], blocks: Float[np.ndarray, "p k k"], size: int) -> csc_matrix:
+    """Add up small dense blocks in a sparse matrix, each at the rows and columns of its unknowns."""
+    rows = np.broadcast_to(unknowns[:, :, None], blocks.shape)
+    columns = np.broadcast_to(unknowns[:, None, :], blocks.shape)
+    return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsc()
+
+
+def frame_priors(
+    state: BundleState, settings: BundleSettings, joined: Int[np.ndarray, "m"], observed: Observations
+) -> tuple[float, csc_matrix, Float[np.ndarray, "u"]]:
+    """What is assumed of the frames: they are nearly level, and the car rolls on arcs that change slowly.
+
+    Args:
+        state: Where to linearise.
+        settings: Sigmas.
+        joined: Frames that are followed by the next one.
+        observed: What was commanded.
+
+    Returns:
+        Cost, H and -g of the priors by the frames' numbers.
+    """
+    s, n = settings, len(state.poses)
+    i, j = joined, joined + 1
+    own = N_FRAME * np.arange(n)[:, None]
+    step_at = np.concatenate(
+        [N_FRAME * i[:, None] + np.arange(3), N_FRAME * j[:, None] + np.arange(3)], axis=1
+    )
+    # On an arc the rear axle moves along the heading at half of the turn. The motion along and across it,
+    # with Jacobians by both poses:
+    c, si = np.cos(state.poses[i, 2]), np.sin(state.poses[i, 2])
+    dx, dy = (state.poses[j] - state.poses[i])[:, :2].T
+    ahead, left = c * dx + si * dy, c * dy - si * dx
+    turn = state.poses[j, 2] - state.poses[i, 2]
+    half, middle = 0.5 * turn, state.poses[i, 2] + 0.5 * turn
+    along = np.cos(half) * ahead + np.sin(half) * left
+    across = np.cos(half) * left - np.sin(half) * ahead
+    cm, sm = np.cos(middle), np.sin(middle)
+    along_by = np.stack([-cm, -sm, 0.5 * across, cm, sm, 0.5 * across], axis=1)
+    across_by = np.stack([sm, -cm, -0.5 * along, -sm, cm, -0.5 * along], axis=1)
+    turn_by = np.broadcast_to([0.0, 0.0, -1.0, 0.0, 0.0, 1.0], along_by.shape)
+    # Neighbouring steps: a is followed by b.
+    a = np.flatnonzero(j[:-1] == i[1:])
+    b = a + 1
+    both_at = np.concatenate([step_at[b], step_at[a]], axis=1)
+    # Steps per commanded step; nothing is assumed of steps for which the car was commanded to stand.
+    commanded = (np.ones(n) if observed.relative_steps is None else observed.relative_steps)[j]
+    per = np.where(commanded > 0.0, 1.0 / np.maximum(commanded, _LEAST_STEP), 0.0)
+    per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
+    speed_by = np.concatenate([per_b[:, None] * along_by[b], -per_a[:, None] * along_by[a]], axis=1)
+    # Each prior: residual, sigma, and the unknowns that it depends on with the Jacobian by them.
+    priors = [
+        (state.tilt[:, 0], s.frame_pitch, own + 3, np.ones((n, 1))),
+        (state.tilt[:, 1], s.frame_roll, own + 4, np.ones((n, 1))),
+        (across, s.slip, step_at, across_by),
+        (per_b * along[b] - per_a * along[a], s.speed_change, both_at, speed_by),
+        (turn[b] - turn[a], s.turn_change, both_at, np.concatenate([turn_by[b], -turn_by[a]], axis=1)),
+        (np.zeros(3), _FIXED_SIGMA, np.arange(3)[:, None], np.ones((3, 1))),
+    ]
+    known = np.flatnonzero(commanded >= _LEAST_STEP) if observed.speed_recorded else np.zeros(0, np.int64)
+    if known.size:
+        # The gain of the speed is that of the median step: what all steps share is left to the images.
+        gain = max(float(np.median(per[known] * along[known])), 1e-6)
+        share = per[known] / gain
+        priors.append(
+            (share * along[known] - 1.0, s.recorded_speed, step_at[known], share[:, None] * along_by[known])
+        )
+    e = np.concatenate([residual / sigma for residual, sigma, _, _ in priors])
+    counts = np.concatenate([np.full(len(columns), columns.shape[1]) for _, _, columns, _ in priors])
+    values = np.concatenate([(by / sigma).ravel() for _, sigma, _, by in priors])
+    columns = np.concatenate([at.ravel() for _, _, at, _ in priors])
+    jacobian = coo_matrix(
+        (values, (np.repeat(np.arange(len(e)), counts), columns)), shape=(len(e), N_FRAME * n)
+    ).tocsc()
+    return 0.5 * float(e @ e), (jacobian.T @ jacobian).tocsc(), -(jacobian.T @ e)
 
 
 def _pairs(
@@ -409,12 +291,12 @@ def _pairs(
     loops: Sequence[tuple[int, int]],
     rng: np.random.Generator,
 ) -> Int[np.ndarray, "p 2"]:
-    """Pairs of frames: points of the first are moved into the second."""
+    """Pairs of frames of one segment, a lag apart, and those of loops in both directions."""
     pairs = []
     for lag in lags:
         i = np.arange(len(segment) - lag)
         i = i[segment[i] == segment[i + lag]]
-        # Back and forth: points that leave the view one way are seen the other way.
+        # Forwards or backwards: points that leave the view in one direction stay in view in the other.
         back = rng.random(len(i)) < 0.5
         pairs.append(np.where(back[:, None], np.stack([i + lag, i], 1), np.stack([i, i + lag], 1)))
     both = [(a, b) for a, b in loops] + [(b, a) for a, b in loops]
@@ -432,15 +314,19 @@ def inner_pixels(camera: Camera, keep: UInt8[np.ndarray, "h w"] | None) -> Bool[
     seen = np.zeros((camera.height + 2, camera.width + 2), np.uint8)
     seen[1:-1, 1:-1] = 1 if keep is None else keep > 0
     rim_px = cv2.distanceTransform(seen, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    return np.asarray(rim_px > _RIM_PX * camera.width / 160.0)
+    return np.asarray(rim_px > _RIM_PX * camera.width / _REFERENCE_WIDTH)
 
 
 def point_trust(in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Trust in each moved point by how often it met an edge.
+    """Return the trust in each compared point, from the share of frames in which it met an edge.
 
-    Noise meets an edge by chance, wherever it is moved; its residual then only says that all may stay as it
-    is. What is on the road is met again in nearly every picture.
+    Noise meets an edge by chance, wherever it is moved, and its residual only says that all may stay as it
+    is. A mark on the road is met again in nearly every image.
+
+    Args:
+        in_view: In how many frames each point fell into the inner pixels.
+        matched: In how many of them it met an edge.
     """
     share = matched / np.maximum(in_view, 1)
     trust = np.clip((share - _CHANCE) / (_SURE - _CHANCE), _LEAST_TRUST, 1.0)
-    return np.where(in_view >= 2, trust, np.minimum(trust, 0.3))
+    return np.where(in_view >= 2, trust, np.minimum(trust, _TRUST_ONCE))

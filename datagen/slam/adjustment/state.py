@@ -1,22 +1,101 @@
-"""What the bundle adjustment changes: poses, each frame's tilt, and the camera's numbers.
+"""What goes into a bundle adjustment and what comes out: settings, observations, estimates and the state.
 
-Priors and robustness of the bundle adjustment.
+Poses are in cm outside this room. Inside, in :class:`BundleState` and the kernels, lengths are in camera
+heights.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 
 from datagen.slam.adjustment.kernels import N_FRAME
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import EdgePixels
 
 #: Names of the camera's adjustable numbers, in the order of the kernels.
 CAMERA_NAMES = ("focal", "cx", "cy", "k1", "pitch", "roll", "yaw", "lever")
+
+
+class BundleSettings(Settings):
+    """Priors and robustness of the adjustment; lengths in camera heights, angles in radians.
+
+    "Real drives" are ``donkey_circuit``, ``usi_mat`` and ``garage_tape`` (docs/mapping.md). Where no other
+    source is named, a value was chosen on them and on simulated drives (``tests/bench/bench_mapping.py``).
+
+    Attributes:
+        lags: Frames between the two frames of a pair. With these, a closed ``donkey_circuit`` gave focal
+            lengths within 1 px from starts of 50 to 76 px.
+        points: Edge points per frame that are compared.
+        gates_px: Search radius for the nearest edge, [px], one per round of association. Chosen: it
+            shrinks as the poses improve.
+        iterations: Levenberg-Marquardt steps per round.
+        cauchy_px: Scale of the Cauchy loss, [px]: about three times the robust sd of ``donkey_circuit``.
+        pixel_sigma: Standard deviation of a residual, [px]. Larger than the residuals seen, since
+            neighbouring edge points share their errors and count for fewer.
+        focal: Relative sigma of the focal length's prior; wide, for a guessed lens.
+        centre_px: Sigma of the principal point, for images 160 px wide. Tight: with yaw and roll it is nearly
+            degenerate.
+        k1: Sigma of the first lens coefficient; the three real drives have -0.03 to -0.07.
+        pitch: Sigma of the mounting's pitch.
+        roll: Sigma of the mounting's roll: nearly degenerate with the principal point, hence tight.
+        yaw: Sigma of the mounting's yaw.
+        lever: Sigma of the camera's position ahead of the rear axle.
+        frame_pitch: Sigma of each frame's pitch about the mounting's: 0.33 to 0.83 degrees on the real
+            drives.
+        frame_roll: Sigma of each frame's roll: half of the pitch's.
+        slip: Sigma of the rear axle's sideways motion per frame.
+        speed_change: Sigma of the change of step length from frame to frame, relative to the commands.
+        recorded_speed: Sigma of a step length about recorded speed times its gain, as a share: errors of some
+            per cent that last for several frames. With it, steps where nothing across the road is seen no
+            longer come out 15 % too long (docs/mapping.md).
+        turn_change: Sigma of the change of turn from frame to frame.
+    """
+
+    lags: tuple[int, ...] = (1, 4, 9, 14)
+    points: int = Field(default=60, ge=10)
+    gates_px: tuple[float, ...] = (5.0, 4.0, 3.0, 2.5, 2.5)
+    iterations: int = Field(default=2, ge=1)
+    cauchy_px: float = Field(default=0.7, gt=0.0)
+    pixel_sigma: float = Field(default=2.0, gt=0.0)
+    focal: float = Field(default=0.3, gt=0.0)
+    centre_px: float = Field(default=1.0, gt=0.0)
+    k1: float = Field(default=0.03, gt=0.0)
+    pitch: float = Field(default=0.2, gt=0.0)
+    roll: float = Field(default=0.02, gt=0.0)
+    yaw: float = Field(default=0.1, gt=0.0)
+    lever: float = Field(default=0.4, gt=0.0)
+    frame_pitch: float = Field(default=0.012, gt=0.0)
+    frame_roll: float = Field(default=0.006, gt=0.0)
+    slip: float = Field(default=0.004, gt=0.0)
+    speed_change: float = Field(default=0.003, gt=0.0)
+    recorded_speed: float = Field(default=0.2, gt=0.0)
+    turn_change: float = Field(default=0.01, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What the frames of a drive show, and what was commanded: the same for every adjustment of them.
+
+    Attributes:
+        edges: Edge pixels per frame, only such that see the road.
+        keep: Pixels in which edges were looked for; None for all.
+        relative_steps: Commanded step length to each frame, 1 where it is typical; None for equal steps.
+        speed_recorded: Whether these come from a recorded speed.
+        breaks: Frames that do not follow the one before them; None for one segment.
+    """
+
+    edges: Sequence[EdgePixels]
+    keep: UInt8[np.ndarray, "h w"] | None = None
+    relative_steps: Float[np.ndarray, "n"] | None = None
+    speed_recorded: bool = False
+    breaks: Bool[np.ndarray, "n"] | None = None
 
 
 @dataclass(frozen=True)
@@ -39,24 +118,33 @@ class BundleEstimate:
         return BundleEstimate(poses, np.zeros((len(poses), 2)), camera)
 
 
-@dataclass(frozen=True)
-class BundleState:
-    """Lengths in camera heights.
+class BundleState(NamedTuple):
+    """The unknowns of the adjustment; lengths in camera heights.
 
     Attributes:
         poses: Rear-axle poses, frame map.
         tilt: Pitch and roll of each frame beyond the camera's, [rad].
         lens: See :mod:`datagen.slam.adjustment.kernels`.
-        mount: The same.
+        mount: See :mod:`datagen.slam.adjustment.kernels`.
+        fisheye: Lens model.
     """
 
     poses: Float[np.ndarray, "n 3"]
     tilt: Float[np.ndarray, "n 2"]
     lens: Float[np.ndarray, "9"]
     mount: Float[np.ndarray, "5"]
+    fisheye: bool
+
+    @staticmethod
+    def at(estimate: BundleEstimate) -> BundleState:
+        """Return the state at an estimate."""
+        camera = estimate.camera
+        height, fisheye = camera.mounting.height_cm, camera.model == "fisheye"
+        poses = estimate.poses / [height, height, 1.0]
+        return BundleState(poses, estimate.tilt, *camera_vectors(camera), fisheye)
 
     def moved(self, step: Float[np.ndarray, "u"], free: Bool[np.ndarray, "8"]) -> BundleState:
-        """Return the state after a step: five numbers per frame, then those of the camera that are free."""
+        """Return the state after a step: five numbers per frame, then the camera's free numbers."""
         count = N_FRAME * len(self.poses)
         frames = step[:count].reshape(-1, N_FRAME)
         camera = np.zeros(len(CAMERA_NAMES))
@@ -65,7 +153,7 @@ class BundleState:
         lens[:2] *= np.exp(camera[0])
         lens[2:5] += camera[1:4]
         mount[:4] += camera[4:8]
-        return BundleState(self.poses + frames[:, :3], self.tilt + frames[:, 3:], lens, mount)
+        return BundleState(self.poses + frames[:, :3], self.tilt + frames[:, 3:], lens, mount, self.fisheye)
 
     def camera_like(self, camera: Camera) -> Camera:
         """Return the camera with this state's numbers."""
@@ -82,71 +170,18 @@ class BundleState:
         D[0] = lens[4]
         return replace(camera, K=K, D=D, mounting=mounting)
 
-    def camera_off(self, believed: Camera) -> Float[np.ndarray, "8"]:
-        """How far the camera's numbers are from those of another one; the focal length relative."""
-        lens, mount = numbers_of(believed)
+    def camera_minus(self, other: Camera) -> Float[np.ndarray, "8"]:
+        """Return the camera's adjustable numbers minus those of another camera; the focal length relative."""
+        lens, mount = camera_vectors(other)
         focal = np.log(self.lens[0] / lens[0])
         return np.array([focal, *(self.lens[2:5] - lens[2:5]), *(self.mount[:4] - mount[:4])])
 
 
-def numbers_of(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]:
-    """A camera as the kernels take it: lens, and mounting with lengths in camera heights."""
+def camera_vectors(camera: Camera) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "5"]]:
+    """Return a camera's lens and mount as the kernels take them, lengths in camera heights."""
     m = camera.mounting
     D = np.concatenate([camera.D, np.zeros(5)])[:5]
     lens = np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *D])
     lever = (m.ahead_of_front_axle_cm + camera.wheelbase_cm) / m.height_cm
     mount = np.array([m.pitch_down_rad, m.roll_rad, m.yaw_rad, lever, -m.right_of_centre_cm / m.height_cm])
     return lens, mount
-
-
-def start_state(start: BundleEstimate) -> BundleState:
-    """Return the state at an estimate."""
-    height = start.camera.mounting.height_cm
-    return BundleState(start.poses / [height, height, 1.0], start.tilt, *numbers_of(start.camera))
-
-
-class BundleSettings(Settings):
-    """Priors and robustness; lengths in camera heights, angles in radians.
-
-    Attributes:
-        lags: Frames between the frames of a pair.
-        points: Edge points per frame that are moved.
-        gates_px: Radius of the search for the edge, one per round of association.
-        iterations: Steps per round.
-        cauchy_px: Residual at which the robust loss sets in.
-        pixel_sigma: Standard deviation of a residual, with all that makes neighbours alike.
-        focal: Relative standard deviation of the focal length's prior.
-        centre_px: Of the principal point, for images of 160 px.
-        k1: Of the first coefficient of the lens.
-        pitch: Of the mounting's pitch.
-        roll: Of the mounting's roll.
-        yaw: Of the mounting's yaw.
-        lever: Of the camera's place ahead of the rear axle.
-        frame_pitch: Of each frame's pitch about the mounting's.
-        frame_roll: Of each frame's roll.
-        slip: Of the rear axle's sideways motion per frame.
-        speed_change: Of the change of the way per frame, from one frame to the next, against the commanded.
-        recorded_speed: Of the way per frame about the recorded speed times its gain, as a share of it: errors
-            of a few per cent that last for some frames. Only where a speed was recorded.
-        turn_change: Of the change of turn per frame, from one frame to the next.
-    """
-
-    lags: tuple[int, ...] = (1, 4, 9, 14)
-    points: int = Field(default=60, ge=10)
-    gates_px: tuple[float, ...] = (5.0, 4.0, 3.0, 2.5, 2.5)
-    iterations: int = Field(default=2, ge=1)
-    cauchy_px: float = Field(default=0.7, gt=0.0)
-    pixel_sigma: float = Field(default=2.0, gt=0.0)
-    focal: float = Field(default=0.3, gt=0.0)
-    centre_px: float = Field(default=1.0, gt=0.0)
-    k1: float = Field(default=0.03, gt=0.0)
-    pitch: float = Field(default=0.2, gt=0.0)
-    roll: float = Field(default=0.02, gt=0.0)
-    yaw: float = Field(default=0.1, gt=0.0)
-    lever: float = Field(default=0.4, gt=0.0)
-    frame_pitch: float = Field(default=0.012, gt=0.0)
-    frame_roll: float = Field(default=0.006, gt=0.0)
-    slip: float = Field(default=0.004, gt=0.0)
-    speed_change: float = Field(default=0.003, gt=0.0)
-    recorded_speed: float = Field(default=0.2, gt=0.0)
-    turn_change: float = Field(default=0.01, gt=0.0)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_rim, standing_out, usual_step
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence
 from datagen.slam.odometry.scans import Progress, seen_edges
 from datagen.slam.settings import GuessSettings
 from datagen.slam.view import mapping_range
@@ -109,10 +109,10 @@ def coarse_camera(
                 camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
                 pictures = _pictures(pixels, camera, perception, seed)
                 steps = usual * _AROUND
-                _, fits = usual_step(pictures, relative, steps, _PAIRS)
+                _, fits = best_step(pictures, relative, steps, _PAIRS)
                 # The fit itself decides nothing: with too much pitch, standing still fits better than the
                 # true motion with the right camera.
-                clear = standing_out(fits, steps)[_INNER] / pictures.points_per_frame
+                clear = prominence(fits, steps)[_INNER] / pictures.points_per_frame
                 fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2)
                 step = float(steps[_INNER][np.argmax(clear)])
                 tried[focal, pitch] = Candidate(focal, pitch, step, fit)
@@ -128,7 +128,7 @@ def coarse_camera(
     return camera, list(tried.values())
 
 
-def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"]) -> float:
+def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"]) -> float:
     """Typical step length, in camera heights, with the camera in which one is most prominent.
 
     With a camera that is far off, images agree at no step. The best fit then lies at either end: almost no
@@ -141,9 +141,9 @@ def clearest_step(cameras: Iterable[Pictures], relative: Float[np.ndarray, "n"])
     steps = np.array(STEPS_HEIGHTS)
     best, most = float(np.sqrt(steps[0] * steps[-1])), 0.0
     for pictures in cameras:
-        step, fit = usual_step(pictures, relative, steps, _FIRST_PAIRS)
-        clear = float(standing_out(fit, steps).max()) / pictures.points_per_frame
-        if clear > most and not at_rim(step, steps):
+        step, fit = best_step(pictures, relative, steps, _FIRST_PAIRS)
+        clear = float(prominence(fit, steps).max()) / pictures.points_per_frame
+        if clear > most and not at_limit(step, steps):
             best, most = step, clear
     return best
 
@@ -154,8 +154,8 @@ def _spacing(values: tuple[float, ...]) -> float:
 
 def _pictures(
     pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, seed: int
-) -> Pictures:
+) -> ImagePairs:
     """The edges that see the road with a camera; the same points are drawn for every camera."""
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
     edges = [seen_edges(frame, table) for frame in pixels]
-    return Pictures(edges, camera, OdometrySettings(), np.random.default_rng(seed))
+    return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(seed))

@@ -1,9 +1,12 @@
-"""One map that all particles share, each cell of which knows what each lineage saw there.
+"""The map that all particles share: each cell knows what each lineage saw there.
 
-After Eliazar and Parr (DP-SLAM, 2003): particles differ in where they were during the last frames only;
-before that they descend from the same ancestor. What a frame showed is entered once for each particle that
-survived its resampling (a node of the ancestry), and a particle sees of it what its own ancestor entered.
-Once all particles descend from one node, its entries belong to all; once none does, they are dropped.
+Particles differ in where they were during the last frames only; before that they descend from one ancestor.
+What a frame showed is entered once for each particle that survived its resampling (a node of the ancestry
+tree). A particle sees what its own ancestors entered. Once all particles descend from a node, its entries
+belong to all of them; once none does, they are dropped.
+
+Source:
+    Eliazar and Parr 2003 and 2004 (see :mod:`datagen.slam.filter.dp_slam`).
 """
 
 from __future__ import annotations
@@ -14,79 +17,76 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.slam.filter.ancestry_kernels import PAGE_SIZE, Cells, Pages, Tree, forget, grow, score, write
+from datagen.slam.filter.ancestry_kernels import (
+    PAGE_SIZE,
+    AncestryTree,
+    Cells,
+    MapArrays,
+    Pages,
+    collapse,
+    grow,
+    score,
+    write,
+)
+from datagen.slam.odometry.scans import Scan
 
 Likelihood = Literal["direction", "count"]
 
-#: A cell counts as occupied until what was seen in it has faded to this share (three memories).
-_OCCUPIED = 0.05
+#: Frames that may be collapsed while one is entered: two bound the work of a frame and catch up in time.
+_COLLAPSED_PER_FRAME = 2
 
 
-@dataclass
-class AncestryMap:
-    """The shared map; its memory is taken at the start and never grows.
+@dataclass(frozen=True)
+class MapLayout:
+    """Geometry and limits of a shared map.
 
     Attributes:
         cell_cm: Side of a cell.
-        memory_frames: Frames after which what was mapped has faded to 1/e.
+        size: Cells along each side of the grid, a power of two; the grid wraps around.
+        memory_frames: Frames after which an entry has faded to 1/e.
         wheelbase_cm: Distance between the axles.
+        points: How many edge points a frame may enter.
+        window: Frames for which lineages are told apart.
         likelihood: What is entered and scored: blurred normals, or the occupied cells of the paper.
-        tree: The living ancestry.
-        cells: The grid.
-        pages: What single lineages saw.
-        forced: Frames that were entered for all at the mean pose of their ancestors, because lineages still
-            differed when the window or the pages were full.
+        pages: Room for the entries of single lineages, in pages of ``PAGE_SIZE``. Chosen: with them the
+            whole map takes 26 MB (``tests/bench/bench_filter.py``).
     """
 
     cell_cm: float
+    size: int
     memory_frames: float
     wheelbase_cm: float
-    likelihood: Likelihood
-    tree: Tree
-    cells: Cells
-    pages: Pages
-    forced: int = 0
-    _oldest: int = 0
+    points: int
+    window: int = 64
+    likelihood: Likelihood = "direction"
+    pages: int = 40_000
 
-    @staticmethod
-    def empty(
-        particles: int,
-        cell_cm: float,
-        size: int,
-        memory_frames: float,
-        wheelbase_cm: float,
-        points: int,
-        window: int = 64,
-        likelihood: Likelihood = "direction",
-        pages: int = 40_000,
-    ) -> AncestryMap:
-        """Return a map with nothing in it.
 
-        Args:
-            particles: How many share it.
-            cell_cm: Side of a cell.
-            size: Cells along each side of the grid, a power of two; the grid wraps around.
-            memory_frames: Frames after which what was mapped has faded to 1/e.
-            wheelbase_cm: Distance between the axles.
-            points: How many edge points a frame may enter.
-            window: Frames for which lineages are told apart.
-            likelihood: Which likelihood the map serves.
-            pages: Room for what single lineages saw, in pages of 16 entries.
-        """
-        tree = Tree(
+class AncestryMap:
+    """The shared map; its memory is allocated at the start and never grows.
+
+    Attributes:
+        arrays: What it holds.
+        forced: Frames that were collapsed although lineages still differed, because the window or the pages
+            were full. They are entered for all particles at the mean pose of their ancestors.
+    """
+
+    def __init__(self, particles: int, layout: MapLayout) -> None:
+        window, size, pages = layout.window, layout.size, layout.pages
+        self.forced, self._oldest = 0, 0
+        tree = AncestryTree(
             np.zeros((window, particles, 2), np.int32),
             np.zeros(window, np.int32),
             np.zeros(window, np.int32),
             np.zeros((window, particles, 3)),
-            np.zeros((window, points, 5)),
+            np.zeros((window, layout.points, 5)),
             np.zeros(window, np.int32),
             np.zeros(2, np.int64),
-            np.exp(-np.arange(-window, window + 1) / memory_frames),
+            np.exp(-np.arange(-window, window + 1) / layout.memory_frames),
             np.zeros((particles, 4), np.int64),
         )
         state = np.zeros((size, size, 8), np.int32)
         state[:, :, 2:] = -1
-        cells = Cells(state, np.zeros((size, size, 2)))
         following = np.arange(1, pages + 1, dtype=np.int32)
         following[-1] = -1
         pool = Pages(
@@ -96,61 +96,32 @@ class AncestryMap:
             np.zeros((pages, PAGE_SIZE, 2)),
             np.array([0, pages], np.int32),
         )
-        return AncestryMap(
-            cell_cm,
-            memory_frames,
-            wheelbase_cm,
-            likelihood,
-            tree,
-            cells,
-            pool,
+        cells, counting = Cells(state, np.zeros((size, size, 2))), layout.likelihood == "count"
+        self.arrays = MapArrays(
+            tree, cells, pool, layout.cell_cm, layout.wheelbase_cm, layout.memory_frames, counting
         )
 
     @property
     def bytes(self) -> int:
         """Memory of the map."""
-        return sum(array.nbytes for part in (self.tree, self.cells, self.pages) for array in part)
+        return sum(array.nbytes for part in self.arrays[:3] for array in part)
 
-    def score(
-        self,
-        poses: Float[np.ndarray, "p 3"],
-        points_car_cm: Float[np.ndarray, "n 2"],
-        normals_car: Float[np.ndarray, "n 2"],
-        weights: Float[np.ndarray, "n"],
-        frame: int,
-    ) -> Float[np.ndarray, "p"]:
+    def score(self, poses: Float[np.ndarray, "p 3"], scan: Scan, frame: int) -> Float[np.ndarray, "p"]:
         """Score how well a frame's edges fit what each particle's lineage has seen.
 
         Args:
             poses: One per particle, in their order.
-            points_car_cm: Edge points, frame car.
-            normals_car: Their unit normals.
-            weights: Trust in each.
+            scan: Edge points of the frame.
             frame: Number of the frame, later than all that was mapped.
 
         Returns:
             About the weighted number of matched points, one number per particle.
         """
-        scores = np.zeros(len(poses))
-        points = np.concatenate([points_car_cm, normals_car, weights[:, None]], axis=1)
-        occupied = _OCCUPIED if self.likelihood == "count" else 0.0
-        score(
-            self.tree,
-            self.cells,
-            self.pages,
-            poses,
-            points,
-            frame,
-            self.wheelbase_cm,
-            self.cell_cm,
-            self.memory_frames,
-            occupied,
-            scores,
-        )
-        return scores
+        points = np.concatenate([scan.points_cm, scan.normals, scan.weights[:, None]], axis=1)
+        return np.asarray(score(self.arrays, poses, points, frame))
 
     def descend(self, states: Float[np.ndarray, "p s"], chosen: Int[np.ndarray, "p"], frame: int) -> int:
-        """Follow a resampling and give the survivors nodes of this frame.
+        """Follow a resampling, and give the survivors nodes of this frame.
 
         Args:
             states: Particles before resampling, x, y and heading first.
@@ -160,61 +131,42 @@ class AncestryMap:
         Returns:
             Number of survivors.
         """
-        window = len(self.tree.nodes)
+        tree = self.arrays.tree
+        window = len(tree.nodes)
         if frame - self._oldest >= window:
-            self._forget_oldest()
-        grow(self.tree, frame % window, frame, states, chosen)
-        # Lineages that have met free a frame each, some frames at once; to share the work, two at most.
-        for _ in range(2):
+            self._collapse_oldest()
+        grow(tree, frame % window, frame, states, chosen)
+        # Where lineages have met, frames can be collapsed: one a frame on average, sometimes many at once.
+        for _ in range(_COLLAPSED_PER_FRAME):
             if self._oldest < frame and self._agreed(self._oldest % window):
-                self._forget_oldest()
-        return int(self.tree.nodes[frame % window])
+                self._collapse_oldest()
+        return int(tree.nodes[frame % window])
 
-    def enter(
-        self,
-        points_car_cm: Float[np.ndarray, "n 2"],
-        normals_car: Float[np.ndarray, "n 2"],
-        weights: Float[np.ndarray, "n"],
-        frame: int,
-    ) -> None:
-        """Enter a frame's edges as seen from each of its nodes, [cm], frame car."""
-        row = frame % len(self.tree.nodes)
-        stored = self.tree.points[row, : len(weights)]
-        stored[:, :2], stored[:, 2:4], stored[:, 4] = points_car_cm, normals_car, weights
-        self.tree.size[row] = len(weights)
-        plain, done = self.likelihood == "count", 0
+    def enter(self, scan: Scan, frame: int) -> None:
+        """Enter a frame's edges as seen from each of its nodes."""
+        tree = self.arrays.tree
+        row, count = frame % len(tree.nodes), len(scan.weights)
+        stored = tree.points[row, :count]
+        stored[:, :2], stored[:, 2:4], stored[:, 4] = scan
+        tree.size[row] = count
+        done = 0
         while True:
-            done = write(self.tree, self.cells, self.pages, row, done, self.wheelbase_cm, self.cell_cm, plain)
-            if done == len(weights) or self._oldest == frame:
+            done = write(self.arrays, row, done)
+            if done == count or self._oldest == frame:
                 break
-            self._forget_oldest()
+            self._collapse_oldest()
 
     def _agreed(self, row: int) -> bool:
         """Whether all particles descend from one node of a row."""
-        span = self.tree.span[row, : int(self.tree.nodes[row])]
-        return bool(np.any(span[:, 1] - span[:, 0] == self.tree.span.shape[1]))
+        tree = self.arrays.tree
+        span = tree.span[row, : int(tree.nodes[row])]
+        return bool(np.any(span[:, 1] - span[:, 0] == tree.span.shape[1]))
 
-    def _forget_oldest(self) -> None:
+    def _collapse_oldest(self) -> None:
         """Free the row of the oldest frame."""
-        row = self._oldest % len(self.tree.nodes)
-        plain = self.likelihood == "count"
-        if self._forget(row):
+        row = self._oldest % len(self.arrays.tree.nodes)
+        if collapse(self.arrays, row):
             self.forced += 1
-            write(self.tree, self.cells, self.pages, row, 0, self.wheelbase_cm, self.cell_cm, plain)
-            self._forget(row)
+            write(self.arrays, row, 0)
+            collapse(self.arrays, row)
         self._oldest += 1
-
-    def _forget(self, row: int) -> bool:
-        plain = self.likelihood == "count"
-        return bool(
-            forget(
-                self.tree,
-                self.cells,
-                self.pages,
-                row,
-                self.wheelbase_cm,
-                self.cell_cm,
-                self.memory_frames,
-                plain,
-            )
-        )

@@ -1,18 +1,15 @@
-"""The loops of the shared map: following the ancestry, writing, pruning.
+"""Arrays and inner loops of the shared map: growing the ancestry, entering, pruning, collapsing, scoring.
 
-Resampling keeps the order of the particles (systematic resampling draws ascending indices), so that the
-living descendants of a node are always neighbours: one interval of particles. Whether a particle descends
-from a node is two comparisons, and what a cell holds for each particle is a sum over intervals.
+Resampling keeps the order of the particles (systematic resampling draws ascending indices). The living
+descendants of a node are therefore neighbours: one interval of particles. Whether a particle descends from a
+node is two comparisons, and what a cell holds for each particle is a sum over intervals.
 
-An entry whose interval is empty is dead; one whose interval holds everybody is the same for all particles and
-moves into the root. Both happen where a cell is visited, and at the latest when its frame leaves the tree.
+An entry whose interval is empty is dead. One whose interval holds everybody is the same for all particles and
+moves into the root of its cell. Both are dealt with when a cell is visited, and at the latest when the
+frame's row leaves the tree.
 
-The entries of a cell stand in pages, each of which is one run of memory, and the loops over points are
-outermost: chasing entries one by one through memory would take longer than all the arithmetic.
-
-The arrays of the shared map, as the numba kernels take them.
-
-Scoring: what each particle sees of a frame, against what its own lineage saw before.
+The entries of a cell are stored in pages, each of which is contiguous, and the loops over points are
+outermost: following entries one by one through memory would take longer than all the arithmetic.
 """
 
 from __future__ import annotations
@@ -23,18 +20,18 @@ import numpy as np
 from jaxtyping import Float, Int32, Int64
 from numba import njit
 
-#: Entries per page.
+#: Entries per page. Chosen: a page of vectors is four cache lines.
 PAGE_SIZE = 16
-#: A node's number in an entry: its row above this many bits, its place in the row below.
+#: A node's number in an entry: its row in the bits above these, its place in the row below.
 PLACE_BITS = 16
 PLACE = (1 << PLACE_BITS) - 1
-#: Type of an index: without a sign, numba need not look whether it counts from the end.
+#: Type of an index: unsigned, so that numba need not check for indices from the end.
 U = np.uint32
 #: Columns of a cell's state.
 OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
 
 
-class Tree(NamedTuple):
+class AncestryTree(NamedTuple):
     """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
 
     Attributes:
@@ -83,7 +80,7 @@ class Pages(NamedTuple):
         following: Next page of the cell, or of the free ones; -1 at the end.
         used: Entries in each page.
         node: Who saw it: row << PLACE_BITS | place in the row.
-        vector: What was seen.
+        vector: What was seen: weighted normal, or weight.
         free: First free page, and how many are free.
     """
 
@@ -94,8 +91,35 @@ class Pages(NamedTuple):
     free: Int32[np.ndarray, "2"]
 
 
-_RECENT = 4  # cells along each side of the square that a node's last entries are known of
+class MapArrays(NamedTuple):
+    """The shared map as the kernels take it.
+
+    Attributes:
+        tree: The living ancestry.
+        cells: The grid.
+        pages: Entries of single lineages.
+        cell_cm: Side of a cell.
+        wheelbase_cm: Distance between the axles.
+        memory_frames: Frames after which an entry has faded to 1/e.
+        counting: Whether (weight, 0) is entered into a point's own cell, and occupied cells are counted; else
+            blurred normals are entered, and directions scored.
+    """
+
+    tree: AncestryTree
+    cells: Cells
+    pages: Pages
+    cell_cm: float
+    wheelbase_cm: float
+    memory_frames: float
+    counting: bool
+
+
+#: Cells along each side of the square in which a node's last entries are remembered. Chosen: neighbouring
+#: points are at most a patch apart, which is a cell.
+_RECENT = 4
 _NOWHERE = -(1 << 31)  # no cell has this number
+#: A cell counts as occupied until what was seen in it has faded to this share: three memories, exp(-3).
+_OCCUPIED = 0.05
 
 
 @njit(cache=True, error_model="numpy")
@@ -136,9 +160,9 @@ def grow(tree, row, frame, states, chosen):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def prune(tree, cells, pages, a, b, memory):
-    """Take the dead entries out of a cell, and move those that all particles share into its root.
+    """Prune a cell: drop dead entries, and move those that all particles share into its root.
 
-    Entries with the same descendants will have the same for ever: they become one.
+    Entries with the same descendants keep the same descendants: they are merged.
     """
     state, root = cells.state, cells.root
     following, used = pages.following, pages.used
@@ -148,7 +172,7 @@ def prune(tree, cells, pages, a, b, memory):
     state[a, b, PRUNED] = tree.version[0]
     tree.version[1] += 1
     serial = tree.version[1]
-    # Entries that stay move up to the front; ``into`` is the page that is being filled, ``out`` the place.
+    # Entries that stay move to the front; ``into`` is the page that is being filled, ``out`` the place.
     page = into = state[a, b, PAGE]
     out = into * PAGE_SIZE
     while page >= 0:
@@ -198,7 +222,7 @@ def prune(tree, cells, pages, a, b, memory):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _free(pages, page):
-    """Give a chain of pages back."""
+    """Return a chain of pages to the free ones."""
     while page >= 0:
         following = pages.following[page]
         pages.following[page] = pages.free[0]
@@ -209,22 +233,19 @@ def _free(pages, page):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
+def write(shared, row, start):
     """Enter the points of a row, seen from each of its nodes.
 
     Args:
-        tree: The tree.
-        cells: The grid.
-        pages: The pages.
+        shared: The map.
         row: Row to enter.
         start: First point to enter.
-        wheelbase: Distance between the axles, [cm].
-        cell_cm: Side of a cell.
-        plain: Enter (weight, 0) into the point's own cell instead of blurred normals, for counting.
 
     Returns:
         First point that was not entered, because the pages might not suffice for it.
     """
+    tree, cells, pages = shared.tree, shared.cells, shared.pages
+    wheelbase, cell_cm, plain = shared.wheelbase_cm, shared.cell_cm, shared.counting
     pose, points, state, root = tree.pose, tree.points, cells.state, cells.root
     following, used, free = pages.following, pages.used, pages.free
     entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
@@ -232,7 +253,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
     wx, wy = np.ones(2), np.ones(2)
     reach, half = (1, 0.0) if plain else (2, 0.5)
     cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
-    # Neighbouring points share cells: the entry that a node made last in each of a few cells takes both.
+    # Neighbouring points share cells: the last entry of a node in each of a few cells takes both.
     recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
@@ -259,7 +280,7 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
                     a, b = U(iy & mask), U(ix & mask)
                     slot = U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
                     if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
-                        # Another patch of road takes the cell over; what it held is forgotten.
+                        # The cell is taken over by another patch of road; what it held is dropped.
                         if state[a, b, PAGE] >= 0:
                             _free(pages, state[a, b, PAGE])
                             recent[:] = _NOWHERE
@@ -290,25 +311,21 @@ def write(tree, cells, pages, row, start, wheelbase, cell_cm, plain):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
-    """Free a row of the tree: its entries move into the roots or are dropped.
+def collapse(shared, row):
+    """Collapse a row of the tree: its entries move into the roots or are dropped.
 
-    Where particles still disagree on the frame, a node at their ancestors' mean pose is left in the row, to
-    be entered and forgotten in its turn.
+    Where lineages still differ, one node at their ancestors' mean pose is left in the row, to be entered and
+    collapsed in turn.
 
     Args:
-        tree: The tree.
-        cells: The grid.
-        pages: The pages.
+        shared: The map.
         row: Row to free.
-        wheelbase: Distance between the axles, [cm].
-        cell_cm: Side of a cell.
-        memory: Frames after which what was mapped has faded to 1/e.
-        plain: As in :func:`write`.
 
     Returns:
-        Whether they disagreed.
+        Whether lineages still differed.
     """
+    tree, cells, pages = shared.tree, shared.cells, shared.pages
+    wheelbase, cell_cm, plain = shared.wheelbase_cm, shared.cell_cm, shared.counting
     span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
     particles, nodes, mask = span.shape[1], tree.nodes[row], state.shape[0] - 1
     reach, half = (1, 0.0) if plain else (2, 0.5)
@@ -332,9 +349,9 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
                 for ix in range(cx, cx + reach):
                     a, b = U(iy & mask), U(ix & mask)
                     if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
-                        prune(tree, cells, pages, a, b, memory)
+                        prune(tree, cells, pages, a, b, shared.memory_frames)
     if forced:
-        # All lineages are gone from the cells; one node that everybody descends from takes their place.
+        # No entry of single lineages is left; one node that everybody descends from takes their place.
         pose[row, 0] = mean
         span[row, 0, 1] = particles
         tree.nodes[row] = 1
@@ -345,29 +362,30 @@ def forget(tree, cells, pages, row, wheelbase, cell_cm, memory, plain):
     return forced
 
 
-_BOX = 4096  # cells that the particles' views of one point may spread over to be looked up together
-_FEW = 4  # particles that ask for the same cell and are yet looked up singly
+#: Cells that the particles' views of one point may spread over to be looked up together. Chosen: 64 x 64
+#: cells, far more than particles spread over while they track.
+_BOX = 4096
+#: Particles with the same cell up to which each is looked up singly. Chosen: it only changes the time.
+_FEW = 4
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, occupied, scores):
+def score(shared, poses, points, frame):
     """Score each particle's view of a frame against the map of its own lineage.
 
     Args:
-        tree: The tree.
-        cells: The grid.
-        pages: The pages.
+        shared: The map.
         poses: Predicted poses, frame map.
-        points: Edge points as in :class:`Tree`.
+        points: Edge points as in :class:`AncestryTree`.
         frame: Number of the frame, one more than the newest in the tree.
-        wheelbase: Distance between the axles, [cm].
-        cell_cm: Side of a cell.
-        memory: Frames after which what was mapped has faded to 1/e.
-        occupied: Score 1 for a point in a cell that holds at least this; 0 scores directions.
-        scores: Filled.
+
+    Returns:
+        About the weighted number of matched points, one number per particle.
+
     """
-    particles = len(poses)
+    tree, cells, pages, cell_cm = shared.tree, shared.cells, shared.pages, shared.cell_cm
+    wheelbase, memory, particles = shared.wheelbase_cm, shared.memory_frames, len(poses)
     state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
     following, used = pages.following, pages.used
     entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
@@ -380,7 +398,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
     seen_x, seen_y = np.empty(particles), np.empty(particles)
-    scores[:] = 0.0
+    scores = np.zeros(particles)
     for i in range(len(points)):
         right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
         for p in range(particles):
@@ -397,7 +415,7 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
             x, y = 0.0, 0.0
             box = (iy[p] - low_y) * wide + ix[p] - low_x if boxed else 0
             if boxed and asked[box] == 0:
-                # Looked up before, for all particles.
+                # Looked up before for all particles.
                 x, y = values[rows[box], p, 0], values[rows[box], p, 1]
             else:
                 a, b = U(iy[p] & mask), U(ix[p] & mask)
@@ -442,14 +460,15 @@ def score(tree, cells, pages, poses, points, frame, wheelbase, cell_cm, memory, 
                                 y += fade_of[row] * vector[e, 1]
                         page = following[page]
             seen_x[p], seen_y[p] = x, y
-        if occupied > 0.0:
+        if shared.counting:
             for p in range(particles):
-                scores[p] += weight * (seen_x[p] >= occupied)
+                scores[p] += weight * (seen_x[p] >= _OCCUPIED)
             continue
-        # A loop of its own, which the processor takes several particles at a time through.
+        # A loop of its own, so that it is vectorised.
         for p in range(particles):
             x, y = seen_x[p], seen_y[p]
             nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
             ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
             # Saturate: an edge that was seen often counts once.
             scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))
+    return scores

@@ -1,121 +1,54 @@
-"""The particle filter over trajectories: predict, weigh, estimate, resample, map.
+"""DP-SLAM: a particle filter over trajectories, in which all particles share one map.
 
-Weights of particles: from scores, and back to equal ones by drawing anew.
+Source:
+    Eliazar and Parr, "DP-SLAM: fast, robust simultaneous localization and mapping without predetermined
+    landmarks" (IJCAI 2003) and "DP-SLAM 2.0" (ICRA 2004); for a car with one camera: Kozlowski et al. 2024,
+    sections 3.1-3.3.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, no_type_check
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from pydantic import Field
 
-from datagen.slam.filter.ancestry import AncestryMap, Likelihood
+from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
 from datagen.slam.filter.motion import FACTOR, MotionModel, widen_steps
-from datagen.slam.odometry.scans import Progress, Scans, condense
+from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
+from datagen.slam.odometry.scans import Progress, Scan, Scans, condense
 from lanenet.config import Settings
-
-
-def reweigh(
-    weights: Float[np.ndarray, "p"], scores: Float[np.ndarray, "p"], effective_share: float
-) -> Float[np.ndarray, "p"]:
-    """Turn match scores into weights, as sharply as the particles can bear.
-
-    Edge points of one line are not independent, so that the plain likelihood would leave one particle. The
-    scores are tempered until the effective number of particles is at least ``effective_share`` of them.
-    """
-    new = np.empty(len(weights))
-    temper(weights, scores, effective_share, new)
-    return new
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def temper(weights, scores, effective_share, new):
-    """Fill ``new`` with the weights of :func:`reweigh`."""
-    highest, temperature = scores[0], 1.0
-    for p in range(len(weights)):
-        highest = max(highest, scores[p])
-    for _ in range(20):
-        total = 0.0
-        for p in range(len(weights)):
-            new[p] = weights[p] * np.exp((scores[p] - highest) / temperature)
-            total += new[p]
-        for p in range(len(weights)):
-            new[p] /= total
-        if count_effective(new) >= effective_share * len(new):
-            break
-        temperature *= 1.4
-
-
-def effective_number(weights: Float[np.ndarray, "p"]) -> float:
-    """How many equally weighted particles would be as good."""
-    return float(count_effective(weights))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def count_effective(weights):
-    """See :func:`effective_number`."""
-    total = 0.0
-    for p in range(len(weights)):
-        total += weights[p] * weights[p]
-    return 1.0 / total
-
-
-def systematic_resample(weights: Float[np.ndarray, "p"], rng: np.random.Generator) -> Int[np.ndarray, "p"]:
-    """Draw as many particles as there are, each N times its weight on average, with one random number.
-
-    Returns:
-        Indices in ascending order, on which the ancestry relies: descendants of a particle stay neighbours.
-
-    Source:
-        Kitagawa 1996; copies of each particle differ from N * weight by less than one.
-    """
-    chosen = np.empty(len(weights), np.int64)
-    draw_evenly(weights, rng.random(), chosen)
-    return chosen
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def draw_evenly(weights, uniform, chosen):
-    """Fill ``chosen`` as :func:`systematic_resample` returns it; ``uniform`` is its random number."""
-    n = len(weights)
-    at, cumulative = 0, weights[0]
-    for k in range(n):
-        position = (k + uniform) / n
-        while at < n - 1 and cumulative <= position:
-            at += 1
-            cumulative += weights[at]
-        chosen[k] = at
 
 
 class FilterSettings(Settings):
     """Size of the filter and sharpness of its likelihood.
 
     Lengths are in camera heights, because the road in one pixel, and with it every tolerance, scales with it.
+    Values were chosen on ``donkey_circuit`` and on simulated drives (docs/mapping.md); what they cost is
+    measured by ``tests/bench/bench_filter.py``.
 
     Attributes:
-        particles: How many trajectories are followed.
-        likelihood: ``direction`` scores edges that brighten the same way; ``count`` is the paper's number of
-            matched points.
-        maps: ``lineage`` is DP-SLAM: a particle's map is what its own ancestors saw from where they were;
-            ``mean`` enters every frame once, at the particles' mean pose, for all. That is cheaper, and
-            steadier where the model does not quite fit, but its particles cannot disagree on the map.
-        cell_heights: Side of a cell of the map.
-        field_size: Cells along each side of the map, which wraps around; a power of two.
-        memory_frames: Frames after which what was mapped has faded to 1/e.
-        patch_heights: Side of the patches whose edge points are taken together.
+        particles: Number of particles.
+        likelihood: ``direction`` scores edges that brighten in the same direction; ``count`` is the paper's
+            number of matched points.
+        maps: ``lineage`` is DP-SLAM: a particle's map is what its own ancestors saw from where they were.
+            ``mean`` enters every frame once, at the particles' mean pose. That is cheaper, but it drifted
+            more on the simulated drives where both were run.
+        cell_heights: Side of a map cell: about what a car moves per frame.
+        field_size: Cells along each side of the map, which wraps around; a power of two. 512 cells are 41
+            camera heights, more than a frame sees.
+        memory_frames: Frames after which a map entry has faded to 1/e. Far more than the four frames that the
+            odometry compares, so that headings drift less.
+        patch_heights: Side of the patches whose edge points are averaged: a map cell.
         max_points: Patches per frame that are scored and mapped, the heaviest first.
         window: Frames for which the map tells lineages apart.
         effective_share: Least effective share of the particles; scores are tempered until it is reached.
-        resample_below: Effective share below which the particles are drawn anew.
+        resample_below: Effective share below which the particles are resampled; half is customary (Liu and
+            Chen 1998).
         stray_every: One of so many particles strays from the predicted step further than the others; 0: none.
-        stray_factor: How many times as far (see :func:`widen_steps`).
+        stray_factor: How many times as far (see :func:`datagen.slam.filter.motion.widen_steps`).
     """
 
     particles: int = Field(default=300, ge=10, lt=1 << 16)
@@ -182,7 +115,7 @@ class Trajectory:
 
 
 class ParticleFilter:
-    """The filter, a frame at a time; its memory is bounded, so that it runs for as long as a car drives.
+    """The filter, a frame at a time; its memory is bounded, so that it can run for as long as a car drives.
 
     Attributes:
         states: Particles after the last step (columns as in :mod:`datagen.slam.filter.motion`).
@@ -201,75 +134,63 @@ class ParticleFilter:
         wheelbase_cm: float,
         rng: np.random.Generator,
     ) -> None:
-        count = settings.particles
+        count, s = settings.particles, settings
         self.settings, self.rng = settings, rng
-        self.patch_cm = settings.patch_heights * camera_height_cm
+        self.patch_cm = s.patch_heights * camera_height_cm
         self.states = motion.start(count, rng)
         self.weights = np.full(count, 1.0 / count)
-        self.map = AncestryMap.empty(
-            count,
-            settings.cell_heights * camera_height_cm,
-            settings.field_size,
-            settings.memory_frames,
-            wheelbase_cm,
-            settings.max_points,
-            settings.window,
-            settings.likelihood,
-        )
+        cell_cm, memory = s.cell_heights * camera_height_cm, s.memory_frames
+        layout = MapLayout(cell_cm, s.field_size, memory, wheelbase_cm, s.max_points, s.window, s.likelihood)
+        self.map = AncestryMap(count, layout)
         self.survivors = Survivors(self.states[:0], np.zeros(0, np.int64))
         self.survivor_of = np.zeros(count, np.int64)
         self.frame = 0
 
-    def step(
-        self,
-        points_cm: Float[np.ndarray, "m 2"],
-        normals: Float[np.ndarray, "m 2"],
-        trust: Float[np.ndarray, "m"],
-        motion: MotionModel,
-        k: int,
-    ) -> Estimate:
-        """Take in the next frame.
+    def step(self, scan: Scan, motion: MotionModel, k: int) -> Estimate:
+        """Take in the next frame: predict, weigh, estimate, resample, update the map.
 
         Args:
-            points_cm: Edge points, frame car.
-            normals: Their unit normals.
-            trust: Weight of each.
+            scan: Edge points of the frame.
             motion: How the car may have moved since the last frame; a live car may pass a model of one row.
             k: Row of the motion model.
-
-        Source:
-            Kozlowski et al. 2024, sections 3.1-3.3, after Eliazar and Parr, DP-SLAM, 2003.
         """
-        points_cm, normals, trust = condense(
-            points_cm, normals, trust, self.patch_cm, self.settings.max_points
-        )
+        scan = condense(scan, self.patch_cm, self.settings.max_points)
         match = np.nan
         if self.frame > 0:
-            before = self.states.copy()
-            motion.predict(self.states, k, self.rng)
-            widen_steps(before, self.states, self.settings.stray_every, self.settings.stray_factor)
-            scores = self.map.score(self.states[:, :3], points_cm, normals, trust, self.frame)
+            self._predict(motion, k)
+            scores = self.map.score(self.states[:, :3], scan, self.frame)
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
-            match = scores.max() / trust.sum() if trust.size else np.nan
+            match = scores.max() / scan.weights.sum() if scan.weights.size else np.nan
         estimate = self._estimate(match)
-        self._resample(estimate.pose)
-        self.map.enter(points_cm, normals, trust, self.frame)
+        chosen = self._resample()
+        self._update_ancestry(chosen, estimate.pose)
+        self.map.enter(scan, self.frame)
         self.frame += 1
         return estimate
 
+    def _predict(self, motion: MotionModel, k: int) -> None:
+        before = self.states.copy()
+        motion.predict(self.states, k, self.rng)
+        widen_steps(before, self.states, self.settings.stray_every, self.settings.stray_factor)
+
     def _estimate(self, match: float) -> Estimate:
-        # Headings are unwrapped and close together, so that a plain mean serves.
+        # Headings are unwrapped and close together: a plain mean serves.
         mean = self.weights @ self.states
         spread = np.sqrt(self.weights @ np.sum((self.states[:, :2] - mean[:2]) ** 2, axis=1))
         return Estimate(mean[:3], float(mean[FACTOR]), float(match), float(spread))
 
-    def _resample(self, mean_pose: Float[np.ndarray, "3"]) -> None:
-        """Draw the particles anew where too few of them count, and let the ancestry follow."""
+    def _resample(self) -> Int[np.ndarray, "p"]:
+        """Resample if too few particles count; return the parent of each new particle."""
         count = len(self.weights)
-        chosen = np.arange(count)
-        if self.frame > 0 and effective_number(self.weights) < self.settings.resample_below * count:
-            chosen = systematic_resample(self.weights, self.rng)
-            self.weights = np.full(count, 1.0 / count)
+        if self.frame == 0 or effective_number(self.weights) >= self.settings.resample_below * count:
+            return np.arange(count)
+        chosen: Int[np.ndarray, "p"] = systematic_resample(self.weights, self.rng.random())
+        self.weights = np.full(count, 1.0 / count)
+        return chosen
+
+    def _update_ancestry(self, chosen: Int[np.ndarray, "p"], mean_pose: Float[np.ndarray, "3"]) -> None:
+        """Keep the particles with descendants, and let the ancestry of the map follow."""
+        count = len(chosen)
         survived = np.bincount(chosen, minlength=count) > 0
         self.survivors = Survivors(self.states[survived], self.survivor_of[survived])
         self.survivor_of = (np.cumsum(survived) - 1)[chosen]
@@ -299,9 +220,7 @@ def run_filter(
     history: list[Survivors] = []
     match, spread = np.full(n, np.nan), np.zeros(n)
     for k in range(n):
-        frame = scans.frame(k)
-        points_cm, normals, trust = scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
-        estimate = particles.step(points_cm, normals, trust, motion, k)
+        estimate = particles.step(scans.scan(k), motion, k)
         match[k], spread[k] = estimate.match, estimate.spread_cm
         history.append(particles.survivors)
         if progress is not None:

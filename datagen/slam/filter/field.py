@@ -1,29 +1,30 @@
-"""The likelihood field: blurred unit gradients of the mapped edges, scored by dot product.
+"""A likelihood field: blurred unit gradients of the mapped edges, scored by dot product.
 
-A plain count of matched points prefers standing still; with directions, an edge only matches an edge that
-brightens the same way. The grid wraps around (a cell holds whichever patch of road was mapped there last),
-so that memory and cost per frame stay constant however long the drive is.
+A count of matched points prefers standing still; with directions, an edge only matches an edge that brightens
+in the same direction. The grid wraps around: a cell holds the patch of road that was mapped there last.
+Memory and cost per frame stay constant however long the drive is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numba import njit
 
-_REACH = 2  # cells on each side of a point that it blurs into
+from datagen.slam.odometry.scans import Scan
+
+#: Cells on each side of a point that it blurs into: two standard deviations of the blur, which is one cell.
+_REACH = 2
 
 
-@dataclass(frozen=True)
-class DirectionField:
+class DirectionField(NamedTuple):
     """A wrapping grid of blurred, ageing unit vectors.
 
     Attributes:
         cell_cm: Side of a cell.
-        memory_frames: Frames after which what was mapped has faded to 1/e.
+        memory_frames: Frames after which a cell has faded to 1/e.
         vectors: Sum of unit normals per cell, size x size x 2.
         owner: Which cell of the unbounded plane (ix, iy) each grid cell holds.
         seen: Frame at which the cell was last written; -1 where never.
@@ -37,7 +38,7 @@ class DirectionField:
 
     @staticmethod
     def empty(cell_cm: float, size: int, memory_frames: float) -> DirectionField:
-        """Return a field with nothing mapped; ``size`` must be a power of two."""
+        """Return an empty field; ``size`` must be a power of two."""
         return DirectionField(
             cell_cm,
             memory_frames,
@@ -54,25 +55,13 @@ class DirectionField:
         frame: int,
     ) -> None:
         """Map the edge points of a frame, [cm], frame map."""
-        _insert(
-            self.vectors,
-            self.owner,
-            self.seen,
-            self.cell_cm,
-            self.memory_frames,
-            points_map_cm,
-            normals_map,
-            weights,
-            frame,
-        )
+        _insert(self, points_map_cm, normals_map, weights, frame)
 
     def score(
         self,
         poses: Float[np.ndarray, "p 3"],
         wheelbase_cm: float,
-        points_car_cm: Float[np.ndarray, "n 2"],
-        normals_car: Float[np.ndarray, "n 2"],
-        weights: Float[np.ndarray, "n"],
+        scan: Scan,
         frame: int,
     ) -> Float[np.ndarray, "p"]:
         """Score how well a frame's edges fit the map from each pose.
@@ -81,24 +70,14 @@ class DirectionField:
             Weighted sum over the points of normal . field, one number per pose; about the weighted number
             of matched points.
         """
-        return _score(
-            self.vectors,
-            self.owner,
-            self.seen,
-            self.cell_cm,
-            self.memory_frames,
-            poses,
-            wheelbase_cm,
-            points_car_cm,
-            normals_car,
-            weights,
-            frame,
-        )
+        return np.asarray(_score(self, poses, wheelbase_cm, scan, frame))
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _insert(vectors, owner, seen, cell_cm, memory, points, normals, weights, frame):
+def _insert(field, points, normals, weights, frame):
+    vectors, owner, seen = field.vectors, field.owner, field.seen
+    cell_cm, memory = field.cell_cm, field.memory_frames
     mask = vectors.shape[0] - 1
     for i in range(points.shape[0]):
         gx, gy = points[i, 0] / cell_cm, points[i, 1] / cell_cm
@@ -123,7 +102,10 @@ def _insert(vectors, owner, seen, cell_cm, memory, points, normals, weights, fra
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _score(vectors, owner, seen, cell_cm, memory, poses, wheelbase, points, normals, weights, frame):
+def _score(field, poses, wheelbase, scan, frame):
+    vectors, owner, seen = field.vectors, field.owner, field.seen
+    cell_cm, memory = field.cell_cm, field.memory_frames
+    points, normals, weights = scan.points_cm, scan.normals, scan.weights
     mask = vectors.shape[0] - 1
     scores = np.zeros(poses.shape[0])
     for p in range(poses.shape[0]):

@@ -1,4 +1,4 @@
-"""How the car may have moved between two frames: the Ackermann model with slow, unknown gains."""
+"""Motion model of the filter: the Ackermann model with gains that are unknown and change slowly."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ X, Y, HEADING, FACTOR, OFFSET = range(5)
 
 @dataclass(frozen=True)
 class MotionModel:
-    """What the commands predict, and how far the car may stray from it.
+    """Predicted motion per frame, and how far the car may stray from it.
 
     Attributes:
         distance_cm: Predicted distance from the previous frame to this one.
         curvature_per_cm: Predicted curvature of the path, positive left.
         factor_start: Mean and spread of the distance factor at the start.
-        factor_walk: Standard deviation of the factor's change per frame (slow: gain of the speed).
-        factor_pull: Share by which the factor returns to its mean per frame; a weak prior against standstill.
+        factor_walk: Standard deviation of the factor's change per frame; small, as the gain of a speed.
+        factor_pull: Share by which the factor returns to its mean per frame: a prior against creeping.
         distance_noise: Standard deviation of the distance per frame, relative.
         offset_walk_per_cm: Change of the curvature offset per frame (trim, servo lag).
         offset_decay: Share of the offset that is forgotten per frame.
@@ -103,13 +103,13 @@ def advance(states, noise, distance_cm, curvature_per_cm, numbers):
         states[p, HEADING] += turn
 
 
-def widen_steps(
-    before: Float[np.ndarray, "p 5"], states: Float[np.ndarray, "p 5"], every: int, factor: float
-) -> None:
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def widen_steps(before, states, every, factor):
     """Let some particles stray further from the mean step than the motion model does, in place.
 
     Recorded drives jerk: a frame is missing, a wheel slips, the camera nods. Normal noise that is wide enough
-    for such a frame is far too wide for all others; a few particles that stray far keep track through it.
+    for such a frame is far too wide for all others. A few particles that stray far keep track.
 
     Args:
         before: Particles before the prediction.
@@ -120,27 +120,21 @@ def widen_steps(
     Source:
         Mixture of two normal distributions; own derivation.
     """
-    if every > 0:
-        stray(before, states, every, factor)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def stray(before, states, every, factor):
-    """See :func:`widen_steps`."""
+    if every <= 0:
+        return
     particles = len(states)
-    turns, ways = np.empty(particles), np.empty(particles)
+    turns, steps = np.empty(particles), np.empty(particles)
     for p in range(particles):
         turns[p] = states[p, HEADING] - before[p, HEADING]
         middle = before[p, HEADING] + 0.5 * turns[p]
-        # A step is a chord in the direction of the middle heading (see MotionModel.predict).
+        # A step is a chord in the direction of the middle heading, see advance().
         dx, dy = states[p, X] - before[p, X], states[p, Y] - before[p, Y]
-        ways[p] = dx * np.cos(middle) + dy * np.sin(middle)
-    mean_turn, mean_way = turns.mean(), ways.mean()
+        steps[p] = dx * np.cos(middle) + dy * np.sin(middle)
+    mean_turn, mean_step = turns.mean(), steps.mean()
     for p in range(0, particles, every):
         turn = mean_turn + factor * (turns[p] - mean_turn)
-        way = mean_way + factor * (ways[p] - mean_way)
+        step = mean_step + factor * (steps[p] - mean_step)
         middle = before[p, HEADING] + 0.5 * turn
-        states[p, X] = before[p, X] + way * np.cos(middle)
-        states[p, Y] = before[p, Y] + way * np.sin(middle)
+        states[p, X] = before[p, X] + step * np.cos(middle)
+        states[p, Y] = before[p, Y] + step * np.sin(middle)
         states[p, HEADING] = before[p, HEADING] + turn

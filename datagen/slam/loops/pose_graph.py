@@ -1,25 +1,66 @@
-"""Sparse least squares over all poses: odometry between neighbours, revisits across laps.
+"""Pose graph: all poses by sparse least squares, from odometry between neighbours and loop closures.
 
-Pairs of frames that show the same place, for the adjustment of all frames together.
+Also here: which pairs of frames show the same place once loops are closed, for the adjustment of all frames.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
-from datagen.slam.loops.places import Revisit, RevisitSettings
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from lanenet.geometry.frames import wrap_angle
-from lanenet.geometry.poses import path_lengths, relative_pose
+from lanenet.geometry.poses import compose, path_lengths, relative_pose
 
-_ITERATIONS = 12
-#: Weight of the motion across a break, which is known from nothing; not zero, so that all stays determined.
+#: Gauss-Newton steps at most, and the step, in camera heights and rad, at which they end. Chosen: four or
+#: five are usual.
+_ITERATIONS, _CONVERGED = 12, 1e-4
+#: Weight of the motion across a break, which is unknown; not zero, so that the system stays determined.
 _ACROSS_BREAK = 1e-4
-#: What a revisit may miss in a closed map, in camera heights and heading: the next dash of a dashed line is
+#: Weight that holds the first heading; far above all others.
+_HOLD = 1e3
+#: Sigmas of a turn between neighbours and of a revisit's heading when the headings are solved alone, [rad].
+#: Chosen: only their ratio counts.
+_TURN_RAD, _REVISIT_RAD = 0.01, 0.05
+#: Sigmas of the odometry: along the road, a share of the step plus camera heights; across, as a share of
+#: that; heading, [rad]. Odometry is good to a few per cent of the step, and better across than along.
+_STEP_SHARE, _STEP_HEIGHTS, _ACROSS_SHARE, _STEP_RAD = 0.1, 0.01, 0.3, 0.015
+#: Sigmas of a revisit along and across the road, camera heights, and in heading, [rad]: about twice the
+#: residuals that closed loops left on ``donkey_circuit`` (0.08, 0.03, 0.012).
+_ALONG_HEIGHTS, _SIDEWAYS_HEIGHTS, _HEADING_RAD = 0.15, 0.05, 0.02
+#: Scale of the Cauchy loss on revisits, in sigmas: the usual three.
+_CAUCHY = 3.0
+#: What an inlier may miss in a closed map, in camera heights and heading: on a dashed line the next dash is
 #: not much further.
-_BORNE_OUT_HEIGHTS, _BORNE_OUT_RAD = 1.0, 0.2
+_INLIER_HEIGHTS, _INLIER_RAD = 1.0, 0.2
+#: Frames around a revisit that are paired, too: every fourth of twelve to either side.
+_AROUND_REVISIT = range(-12, 13, 4)
+#: Every so many frames one is paired with the nearest ones of so many earlier laps, if they are no further
+#: away than this, in camera heights and in heading. With one lap only, laps lay a pixel apart from the rest.
+_LAP_EVERY, _LAPS, _LAP_HEIGHTS, _LAP_RAD = 3, 3, 1.5, 0.3
+#: Path before the last nearby frame of a lap on which the nearest one is looked for, in camera heights.
+_PASSING_HEIGHTS = 10.0
+
+
+@dataclass(frozen=True)
+class _Constraints:
+    """Measured relative poses between pairs of poses; odometry first, then revisits.
+
+    Attributes:
+        start: Pose from which each is measured.
+        end: Pose that is measured.
+        measured: Relative poses.
+        weight: Inverse sigmas.
+    """
+
+    start: Int[np.ndarray, "m"]
+    end: Int[np.ndarray, "m"]
+    measured: Float[np.ndarray, "m 3"]
+    weight: Float[np.ndarray, "m 3"]
 
 
 def close_loops(
@@ -30,9 +71,9 @@ def close_loops(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "r 3"]]:
     """Bend a trajectory so that revisits meet.
 
-    The headings are solved first, on their own: that is linear, and a path that is off by a turn of heading
-    is too far from its solution for the full problem. The path is then integrated again with them, and all
-    poses are solved together, first with plain, then with robust revisit factors.
+    The headings are solved first, alone: that is linear, and a path whose heading is off by a turn is too far
+    from the solution of the full problem. The path is then integrated with them, and all poses are solved
+    together, first with plain, then with robust loop closures.
 
     Args:
         poses: Open-loop trajectory, heading unwrapped.
@@ -46,162 +87,70 @@ def close_loops(
     if not revisits:
         return poses, np.empty((0, 3))
     odometry = relative_pose(poses[:-1], poses[1:])
-    # How far the motion to each frame can be trusted, 1 for what the drive has seen.
+    # How far the motion to each frame is known: 1 where the drive was recorded.
     trust = np.ones(len(odometry)) if breaks is None else np.where(breaks[1:], _ACROSS_BREAK, 1.0)
+    constraints = _constraints(odometry, trust, revisits, camera_height_cm)
     closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits, trust))
     for robust in (False, True):
         for _ in range(_ITERATIONS):
-            closed, step = _gauss_newton(closed, odometry, trust, revisits, camera_height_cm, robust)
-            if step < 1e-4 * camera_height_cm:
+            closed, step = _gauss_newton(closed, constraints, robust)
+            if step < _CONVERGED * camera_height_cm:
                 break
-    return closed, missed_by(closed, revisits)
+    return closed, revisit_residuals(closed, revisits)
 
 
-def borne_out(
+def revisit_residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
+    """What each revisit misses with these poses: ahead and to the left, [cm], and in heading, [rad]."""
+    if not revisits:
+        return np.empty((0, 3))
+    earlier, later, relative = _arrays(revisits)
+    residual = relative_pose(poses[earlier], poses[later]) - relative
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    return residual
+
+
+def inlier_revisits(
     poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
 ) -> list[Revisit]:
-    """Return the revisits that an adjusted map bears out: what the pictures outvoted shows another place.
+    """Return the revisits that an adjusted map confirms; one that the images outvoted shows another place.
 
     Args:
         poses: Poses after closing loops and adjusting all frames.
         revisits: What the loops were closed with.
         camera_height_cm: Sets the scale.
     """
-    missed = missed_by(poses, revisits)
-    near = np.hypot(missed[:, 0], missed[:, 1]) < _BORNE_OUT_HEIGHTS * camera_height_cm
-    true = near & (np.abs(missed[:, 2]) < _BORNE_OUT_RAD)
-    return [revisit for revisit, kept in zip(revisits, true, strict=True) if kept]
-
-
-def _solve_headings(
-    heading: Float[np.ndarray, "n"], revisits: list[Revisit], trust: Float[np.ndarray, "m"]
-) -> Float[np.ndarray, "n"]:
-    """Headings that keep the turns between neighbours and meet the revisits with their whole turns."""
-    n = len(heading)
-    turn_sigma, revisit_sigma = 0.01, 0.05
-    rows, columns, values, targets = [0], [0], [1e3], [1e3 * heading[0]]
-    for k in range(n - 1):
-        rows += [k + 1, k + 1]
-        columns += [k, k + 1]
-        weight = float(trust[k]) / turn_sigma
-        values += [-weight, weight]
-        targets.append((heading[k + 1] - heading[k]) * weight)
-    for i, revisit in enumerate(revisits):
-        rows += [n + i, n + i]
-        columns += [revisit.earlier, revisit.later]
-        values += [-1.0 / revisit_sigma, 1.0 / revisit_sigma]
-        targets.append((revisit.relative[2] + 2.0 * np.pi * revisit.turns) / revisit_sigma)
-    entries = (np.array(values), (np.array(rows), np.array(columns)))
-    a = coo_matrix(entries, shape=(n + len(revisits), n)).tocsc()
-    return np.asarray(spsolve((a.T @ a).tocsc(), a.T @ np.array(targets)))
-
-
-def _integrate(
-    start: Float[np.ndarray, "3"], odometry: Float[np.ndarray, "m 3"], heading: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "n 3"]:
-    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-    steps = np.stack(
-        [c * odometry[:, 0] - s * odometry[:, 1], s * odometry[:, 0] + c * odometry[:, 1]], axis=1
-    )
-    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return np.concatenate([xy, heading[:, None]], axis=1)
-
-
-def missed_by(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
-    """What each revisit misses with these poses: ahead and to the left, [cm], and in heading, [rad]."""
-    if not revisits:
-        return np.empty((0, 3))
-    seen = relative_pose(poses[[r.earlier for r in revisits]], poses[[r.later for r in revisits]])
-    residual = seen - np.array([r.relative for r in revisits])
-    residual[:, 2] = wrap_angle(residual[:, 2])
-    return residual
-
-
-def _gauss_newton(
-    poses: Float[np.ndarray, "n 3"],
-    odometry: Float[np.ndarray, "m 3"],
-    trust: Float[np.ndarray, "m"],
-    revisits: list[Revisit],
-    camera_height_cm: float,
-    robust: bool,
-) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """One step on all factors; a factor is (from, to, relative pose, inverse sigmas)."""
-    n = len(poses)
-    i = np.concatenate([np.arange(n - 1), [r.earlier for r in revisits]]).astype(np.intp)
-    j = np.concatenate([np.arange(1, n), [r.later for r in revisits]]).astype(np.intp)
-    measured = np.concatenate([odometry, [r.relative for r in revisits]])
-    # Odometry is good to a few per cent of the step, and better across than along.
-    along = 0.1 * np.abs(odometry[:, 0]) + 0.01 * camera_height_cm
-    odometry_sigma = np.stack([along, 0.3 * along, np.full(n - 1, 0.015)], axis=1)
-    revisit_sigma = np.tile([0.15 * camera_height_cm, 0.05 * camera_height_cm, 0.02], (len(revisits), 1))
-    weight = np.concatenate([trust[:, None] / odometry_sigma, 1.0 / revisit_sigma])
-    c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
-    dx, dy = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
-    residual = (
-        np.stack([c * dx + s * dy, -s * dx + c * dy, wrap_angle(poses[j, 2] - poses[i, 2])], axis=1)
-        - measured
-    )
-    residual[:, 2] = wrap_angle(residual[:, 2])
-    if robust:
-        # Cauchy weights on whole revisits: a wrong one is wrong in all three numbers.
-        scaled = np.sum((residual * weight)[n - 1 :] ** 2, axis=1)
-        weight[n - 1 :] /= np.sqrt(1.0 + scaled[:, None] / 9.0)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    jac_i = np.array([[-c, -s, -s * dx + c * dy], [s, -c, -c * dx - s * dy], [zero, zero, -one]])
-    jac_j = np.array([[c, s, zero], [-s, c, zero], [zero, zero, one]])
-    m = len(i)
-    rows = np.broadcast_to(3 * np.arange(m) + np.arange(3)[:, None, None], (3, 3, m))
-    parts = []
-    for jac, index in ((jac_i, i), (jac_j, j)):
-        columns = np.broadcast_to(3 * index + np.arange(3)[None, :, None], (3, 3, m))
-        values = jac * weight.T[:, None, :]
-        parts.append((values.ravel(), rows.ravel(), columns.ravel()))
-    values, row, column = (np.concatenate(p) for p in zip(*parts, strict=True))
-    a = coo_matrix((values, (row, column)), shape=(3 * m, 3 * n)).tocsc()
-    # The first pose stays where it is.
-    free = a[:, 3:]
-    rhs = -(free.T @ (residual * weight).ravel())
-    delta = np.asarray(spsolve((free.T @ free).tocsc(), rhs)).reshape(-1, 3)
-    moved = poses.copy()
-    moved[1:] += delta
-    return moved, float(np.abs(delta).max())
-
-
-#: Where around a revisit more pairs of frames show the same place, in frames.
-_BESIDE_REVISIT = range(-12, 13, 4)
-#: Every so many frames one is compared with the nearest ones of so many earlier laps, if they are no further
-#: away, in camera heights and in heading.
-_BESIDE_EVERY, _BESIDE_LAPS, _BESIDE_HEIGHTS, _BESIDE_RAD = 3, 3, 1.5, 0.3
-#: Way before the last frame of a lap that is near within which the nearest one of it lies, in camera heights.
-_PASSING_HEIGHTS = 10.0
+    missed = revisit_residuals(poses, revisits)
+    near = np.hypot(missed[:, 0], missed[:, 1]) < _INLIER_HEIGHTS * camera_height_cm
+    inlier = near & (np.abs(missed[:, 2]) < _INLIER_RAD)
+    return [revisit for revisit, kept in zip(revisits, inlier, strict=True) if kept]
 
 
 def loop_pairs(
     revisits: list[Revisit], count: int, breaks: Bool[np.ndarray, "n"] | None = None
 ) -> list[tuple[int, int]]:
-    """Pairs of frames around each revisit that show the same place, not beyond a break of the drive.
+    """Pairs of frames around each revisit that show the same place, not across a break of the drive.
 
     Args:
         revisits: The revisits.
         count: Number of frames.
-        breaks: Frames that do not follow the one before them; None for one stretch.
+        breaks: Frames that do not follow the one before them; None for one segment.
     """
-    stretch = np.zeros(count, np.int64) if breaks is None else np.cumsum(breaks)
-    pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _BESIDE_REVISIT]
+    segment = np.zeros(count, np.int64) if breaks is None else np.cumsum(breaks)
+    pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _AROUND_REVISIT]
     return [
         (a, b)
         for r, a, b in pairs
-        if a >= 0 and b < count and stretch[a] == stretch[r.earlier] and stretch[b] == stretch[r.later]
+        if a >= 0 and b < count and segment[a] == segment[r.earlier] and segment[b] == segment[r.later]
     ]
 
 
-def side_by_side(
+def neighbouring_laps(
     poses: Float[np.ndarray, "n 3"], camera_height_cm: float, settings: RevisitSettings
 ) -> list[tuple[int, int]]:
     """Pairs of frames of different laps that a closed map has at about the same place and heading.
 
-    Revisits are too few to hold all of one lap on the others; between them every lap would have lines of its
-    own. Laps that hang on one other lap each may still lie apart from the rest.
+    Revisits are too few to hold the laps together everywhere: between them every lap would have lines of its
+    own.
 
     Args:
         poses: Rear-axle poses after closing loops.
@@ -210,12 +159,12 @@ def side_by_side(
     """
     path = path_lengths(poses)
     pairs = []
-    for later in range(0, len(poses), _BESIDE_EVERY):
+    for later in range(0, len(poses), _LAP_EVERY):
         apart = np.hypot(*(poses[:later, :2] - poses[later, :2]).T)
         turned = np.abs(wrap_angle(poses[:later, 2] - poses[later, 2]))
-        near = np.flatnonzero((turned < _BESIDE_RAD) & (apart < _BESIDE_HEIGHTS * camera_height_cm))
+        near = np.flatnonzero((turned < _LAP_RAD) & (apart < _LAP_HEIGHTS * camera_height_cm))
         visit = later
-        for _ in range(_BESIDE_LAPS):
+        for _ in range(_LAPS):
             near = near[path[near] <= path[visit] - settings.min_gap_heights * camera_height_cm]
             if not near.size:
                 break
@@ -223,3 +172,97 @@ def side_by_side(
             visit = int(passing[np.argmin(apart[passing])])
             pairs.append((visit, later))
     return pairs
+
+
+def _arrays(
+    revisits: list[Revisit],
+) -> tuple[Int[np.ndarray, "r"], Int[np.ndarray, "r"], Float[np.ndarray, "r 3"]]:
+    """Earlier frames, later frames and relative poses."""
+    earlier, later = (
+        np.array([getattr(r, name) for r in revisits], np.intp) for name in ("earlier", "later")
+    )
+    return earlier, later, np.array([r.relative for r in revisits])
+
+
+def _constraints(
+    odometry: Float[np.ndarray, "k 3"],
+    trust: Float[np.ndarray, "k"],
+    revisits: list[Revisit],
+    height_cm: float,
+) -> _Constraints:
+    earlier, later, relative = _arrays(revisits)
+    frames = np.arange(len(odometry))
+    along = _STEP_SHARE * np.abs(odometry[:, 0]) + _STEP_HEIGHTS * height_cm
+    odometry_sigma = np.stack([along, _ACROSS_SHARE * along, np.full(len(odometry), _STEP_RAD)], axis=1)
+    revisit_sigma = [_ALONG_HEIGHTS * height_cm, _SIDEWAYS_HEIGHTS * height_cm, _HEADING_RAD]
+    return _Constraints(
+        np.concatenate([frames, earlier]),
+        np.concatenate([frames + 1, later]),
+        np.concatenate([odometry, relative]),
+        np.concatenate([trust[:, None] / odometry_sigma, 1.0 / np.tile(revisit_sigma, (len(revisits), 1))]),
+    )
+
+
+def _solve_headings(
+    heading: Float[np.ndarray, "n"], revisits: list[Revisit], trust: Float[np.ndarray, "m"]
+) -> Float[np.ndarray, "n"]:
+    """Headings that keep the turns between neighbours and meet the revisits with their whole turns."""
+    n = len(heading)
+    earlier, later, relative = _arrays(revisits)
+    turns = relative[:, 2] + 2.0 * np.pi * np.array([r.turns for r in revisits])
+    step_weight = trust / _TURN_RAD
+    weight = np.concatenate([step_weight, np.full(len(revisits), 1.0 / _REVISIT_RAD)])
+    target = np.concatenate([[_HOLD * heading[0]], np.diff(heading) * step_weight, turns / _REVISIT_RAD])
+    row = 1 + np.arange(len(weight))
+    rows = np.concatenate([[0], row, row])
+    columns = np.concatenate([[0], np.arange(n - 1), earlier, np.arange(1, n), later])
+    a = coo_matrix(
+        (np.concatenate([[_HOLD], -weight, weight]), (rows, columns)), shape=(len(target), n)
+    ).tocsc()
+    return np.asarray(spsolve((a.T @ a).tocsc(), a.T @ target))
+
+
+def _integrate(
+    start: Float[np.ndarray, "3"], odometry: Float[np.ndarray, "m 3"], heading: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Path from a start with these headings and the odometry's distances."""
+    turned = np.column_stack([np.zeros((len(odometry), 2)), heading[:-1]])
+    steps = compose(turned, odometry)[:, :2]
+    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return np.concatenate([xy, heading[:, None]], axis=1)
+
+
+def _gauss_newton(
+    poses: Float[np.ndarray, "n 3"], constraints: _Constraints, robust: bool
+) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """One step on all constraints; returns the poses and the largest change.
+
+    A sparse solver of SciPy for general problems (``least_squares``, trust region with LSMR) gave the same
+    poses to 0.001 cm in 25 to 37 times the time (300 and 1000 frames).
+    """
+    n, i, j = len(poses), constraints.start, constraints.end
+    residual = relative_pose(poses[i], poses[j]) - constraints.measured
+    residual[:, 2] = wrap_angle(residual[:, 2])
+    weight = constraints.weight.copy()
+    if robust:
+        # Cauchy weights on whole revisits: a wrong one is wrong in all three numbers.
+        scaled = np.sum((residual * weight)[n - 1 :] ** 2, axis=1)
+        weight[n - 1 :] /= np.sqrt(1.0 + scaled[:, None] / _CAUCHY**2)
+    c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+    dx, dy = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    by_start = np.array([[-c, -s, -s * dx + c * dy], [s, -c, -c * dx - s * dy], [zero, zero, -one]])
+    by_end = np.array([[c, s, zero], [-s, c, zero], [zero, zero, one]])
+    m = len(i)
+    jacobian = np.concatenate([by_start, by_end], axis=1) * weight.T[:, None, :]
+    rows = np.broadcast_to(3 * np.arange(m) + np.arange(3)[:, None, None], jacobian.shape)
+    columns = np.concatenate([3 * k + np.arange(3)[:, None] for k in (i, j)])
+    columns = np.broadcast_to(columns, jacobian.shape)
+    a = coo_matrix((jacobian.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * m, 3 * n)).tocsc()
+    # The first pose stays where it is.
+    free = a[:, 3:]
+    descent = -(free.T @ (residual * weight).ravel())
+    delta = np.asarray(spsolve((free.T @ free).tocsc(), descent)).reshape(-1, 3)
+    moved = poses.copy()
+    moved[1:] += delta
+    return moved, float(np.abs(delta).max())

@@ -1,10 +1,10 @@
-"""How far the car turned from picture to picture, by what is far away.
+"""How far the car turned from image to image, by what is far away.
 
-Walls and what stands before them move across the picture when the car turns, and hardly when it drives. That
-tells a turn where the road does not: in blur, in a slide, on a road whose lines look alike. How many pixels
-are a turn depends on a lens that may not be known, and some drives show nothing in the distance but the sky,
-or lamps that go with the car. So the shifts count only where they go with the turns that the road itself
-tells in most of the drive, and by as much as that says.
+Walls and what stands before them move across the image when the car turns, and hardly when it drives. That
+shows a turn where the road does not: in blur, in a slide, on a road whose lines look alike. How many pixels a
+turn is depends on a lens that may not be known, and some drives show nothing in the distance but the sky, or
+lamps that move with the car. The shifts therefore count only where they agree with the turns by the road in
+most of the drive, and in the scale that those give.
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import to_gray
 
-#: What is this far away on the ground, in camera heights, and all above it counts as far.
+#: What is this far away on the ground, in camera heights, and all above it counts as far. With a focal length
+#: of 80 px, a step of half a camera height moves that row by 0.6 px.
 _FAR_HEIGHTS = 8.0
-#: Width at which pictures are compared, and the rows that it takes at least.
+#: Width at which images are compared, that of a Donkeycar tub, and the fewest rows that tell anything.
 _WIDTH, _LEAST_ROWS = 160, 12
-#: Height of the peak of the correlation from which a shift is believed, and the largest such shift, as a
-#: share of the width.
+#: Correlation peak from which a shift is believed, and the largest such shift as a share of the width.
+#: Chosen: well above the peak of noise; a larger shift leaves too little overlap.
 _LEAST_PEAK, _MOST_SHIFT = 0.3, 0.25
-#: Gray levels by which a view varies at least: less is the noise of a blank wall.
+#: Least standard deviation of a view, gray levels: less is the noise of a blank wall.
 _LEAST_CONTRAST = 2.0
-#: Frames that tell how the shifts go with the turns, their correlation, and the share that goes with them.
+#: Frames, correlation with the turns by the road, and share of inliers that are needed. Chosen: 50 frames are
+#: two to five seconds; lamps that move with the car, and blank distance, must stay below the others.
 _LEAST_FRAMES, _LEAST_CORRELATION, _LEAST_SHARE = 50, 0.8, 0.6
-#: What counts as going with them, in standard deviations, and the rounds of the fit without the others.
+#: Inliers are within so many sigmas; rounds of the fit without the others. Chosen: usual for a robust fit.
 _INLIER, _ROUNDS = 4.0, 5
-#: Factor on the turn that the believed lens gives, at most, either way.
+#: Factor on the turns that the lens gives, at most, either way: a guessed lens is not further off.
 _LENS_FACTOR = 2.0
-#: Standard deviation of such a turn at least, [rad].
+#: Least sigma of such a turn, [rad]: a third of a pixel of a lens of 80 px.
 _LEAST_SIGMA_RAD = 0.004
 
 
@@ -52,10 +54,13 @@ class SeenTurns:
 
 
 def far_turns(drive: Drive, camera: Camera) -> Float[np.ndarray, "n"]:
-    """Measure how far the distance turned from each frame to the next, with the camera as believed.
+    """Measure how far the distance turned from each frame to the next, in the scale of the given camera.
 
     Returns:
         Turns, positive left, [rad]; NaN for the first frame, and where nothing was recognised.
+
+    Source:
+        Phase correlation: Kuglin and Hines 1975; here OpenCV's.
     """
     turns = np.full(len(drive), np.nan)
     m = camera.mounting
@@ -72,7 +77,7 @@ def far_turns(drive: Drive, camera: Camera) -> Float[np.ndarray, "n"]:
     for k in range(len(drive)):
         view = _far_view(drive, k, width, rows, scale)
         blank = float(view.std()) < _LEAST_CONTRAST
-        # Without the mean, whose window would look alike in all pictures.
+        # Without the mean: the window itself would look alike in all images.
         view = (view - view.mean()) * window
         if before is not None and not blank:
             (right_px, _), peak = cv2.phaseCorrelate(before.copy(), view.copy())
@@ -83,14 +88,14 @@ def far_turns(drive: Drive, camera: Camera) -> Float[np.ndarray, "n"]:
 
 
 def seen_turns(far_rad: Float[np.ndarray, "n"], turns_rad: Float[np.ndarray, "n"]) -> SeenTurns | None:
-    """Compare the turns that the distance shows with those that the road does, in the scale of the latter.
+    """Compare the turns by the distance with those by the road, and bring them to the scale of the latter.
 
     Args:
         far_rad: See :func:`far_turns`.
         turns_rad: Turns by the road.
 
     Returns:
-        None where the two have little to do with each other.
+        None where the two do not agree.
     """
     known = np.isfinite(far_rad)
     known[:1] = False
@@ -112,7 +117,7 @@ def seen_turns(far_rad: Float[np.ndarray, "n"], turns_rad: Float[np.ndarray, "n"
 
 
 def _median_ratio(x: Float[np.ndarray, "m"], y: Float[np.ndarray, "m"]) -> float:
-    """Slope through the origin with the least absolute errors: the turns that the road misses are large."""
+    """Slope through the origin with the least absolute errors; turns that the road misses are outliers."""
     moved = x != 0.0
     ratio, weight = y[moved] / x[moved], np.abs(x[moved])
     order = np.argsort(ratio)

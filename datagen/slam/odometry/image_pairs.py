@@ -1,13 +1,9 @@
-"""The pictures of a drive in pairs: how well a step and a turn carry the edges of one onto the next.
-
-Inner loops of the odometry from pictures: which edge is near a pixel, and how well a motion fits.
-"""
+"""Images of a drive in pairs: how well a step and a turn carry the edges of one onto those of the next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,20 +16,243 @@ from lanenet.perception.edges.canny import EdgePixels
 
 #: Directions that edges are told apart by; each edge counts for the two nearest.
 SECTORS = 8
-#: Pixels around an edge from which it is found.
+#: Pixels around an edge in which it is found: four standard deviations of its place.
 REACH = 2
+#: Spacing of the grid of road points whose pixels are looked up instead of projected, in camera heights, and
+#: its reach. Chosen: 7 camera heights are 1 to 1.5 m; further away a pixel spans too much road.
+_CELL_HEIGHTS, _REACH_HEIGHTS = 0.05, 7.0
+#: Directions on the road of which equal numbers of points are drawn: along, across and both diagonals.
+_DIRECTIONS = 4
+#: Sigmas that a far edge moves from one turn of the grid to the next. Chosen: about the width of a peak.
+_TURN_SIGMAS = 1.2
+#: Share of an image's points that must stay in view for their match to count. Chosen: few points fit
+#: anywhere.
+_LEAST_SEEN = 0.5
+#: Image width up to which an edge's place is known to the same fraction of a pixel; beyond, blur grows with
+#: it.
+_FINE_WIDTH = 320
+
+
+class OdometrySettings(Settings):
+    """How images are compared, and what is assumed of the motion between them.
+
+    Values were chosen on ``donkey_circuit``, ``usi_mat`` and ``garage_tape`` and on simulated drives
+    (docs/mapping.md) unless another source is named.
+
+    Attributes:
+        lags: Frames between the images of a pair. Dashes resolve motion between close frames only.
+        points: Edge points of the earlier image that are compared.
+        sigma_px: Standard deviation of an edge's place across itself, for images up to 320 px wide.
+        gain: How much likelier a point of the road falls on an edge of the later image than off it.
+        unseen_share: Match of a point that leaves the view, as a share of the best mean match of its pair of
+            images with the same step. With less, short steps win, since they lose fewer points; with more,
+            sharp turns in blurred images are lost.
+        temper: Power of the likelihood, since neighbouring points and the lags share their errors.
+        known_spread: Spread of the speed about the recorded one times its gain, as a logarithm.
+        known_keep: Share of that deviation which stays until the next frame.
+        unknown_spread: The same where no speed was recorded.
+        unknown_keep: The same where no speed was recorded.
+        turn_walk_rad: Standard deviation of the change of turn from frame to frame.
+        steering_heights: Standard deviation of the curvature about the steering's prediction, times camera
+            height.
+        jump: Probability that the step changes to any other.
+        max_curvature_heights: Tightest curve times camera height.
+    """
+
+    lags: tuple[int, ...] = (1, 2, 4)
+    points: int = Field(default=80, ge=20)
+    sigma_px: float = Field(default=0.5, gt=0.0)
+    gain: float = Field(default=10.0, gt=0.0)
+    unseen_share: float = Field(default=0.6, ge=0.0, le=1.0)
+    temper: float = Field(default=0.02, gt=0.0)
+    known_spread: float = Field(default=0.05, gt=0.0)
+    known_keep: float = Field(default=0.95, gt=0.0, lt=1.0)
+    unknown_spread: float = Field(default=0.2, gt=0.0)
+    unknown_keep: float = Field(default=0.99, gt=0.0, lt=1.0)
+    turn_walk_rad: float = Field(default=0.008, gt=0.0)
+    steering_heights: float = Field(default=0.03, gt=0.0)
+    jump: float = Field(default=0.01, gt=0.0, lt=1.0)
+    max_curvature_heights: float = Field(default=0.6, gt=0.0)
+
+
+class Image(NamedTuple):
+    """Edges of a frame, and the points among them that are compared with later frames.
+
+    Attributes:
+        points: Points ahead and left of the rear axle, camera heights.
+        sector: Sector of each.
+        uv: Edge pixels.
+        normals: Their unit gradients.
+        edge_sector: Direction of each in sectors, as a real number.
+    """
+
+    points: Float[np.ndarray, "m 2"]
+    sector: Int[np.ndarray, "m"]
+    uv: Float[np.ndarray, "e 2"]
+    normals: Float[np.ndarray, "e 2"]
+    edge_sector: Float[np.ndarray, "e"]
+
+
+class RoadGrid(NamedTuple):
+    """Pixels of road points, to be looked up instead of projected; lengths in camera heights.
+
+    Attributes:
+        pixel_of: Pixel of each point of a grid on the road, NaN where the camera does not see it.
+        origin: Ahead and left of the grid's first point.
+        cell: Its spacing.
+    """
+
+    pixel_of: Float[np.ndarray, "a l 2"]
+    origin: Float[np.ndarray, "2"]
+    cell: float
+
+
+class ImagePairs:
+    """The edges of a drive, ready to be compared in pairs; lengths are in camera heights."""
+
+    def __init__(
+        self,
+        edges: Sequence[EdgePixels],
+        camera: Camera,
+        settings: OdometrySettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Draw the points that are compared.
+
+        Args:
+            edges: Edge pixels per frame, only such that see the road.
+            camera: The camera.
+            settings: How images are compared.
+            rng: Draws the points.
+        """
+        self.settings, self._camera = settings, camera
+        self._sigma_px = settings.sigma_px * max(1.0, camera.width / _FINE_WIDTH)
+        ahead = np.arange(0.0, _REACH_HEIGHTS, _CELL_HEIGHTS)
+        left = np.arange(-_REACH_HEIGHTS, _REACH_HEIGHTS, _CELL_HEIGHTS)
+        grid_cm = camera.mounting.height_cm * np.stack(np.meshgrid(ahead, left, indexing="ij"), -1)
+        car_cm = np.stack([-grid_cm[..., 1], grid_cm[..., 0] - camera.wheelbase_cm], axis=-1)
+        pixel_of = camera.project_ground(car_cm.reshape(-1, 2)).reshape(car_cm.shape)
+        self._grid = RoadGrid(pixel_of, np.array([ahead[0], left[0]]), _CELL_HEIGHTS)
+        self.height_cm = camera.mounting.height_cm
+        self._images = [self._image(pixels, rng) for pixels in edges]
+        shape = (SECTORS, camera.height, camera.width)
+        self._nearest, self._distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
+        self._indexed: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @property
+    def points_per_frame(self) -> float:
+        """Mean number of points in the comparison of a frame with those before it."""
+        drawn = sum(len(image.points) for image in self._images)
+        return max(len(self.settings.lags) * drawn / max(len(self), 1), 1.0)
+
+    @property
+    def turn_step_rad(self) -> float:
+        """Difference of two turns that the images can just tell apart."""
+        return float(_TURN_SIGMAS * self._sigma_px / self._camera.K[0, 0])
+
+    def _image(self, pixels: EdgePixels, rng: np.random.Generator) -> Image:
+        """Draw equal numbers of points of every direction on the road.
+
+        Source:
+            Rusinkiewicz and Levoy 2001, "Efficient variants of the ICP algorithm", section 3.1 (normal-space
+            sampling): lines along the road are most of the edges and say nothing about the distance along it.
+        """
+        uv, normals = pixels.uv_px.astype(np.float64), pixels.normals.astype(np.float64)
+        sector = np.arctan2(normals[:, 1], normals[:, 0]) * (SECTORS / (2.0 * np.pi)) % SECTORS
+        along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+        road, beside = self._camera.intersect_ground(np.concatenate([uv, uv + 0.5 * along])).reshape(2, -1, 2)
+        tangent = beside - road
+        good = np.isfinite(road).all(axis=1) & np.isfinite(tangent).all(axis=1)
+        angle = np.arctan2(tangent[good, 1], tangent[good, 0])
+        direction = np.full(len(uv), -1)
+        direction[good] = np.rint(angle * (_DIRECTIONS / np.pi)).astype(np.int64) % _DIRECTIONS
+        each = self.settings.points // _DIRECTIONS
+        drawn = []
+        for number in range(_DIRECTIONS):
+            candidates = np.flatnonzero(direction == number)
+            drawn.append(rng.choice(candidates, min(each, len(candidates)), replace=False))
+        chosen = np.concatenate(drawn)
+        forward_cm = road[chosen, 1] + self._camera.wheelbase_cm
+        points = np.stack([forward_cm, -road[chosen, 0]], axis=1) / self.height_cm
+        return Image(points, np.rint(sector[chosen]).astype(np.int64) % SECTORS, uv, normals, sector)
+
+    def fit(
+        self,
+        k: int,
+        steps: Float[np.ndarray, "w"],
+        turns_rad: Float[np.ndarray, "t"],
+        relative: Float[np.ndarray, "n"],
+        lags: Sequence[int] | None = None,
+        typical_turns_rad: Float[np.ndarray, "n"] | None = None,
+    ) -> Float[np.ndarray, "w t"]:
+        """Compare frame k with those before it, for every step and turn.
+
+        Args:
+            k: Frame.
+            steps: Typical step lengths to try.
+            turns_rad: Turns of frame k.
+            relative: Step length of each frame relative to the typical one.
+            lags: Frames between the images of a pair; None for those of the settings.
+            typical_turns_rad: About the turn of each frame, for the differences between frame k and the
+                frames before it. None where all turns are alike.
+
+        Returns:
+            Log likelihood up to a constant, not tempered.
+        """
+        s, later = self.settings, self._images[k]
+        out, seen_fit, unseen = (np.zeros((len(steps), len(turns_rad))) for _ in range(3))
+        # The search for the typical step asks for one frame repeatedly, with other turns for every step.
+        if self._indexed != k:
+            index_edges(later.uv, later.edge_sector, self._nearest, self._distance)
+            self._indexed = k
+        for lag in s.lags if lags is None else lags:
+            if lag > k:
+                continue
+            earlier = self._images[k - lag]
+            turned = 0.0
+            if typical_turns_rad is not None:
+                turned = float(np.sum(typical_turns_rad[k - lag + 1 : k + 1] - typical_turns_rad[k]))
+            distances = relative[k - lag + 1 : k + 1].sum() * steps
+            turns = lag * turns_rad + turned
+            fit_of_motions(
+                earlier,
+                later,
+                self._nearest,
+                self._grid,
+                distances,
+                turns,
+                self._sigma_px,
+                s.gain,
+                seen_fit,
+                unseen,
+            )
+            count = len(earlier.points)
+            seen = count - unseen
+            enough = seen >= max(_LEAST_SEEN * count, 1.0)
+            best = np.where(enough, seen_fit / np.maximum(seen, 1.0), 0.0).max(axis=1, keepdims=True)
+            out += seen_fit + s.unseen_share * best * unseen
+        return out
+
+
+def turns_up_to(most_rad: float, step_rad: float) -> Float[np.ndarray, "t"]:
+    """Return evenly spaced turns, as many to the left as to the right."""
+    half = int(np.ceil(most_rad / step_rad))
+    return step_rad * np.arange(-half, half + 1)
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def index_edges(uv, sector, nearest, distance):
-    """Enter for each pixel and sector the nearest edge around it.
+    """Find for each pixel and sector the nearest edge around it.
 
     Args:
         uv: Edge pixels of a frame.
         sector: Direction of each in sectors, as a real number.
         nearest: Filled: index of the edge, -1 without one.
-        distance: Of the same shape, for the squared distances.
+        distance: Filled: of the same shape, squared distances.
     """
     nearest[:] = -1
     distance[:] = 1e9
@@ -52,33 +271,29 @@ def index_edges(uv, sector, nearest, distance):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def fit_of_motions(
-    points, sector, uv, normals, nearest, pixel_of, origin, cell, ways, turns, sigma_px, gain, out, unseen
-):
+def fit_of_motions(earlier, later, nearest, grid, distances, turns, sigma_px, gain, out, unseen):
     """Add up how well each motion carries the points of one frame onto the edges of a later one.
 
     Args:
-        points: Points of the earlier frame, ahead and left of its rear axle.
-        sector: Sector of each.
-        uv: Edge pixels of the later frame.
-        normals: Their normals.
+        earlier: Frame whose points are moved.
+        later: Frame whose edges they should meet.
         nearest: See :func:`index_edges`, of the later frame.
-        pixel_of: Pixel of each point of a grid on the road, NaN where the camera does not see it.
-        origin: Ahead and left of the grid's first point.
-        cell: Its spacing.
-        ways: Ways of the rear axle to try.
+        grid: Pixels of road points.
+        distances: Distances of the rear axle to try.
         turns: Turns to try, positive left.
         sigma_px: Standard deviation of an edge's place across itself.
         gain: How much likelier a place is on an edge than off it.
-        out: The sums over the points that stay in view, a row per way and a column per turn.
-        unseen: Of the same shape: number of points that leave the view.
+        out: Filled: sums over the points that stay in view, a row per distance and a column per turn.
+        unseen: Filled: of the same shape, number of points that leave the view.
     """
+    points, sector, uv, normals = earlier.points, earlier.sector, later.uv, later.normals
+    pixel_of, origin, cell = grid.pixel_of, grid.origin, grid.cell
     height, width = nearest.shape[1:]
     rows, columns = pixel_of.shape[:2]
-    for a in range(ways.shape[0]):
+    for a in range(distances.shape[0]):
         for b in range(turns.shape[0]):
             c, s = np.cos(turns[b]), np.sin(turns[b])
-            dx, dy = ways[a] * np.cos(0.5 * turns[b]), ways[a] * np.sin(0.5 * turns[b])
+            dx, dy = distances[a] * np.cos(0.5 * turns[b]), distances[a] * np.sin(0.5 * turns[b])
             total, lost = 0.0, 0
             for p in range(points.shape[0]):
                 x, y = points[p, 0] - dx, points[p, 1] - dy
@@ -102,202 +317,3 @@ def fit_of_motions(
                     e = (u - uv[q, 0]) * normals[q, 0] + (v - uv[q, 1]) * normals[q, 1]
                     total += np.log1p(gain * np.exp(-0.5 * (e / sigma_px) ** 2))
             out[a, b], unseen[a, b] = total, lost
-
-
-#: Spacing of the grid on the road that is looked up instead of projecting, in camera heights, and its reach.
-_CELL_HEIGHTS, _REACH_HEIGHTS = 0.05, 7.0
-#: Directions on the road of which the points are drawn in equal numbers.
-_KINDS = 4
-#: Pixels that a far edge moves by from one turn of the grid to the next, in standard deviations.
-_TURN_SIGMAS = 1.2
-#: Share of a picture's points whose match tells how well it meets another one.
-_LEAST_SEEN = 0.5
-#: Width up to which an edge's place is known to the same part of a pixel.
-_FINE_WIDTH = 320
-
-
-class OdometrySettings(Settings):
-    """How pictures are compared, and what is believed of the motion between them.
-
-    Attributes:
-        lags: Frames between the pictures of a pair.
-        points: Edge points of the earlier picture that are moved.
-        sigma_px: Standard deviation of an edge's place across itself, for images up to 320 px wide.
-        gain: How much likelier a point of the road falls on an edge of the later picture than off it.
-        unseen_share: What a point counts for that leaves the view, as a share of the best mean match that its
-            pair of pictures has with the same step: where they are blurred, no point gains by leaving. Less,
-            and short steps win, which lose fewer points; more, and sharp turns in blurred pictures are lost.
-        temper: Power of the likelihood: neighbouring points share their errors, and so do the lags.
-        known_spread: Spread of the speed about the recorded one, times its usual gain, as a logarithm.
-        known_keep: Share of that deviation which stays until the next frame.
-        unknown_spread: The same where no speed was recorded.
-        unknown_keep: The same where no speed was recorded.
-        turn_walk_rad: Change of turn from frame to frame.
-        steering_heights: Curvature by which the car may miss the steering's prediction, times camera height.
-        jump: Probability that the motion changes as none of this expects.
-        max_curvature_heights: Tightest curve times camera height.
-    """
-
-    lags: tuple[int, ...] = (1, 2, 4)
-    points: int = Field(default=80, ge=20)
-    sigma_px: float = Field(default=0.5, gt=0.0)
-    gain: float = Field(default=10.0, gt=0.0)
-    unseen_share: float = Field(default=0.6, ge=0.0, le=1.0)
-    temper: float = Field(default=0.02, gt=0.0)
-    known_spread: float = Field(default=0.05, gt=0.0)
-    known_keep: float = Field(default=0.95, gt=0.0, lt=1.0)
-    unknown_spread: float = Field(default=0.2, gt=0.0)
-    unknown_keep: float = Field(default=0.99, gt=0.0, lt=1.0)
-    turn_walk_rad: float = Field(default=0.008, gt=0.0)
-    steering_heights: float = Field(default=0.03, gt=0.0)
-    jump: float = Field(default=0.01, gt=0.0, lt=1.0)
-    max_curvature_heights: float = Field(default=0.6, gt=0.0)
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """Edges of a frame, and the points among them that are moved into later ones."""
-
-    points: Float[np.ndarray, "m 2"]
-    sector: Int[np.ndarray, "m"]
-    uv_px: Float[np.ndarray, "e 2"]
-    normals: Float[np.ndarray, "e 2"]
-    edge_sector: Float[np.ndarray, "e"]
-
-
-class Pictures:
-    """The edges of a drive, ready to be compared in pairs; lengths are in camera heights."""
-
-    def __init__(
-        self,
-        edges: Sequence[EdgePixels],
-        camera: Camera,
-        settings: OdometrySettings,
-        rng: np.random.Generator,
-    ) -> None:
-        """Draw the points that are moved.
-
-        Args:
-            edges: Edge pixels per frame, only such that see the road.
-            camera: The camera.
-            settings: How pictures are compared.
-            rng: Draws the points.
-        """
-        self.settings, self._camera = settings, camera
-        self._sigma_px = settings.sigma_px * max(1.0, camera.width / _FINE_WIDTH)
-        ahead = np.arange(0.0, _REACH_HEIGHTS, _CELL_HEIGHTS)
-        left = np.arange(-_REACH_HEIGHTS, _REACH_HEIGHTS, _CELL_HEIGHTS)
-        self._origin = np.array([ahead[0], left[0]])
-        grid_cm = camera.mounting.height_cm * np.stack(np.meshgrid(ahead, left, indexing="ij"), -1)
-        car_cm = np.stack([-grid_cm[..., 1], grid_cm[..., 0] - camera.wheelbase_cm], axis=-1)
-        self._pixel_of = camera.project_ground(car_cm.reshape(-1, 2)).reshape(car_cm.shape)
-        self._pictures = [self._picture(pixels, rng) for pixels in edges]
-        shape = (SECTORS, camera.height, camera.width)
-        self._nearest, self._distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
-        self._indexed: int | None = None
-
-    def __len__(self) -> int:
-        return len(self._pictures)
-
-    @property
-    def points_per_frame(self) -> float:
-        """Mean number of points that a comparison of a frame with those before it moves."""
-        drawn = sum(len(picture.points) for picture in self._pictures)
-        return max(len(self.settings.lags) * drawn / max(len(self), 1), 1.0)
-
-    @property
-    def turn_step_rad(self) -> float:
-        """Difference of two turns that the pictures can just tell apart."""
-        return float(_TURN_SIGMAS * self._sigma_px / self._camera.K[0, 0])
-
-    def _picture(self, pixels: EdgePixels, rng: np.random.Generator) -> _Picture:
-        """Draw points of every direction on the road alike.
-
-        Source:
-            Rusinkiewicz and Levoy 2001, "Efficient variants of the ICP algorithm", section 3.1 (normal-space
-            sampling): lines along the road are most of the edges and say nothing of the way along it.
-        """
-        uv, normals = pixels.uv_px.astype(np.float64), pixels.normals.astype(np.float64)
-        sector = np.arctan2(normals[:, 1], normals[:, 0]) * (SECTORS / (2.0 * np.pi)) % SECTORS
-        along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
-        road, beside = self._camera.intersect_ground(np.concatenate([uv, uv + 0.5 * along])).reshape(2, -1, 2)
-        tangent = beside - road
-        good = np.isfinite(road).all(axis=1) & np.isfinite(tangent).all(axis=1)
-        angle = np.arctan2(tangent[good, 1], tangent[good, 0])
-        kind = np.full(len(uv), -1)
-        kind[good] = np.rint(angle * (_KINDS / np.pi)).astype(np.int64) % _KINDS
-        each = self.settings.points // _KINDS
-        drawn = []
-        for number in range(_KINDS):
-            candidates = np.flatnonzero(kind == number)
-            drawn.append(rng.choice(candidates, min(each, len(candidates)), replace=False))
-        chosen = np.concatenate(drawn)
-        forward_cm = road[chosen, 1] + self._camera.wheelbase_cm
-        points = np.stack([forward_cm, -road[chosen, 0]], axis=1) / self._camera.mounting.height_cm
-        return _Picture(points, np.rint(sector[chosen]).astype(np.int64) % SECTORS, uv, normals, sector)
-
-    def fit(
-        self,
-        k: int,
-        steps: Float[np.ndarray, "w"],
-        turns_rad: Float[np.ndarray, "t"],
-        relative: Float[np.ndarray, "n"],
-        lags: Sequence[int] | None = None,
-        usual_turns_rad: Float[np.ndarray, "n"] | None = None,
-    ) -> Float[np.ndarray, "w t"]:
-        """Compare frame k with those before it, for every step and turn.
-
-        Args:
-            k: Frame.
-            steps: Ways per frame of usual length.
-            turns_rad: Turns of frame k.
-            relative: Way of each frame relative to the usual one.
-            lags: Frames between the pictures of a pair; None for those of the settings.
-            usual_turns_rad: Turn of each frame, about: by how much they differ, the frames between a pair
-                turn otherwise than frame k. None where all of them turn alike.
-
-        Returns:
-            Log likelihood up to a constant, not tempered.
-        """
-        s, later = self.settings, self._pictures[k]
-        out, seen_fit, unseen = (np.zeros((len(steps), len(turns_rad))) for _ in range(3))
-        # The usual step asks for one frame again and again, with other turns for every step.
-        if self._indexed != k:
-            index_edges(later.uv_px, later.edge_sector, self._nearest, self._distance)
-            self._indexed = k
-        for lag in s.lags if lags is None else lags:
-            if lag > k:
-                continue
-            earlier = self._pictures[k - lag]
-            turned = 0.0
-            if usual_turns_rad is not None:
-                turned = float(np.sum(usual_turns_rad[k - lag + 1 : k + 1] - usual_turns_rad[k]))
-            fit_of_motions(
-                earlier.points,
-                earlier.sector,
-                later.uv_px,
-                later.normals,
-                self._nearest,
-                self._pixel_of,
-                self._origin,
-                _CELL_HEIGHTS,
-                relative[k - lag + 1 : k + 1].sum() * steps,
-                lag * turns_rad + turned,
-                self._sigma_px,
-                s.gain,
-                seen_fit,
-                unseen,
-            )
-            count = len(earlier.points)
-            seen = count - unseen
-            # Few points fit anywhere.
-            enough = seen >= max(_LEAST_SEEN * count, 1.0)
-            best = np.where(enough, seen_fit / np.maximum(seen, 1.0), 0.0).max(axis=1, keepdims=True)
-            out += seen_fit + s.unseen_share * best * unseen
-        return out
-
-
-def turns_up_to(most_rad: float, step_rad: float) -> Float[np.ndarray, "t"]:
-    """Return turns at even spacing, as many to the left as to the right."""
-    half = int(np.ceil(most_rad / step_rad))
-    return step_rad * np.arange(-half, half + 1)

@@ -1,7 +1,7 @@
-"""The likeliest motion of a drive, frame by frame, on a grid of steps and turns: forward and backward.
+"""The likeliest motion of a drive on a grid of steps and turns: a hidden Markov model, forward and backward.
 
-A hidden Markov model: the state is the step (way per frame of usual length) and the turn of a frame. It
-changes slowly, the pictures say how likely each state is, and both directions of time are taken together.
+The state is the typical step length and the turn of a frame. It changes slowly, and the images say how likely
+each state is; both directions of time are combined.
 """
 
 from __future__ import annotations
@@ -13,19 +13,22 @@ from jaxtyping import Float
 
 from datagen.slam.odometry.far_view import SeenTurns
 
-#: Spacing of the steps, as a logarithm, and how many spreads they reach to either side, at least so far.
+#: Spacing of the steps as a logarithm, about the accuracy of one pair of images; how many spreads they reach
+#: to either side; and the least reach. Chosen: 2.8 spreads hold 99.5 % of a normal distribution.
 _SPACING, _SPREADS, _LEAST_REACH = 0.056, 2.8, 0.3
-#: Variance per step of the chain, in cells, beyond which it would have to step further than one.
+#: Variance per step of the birth-and-death chain, in cells, beyond which it would have to move by more than
+#: one cell.
 _CHAIN_VARIANCE = 0.5
-#: Share and width of the turns that change quickly, as when a driver catches a slide.
+#: Share and width of turns that change quickly, as when a driver catches a slide. Chosen: rare, and
+#: wide enough for a slide.
 _QUICK_SHARE, _QUICK_FACTOR = 0.1, 4.0
-#: Cells around the likeliest state whose mean is taken.
+#: Cells around the likeliest state whose mean is taken. Chosen: the width of a peak.
 _AROUND = 2
-#: Prediction by the steering: its misses last, so that neighbouring frames count for less than one each; and
-#: it may be wrong altogether.
+#: The steering's prediction is tempered, since its errors last for several frames, and its likelihood has a
+#: floor, since it may be wrong altogether. Chosen: neighbouring frames count for about a third of one each.
 _STEERING_TEMPER, _STEERING_FLOOR = 0.3, 0.02
-#: What the distance shows wrongly it shows wrongly for a while, so that each frame counts for a ninth of one;
-#: and it may be wrong altogether.
+#: Errors of turns seen in the distance last as well: each frame's sigma is widened, and there is a floor.
+#: Chosen: lower than the steering's, as these turns are measured.
 _SEEN_WIDER, _SEEN_FLOOR = 1.5, 0.005
 
 
@@ -34,14 +37,14 @@ class MotionGrid:
     """States, and how they change.
 
     Attributes:
-        usual: Step about which the steps lie.
-        spread: Standard deviation of the step about the usual one, as a logarithm.
+        typical: Step length about which the steps lie.
+        spread: Standard deviation of the step about it, as a logarithm.
         keep: Share of the deviation that stays until the next frame.
         jump: Probability that the step changes to any other.
         turns_rad: Turns of the grid, evenly spaced.
     """
 
-    usual: float
+    typical: float
     spread: float
     keep: float
     jump: float
@@ -49,14 +52,14 @@ class MotionGrid:
 
     @property
     def log_factors(self) -> Float[np.ndarray, "w"]:
-        """Logarithms of the steps over the usual one."""
+        """Logarithms of the steps over the typical one."""
         half = int(np.ceil(max(_SPREADS * self.spread, _LEAST_REACH) / _SPACING))
         return _SPACING * np.arange(-half, half + 1)
 
     @property
     def steps(self) -> Float[np.ndarray, "w"]:
         """The grid's steps."""
-        return self.usual * np.exp(self.log_factors)
+        return self.typical * np.exp(self.log_factors)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -107,15 +110,15 @@ def follow_motion(
 
     Args:
         grid: States.
-        log_likelihood: What the pictures say of each state, at most 0.
-        relative: Way of each frame relative to the usual one.
-        turn_walk_rad: Change of turn from frame to frame.
-        curvature: Predicted turn per way.
+        log_likelihood: Log likelihood of each state given the images, at most 0.
+        relative: Step length of each frame relative to the typical one.
+        turn_walk_rad: Standard deviation of the change of turn from frame to frame.
+        curvature: Predicted curvature.
         curvature_sigma: Standard deviation of the prediction.
-        seen: Turns as seen in the distance, where they are.
+        seen: Turns as seen in the distance, if any.
 
     Returns:
-        Steps (per frame of usual length) and turns: the mean over the states around the likeliest one.
+        Typical steps and turns: the mean over the states around the likeliest one.
 
     Source:
         Rabiner 1989, "A tutorial on hidden Markov models", eq. 19-27 (forward and backward, scaled).
@@ -126,10 +129,9 @@ def follow_motion(
 
     def likelihood(k: int) -> Float[np.ndarray, "w t"]:
         likely: Float[np.ndarray, "w t"] = np.exp(log_likelihood[k].astype(np.float64))
-        ways = steps[:, None] * relative[k]
-        # The same for all steps: a prediction of the turn is none of the step.
-        sigma = max(curvature_sigma * grid.usual * relative[k], 0.5 * turn_walk_rad)
-        miss = (turns_rad[None, :] - curvature[k] * ways) / sigma
+        # One sigma for all steps: a prediction of the turn says nothing about the step.
+        sigma = max(curvature_sigma * grid.typical * relative[k], 0.5 * turn_walk_rad)
+        miss = (turns_rad[None, :] - curvature[k] * (steps[:, None] * relative[k])) / sigma
         likely = likely * (np.exp(-0.5 * miss**2) + _STEERING_FLOOR) ** _STEERING_TEMPER
         if seen is not None and np.isfinite(seen.turns_rad[k]):
             off = (turns_rad - seen.turns_rad[k]) / (_SEEN_WIDER * seen.sigma_rad)
@@ -137,7 +139,7 @@ def follow_motion(
         return likely
 
     forward = np.empty(log_likelihood.shape, np.float32)
-    # The first frame's motion is any that the car may be found in.
+    # At the first frame the car may be in any motion.
     state = np.repeat(np.exp(-0.5 * (grid.log_factors / grid.spread) ** 2)[:, None], grid.shape[1], axis=1)
     for k in range(n):
         state = (by_step.T @ state @ by_turn if k else state) * likelihood(k)
@@ -147,13 +149,13 @@ def follow_motion(
     later = np.ones(grid.shape)
     for k in range(n - 1, -1, -1):
         both = forward[k] * later
-        # Of all turns together the likeliest step, and with that the likeliest turn.
+        # The likeliest step over all turns, and the likeliest turn with that step.
         i = int(both.sum(axis=1).argmax())
         rows = slice(max(i - _AROUND, 0), i + _AROUND + 1)
         j = int(both[rows].sum(axis=0).argmax())
         columns = slice(max(j - _AROUND, 0), j + _AROUND + 1)
         near = both[rows, columns] / both[rows, columns].sum()
-        step[k] = grid.usual * np.exp(near.sum(axis=1) @ grid.log_factors[rows])
+        step[k] = grid.typical * np.exp(near.sum(axis=1) @ grid.log_factors[rows])
         turn[k] = near.sum(axis=0) @ turns_rad[columns]
         later = by_step @ (later * likelihood(k)) @ by_turn.T
         later /= later.sum()

@@ -1,10 +1,10 @@
-"""Edges of lamps that are mirrored in the floor: they stand still before the car, and would hold it back.
+"""Edges of lamps that are mirrored in the floor: they stand still before the car and would slow the odometry.
 
-The mirror image of a lamp lies as far below the floor as the lamp hangs above it, so that it hardly moves
-while the road runs by, and only turns with the car. To a matcher that asks how far the car drove, its rim
-says "not at all", and on a road without dashes nothing contradicts. A line that runs along with the car
-stands still in the same way, but it goes on straight where a rim bends away; and a side of a dash, or of
-anything else that lies along the way, stands still without saying a word of it.
+The mirror image of a lamp lies as far below the floor as the lamp hangs above it. It hardly moves while the
+road runs by, and only turns with the car. To the odometry its rim says that the car stands, and on a road
+without dashes nothing contradicts. A line along the road stands still in the same way, but it goes on
+straight where a rim bends away. The side of a dash, or of anything else along the road, stands still without
+saying anything about the motion.
 """
 
 from __future__ import annotations
@@ -20,27 +20,30 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgePixels
 from lanenet.perception.edges.road import RoadEdges, RoadTable
 
-#: Cells of distance and bearing about the camera's foot, in camera heights and radians, and how many.
+#: Cells of distance and bearing about the camera's foot, in camera heights and radians, and how many of them:
+#: 4 camera heights, and 1.6 rad to either side. Chosen: a cell is about what noise moves an edge by.
 _RING_HEIGHTS, _RINGS = 0.05, 80
 _BEARING_RAD, _BEARINGS = 0.04, 80
-#: Turn of the car from one frame to the next that is followed, in cells of bearing.
+#: Largest turn of the car from one frame to the next, in cells of bearing: 0.12 rad.
 _TURN_CELLS = 3
-#: Frames for which an edge keeps its distance before it counts as standing still.
+#: Frames for which an edge keeps its distance before it counts as standing still. Chosen: a car that is not
+#: crawling has driven a camera height by then.
 _LIFE = 8
-#: An edge faces the camera, or away from it, where this is the least share of its normal along the ray, and
-#: of its normal along the way of the car. With the former alone, dashes beside the car were taken for lamps:
-#: their sides face the camera from there, and one follows on the other. Their ends, which tell the way best,
-#: went with them.
+#: An edge faces the camera, or away from it, if the components of its normal along the ray and along the
+#: car's path are at least this. With the former alone, dashes beside the car were taken for lamps, since
+#: their sides face the camera from there; the ends of the dashes, which tell the distance best, went with
+#: them. Chosen: 53 degrees.
 _FACING = 0.6
-#: Frames that one without the edge takes from those for which it has been there: of a row of dashes that
-#: passes by, a place sees one, then a gap.
+#: Frames by which a frame without the edge reduces its count. A place beside a row of dashes sees a dash,
+#: then a gap, and must not reach the count. Chosen.
 _MISSED = 2
-#: Cells of the road in which an edge is looked for further on, in camera heights, and directions told apart.
+#: Cells of the road, in camera heights, in which the continuation of an edge is looked for, and directions
+#: told apart; size of this grid in cells: 9 camera heights ahead, 6 to either side.
 _CELL_HEIGHTS, _SECTORS = 0.05, 8
 _AHEAD_CELLS, _SIDE_CELLS = 180, 120
-#: Where a straight edge is looked for, along it, in camera heights: a rim of a mirrored lamp is smaller.
+#: Places along a straight edge where it must go on, in camera heights: the rim of a mirrored lamp is smaller.
 _ON_STRAIGHT_HEIGHTS = (0.2, 0.4, 0.6, 0.8)
-#: What lies this near to a standing edge, and on no straight one, belongs to it.
+#: Edges this near to a standing one, and on no straight one, belong to it: 0.2 camera heights.
 _NEAR_CELLS = 4
 
 
@@ -53,7 +56,7 @@ class _View:
         normals: Towards the brighter side.
         cell: Ring and bearing of each point, clipped to the grid.
         side: 0 where the brighter side is the farther one, 1 where the nearer one is.
-        faces: True for points inside the grid whose normal is along the ray and along the way.
+        faces: True for points inside the grid whose normal is along the ray and along the path.
     """
 
     points: Float[np.ndarray, "n 2"]
@@ -66,7 +69,7 @@ class _View:
 def without_reflections(edges: Sequence[EdgePixels], camera: Camera, table: RoadTable) -> list[EdgePixels]:
     """Drop the edges of what stands still before the car, frame by frame.
 
-    A car that stands for a while loses edges across the road too; it does not need them.
+    While a car stands it also loses edges across the road, which it does not need then.
 
     Args:
         edges: Edge pixels of consecutive frames.
@@ -74,7 +77,7 @@ def without_reflections(edges: Sequence[EdgePixels], camera: Camera, table: Road
         table: Its table, with which the edges were found.
 
     Source:
-        Own choice.
+        Own method; tests/unit/slam/test_reflections.py.
     """
     views = [_view(table.lift(frame), camera) for frame in edges]
     before = _lives(views)
@@ -108,9 +111,9 @@ def _view(road: RoadEdges, camera: Camera) -> _View:
 
 
 def _lives(views: Sequence[_View]) -> list[UInt8[np.ndarray, "r b 2"]]:
-    """For how many frames, up to each frame, a facing edge has been in a ring, wherever the car turned.
+    """For how many frames, up to each frame, a facing edge has kept its distance, however the car turned.
 
-    One frame in which it was not found is forgiven, at a cost.
+    One frame in which it was not found only reduces the count.
     """
     turn = np.ones((1, 2 * _TURN_CELLS + 1), np.uint8)
     thick = np.ones((3, 1), np.uint8)
@@ -136,25 +139,25 @@ def _goes_on(view: _View) -> Bool[np.ndarray, "n"]:
     row, column = _road_cells(view.points)
     bits = (1 << sector) | (1 << (sector + 1) % _SECTORS) | (1 << (sector - 1) % _SECTORS)
     np.bitwise_or.at(grid, (row, column), bits.astype(np.uint8))
-    # An edge is found from the cells around its own, too.
+    # An edge is also found from the cells around its own.
     for cells in (grid, grid.T):
         beside = cells.copy()
         cells[1:] |= beside[:-1]
         cells[:-1] |= beside[1:]
     tangent = np.stack([-view.normals[:, 1], view.normals[:, 0]], axis=1)
     own = (1 << sector).astype(np.uint8)
-    ways = np.array(_ON_STRAIGHT_HEIGHTS)
-    offsets = np.stack([-ways, ways])[..., None, None] * tangent
-    # By side, way and point; all places are looked up at once.
+    reach = np.array(_ON_STRAIGHT_HEIGHTS)
+    offsets = np.stack([-reach, reach])[..., None, None] * tangent
+    # By side, distance and point.
     found = grid[_road_cells(view.points + offsets)] & own > 0
     return found[:, :2].all(axis=(0, 1)) | found.all(axis=1).any(axis=0)
 
 
 def _road_cells(points: Float[np.ndarray, "*k 2"]) -> tuple[Int[np.ndarray, "*k"], Int[np.ndarray, "*k"]]:
-    """Row and column of points of the road; what lies outside goes to the border.
+    """Row and column of road points; points outside the grid fall on its border.
 
-    What leads out of the grid, to the car or to the side, may go on there: the border says so where an edge
-    of that direction lies in it.
+    An edge that leads out of the grid, to the car or to the side, may go on there: the border says so if it
+    holds an edge of that direction.
     """
     column = np.floor(points[..., 0] / _CELL_HEIGHTS).astype(np.int64) + _SIDE_CELLS + 1
     row = np.floor(points[..., 1] / _CELL_HEIGHTS).astype(np.int64) + 1
@@ -162,7 +165,7 @@ def _road_cells(points: Float[np.ndarray, "*k 2"]) -> tuple[Int[np.ndarray, "*k"
 
 
 def _with_neighbours(view: _View, stands: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Add to what stands still all points beside it."""
+    """Add all points beside those that stand still."""
     if not stands.any():
         return stands
     grid = np.zeros((_AHEAD_CELLS + 2, 2 * _SIDE_CELLS + 2), np.uint8)

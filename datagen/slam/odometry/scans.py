@@ -1,13 +1,10 @@
-"""What the mapper sees of a drive: the edge points of every frame, packed for the numba kernels.
-
-Fewer edge points that say the same: those of one small patch and one direction become one.
-"""
+"""Scans: the edge points of every frame on the road, packed for the numba kernels, and reduced to fewer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +16,26 @@ from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, find_edges
 from lanenet.perception.edges.road import RangeSettings, RoadEdges, RoadTable
 
 Progress = Callable[[int, int], None]
+
+#: Directions that :func:`condense` keeps apart: enough for the two edges of a tape.
+_SECTORS = 4
+#: Distance at which a point weighs one half, camera heights. Chosen: lines that were seen only beyond 3.5
+#: camera heights were wrong on ``donkey_circuit``.
+_HALF_WEIGHT_HEIGHTS = 4.0
+
+
+class Scan(NamedTuple):
+    """Edge points of one frame.
+
+    Attributes:
+        points_cm: Edge points, frame car.
+        normals: Unit vectors across the edges, towards the brighter side, frame car.
+        weights: Trust in each point.
+    """
+
+    points_cm: Float[np.ndarray, "m 2"]
+    normals: Float[np.ndarray, "m 2"]
+    weights: Float[np.ndarray, "m"]
 
 
 @dataclass(frozen=True)
@@ -44,6 +61,11 @@ class Scans:
         """Return the slice of frame k's points."""
         return slice(int(self.starts[k]), int(self.starts[k + 1]))
 
+    def scan(self, k: int) -> Scan:
+        """Return frame k's edge points."""
+        rows = self.frame(k)
+        return Scan(self.points_cm[rows], self.normals[rows], self.weights[rows])
+
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:
         """Frame index of every point."""
@@ -67,7 +89,7 @@ def scans_of(
         edges: Edge pixels per frame.
         camera: The camera.
         range_settings: Which part of the road counts.
-        tilt_rad: Pitch and roll of each frame beyond the camera's mounting; None for none.
+        tilt_rad: Pitch and roll of each frame beyond the mounting's; None for level.
     """
     table = RoadTable(camera, range_settings)
     frames = []
@@ -85,18 +107,18 @@ def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
 
 
 def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
-    """Lift with the camera as it nodded in this frame."""
+    """Lift with the camera as it was tilted in this frame."""
     m = camera.mounting
-    nodded = camera.with_mounting(
+    tilted = camera.with_mounting(
         pitch_down_rad=m.pitch_down_rad + float(tilt_rad[0]), roll_rad=m.roll_rad + float(tilt_rad[1])
     )
     n = len(pixels.uv_px)
     along = np.stack([-pixels.normals[:, 1], pixels.normals[:, 0]], axis=1)
     ends = np.concatenate([pixels.uv_px, pixels.uv_px + 0.5 * along, pixels.uv_px + 0.5 * pixels.normals])
-    road = nodded.intersect_ground(ends).reshape(3, n, 2)
+    road = tilted.intersect_ground(ends).reshape(3, n, 2)
     tangent, towards = road[1] - road[0], road[2] - road[0]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    # Of the two normals the one on the brighter side.
+    # The normal that points to the brighter side.
     normal *= np.where(np.sum(normal * towards, axis=1) < 0.0, -1.0, 1.0)[:, None]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     good = np.isfinite(road[0]).all(axis=1) & np.isfinite(normal).all(axis=1)
@@ -104,50 +126,37 @@ def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray,
 
 
 def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
-    """Pack per-frame edge points; weights halve where a point is about four camera heights away.
+    """Pack per-frame edge points, and weigh them by their distance.
 
-    One pixel spans road in proportion to the squared distance, so that the position of a far edge is worth
-    less; the smooth fall keeps far points useful for the heading.
+    One pixel spans road in proportion to the squared distance, and the position of a far edge is worth less.
+    The weight falls to one half at four camera heights, smoothly, so that far points still help with the
+    heading.
     """
     counts = [len(frame.points_cm) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     points = np.concatenate([np.empty((0, 2)), *(frame.points_cm for frame in frames)])
     normals = np.concatenate([np.empty((0, 2)), *(frame.normals for frame in frames)])
-    distance = np.hypot(points[:, 0], points[:, 1]) / (4.0 * camera_height_cm)
+    distance = np.hypot(points[:, 0], points[:, 1]) / (_HALF_WEIGHT_HEIGHTS * camera_height_cm)
     return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
 
 
-def thin_scan(
-    scans: Scans, k: int, max_points: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-    """Return frame k's points, normals and weights, at most ``max_points`` of them, drawn evenly."""
-    frame = scans.frame(k)
-    size = frame.stop - frame.start
+def thin_scan(scan: Scan, max_points: int, rng: np.random.Generator) -> Scan:
+    """Return at most ``max_points`` of a frame's edge points, drawn evenly."""
+    size = len(scan.weights)
     if size <= max_points:
-        return scans.points_cm[frame], scans.normals[frame], scans.weights[frame]
-    chosen = frame.start + np.sort(rng.choice(size, max_points, replace=False))
-    return scans.points_cm[chosen], scans.normals[chosen], scans.weights[chosen]
+        return scan
+    chosen = np.sort(rng.choice(size, max_points, replace=False))
+    return Scan(*(column[chosen] for column in scan))
 
 
-_SECTORS = 4  # directions that are kept apart, so that both edges of a tape are
+def condense(scan: Scan, patch_cm: float, most: int) -> Scan:
+    """Average the edge points of each patch and direction, and keep the heaviest averages.
 
-
-def condense(
-    points_cm: Float[np.ndarray, "m 2"],
-    normals: Float[np.ndarray, "m 2"],
-    weights: Float[np.ndarray, "m"],
-    patch_cm: float,
-    most: int,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
-    """Take the points of each patch together, and of the patches the heaviest.
-
-    Near the car many pixels see one patch of road; a random choice of them would say as little of the rest as
-    it says of that patch.
+    Near the car many pixels see one patch of road. A random choice of points would crowd there and leave
+    little for the rest of the road.
 
     Args:
-        points_cm: Edge points, frame car.
-        normals: Their unit normals.
-        weights: Trust in each.
+        scan: Edge points of a frame.
         patch_cm: Side of a patch.
         most: How many patches to keep.
 
@@ -155,27 +164,26 @@ def condense(
         Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
         that normals that disagree weigh less.
     """
-    # At most half of the slots are taken, so that a search for a free one is short.
+    weights = scan.weights
+    # At most half of the slots of the hash table are taken, so that a search for a free one is short.
     slots = np.full(2 << max(len(weights), 1).bit_length(), -1, np.int64)
     sums, keys = np.zeros((len(weights), 5)), np.empty((len(weights), 2), np.int64)
-    count = _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums)
+    count = _add_up(scan, patch_cm, slots, keys, sums)
     weight, length = sums[:count, 0], np.hypot(sums[:count, 3], sums[:count, 4])
     kept = np.flatnonzero(length > 1e-9 * weight)
     if len(kept) > most:
         kept = np.sort(kept[np.argpartition(-length[kept], most)[:most]])
     mean, length = sums[kept], length[kept]
-    return mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length
+    return Scan(mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums):
+def _add_up(scan, patch_cm, slots, keys, sums):
     """Sum weight, weighted point and weighted normal of each patch and sector.
 
     Args:
-        points_cm: Edge points.
-        normals: Their normals.
-        weights: Their weights.
+        scan: Edge points.
         patch_cm: Side of a patch.
         slots: Which patch stands in each slot of a hash table, -1 for none; a power of two.
         keys: Filled: column, and row with sector, of each patch.
@@ -184,6 +192,7 @@ def _add_up(points_cm, normals, weights, patch_cm, slots, keys, sums):
     Returns:
         Number of patches.
     """
+    points_cm, normals, weights = scan.points_cm, scan.normals, scan.weights
     count, mask = 0, len(slots) - 1
     for i in range(len(weights)):
         x, y, nx, ny, weight = points_cm[i, 0], points_cm[i, 1], normals[i, 0], normals[i, 1], weights[i]

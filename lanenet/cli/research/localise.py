@@ -16,7 +16,7 @@ from lanenet.cli.shared.outputs import check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError, HardwareError
 
 if TYPE_CHECKING:
-    from datagen.localise.live_filter import Moment
+    from datagen.localise.live_filter import LiveFrame
     from datagen.localise.localise import LiveReport
     from lanenet.onboard.cameras.source import FrameSource
 
@@ -82,7 +82,7 @@ def localise(
     ] = None,
 ) -> None:
     """Run the particle filter alone, as on the car: one pose per frame, in bounded memory."""
-    from datagen.localise.live_filter import StartSettings, moments_of
+    from datagen.localise.live_filter import StartSettings, live_frames
     from datagen.localise.localise import localise as run
     from datagen.settings import MapSettings
     from lanenet.config import load_settings
@@ -107,8 +107,8 @@ def localise(
                 "lanenet map writes one into the map's folder"
             )
         with console.progress_bar("localise") as progress:
-            moments = moments_of(drive)
-            report = run(moments, known, settings, out, start, lambda done: progress(done, len(drive)))
+            recorded = live_frames(drive)
+            report = run(recorded, known, settings, out, start, lambda done: progress(done, len(drive)))
         _show(report)
         console.next_command("map", given, "--lane-width", "CM", "--out", "MAP")
         return
@@ -120,7 +120,7 @@ def localise(
     if chosen is None:
         raise CalibrationError(f"{live}: key 'camera' is missing: expected one, or --camera camera.yaml")
     cruise_cm_s = car.control.speed.cruise_cm_s if speed is None else speed
-    running = LiveMoments(open_source(car.source), cruise_cm_s, frames)
+    running = CameraFrames(open_source(car.source), cruise_cm_s, frames)
     with console.live_line() as show:
         report = run(
             running,
@@ -136,7 +136,7 @@ def localise(
     console.next_command("drive", live, "--dry-run")
 
 
-class LiveMoments:
+class CameraFrames:
     """Frames of a running camera for the filter, each with the speed that the car is meant to hold.
 
     The filter always gets the newest frame. Frames that it was too slow for are left out; the step to the
@@ -162,7 +162,7 @@ class LiveMoments:
         self.skipped = 0
         self._asked = ""
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[LiveFrame]:
         """Yield frames until a signal, an end or a failure.
 
         Raises:
@@ -181,8 +181,8 @@ class LiveMoments:
     def _stop(self, why: str) -> None:
         self._asked = why
 
-    def _frames(self) -> Iterator[Moment]:
-        from datagen.localise.live_filter import Moment
+    def _frames(self) -> Iterator[LiveFrame]:
+        from datagen.localise.live_filter import LiveFrame
         from lanenet.data.drives.recording import Commands
         from lanenet.onboard.cameras.source import SourceEnded
 
@@ -202,7 +202,7 @@ class LiveMoments:
                 continue
             self.skipped += max(0, frame.number - number - 1) if taken else 0
             taken, number, t_s = taken + 1, frame.number, frame.t_s
-            yield Moment(frame.number, frame.t_s, frame.image_bgr, commands)
+            yield LiveFrame(frame.number, frame.t_s, frame.image_bgr, commands)
 
 
 def _show(report: LiveReport) -> None:

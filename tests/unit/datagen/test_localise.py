@@ -13,15 +13,14 @@ import yaml
 from tum import read_tum
 from typer.testing import CliRunner
 
-from datagen.localise.live_filter import Moment, StartSettings, moments_of
-from datagen.localise.localise import HEADER, localise
-from datagen.localise.picture import LiveCanvas
+from datagen.localise.live_filter import LiveFrame, StartSettings, live_frames
+from datagen.localise.localise import HEADER, LiveCanvas, localise
 from datagen.settings import MapSettings
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.cli.app import app
-from lanenet.cli.research.localise import LiveMoments
+from lanenet.cli.research.localise import CameraFrames
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
@@ -51,9 +50,9 @@ def test_every_pose_is_on_disk_before_the_next_frame_comes(simulated, tmp_path):
     written: list[int] = []
 
     def watched():
-        for moment in moments_of(drive):
+        for frame in live_frames(drive):
             written.append(len(rows_of(out)) if out.exists() else 0)
-            yield moment
+            yield frame
 
     report = localise(watched(), drive.camera, SETTINGS, out, KNOWN)
     assert written == list(range(len(drive)))
@@ -74,10 +73,10 @@ def test_ctrl_c_ends_the_drive_and_keeps_what_was_driven(simulated, tmp_path):
     drive, out = open_drive(simulated), tmp_path / "poses.csv"
 
     def stopped():
-        for moment in moments_of(drive):
-            if moment.frame == 12:
+        for frame in live_frames(drive):
+            if frame.frame == 12:
                 raise KeyboardInterrupt
-            yield moment
+            yield frame
 
     assert localise(stopped(), drive.camera, SETTINGS, out, KNOWN).poses == 12
     assert len(rows_of(out)) == len(read_tum(out.with_suffix(".tum"))[0]) == 12
@@ -88,10 +87,10 @@ def test_an_error_leaves_the_poses_so_far_and_no_half_trajectory(simulated, tmp_
     drive, out = open_drive(simulated), tmp_path / "poses.csv"
 
     def torn():
-        for moment in moments_of(drive):
-            if moment.frame == 12:
+        for frame in live_frames(drive):
+            if frame.frame == 12:
                 raise LanenetError("the camera is gone")
-            yield moment
+            yield frame
 
     with pytest.raises(LanenetError, match="the camera is gone"):
         localise(torn(), drive.camera, SETTINGS, out, KNOWN)
@@ -101,12 +100,12 @@ def test_an_error_leaves_the_poses_so_far_and_no_half_trajectory(simulated, tmp_
 
 def test_nothing_to_see_is_said(simulated, tmp_path):
     drive = open_drive(simulated)
-    blind = (Moment(m.frame, m.t_s, None, m.commands) for m in moments_of(drive))
+    blind = (LiveFrame(m.frame, m.t_s, None, m.commands) for m in live_frames(drive))
     with pytest.raises(TrackingLostError, match="0 frames of a moving car"):
         localise(blind, drive.camera, SETTINGS, tmp_path / "poses.csv")
     (tmp_path / "file").touch()
     with pytest.raises(LanenetError, match="is a file, expected a folder"):
-        localise(moments_of(drive), drive.camera, SETTINGS, tmp_path / "file" / "poses.csv", KNOWN)
+        localise(live_frames(drive), drive.camera, SETTINGS, tmp_path / "file" / "poses.csv", KNOWN)
 
 
 def test_a_canvas_coarsens_and_keeps_what_was_drawn():
@@ -176,41 +175,41 @@ def frames_at(*rows: tuple[int, float]) -> list[Frame | None]:
     return [Frame(np.full((4, 6, 3), number, np.uint8), t_s, number) for number, t_s in rows]
 
 
-def test_a_running_camera_gives_moments_at_the_speed_that_is_meant():
+def test_a_running_camera_gives_frames_at_the_speed_that_is_meant():
     rows = frames_at((0, 5.0), (1, 5.1), (4, 5.4))
     source = Replayed([rows[0], None, *rows[1:]])
-    moments = LiveMoments(source, 50.0)
-    taken = list(moments)
+    frames = CameraFrames(source, 50.0)
+    taken = list(frames)
     assert [(m.frame, m.t_s, m.starts) for m in taken] == [(0, 5.0, False), (1, 5.1, False), (4, 5.4, False)]
     assert all(m.image is row.image_bgr for m, row in zip(taken, rows, strict=True))
     assert all(m.commands.speed_cm_s == [50.0] and m.commands.steering_rad is None for m in taken)
-    assert moments.skipped == 2 and moments.failure is None and (source.opened, source.closed) == (1, 1)
+    assert frames.skipped == 2 and frames.failure is None and (source.opened, source.closed) == (1, 1)
 
 
 def test_a_frame_stamped_before_the_last_one_is_left_out():
-    moments = list(LiveMoments(Replayed(frames_at((0, 1.0), (1, 1.0), (2, 0.9), (3, 1.1))), 50.0))
-    assert [m.frame for m in moments] == [0, 3]
+    frames = list(CameraFrames(Replayed(frames_at((0, 1.0), (1, 1.0), (2, 0.9), (3, 1.1))), 50.0))
+    assert [m.frame for m in frames] == [0, 3]
 
 
 def test_as_many_frames_as_asked():
     source = Replayed(frames_at(*((k, 0.1 * k) for k in range(9))))
-    assert [m.frame for m in LiveMoments(source, 50.0, 4)] == [0, 1, 2, 3] and source.closed == 1
+    assert [m.frame for m in CameraFrames(source, 50.0, 4)] == [0, 1, 2, 3] and source.closed == 1
 
 
 def test_a_signal_ends_the_frames_and_the_camera_is_let_go():
     source, numbers = Replayed(frames_at(*((k, 0.1 * k) for k in range(9)))), []
-    for moment in LiveMoments(source, 50.0):
-        numbers.append(moment.frame)
-        if moment.frame == 3:
+    for frame in CameraFrames(source, 50.0):
+        numbers.append(frame.frame)
+        if frame.frame == 3:
             signal.raise_signal(signal.SIGTERM)
     assert numbers == [0, 1, 2, 3] and source.closed == 1
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_a_camera_that_is_lost_ends_the_frames_and_is_told():
-    moments = LiveMoments(Replayed(frames_at((0, 0.0), (1, 0.1)), HardwareError("cam: lost for 60 s")), 50.0)
-    assert len(list(moments)) == 2
-    assert str(moments.failure) == "cam: lost for 60 s"
+    frames = CameraFrames(Replayed(frames_at((0, 0.0), (1, 0.1)), HardwareError("cam: lost for 60 s")), 50.0)
+    assert len(list(frames)) == 2
+    assert str(frames.failure) == "cam: lost for 60 s"
 
 
 def test_a_filter_that_is_too_slow_for_its_camera_keeps_to_the_way(simulated, tmp_path):
@@ -220,10 +219,10 @@ def test_a_filter_that_is_too_slow_for_its_camera_keeps_to_the_way(simulated, tm
     source = Replayed([Frame(drive.image(k), float(drive.t_s[k]), k) for k in kept])
     way_cm = np.hypot(*(np.diff(truth[name][kept]) for name in ("x_cm", "y_cm"))).sum()
     speed_cm_s = way_cm / (drive.t_s[kept[-1]] - drive.t_s[0])
-    moments = LiveMoments(source, speed_cm_s)
-    report = localise(moments, drive.camera, SETTINGS, tmp_path / "poses.csv", KNOWN)
+    frames = CameraFrames(source, speed_cm_s)
+    report = localise(frames, drive.camera, SETTINGS, tmp_path / "poses.csv", KNOWN)
     assert (report.frames, report.poses, report.segments) == (len(kept), len(kept), 1)
-    assert moments.skipped == len(drive) - len(kept) and report.speed_known
+    assert frames.skipped == len(drive) - len(kept) and report.speed_known
     _, poses = read_tum(report.trajectory)
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() == pytest.approx(way_cm, rel=0.06)
 

@@ -79,7 +79,7 @@ def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monk
         return SimpleNamespace(solved=longest, camera=CAMERA, how="found", figures={}, note="found")
 
     monkeypatch.setattr(prepare, "open_drive", lambda path: drive)
-    monkeypatch.setattr(prepare, "following_frames", lambda drive, notes: drive)
+    monkeypatch.setattr(prepare, "following_frames", lambda drive: (drive, []))
     monkeypatch.setattr(prepare, "keep_images", lambda drive: drive)
     monkeypatch.setattr(prepare, "check_moving", lambda *_: None)
     monkeypatch.setattr(drive_segments, "check_edges", lambda *_: None)

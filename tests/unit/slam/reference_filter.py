@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from datagen.slam.filter.dp_slam import FilterSettings, effective_number, reweigh, systematic_resample
+from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.filter.motion import MotionModel, widen_steps
+from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import Scans, condense
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
@@ -74,13 +75,8 @@ def reference_filter(
     maps: list[PlainMap] = [{} for _ in range(count)]
     all_states, all_weights = [], []
     for k in range(len(scans)):
-        rows = scans.frame(k)
         points, normals, trust = condense(
-            scans.points_cm[rows],
-            scans.normals[rows],
-            scans.weights[rows],
-            settings.patch_heights * camera_height_cm,
-            settings.max_points,
+            scans.scan(k), settings.patch_heights * camera_height_cm, settings.max_points
         )
         if k > 0:
             before = states.copy()
@@ -100,7 +96,7 @@ def reference_filter(
                 scores = (np.sum(turned * held, axis=2) / (1.0 + strength)) @ trust
             weights = reweigh(weights, scores, settings.effective_share)
             if effective_number(weights) < settings.resample_below * count:
-                chosen = systematic_resample(weights, rng)
+                chosen = systematic_resample(weights, rng.random())
                 states, weights = states[chosen], np.full(count, 1.0 / count)
                 maps = [copy_of(maps[p]) for p in chosen]
         for p in range(count):

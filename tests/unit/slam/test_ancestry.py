@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 from reference_filter import reference_filter
 from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, tape_road
 
-from datagen.slam.filter.ancestry import AncestryMap, Likelihood
-from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter, systematic_resample
+from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
+from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter
 from datagen.slam.filter.motion import MotionModel
+from datagen.slam.filter.resampling import systematic_resample
+from datagen.slam.odometry.scans import Scan
 
 CELL_CM = 0.8
 MEMORY = 30.0
@@ -44,8 +46,7 @@ def test_the_filter_equals_one_with_a_map_per_particle(seed, likelihood):
     shared = ParticleFilter(motion, chosen, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(seed))
     resampled = 0
     for k in range(frames):
-        rows = scans.frame(k)
-        shared.step(scans.points_cm[rows], scans.normals[rows], scans.weights[rows], motion, k)
+        shared.step(scans.scan(k), motion, k)
         np.testing.assert_allclose(shared.states, states[k], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(shared.weights, weights[k], rtol=1e-9, atol=0.0)
         resampled += len(shared.survivors.states) < chosen.particles
@@ -55,15 +56,16 @@ def test_the_filter_equals_one_with_a_map_per_particle(seed, likelihood):
 
 
 def _map(particles: int, likelihood: Likelihood = "direction", **changes: int) -> AncestryMap:
-    return AncestryMap.empty(
-        particles, CELL_CM, 64, MEMORY, WHEELBASE_CM, 12, likelihood=likelihood, **({"pages": 3000} | changes)
+    layout = MapLayout(
+        CELL_CM, 64, MEMORY, WHEELBASE_CM, 12, likelihood=likelihood, **({"pages": 3000} | changes)
     )
+    return AncestryMap(particles, layout)
 
 
-def _scan(rng: np.random.Generator, n: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scan(rng: np.random.Generator, n: int = 12) -> Scan:
     angle = rng.uniform(-np.pi, np.pi, n)
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
-    return rng.uniform([-6.0, 2.0], [6.0, 14.0], (n, 2)), normals, rng.uniform(0.2, 2.0, n)
+    return Scan(rng.uniform([-6.0, 2.0], [6.0, 14.0], (n, 2)), normals, rng.uniform(0.2, 2.0, n))
 
 
 def _states(rng: np.random.Generator, particles: int) -> np.ndarray:
@@ -82,17 +84,17 @@ def test_any_family_tree_scores_as_separate_maps_do(seed, frames, particles):
         states, scan = _states(rng, particles), _scan(rng)
         chosen = np.sort(rng.integers(0, particles, particles))
         shared.descend(states, chosen, frame)
-        shared.enter(*scan, frame)
+        shared.enter(scan, frame)
         shown.append(scan)
         lineages = [[*lineages[parent], (states[parent], frame)] for parent in chosen]
     poses, view = _states(rng, particles), _scan(rng)
-    matches = shared.score(poses, *view, frames)
+    matches = shared.score(poses, view, frames)
     for p, lineage in enumerate(lineages):
         alone = _map(1)
         for pose, frame in lineage:
             alone.descend(pose[None], np.zeros(1, np.int64), frame)
-            alone.enter(*shown[frame], frame)
-        expected = alone.score(poses[p : p + 1], *view, frames)[0]
+            alone.enter(shown[frame], frame)
+        expected = alone.score(poses[p : p + 1], view, frames)[0]
         assert matches[p] == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
@@ -107,8 +109,8 @@ def test_no_cell_of_the_plane_is_special(likelihood):
             moved = states + [ix * CELL_CM, iy * CELL_CM, 0.0]
             shared = _map(3, likelihood)
             shared.descend(moved, np.arange(3), 0)
-            shared.enter(*scan, 0)
-            seen.append(shared.score(moved, *scan, 1))
+            shared.enter(scan, 0)
+            seen.append(shared.score(moved, scan, 1))
     assert seen[0].min() > 1.0
     np.testing.assert_allclose(seen, np.tile(seen[0], (len(seen), 1)), rtol=1e-6)
 
@@ -116,16 +118,16 @@ def test_no_cell_of_the_plane_is_special(likelihood):
 def test_entries_live_exactly_as_long_as_their_lineages_differ():
     rng = np.random.default_rng(0)
     shared = _map(4)
-    free = int(shared.pages.free[1])
+    free = int(shared.arrays.pages.free[1])
     shared.descend(_states(rng, 4), np.arange(4), 0)
-    shared.enter(*_scan(rng), 0)
-    assert shared.pages.free[1] < free
+    shared.enter(_scan(rng), 0)
+    assert shared.arrays.pages.free[1] < free
     # All descend from the third: the others' entries are dead, and its own belong to all.
     survivors = shared.descend(_states(rng, 4), np.full(4, 2), 1)
     assert survivors == 1
-    assert shared.pages.free[1] == free
+    assert shared.arrays.pages.free[1] == free
     assert shared.forced == 0
-    assert (shared.cells.root != 0.0).any()
+    assert (shared.arrays.cells.root != 0.0).any()
 
 
 def test_a_full_window_takes_the_mean_of_the_ancestors_and_counts_it():
@@ -138,21 +140,21 @@ def test_a_full_window_takes_the_mean_of_the_ancestors_and_counts_it():
     # One lineage of the first particle, three of the second, one of the third.
     chosen = np.array([0, 1, 1, 1, 2])
     shared.descend(ancestors, chosen, 0)
-    shared.enter(*scan, 0)
+    shared.enter(scan, 0)
     poses = np.tile(ancestors[chosen].mean(axis=0), (5, 1))
     mean.descend(poses[:1], np.zeros(1, np.int64), 0)
-    mean.enter(*scan, 0)
-    nothing = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    mean.enter(scan, 0)
+    nothing = Scan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     for frame in range(1, 5):
         shared.descend(poses, np.arange(5), frame)
-        shared.enter(*nothing, frame)
+        shared.enter(nothing, frame)
         mean.descend(poses[:1], np.zeros(1, np.int64), frame)
     assert shared.forced == 1
     # Nothing of it is left to single lineages.
-    assert shared.pages.free[1] == len(shared.pages.used)
-    expected = mean.score(poses[:1], *scan, 5)[0]
+    assert shared.arrays.pages.free[1] == len(shared.arrays.pages.used)
+    expected = mean.score(poses[:1], scan, 5)[0]
     assert expected > 1.0
-    np.testing.assert_allclose(shared.score(poses, *scan, 5), expected, rtol=1e-6)
+    np.testing.assert_allclose(shared.score(poses, scan, 5), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("pages", [700, 5000])
@@ -163,12 +165,12 @@ def test_memory_is_bounded_however_long_lineages_stay_apart(pages):
     for frame in range(60):
         # Nobody ever dies, the worst case.
         shared.descend(_states(rng, 6), np.arange(6), frame)
-        shared.enter(*_scan(rng), frame)
-        assert shared.pages.free[1] >= 0
+        shared.enter(_scan(rng), frame)
+        assert shared.arrays.pages.free[1] >= 0
     assert shared.bytes == size
     # With room enough only the window binds; with little the pool does, earlier.
     assert shared.forced >= 60 - 16
-    assert np.isfinite(shared.score(_states(rng, 6), *_scan(rng), 60)).all()
+    assert np.isfinite(shared.score(_states(rng, 6), _scan(rng), 60)).all()
 
 
 def test_no_page_is_lost_over_many_generations():
@@ -176,15 +178,15 @@ def test_no_page_is_lost_over_many_generations():
     shared = _map(30)
     for frame in range(80):
         weights = rng.dirichlet(np.ones(30))
-        shared.descend(_states(rng, 30), systematic_resample(weights, rng), frame)
-        shared.enter(*_scan(rng), frame)
-        shared.score(_states(rng, 30), *_scan(rng), frame + 1)
+        shared.descend(_states(rng, 30), systematic_resample(weights, rng.random()), frame)
+        shared.enter(_scan(rng), frame)
+        shared.score(_states(rng, 30), _scan(rng), frame + 1)
     in_cells = 0
-    for page in shared.cells.state[:, :, 2].ravel():
+    for page in shared.arrays.cells.state[:, :, 2].ravel():
         while page >= 0:
             in_cells += 1
-            page = shared.pages.following[page]
-    assert in_cells + shared.pages.free[1] == len(shared.pages.used)
+            page = shared.arrays.pages.following[page]
+    assert in_cells + shared.arrays.pages.free[1] == len(shared.arrays.pages.used)
     assert in_cells > 0
 
 
@@ -194,9 +196,10 @@ def test_counting_takes_no_notice_of_directions():
     for likelihood in ("direction", "count"):
         shared = _map(1, likelihood)
         shared.descend(np.zeros((1, 3)), np.zeros(1, np.int64), 0)
-        shared.enter(points, normals, weights, 0)
+        shared.enter(Scan(points, normals, weights), 0)
         results[likelihood] = [
-            shared.score(np.zeros((1, 3)), points, sign * normals, weights, 1)[0] for sign in (1.0, -1.0)
+            shared.score(np.zeros((1, 3)), Scan(points, sign * normals, weights), 1)[0]
+            for sign in (1.0, -1.0)
         ]
     assert results["count"] == [2.0, 2.0]
     assert results["direction"][0] == pytest.approx(-results["direction"][1])

@@ -10,7 +10,7 @@ from tape_road import tape_road
 from datagen.slam.adjustment import problem as bundle_problem
 from datagen.slam.adjustment.adjust import BundleEstimate, BundleSettings, Observations, adjust
 from datagen.slam.adjustment.problem import BundleProblem, frame_priors, inner_pixels, point_trust
-from datagen.slam.adjustment.state import start_state
+from datagen.slam.adjustment.state import BundleState
 from lanenet.geometry.poses import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
@@ -129,8 +129,8 @@ def test_what_falls_on_the_rim_of_what_is_seen_looks_for_no_edge():
     where = []
     for known in (keep, None):
         problem = BundleProblem(Observations(edges, known), camera, SMALL, _rng())
-        state = start_state(BundleEstimate.level(road.poses[[0, 0]], camera))
-        where.append(problem.uv[problem.associate(state, 5.0).point, 1])
+        state = BundleState.at(BundleEstimate.level(road.poses[[0, 0]], camera))
+        where.append(problem.points.uv[problem.associate(state, 5.0).point, 1])
     assert len(where[0]) > 10 and where[0].min() > 55.5 and where[0].max() < 93.5
     assert len(where[1]) > len(where[0])
     met = [len(w[(w > 56.5) & (w < 92.5)]) for w in where]
@@ -195,8 +195,9 @@ def test_ways_follow_the_commands_where_the_pictures_are_silent(command):
 
 def _prior(poses: np.ndarray, expected: np.ndarray, recorded: bool) -> tuple[float, np.ndarray]:
     """Cost of what is believed of the frames, and its downhill slope by their numbers."""
-    state = start_state(BundleEstimate.level(poses, fisheye()))
-    cost, _, downhill = frame_priors(state, BundleSettings(), np.arange(len(poses) - 1), expected, recorded)
+    state = BundleState.at(BundleEstimate.level(poses, fisheye()))
+    observed = Observations([], relative_steps=expected, speed_recorded=recorded)
+    cost, _, downhill = frame_priors(state, BundleSettings(), np.arange(len(poses) - 1), observed)
     return cost, downhill
 
 

@@ -10,9 +10,9 @@ from pixel_road import HEIGHT, WIDTH, fisheye, pinhole, pixels
 from tape_road import HEIGHT_CM, tape_road
 
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
-from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_slopes, set_view
-from datagen.slam.adjustment.problem import BundleProblem, Observations
-from datagen.slam.adjustment.state import BundleEstimate, start_state
+from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_jacobian, set_view
+from datagen.slam.adjustment.problem import BundleProblem
+from datagen.slam.adjustment.state import BundleEstimate, BundleState, Observations
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgePixels
 
@@ -31,7 +31,7 @@ def _problem(camera: Camera, frames: int = 2) -> BundleProblem:
 
 def _vectors(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Lens and view."""
-    state, view = start_state(BundleEstimate.level(np.zeros((1, 3)), camera)), np.empty(N_VIEW)
+    state, view = BundleState.at(BundleEstimate.level(np.zeros((1, 3)), camera)), np.empty(N_VIEW)
     set_view(state.mount, 0.0, 0.0, view)
     return state.lens, view
 
@@ -103,7 +103,7 @@ def test_slopes_of_projecting_by_the_point_and_by_the_camera(model, seed):
 
     for point in rng.uniform([1.5, -2.0], [6.0, 2.0], (20, 2)):
         np.testing.assert_allclose(
-            project_with_slopes(model == "fisheye", lens, view, *point, by), seen(point), atol=1e-6
+            project_with_jacobian(model == "fisheye", lens, view, *point, by), seen(point), atol=1e-6
         )
         slopes = [(seen(point + d) - seen(point - d)) / 2e-4 for d in 1e-4 * np.eye(2)]
         for name, step in zip(CAMERA_NAMES, STEPS, strict=True):
@@ -116,13 +116,15 @@ def test_slopes_of_projecting_by_the_point_and_by_the_camera(model, seed):
 def test_derivatives_of_lifting_by_the_camera(model):
     camera = CAMERAS[model]
     problem = _problem(camera)
-    lifted, by, half = problem.lift(start_state(BundleEstimate.level(np.zeros((2, 3)), camera)))
-    np.testing.assert_allclose(lifted, _ground(camera, problem.uv), atol=1e-6)
-    np.testing.assert_allclose(half, _ground(camera, problem.uv + 0.5 * problem.normals), atol=1e-5)
+    lifted, by, half = problem.lift(BundleState.at(BundleEstimate.level(np.zeros((2, 3)), camera)))
+    np.testing.assert_allclose(lifted, _ground(camera, problem.points.uv), atol=1e-6)
+    np.testing.assert_allclose(
+        half, _ground(camera, problem.points.uv + 0.5 * problem.points.normals), atol=1e-5
+    )
     near = lifted[:, 0] < 6.0
     for k, name in enumerate(CAMERA_NAMES):
         h = 0.5 * STEPS[k]
-        ends = [_ground(_changed(camera, name, sign * h), problem.uv) for sign in (1.0, -1.0)]
+        ends = [_ground(_changed(camera, name, sign * h), problem.points.uv) for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1])[near] / (2.0 * h)
         scale = np.abs(expected).max()
         np.testing.assert_allclose(by[near, k], expected, atol=1e-4 * scale, err_msg=name)
@@ -132,12 +134,12 @@ def test_a_frame_that_nods_is_a_camera_that_is_mounted_so():
     camera = fisheye()
     problem = _problem(camera)
     tilt = np.array([[0.0, 0.0], [0.02, -0.015]])
-    lifted, _, _ = problem.lift(start_state(BundleEstimate(np.zeros((2, 3)), tilt, camera)))
+    lifted, _, _ = problem.lift(BundleState.at(BundleEstimate(np.zeros((2, 3)), tilt, camera)))
     m = camera.mounting
     nodded = camera.with_mounting(pitch_down_rad=m.pitch_down_rad + 0.02, roll_rad=m.roll_rad - 0.015)
     for frame, seen in enumerate((camera, nodded)):
-        mine = slice(problem.point_starts[frame], problem.point_starts[frame + 1])
-        np.testing.assert_allclose(lifted[mine], _ground(seen, problem.uv[mine]), atol=1e-5)
+        mine = slice(problem.points.starts[frame], problem.points.starts[frame + 1])
+        np.testing.assert_allclose(lifted[mine], _ground(seen, problem.points.uv[mine]), atol=1e-5)
 
 
 @pytest.mark.parametrize("model", ["fisheye", "pinhole"])
@@ -149,25 +151,25 @@ def test_the_normal_equations_hold_the_slope_of_the_cost(model, seed):
     road = tape_road(frames)
     problem = _problem(camera, frames)
     poses_cm = road.poses + rng.normal(size=(frames, 3)) * [0.01 * HEIGHT_CM, 0.01 * HEIGHT_CM, 0.004]
-    state = start_state(BundleEstimate(poses_cm, 0.003 * rng.normal(size=(frames, 2)), camera))
+    state = BundleState.at(BundleEstimate(poses_cm, 0.003 * rng.normal(size=(frames, 2)), camera))
     away = np.concatenate([np.zeros(5 * frames), [0.02, 0.3, -0.4, 0.004, 0.003, 0.002, -0.004, 0.05]])
     state = state.moved(away, problem.free)
     links = problem.associate(state, 4.0)
     assert len(links.point) > 300
     now = problem.equations(state, links)
-    rhs, curvature = now.rhs, np.concatenate([now.frames.diagonal(), np.diag(now.camera)])
+    descent, curvature = now.descent, np.concatenate([now.frames.diagonal(), np.diag(now.camera)])
     assert abs(now.frames - now.frames.T).max() < 1e-9 * abs(now.frames).max()
     size = np.concatenate([np.full(5 * frames, 1e-5), 0.1 * STEPS])
     # The first pose is held by a prior that drowns every other slope.
     for k in [*rng.choice(np.arange(3, 5 * frames), 12, replace=False), *range(5 * frames, 5 * frames + 8)]:
         ends = []
         for sign in (1.0, -1.0):
-            step = np.zeros(len(rhs))
+            step = np.zeros(len(descent))
             step[k] = sign * size[k]
             ends.append(problem.equations(state.moved(step, problem.free), links).cost)
         slope = (ends[0] - ends[1]) / (2.0 * size[k])
         tolerance = 1e-4 * abs(slope) + 1e-4 * np.sqrt(curvature[k])
-        assert -rhs[k] == pytest.approx(slope, abs=tolerance), k
+        assert -descent[k] == pytest.approx(slope, abs=tolerance), k
 
 
 @pytest.mark.parametrize("model", ["fisheye", "pinhole"])
@@ -176,11 +178,13 @@ def test_uncertainty_of_a_link_grows_with_the_stretch(model):
     camera, frames = CAMERAS[model], 6
     road = tape_road(frames)
     problem = _problem(camera, frames)
-    state = start_state(BundleEstimate.level(road.poses, camera))
+    state = BundleState.at(BundleEstimate.level(road.poses, camera))
     links = problem.associate(state, 2.0)
-    pair = np.searchsorted(links.pair_starts, np.arange(len(links.point)), side="right") - 1
-    i, j = problem.pairs[pair].T
-    ends = [_ground(camera, problem.uv[links.point] + s * problem.normals[links.point]) for s in (0.0, 0.5)]
+    i, j = problem.pairs[links.pair].T
+    ends = [
+        _ground(camera, problem.points.uv[links.point] + s * problem.points.normals[links.point])
+        for s in (0.0, 0.5)
+    ]
     poses = state.poses
     there = []
     for end in ends:
@@ -201,7 +205,7 @@ def test_an_edge_that_brightens_the_other_way_is_not_met():
     camera = fisheye()
     edges = pixels(tape_road(2), camera)
     turned = EdgePixels(edges[1].uv_px, -edges[1].normals)
-    state = start_state(BundleEstimate.level(tape_road(2).poses, camera))
+    state = BundleState.at(BundleEstimate.level(tape_road(2).poses, camera))
     met = []
     for second in (edges[1], turned):
         problem = BundleProblem(Observations([edges[0], second]), camera, SMALL, np.random.default_rng(0))

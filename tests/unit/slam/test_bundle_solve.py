@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.slam.adjustment.kernels import N_FRAME
-from datagen.slam.adjustment.problem import Equations, FramePattern
+from datagen.slam.adjustment.problem import Equations, sum_blocks
 
 FRAMES = 9
 
@@ -15,6 +15,10 @@ def _pairs(rng: np.random.Generator) -> np.ndarray:
     """Neighbours both ways round, one pair twice, a loop; the last frame in no pair."""
     near = [(k + 1, k) if rng.random() < 0.5 else (k, k + 1) for k in range(FRAMES - 2)]
     return np.array([*near, (0, 4), (0, 4), (7, 1)])
+
+
+def _unknowns(pairs: np.ndarray) -> np.ndarray:
+    return (N_FRAME * pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
 
 
 def _dense(pairs: np.ndarray, blocks: np.ndarray) -> np.ndarray:
@@ -29,15 +33,13 @@ def _dense(pairs: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 def test_blocks_of_pairs_add_up_where_they_belong(seed):
     rng = np.random.default_rng(seed)
     pairs = _pairs(rng)
-    pattern = FramePattern(pairs, FRAMES)
-    # Twice: the pattern stays as it is, and blocks of zeros keep their place.
-    for blocks in (np.zeros((len(pairs), 10, 10)), rng.normal(size=(len(pairs), 10, 10))):
-        np.testing.assert_allclose(pattern.matrix(blocks).toarray(), _dense(pairs, blocks), atol=1e-12)
+    blocks = rng.normal(size=(len(pairs), 10, 10))
+    found = sum_blocks(_unknowns(pairs), blocks, N_FRAME * FRAMES)
+    np.testing.assert_allclose(found.toarray(), _dense(pairs, blocks), atol=1e-12)
 
 
 def test_without_a_pair_the_matrix_is_empty():
-    pattern = FramePattern(np.empty((0, 2), np.int64), 3)
-    assert not pattern.matrix(np.empty((0, 10, 10))).toarray().any()
+    assert not sum_blocks(np.empty((0, 10), np.int64), np.empty((0, 10, 10)), 15).toarray().any()
 
 
 @pytest.mark.parametrize("free", [0, 3])
@@ -46,8 +48,8 @@ def test_a_step_and_the_uncertainty_are_those_of_the_full_system(free, damping):
     rng = np.random.default_rng(free)
     pairs, size = _pairs(rng), N_FRAME * FRAMES
     half = rng.normal(size=(len(pairs), 12, 10))
-    frames = FramePattern(pairs, FRAMES).matrix(np.einsum("pki,pkj->pij", half, half))
-    frames = frames + 0.5 * FramePattern(pairs, FRAMES).matrix(np.tile(np.eye(10), (len(pairs), 1, 1)))
+    blocks = np.einsum("pki,pkj->pij", half, half) + 0.5 * np.eye(10)
+    frames = sum_blocks(_unknowns(pairs), blocks, size)
     frames.setdiag(frames.diagonal() + 1.0)
     border, rhs = 0.1 * rng.normal(size=(size, free)), rng.normal(size=size + free)
     camera = 5.0 * np.eye(free) + 0.3

@@ -11,8 +11,8 @@ from pixel_road import fisheye
 
 from datagen.slam.camera.changes import looking_alike, with_known_scale
 from datagen.slam.camera.coarse import NOMINAL_HEIGHT_CM, clearest_step, coarse_camera, guessed_camera
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, usual_step
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, best_step
 from datagen.slam.odometry.scans import seen_edges
 from datagen.slam.settings import GuessSettings
 from datagen.slam.view import mapping_range
@@ -118,9 +118,9 @@ def test_the_step_is_that_of_the_camera_in_which_one_stands_out():
     for name, camera in (("true", true), ("far off", far_off)):
         table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
         edges = [seen_edges(frame, table) for frame in pixels]
-        pictures[name] = Pictures(edges, camera, OdometrySettings(), np.random.default_rng(0))
+        pictures[name] = ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(0))
     relative = np.ones(60)
-    wrong, _ = usual_step(pictures["far off"], relative, np.array(STEPS_HEIGHTS))
+    wrong, _ = best_step(pictures["far off"], relative, np.array(STEPS_HEIGHTS))
     step_heights = 4.0 / true.mounting.height_cm
     assert abs(wrong / step_heights - 1.0) > 0.3
     for order in (("true", "far off"), ("far off", "true")):

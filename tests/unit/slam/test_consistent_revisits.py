@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits
+from datagen.slam.loops.consistency import consistent_revisits
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from lanenet.geometry.poses import path_lengths
 
 LAP = 80

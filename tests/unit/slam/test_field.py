@@ -7,6 +7,7 @@ import pytest
 from tape_road import WHEELBASE_CM, tape_road
 
 from datagen.slam.filter.field import DirectionField
+from datagen.slam.odometry.scans import Scan
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 CELL_CM = 0.8
@@ -68,7 +69,7 @@ def _one_point(
     """Score of one edge at a place of the map, for a car at the origin that heads along +x."""
     car = np.array([[-y_cm, x_cm - WHEELBASE_CM]])
     normal_car = np.array([[-normal[1], normal[0]]])
-    return float(field.score(np.zeros((1, 3)), WHEELBASE_CM, car, normal_car, np.ones(1), frame)[0])
+    return float(field.score(np.zeros((1, 3)), WHEELBASE_CM, Scan(car, normal_car, np.ones(1)), frame)[0])
 
 
 def _with_point(x_cm: float, y_cm: float, memory: float = 40.0, size: int = 64) -> DirectionField:
@@ -90,7 +91,7 @@ def test_field_equals_a_plain_reference(seed, reach_cm):
         plain.insert(points, normals, weights, frame)
     poses = np.column_stack([rng.uniform(-10.0, 10.0, (5, 2)), rng.uniform(-np.pi, np.pi, 5)])
     points, normals, trust = rng.uniform(-reach_cm, reach_cm, (60, 2)), _unit(rng, 60), rng.uniform(0, 1, 60)
-    found = field.score(poses, WHEELBASE_CM, points, normals, trust, 12)
+    found = field.score(poses, WHEELBASE_CM, Scan(points, normals, trust), 12)
     expected = [plain.score(pose, points, normals, trust, 12) for pose in poses]
     assert np.ptp(expected) > 0.01
     np.testing.assert_allclose(found, expected, atol=2e-4)
@@ -149,11 +150,10 @@ def test_what_was_mapped_fades_to_one_over_e_after_the_memory():
 @pytest.mark.parametrize("frame", [0, 20, 40])
 def test_the_score_is_highest_at_the_true_pose(frame):
     road = tape_road(41)
-    scans = road.scans()
-    rows = scans.frame(frame)
+    scan = road.scans().scan(frame)
     pose = road.poses[frame]
     field = DirectionField.empty(0.6, 512, 40.0)
-    points, normals, trust = scans.points_cm[rows], scans.normals[rows], scans.weights[rows]
+    points, normals, trust = scan
     field.insert(
         map_from_car(points, pose, WHEELBASE_CM), map_from_car_directions(normals, pose[2]), trust, 0
     )
@@ -161,7 +161,7 @@ def test_the_score_is_highest_at_the_true_pose(frame):
     near = rng.normal(size=(2000, 3)) * [2.0, 2.0, 0.05]
     # Within a tenth of a cell nothing can be told apart.
     near = near[(np.abs(near) > [0.06, 0.06, 0.002]).any(axis=1)]
-    scores = field.score(np.vstack([pose, pose + near]), WHEELBASE_CM, points, normals, trust, 0)
+    scores = field.score(np.vstack([pose, pose + near]), WHEELBASE_CM, scan, 0)
     assert scores[0] >= scores.max() - 0.002 * scores[0]
     best = near[np.argsort(scores[1:])[-10:]]
     assert np.abs(best[:, :2]).max() < 1.0

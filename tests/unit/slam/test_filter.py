@@ -10,19 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, TapeRoad, tape_road
 
-from datagen.slam.filter.ancestry import AncestryMap
+from datagen.slam.filter.ancestry import AncestryMap, MapLayout
 from datagen.slam.filter.dp_slam import (
     FilterSettings,
     ParticleFilter,
     Survivors,
     Trajectory,
-    effective_number,
-    reweigh,
     run_filter,
     smooth_lineages,
-    systematic_resample,
 )
 from datagen.slam.filter.motion import MotionModel
+from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import thin_scan
 
 SETTINGS = FilterSettings(particles=250)
@@ -44,7 +42,7 @@ def test_copies_are_n_times_the_weight_on_average(weights):
     n, runs = len(w), 4000
     copies = np.array(
         [
-            np.bincount(systematic_resample(w, np.random.default_rng(seed)), minlength=n)
+            np.bincount(systematic_resample(w, np.random.default_rng(seed).random()), minlength=n)
             for seed in range(runs)
         ]
     )
@@ -60,7 +58,7 @@ def test_copies_are_n_times_the_weight_on_average(weights):
 )
 def test_copies_differ_from_n_times_the_weight_by_less_than_one(raw, seed):
     w = np.array(raw) / np.sum(raw)
-    chosen = systematic_resample(w, np.random.default_rng(seed))
+    chosen = systematic_resample(w, np.random.default_rng(seed).random())
     assert (np.diff(chosen) >= 0).all()
     copies = np.bincount(chosen, minlength=len(w))
     assert copies.sum() == len(w)
@@ -116,14 +114,14 @@ def test_thinned_scans_are_drawn_evenly_and_kept_whole_when_small():
     scans = tape_road(3).scans()
     rng = np.random.default_rng(0)
     size = int(np.diff(scans.starts)[1])
-    points, normals, trust = thin_scan(scans, 1, size, rng)
+    points, normals, trust = thin_scan(scans.scan(1), size, rng)
     np.testing.assert_array_equal(points, scans.points_cm[scans.frame(1)])
-    points, normals, trust = thin_scan(scans, 1, 50, rng)
+    points, normals, trust = thin_scan(scans.scan(1), 50, rng)
     assert len(points) == len(normals) == len(trust) == 50
     whole = {tuple(p) for p in scans.points_cm[scans.frame(1)]}
     assert {tuple(p) for p in points} <= whole
     assert len({tuple(p) for p in points}) == 50
-    drawn = np.concatenate([thin_scan(scans, 1, 50, rng)[0] for _ in range(100)])
+    drawn = np.concatenate([thin_scan(scans.scan(1), 50, rng)[0] for _ in range(100)])
     # Near points are not preferred: the mean over many draws is that of the frame.
     np.testing.assert_allclose(drawn.mean(axis=0), scans.points_cm[scans.frame(1)].mean(axis=0), atol=1.5)
 
@@ -135,11 +133,10 @@ def test_a_filter_taken_frame_by_frame_is_the_filter_of_the_whole_drive():
     live = ParticleFilter(motion, SETTINGS, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(2))
     size, estimates = live.map.bytes, []
     for k in range(30):
-        rows = scans.frame(k)
         now = replace(
             motion, distance_cm=motion.distance_cm[[k]], curvature_per_cm=motion.curvature_per_cm[[k]]
         )
-        estimates.append(live.step(scans.points_cm[rows], scans.normals[rows], scans.weights[rows], now, 0))
+        estimates.append(live.step(scans.scan(k), now, 0))
     assert live.map.bytes == size
     whole = run_filter(scans, motion, SETTINGS, HEIGHT_CM, WHEELBASE_CM, np.random.default_rng(2))
     np.testing.assert_array_equal(whole.match, [estimate.match for estimate in estimates])
@@ -308,10 +305,7 @@ def test_where_the_car_starts_on_the_map_changes_nothing_but_by_its_cells():
 @pytest.mark.parametrize("seed", range(5))
 def test_the_shared_map_scores_alike_wherever_it_lies(seed, likelihood):
     scans, cell_cm = tape_road(2).scans(), SETTINGS.cell_heights * HEIGHT_CM
-    first, second = (
-        (scans.points_cm[scans.frame(k)], scans.normals[scans.frame(k)], scans.weights[scans.frame(k)])
-        for k in (0, 1)
-    )
+    first, second = scans.scan(0), scans.scan(1)
     # Poses of the second frame about the true one, in the frame of the first.
     ways = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     turns = np.deg2rad([-8.0, -4.0, 0.0, 4.0, 8.0])
@@ -319,12 +313,11 @@ def test_the_shared_map_scores_alike_wherever_it_lies(seed, likelihood):
 
     def scores(start: tuple[float, float, float]) -> np.ndarray:
         states = np.tile([*start, 1.0, 0.0], (len(tried), 1))
-        shared = AncestryMap.empty(
-            len(tried), cell_cm, 512, 40.0, WHEELBASE_CM, len(first[2]), likelihood=likelihood
-        )
+        layout = MapLayout(cell_cm, 512, 40.0, WHEELBASE_CM, len(first.weights), likelihood=likelihood)
+        shared = AncestryMap(len(tried), layout)
         shared.descend(states, np.arange(len(tried)), 0)
-        shared.enter(*first, 0)
-        return shared.score(_laid_from(start, tried), *second, 1)
+        shared.enter(first, 0)
+        return shared.score(_laid_from(start, tried), second, 1)
 
     here = scores((0.0, 0.0, 0.0))
     # A blurred map likes slow motion, by less than a cell.

@@ -14,8 +14,8 @@ from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, BundleS
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.join import JoinedSegments, _agreeing, frames_text, join_segments
 from datagen.slam.keyframes import keyframe_pairs
-from datagen.slam.loops.places import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.view import RoadView, view_road
 from lanenet.data.drives.recording import Commands, Drive

@@ -11,12 +11,12 @@ from picture_road import Pictures, loop_drive
 from pixel_road import bean, fisheye
 
 from datagen.localise.live_filter import (
+    LiveFrame,
     LiveLocaliser,
     LivePose,
-    Moment,
     StartSettings,
+    live_frames,
     live_motion,
-    moments_of,
 )
 from datagen.settings import MapSettings
 from datagen.slam.commands import commands_of
@@ -41,9 +41,9 @@ def road() -> tuple[Drive, np.ndarray]:
     return replace(drive, commands=Commands(speed_cm_s=np.full(len(drive), SPEED_CM_S))), poses
 
 
-def ran(moments, start: StartSettings = KNOWN, settings: MapSettings = SETTINGS):
+def ran(frames, start: StartSettings = KNOWN, settings: MapSettings = SETTINGS):
     localiser = LiveLocaliser(CAMERA, settings, start)
-    poses = [pose for moment in moments for pose in localiser.take(moment)]
+    poses = [pose for frame in frames for pose in localiser.take(frame)]
     return localiser, [*poses, *localiser.finish()]
 
 
@@ -71,12 +71,8 @@ def test_poses_are_those_that_the_filter_has_when_it_has_seen_each_frame(road):
     scans, motion = scans_and_motion(drive)
     settings = (SETTINGS.filter, CAMERA.mounting.height_cm, CAMERA.wheelbase_cm)
     plain = ParticleFilter(motion, *settings, np.random.default_rng(SETTINGS.seed))
-    frames = [scans.frame(k) for k in range(len(drive))]
-    known = [
-        plain.step(scans.points_cm[f], scans.normals[f], scans.weights[f], motion, k)
-        for k, f in enumerate(frames)
-    ]
-    _, poses = ran(moments_of(drive))
+    known = [plain.step(scans.scan(k), motion, k) for k in range(len(drive))]
+    _, poses = ran(live_frames(drive))
     np.testing.assert_allclose(stacked(poses), [estimate.pose for estimate in known], rtol=0, atol=1e-9)
     # The whole drive in one go gives the same matches; its poses are smoothed by what came later.
     whole = run_filter(scans, motion, *settings, np.random.default_rng(SETTINGS.seed))
@@ -86,7 +82,7 @@ def test_poses_are_those_that_the_filter_has_when_it_has_seen_each_frame(road):
 
 def test_the_path_is_the_true_one(road):
     drive, truth = road
-    localiser, poses = ran(moments_of(drive), StartSettings(frames=60))
+    localiser, poses = ran(live_frames(drive), StartSettings(frames=60))
     assert [pose.frame for pose in poses] == drive.frames.tolist()
     assert localiser.factor == pytest.approx(1.0, abs=0.05)
     found = stacked(poses)
@@ -103,30 +99,30 @@ def test_how_the_car_answers_to_the_steering_is_learned_on_the_way(road):
     lag = 3
     told = np.concatenate([angle[lag:], np.full(lag, angle[-1])])
     steered = replace(drive, commands=replace(drive.commands, angle=np.clip(told, -1.0, 1.0)))
-    localiser, poses = ran(moments_of(steered), StartSettings(frames=100, factor=1.0))
+    localiser, poses = ran(live_frames(steered), StartSettings(frames=100, factor=1.0))
     assert localiser.steering is not None
     assert localiser.steering.gain == pytest.approx(1.0 / 20.0, rel=0.25)
     assert abs(localiser.steering.lag_frames - lag) <= 2
     check_turned(poses, truth)
 
 
-def test_the_usual_way_per_frame_is_found_where_no_speed_was_recorded(road):
+def test_the_typical_step_is_found_where_no_speed_was_recorded(road):
     unknown = replace(road[0], commands=Commands()).subset(slice(0, 80))
     localiser = LiveLocaliser(CAMERA, SETTINGS, StartSettings(frames=60))
-    counts = [len(localiser.take(moment)) for moment in moments_of(unknown)]
+    counts = [len(localiser.take(frame)) for frame in live_frames(unknown)]
     # Nothing is known until the speed is; then all of it at once, and each frame as it comes.
     assert counts == [0] * 59 + [60] + [1] * 20
     assert localiser.factor == pytest.approx(STEP_CM, rel=0.1)
     told = StartSettings(factor=STEP_CM)
-    assert len(ran(moments_of(unknown.subset(slice(0, 10))), told)[1]) == 10
+    assert len(ran(live_frames(unknown.subset(slice(0, 10))), told)[1]) == 10
 
 
 def test_a_drive_shorter_than_the_start_uses_what_there_is(road):
     drive = replace(road[0], commands=Commands())
-    localiser, poses = ran(moments_of(drive.subset(slice(0, 62))), StartSettings())
+    localiser, poses = ran(live_frames(drive.subset(slice(0, 62))), StartSettings())
     assert len(poses) == 62
     localiser.check_found()
-    localiser, poses = ran(moments_of(drive.subset(slice(0, 40))), StartSettings())
+    localiser, poses = ran(live_frames(drive.subset(slice(0, 40))), StartSettings())
     assert not poses and localiser.dropped == 40
     with pytest.raises(TrackingLostError, match=r"40 frames .* 60 that follow"):
         localiser.check_found()
@@ -135,10 +131,8 @@ def test_a_drive_shorter_than_the_start_uses_what_there_is(road):
 def test_frames_that_cannot_be_read_are_driven_through(road):
     drive, truth = road
     broken = {20, 50, 51, 52, 53}
-    moments = [
-        replace(moment, image=None) if moment.frame in broken else moment for moment in moments_of(drive)
-    ]
-    localiser, poses = ran(moments)
+    frames = [replace(frame, image=None) if frame.frame in broken else frame for frame in live_frames(drive)]
+    localiser, poses = ran(frames)
     assert localiser.unreadable == len(broken) and localiser.segment == 0
     assert [pose.frame for pose in poses] == drive.frames.tolist()
     assert {pose.frame for pose in poses[1:] if np.isnan(pose.estimate.match)} == broken
@@ -147,11 +141,11 @@ def test_frames_that_cannot_be_read_are_driven_through(road):
 
 def test_after_a_pause_a_new_segment_begins(road):
     drive = road[0].subset(slice(0, 100))
-    moments = list(moments_of(drive))
-    late = [replace(m, t_s=m.t_s + 5.0) if m.frame >= 60 else m for m in moments]
-    told = [replace(m, starts=True) if m.frame == 60 else m for m in moments]
+    frames = list(live_frames(drive))
+    late = [replace(m, t_s=m.t_s + 5.0) if m.frame >= 60 else m for m in frames]
+    told = [replace(m, starts=True) if m.frame == 60 else m for m in frames]
     # For longer than a second the camera gives nothing.
-    blind = [replace(m, image=None) if 30 <= m.frame < 60 else m for m in moments]
+    blind = [replace(m, image=None) if 30 <= m.frame < 60 else m for m in frames]
     for changed in (late, told, blind):
         localiser, poses = ran(changed)
         assert localiser.segment == 1
@@ -165,21 +159,21 @@ def test_after_a_pause_a_new_segment_begins(road):
 
 def test_a_car_that_stands_stays_where_it_is(road):
     drive = replace(road[0], commands=Commands())
-    moments = list(moments_of(drive.subset(slice(0, 80))))
+    frames = list(live_frames(drive.subset(slice(0, 80))))
     rng = np.random.default_rng(0)
     stop = [
         replace(
-            moments[59],
+            frames[59],
             frame=60 + k,
             t_s=3.0 + 0.05 * k,
-            image=np.clip(moments[59].image + rng.normal(0.0, 1.0, moments[59].image.shape), 0, 255).astype(
+            image=np.clip(frames[59].image + rng.normal(0.0, 1.0, frames[59].image.shape), 0, 255).astype(
                 np.uint8
             ),
         )
         for k in range(60)
     ]
-    after = [replace(m, frame=m.frame + 60, t_s=m.t_s + 3.0) for m in moments[60:]]
-    localiser, poses = ran([*moments[:60], *stop, *after], StartSettings(factor=STEP_CM))
+    after = [replace(m, frame=m.frame + 60, t_s=m.t_s + 3.0) for m in frames[60:]]
+    localiser, poses = ran([*frames[:60], *stop, *after], StartSettings(factor=STEP_CM))
     assert localiser.segment == 0 and len(poses) == 140
     # Some frames pass before a stop is told from a crawl.
     assert 52 <= localiser.standing <= 58
@@ -193,11 +187,11 @@ def test_memory_does_not_grow_with_the_drive(road):
     drive = road[0].subset(slice(0, 120))
     # Steering that says nothing: what is kept to learn from it is thrown away again and again.
     angle = np.random.default_rng(0).uniform(-1.0, 1.0, len(drive))
-    moments = list(moments_of(replace(drive, commands=replace(drive.commands, angle=angle))))
+    frames = list(live_frames(replace(drive, commands=replace(drive.commands, angle=angle))))
     localiser = LiveLocaliser(CAMERA, SETTINGS, StartSettings(frames=60, factor=1.0))
     sizes = []
     for lap in range(3):
-        for m in moments:
+        for m in frames:
             localiser.take(replace(m, frame=m.frame + 120 * lap, t_s=m.t_s + 6.0 * lap))
             if m.frame % 20 == 19:
                 sizes.append(len(pickle.dumps(localiser)))
@@ -208,12 +202,12 @@ def test_memory_does_not_grow_with_the_drive(road):
 
 def test_bad_input_is_named(road):
     localiser = LiveLocaliser(CAMERA, SETTINGS, KNOWN)
-    moments = list(moments_of(road[0].subset(slice(0, 3))))
-    localiser.take(moments[1])
+    frames = list(live_frames(road[0].subset(slice(0, 3))))
+    localiser.take(frames[1])
     with pytest.raises(DriveFormatError, match=r"frame 0: time 0 s after 0\.05"):
-        localiser.take(moments[0])
+        localiser.take(frames[0])
     with pytest.raises(CalibrationError, match="frame 7: image of 20x10 px, but the camera is for 160x120"):
-        localiser.take(Moment(7, 1.0, np.zeros((10, 20, 3), np.uint8), Commands()))
+        localiser.take(LiveFrame(7, 1.0, np.zeros((10, 20, 3), np.uint8), Commands()))
 
 
 def test_a_frame_that_cannot_be_read_comes_without_its_image(road):
@@ -225,6 +219,6 @@ def test_a_frame_that_cannot_be_read_comes_without_its_image(road):
                 raise DriveFormatError("torn")
             return super().read(row)
 
-    moments = list(moments_of(replace(drive, images=Torn(drive.images.images))))
-    assert [moment.image is None for moment in moments] == [False, True, False]
-    assert [float(m.commands.speed_cm_s[0]) for m in moments] == [SPEED_CM_S] * 3
+    frames = list(live_frames(replace(drive, images=Torn(drive.images.images))))
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert [float(m.commands.speed_cm_s[0]) for m in frames] == [SPEED_CM_S] * 3

@@ -18,7 +18,7 @@ def _grid(spread: float = 0.2, keep: float = 0.95, jump: float = 0.0) -> MotionG
 
 def _seen(grid: MotionGrid, steps: np.ndarray, turns: np.ndarray, sharp: float = 8.0) -> np.ndarray:
     """Log likelihood that peaks at a motion, between the states too."""
-    off_step = (grid.log_factors - np.log(steps / grid.usual)[:, None]) / 0.056
+    off_step = (grid.log_factors - np.log(steps / grid.typical)[:, None]) / 0.056
     off_turn = (TURNS - turns[:, None]) / 0.006
     return (-0.5 * sharp * (off_step[:, :, None] ** 2 + off_turn[:, None, :] ** 2)).astype(np.float32)
 

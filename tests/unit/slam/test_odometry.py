@@ -7,17 +7,23 @@ import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
 from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
-from datagen.slam.odometry.image_pairs import SECTORS, OdometrySettings, Pictures, index_edges, turns_up_to
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, Evidence, Odometry, usual_step, usual_way
+from datagen.slam.odometry.image_pairs import SECTORS, ImagePairs, OdometrySettings, index_edges, turns_up_to
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, Evidence, Odometry, best_step, typical_step
 from lanenet.perception.edges.canny import EdgePixels
 
 SETTINGS = OdometrySettings()
 STEP = STEP_CM / HEIGHT_CM
 
 
-def _pictures(edges: list[EdgePixels], camera=None, seed: int = 0) -> Pictures:
+def _pictures(edges: list[EdgePixels], camera=None, seed: int = 0) -> ImagePairs:
     camera = fisheye() if camera is None else camera
-    return Pictures(edges, camera, SETTINGS, np.random.default_rng(seed))
+    return ImagePairs(edges, camera, SETTINGS, np.random.default_rng(seed))
+
+
+def _evidence(
+    images: ImagePairs, distance_cm: np.ndarray, known: bool, far_rad: np.ndarray | None = None
+) -> Evidence:
+    return Evidence(images, typical_step(images, distance_cm, known), far_rad=far_rad)
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +104,10 @@ def test_way_and_turn_of_a_drive_are_found(road, edges, known, lamp):
     # The recorded speed is a quarter too high.
     distance_cm = np.full(60, 1.25 * STEP_CM if known else 1.0)
     pictures = _pictures(_with_a_lamp(edges, lamp))
-    odometry = Evidence(pictures, distance_cm, known, HEIGHT_CM).motion()
-    assert odometry.ways_cm[0] == odometry.turns_rad[0] == 0.0
-    assert odometry.ways_cm[1:].sum() == pytest.approx(59 * STEP_CM, rel=0.02)
-    np.testing.assert_allclose(odometry.ways_cm[5:], STEP_CM, rtol=0.15)
+    odometry = _evidence(pictures, distance_cm, known).motion()
+    assert odometry.steps_cm[0] == odometry.turns_rad[0] == 0.0
+    assert odometry.steps_cm[1:].sum() == pytest.approx(59 * STEP_CM, rel=0.02)
+    np.testing.assert_allclose(odometry.steps_cm[5:], STEP_CM, rtol=0.15)
     assert np.abs(odometry.poses[:, 2] - road.poses[:, 2]).max() < np.deg2rad(3.0)
 
 
@@ -125,7 +131,7 @@ def test_a_slide_that_is_caught_is_followed(road):
     steps[0] = 0.0
     poses = np.column_stack([np.cumsum(steps, axis=0), heading])
     slid = pixels(TapeRoad(road.points_cm, road.normals, poses), fisheye())
-    odometry = Evidence(_pictures(_blurred(slid, 0.5)), np.ones(60), False, HEIGHT_CM).motion()
+    odometry = _evidence(_pictures(_blurred(slid, 0.5)), np.ones(60), False).motion()
     assert np.abs(odometry.poses[:, 2] - heading).max() < np.deg2rad(8.0)
     assert odometry.turns_rad[28:34].min() < -0.05
 
@@ -144,7 +150,7 @@ def test_turns_that_the_distance_shows_are_followed_where_the_road_shows_nothing
     far = 0.8 * turns + np.random.default_rng(0).normal(0.0, 0.003, 60)
     far[0] = np.nan
     without, with_far = (
-        Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM, None, seen).motion() for seen in (None, far)
+        _evidence(_pictures(edges), np.ones(60), False, seen).motion() for seen in (None, far)
     )
     off = [np.abs(o.poses[:, 2] - heading).max() for o in (without, with_far)]
     assert off[0] > np.deg2rad(15.0)
@@ -153,9 +159,7 @@ def test_turns_that_the_distance_shows_are_followed_where_the_road_shows_nothing
 
 def test_a_distance_that_shows_something_else_changes_nothing(edges):
     far = np.random.default_rng(1).normal(0.0, 0.05, 60)
-    plain, other = (
-        Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM, None, seen).motion() for seen in (None, far)
-    )
+    plain, other = (_evidence(_pictures(edges), np.ones(60), False, seen).motion() for seen in (None, far))
     np.testing.assert_array_equal(other.poses, plain.poses)
 
 
@@ -186,17 +190,17 @@ def test_no_point_gains_by_leaving_the_view_of_blurred_pictures(edges):
 def test_a_mirrored_drive_turns_the_other_way(road, edges):
     flipped = pixels(road.mirrored(), mirrored(fisheye()))
     plain, other = (
-        Evidence(_pictures(e, camera), np.ones(60), False, HEIGHT_CM).motion()
+        _evidence(_pictures(e, camera), np.ones(60), False).motion()
         for e, camera in ((edges, fisheye()), (flipped, mirrored(fisheye())))
     )
     np.testing.assert_allclose(other.poses[-1], plain.poses[-1] * [1.0, -1.0, -1.0], atol=6.0)
     assert np.sign(plain.turns_rad.sum()) == -np.sign(other.turns_rad.sum())
 
 
-def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
+def test_the_typical_step_is_that_of_the_road_not_of_what_stands_still(edges):
     steps = np.array(STEPS_HEIGHTS)
     for lamp in (0, 60):
-        step, fit = usual_step(_pictures(_with_a_lamp(edges, lamp)), np.ones(60), steps)
+        step, fit = best_step(_pictures(_with_a_lamp(edges, lamp)), np.ones(60), steps)
         assert step == pytest.approx(STEP, rel=0.03)
         assert fit.shape == steps.shape
 
@@ -204,7 +208,7 @@ def test_the_usual_step_is_that_of_the_road_not_of_what_stands_still(edges):
 @pytest.mark.parametrize(("off", "lamp"), [(0.25, 60), (4.0, 0), (10.0, 60), (100.0, 0)])
 def test_a_recorded_speed_that_is_far_off_gives_the_right_way(edges, off, lamp):
     pictures = _pictures(_with_a_lamp(edges, lamp))
-    usual = usual_way(pictures, np.full(60, off * STEP_CM), True, HEIGHT_CM)
+    usual = typical_step(pictures, np.full(60, off * STEP_CM), True)
     assert usual.step_heights == pytest.approx(STEP, rel=0.03)
     assert usual.factor == pytest.approx(1.0 / off, rel=0.03)
 
@@ -213,8 +217,8 @@ def test_a_speed_in_the_wrong_unit_asks_for_no_more_turns_than_a_fast_car_makes(
     # Without edges nothing contradicts it.
     nothing = [EdgePixels(np.empty((0, 2)), np.empty((0, 2)))] * 30
     pictures = _pictures(nothing)
-    evidence = Evidence(pictures, np.full(30, 100.0 * STEP_CM), True, HEIGHT_CM)
-    assert evidence.grid.usual == pytest.approx(100.0 * STEP)
+    evidence = _evidence(pictures, np.full(30, 100.0 * STEP_CM), True)
+    assert evidence.grid.typical == pytest.approx(100.0 * STEP)
     most = 1.3 * SETTINGS.max_curvature_heights * STEPS_HEIGHTS[-1]
     assert evidence.grid.turns_rad[-1] == pytest.approx(most, abs=pictures.turn_step_rad)
 
@@ -224,16 +228,16 @@ def test_a_long_frame_takes_a_long_way(road):
     thinned = pixels(TapeRoad(road.points_cm, road.normals, road.poses[kept]), fisheye())
     distance = np.ones(58)
     distance[30] = 3.0
-    odometry = Evidence(_pictures(thinned), distance, False, HEIGHT_CM).motion()
-    assert odometry.ways_cm[30] == pytest.approx(3.0 * STEP_CM, rel=0.1)
-    assert odometry.ways_cm[29] == pytest.approx(STEP_CM, rel=0.1)
+    odometry = _evidence(_pictures(thinned), distance, False).motion()
+    assert odometry.steps_cm[30] == pytest.approx(3.0 * STEP_CM, rel=0.1)
+    assert odometry.steps_cm[29] == pytest.approx(STEP_CM, rel=0.1)
 
 
 def test_pictures_without_edges_leave_it_to_the_commands():
     nothing = [EdgePixels(np.empty((0, 2)), np.empty((0, 2)))] * 30
-    odometry = Evidence(_pictures(nothing), np.full(30, 4.0), True, HEIGHT_CM).motion(np.full(30, 0.01))
+    odometry = _evidence(_pictures(nothing), np.full(30, 4.0), True).motion(np.full(30, 0.01))
     assert odometry.turns_rad[15] > 0.0
-    np.testing.assert_allclose(odometry.turns_rad[5:25] / odometry.ways_cm[5:25], 0.01, rtol=0.2)
+    np.testing.assert_allclose(odometry.turns_rad[5:25] / odometry.steps_cm[5:25], 0.01, rtol=0.2)
 
 
 def test_points_are_drawn_from_every_direction_alike():
@@ -244,12 +248,12 @@ def test_points_are_drawn_from_every_direction_alike():
     uv = np.concatenate([lines, across])
     normals = np.concatenate([np.tile([1.0, 0.0], (len(lines), 1)), np.tile([0.0, 1.0], (24, 1))])
     pictures = _pictures([EdgePixels(uv, normals)])
-    sector = pictures._pictures[0].sector
+    sector = pictures._images[0].sector
     assert (sector == SECTORS // 4).sum() >= SETTINGS.points // 4
 
 
 def test_half_precision_follows_the_same_motion_in_half_the_memory(edges, monkeypatch):
-    evidence = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM)
+    evidence = _evidence(_pictures(edges), np.ones(60), False)
     kept = evidence.motion()
     assert evidence.log_likelihood.nbytes == 2 * 60 * np.prod(evidence.grid.shape)
 
@@ -257,6 +261,6 @@ def test_half_precision_follows_the_same_motion_in_half_the_memory(edges, monkey
         return temper * (fits.astype(np.float64) - fits.max(axis=(1, 2), keepdims=True))
 
     monkeypatch.setattr("datagen.slam.odometry.odometry._likelihood", in_full)
-    full = Evidence(_pictures(edges), np.ones(60), False, HEIGHT_CM).motion()
-    np.testing.assert_allclose(kept.ways_cm[1:], full.ways_cm[1:], rtol=2e-3)
+    full = _evidence(_pictures(edges), np.ones(60), False).motion()
+    np.testing.assert_allclose(kept.steps_cm[1:], full.steps_cm[1:], rtol=2e-3)
     np.testing.assert_allclose(kept.turns_rad[1:], full.turns_rad[1:], atol=1e-4)

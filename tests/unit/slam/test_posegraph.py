@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.places import Revisit
-from datagen.slam.loops.pose_graph import borne_out, close_loops, missed_by
+from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, revisit_residuals
+from datagen.slam.loops.revisits import Revisit
 from lanenet.geometry.poses import relative_pose
 
 HEIGHT_CM = 15.0
@@ -87,15 +87,15 @@ def test_one_wrong_revisit_among_ten_is_left_unsatisfied(wrong):
 
 
 @pytest.mark.parametrize("dashes", [2.0, -2.0])
-def test_a_revisit_that_shows_the_next_dash_is_not_borne_out(dashes):
+def test_a_revisit_that_shows_the_next_dash_is_no_inlier(dashes):
     true, drifted = _laps(np.deg2rad(20.0))
     revisits = _revisits(true, range(5, 96, 10))
     revisits[4] = replace(revisits[4], relative=revisits[4].relative + [dashes * HEIGHT_CM, 0.0, 0.0])
     revisits[7] = replace(revisits[7], relative=revisits[7].relative + [0.0, 0.0, 0.4])
     closed, _ = close_loops(drifted, revisits, HEIGHT_CM)
-    kept = borne_out(closed, revisits, HEIGHT_CM)
+    kept = inlier_revisits(closed, revisits, HEIGHT_CM)
     assert kept == revisits[:4] + revisits[5:7] + revisits[8:]
-    assert borne_out(closed, [], HEIGHT_CM) == []
+    assert inlier_revisits(closed, [], HEIGHT_CM) == []
 
 
 def test_without_revisits_nothing_moves():
@@ -146,14 +146,14 @@ def test_motion_across_a_break_is_not_believed():
 def test_what_revisits_miss_is_measured_in_the_poses_that_are_given():
     true, _ = _laps(0.0)
     revisits = _revisits(true, range(5, 96, 10))
-    assert np.abs(missed_by(true, revisits)).max() < 1e-9
+    assert np.abs(revisit_residuals(true, revisits)).max() < 1e-9
     moved = true.copy()
     # The later frame of the third revisit: ahead, to its left, and turned by it. A turn moves the axes.
     heading = true[125, 2]
     moved[125, :2] += 2.0 * np.array([np.cos(heading), np.sin(heading)])
     moved[125, :2] += 0.5 * np.array([-np.sin(heading), np.cos(heading)])
     moved[125, 2] += 0.1 + 2.0 * np.pi
-    missed = missed_by(moved, revisits)
+    missed = revisit_residuals(moved, revisits)
     np.testing.assert_allclose(missed[2], [2.0, 0.5, 0.1], atol=1e-9)
     assert np.abs(np.delete(missed, 2, axis=0)).max() < 1e-9
-    assert missed_by(true, []).shape == (0, 3)
+    assert revisit_residuals(true, []).shape == (0, 3)

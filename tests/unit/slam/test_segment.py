@@ -14,8 +14,8 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.self_calibration import SIGMA_FACTOR
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.places import Revisit, RevisitSettings
-from datagen.slam.loops.pose_graph import loop_pairs, missed_by, side_by_side
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
+from datagen.slam.loops.pose_graph import loop_pairs, neighbouring_laps, revisit_residuals
 from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -64,7 +64,7 @@ def test_laps_side_by_side_are_paired_once_each():
     angle = 2.0 * np.pi * np.arange(270) / 90
     radius = 64.0 + np.repeat([0.0, 5.0, 30.0], 90)
     poses = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), angle])
-    pairs = side_by_side(poses, 15.0, RevisitSettings())
+    pairs = neighbouring_laps(poses, 15.0, RevisitSettings())
     lap_apart = {(later - 90, later) for later in range(90, 180, 3)}
     assert lap_apart <= set(pairs)
     # The third lap is too far away. Where one lap goes over into the next, both are near.
@@ -72,14 +72,14 @@ def test_laps_side_by_side_are_paired_once_each():
     # Driven the other way round, no picture shows the same.
     back = poses.copy()
     back[90:, 2] += np.pi
-    turned = side_by_side(back[:180], 15.0, RevisitSettings())
+    turned = neighbouring_laps(back[:180], 15.0, RevisitSettings())
     assert all((earlier < 90) == (later < 90) for earlier, later in turned)
 
 
 def test_a_lap_is_held_on_each_of_the_three_before_it():
     angle = 2.0 * np.pi * np.arange(450) / 90
     poses = np.column_stack([64.0 * np.sin(angle), -64.0 * np.cos(angle), angle])
-    pairs = side_by_side(poses, 15.0, RevisitSettings())
+    pairs = neighbouring_laps(poses, 15.0, RevisitSettings())
     for later, laps in ((60, 0), (150, 1), (240, 2), (330, 3), (420, 3)):
         expected = [later - 90 * back for back in range(1, laps + 1)]
         assert [earlier for earlier, frame in pairs if frame == later] == expected
@@ -103,7 +103,7 @@ def test_revisits_are_a_lap_apart_and_meet(solved):
     for revisit in segment.revisits:
         assert abs(revisit.later - revisit.earlier - LAP_FRAMES) <= 2
         assert revisit.turns == 1
-    missed = np.median(np.abs(missed_by(segment.poses, segment.revisits)), axis=0)
+    missed = np.median(np.abs(revisit_residuals(segment.poses, segment.revisits)), axis=0)
     assert missed[:2].max() < 1.0 and missed[2] < np.deg2rad(1.0)
     assert segment.drift_rad_per_cm is not None
     missed_rad = [

@@ -14,7 +14,7 @@ from datagen.slam.adjustment.adjust import BundleResult, BundleSettings
 from datagen.slam.commands import commands_of
 from datagen.slam.filter.dp_slam import FilterSettings, Trajectory
 from datagen.slam.keyframes import keyframe_pairs
-from datagen.slam.loops.places import Revisit
+from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives.recording import Commands, Drive

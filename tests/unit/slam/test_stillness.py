@@ -13,7 +13,7 @@ from datagen.slam.odometry.stillness import (
     following_frames,
     put_elsewhere,
     reversing_runs,
-    small_pictures,
+    small_images,
     standing_frames,
 )
 from lanenet.data.drives.recording import Commands, Drive
@@ -103,8 +103,8 @@ def _drive(place_px, noise=0.3, **changes) -> Drive:
     return made_up_drive(images, **changes)
 
 
-def test_small_pictures_are_means_over_patches():
-    small = small_pictures(_drive(np.arange(5.0), noise=0.0))
+def test_small_images_are_means_over_patches():
+    small = small_images(_drive(np.arange(5.0), noise=0.0))
     assert small.shape == (5, SMALL_HEIGHT, SMALL_WIDTH)
     # To a gray level, but where a patch straddles two blobs.
     assert np.median(np.abs(small - pictures(np.arange(5.0), noise=0.0))) < 1.0
@@ -119,8 +119,7 @@ def test_repeated_frames_and_stops_are_left_out_and_nothing_breaks(step_px):
     twice = [30, 31, 150]
     for k in twice:
         drive.images.images[k] = drive.images.images[k - 1]
-    notes: list[str] = []
-    kept = following_frames(drive, notes)
+    kept, notes = following_frames(drive)
     left_out = np.setdiff1d(drive.frames, kept.frames)
     assert set(twice) <= set(left_out) and set(range(82, 106)) <= set(left_out)
     assert set(left_out) - set(twice) <= set(range(76, 116))
@@ -135,27 +134,25 @@ def test_repeated_frames_and_stops_are_left_out_and_nothing_breaks(step_px):
 
 
 def test_a_drive_that_never_stops_is_kept_as_it_is():
-    notes: list[str] = []
     drive = _drive(np.arange(100) * 0.8)
-    kept = following_frames(drive, notes)
+    kept, notes = following_frames(drive)
     np.testing.assert_array_equal(kept.frames, drive.frames)
     assert notes == [] and not kept.breaks.any()
 
 
 def test_a_break_in_the_pictures_is_told_with_its_frame():
-    notes: list[str] = []
     breaks = np.zeros(160, dtype=bool)
     breaks[40] = True
     place = np.concatenate([np.arange(80) * 0.5, 300.0 + np.arange(80) * 0.5])
-    kept = following_frames(_drive(place, breaks=breaks, frames=np.arange(160) + 1000), notes)
+    kept, notes = following_frames(_drive(place, breaks=breaks, frames=np.arange(160) + 1000))
     # The recording's own break stays.
     assert np.flatnonzero(kept.breaks).tolist() == [40, 80]
-    assert notes == ["1 breaks in the pictures, the first before frame 1080"]
+    assert notes == ["1 breaks in the images, the first before frame 1080"]
 
 
 def test_a_break_after_a_stop_is_not_left_out_with_it():
     place = np.concatenate([np.arange(80) * 0.8, np.full(30, 63.2), 300.0 + np.arange(80) * 0.8])
-    kept = following_frames(_drive(place), [])
+    kept, _ = following_frames(_drive(place))
     assert kept.frames[kept.breaks].tolist() == [110]
     assert len(kept) < 165
 
@@ -168,12 +165,11 @@ def test_a_car_that_backs_up_makes_a_break_and_its_frames_are_left_out(name):
     told = np.full(len(place), 0.4)
     told[80:100] = -0.3
     told[[0, 50]] = np.nan
-    notes: list[str] = []
     numbers = np.arange(len(place)) + 1000
-    kept = following_frames(_drive(place, commands=Commands(**{name: told}), frames=numbers), notes)
+    kept, notes = following_frames(_drive(place, commands=Commands(**{name: told}), frames=numbers))
     assert np.setdiff1d(numbers, kept.frames).tolist() == list(range(1080, 1100))
     assert kept.frames[kept.breaks].tolist() == [1100]
-    assert notes == ["the car was told to reverse in frames 1080-1099: left out"]
+    assert notes == ["the car was commanded to reverse in frames 1080-1099: left out"]
 
 
 def test_a_stop_beside_backing_up_is_told_apart_and_keeps_the_break():
@@ -183,10 +179,10 @@ def test_a_stop_beside_backing_up_is_told_apart_and_keeps_the_break():
     )
     speed = np.full(len(place), 40.0)
     speed[80:100], speed[100:130] = -40.0, 0.0
-    drive, notes = _drive(place, commands=Commands(speed_cm_s=speed)), []
-    kept = following_frames(drive, notes)
+    drive = _drive(place, commands=Commands(speed_cm_s=speed))
+    kept, notes = following_frames(drive)
     assert kept.breaks.sum() == 1 and 100 <= kept.frames[kept.breaks][0] <= 130
-    assert notes[0] == "the car was told to reverse in frames 80-99: left out"
+    assert notes[0] == "the car was commanded to reverse in frames 80-99: left out"
     same = len(place) - len(kept) - 20
     assert 20 < same <= 30
     assert notes[1:] == [f"{same} frames show the same as the one before, and are left out"]
@@ -211,5 +207,5 @@ def test_what_may_not_be_reversing_is_not_taken_for_it():
 
 def test_a_car_that_only_backs_up_is_an_error():
     drive = _drive(np.arange(60) * 0.8, commands=Commands(speed_cm_s=np.full(60, -40.0)))
-    with pytest.raises(TrackingLostError, match="told to reverse in frames 0-59"):
-        following_frames(drive, [])
+    with pytest.raises(TrackingLostError, match="reverse in frames 0-59"):
+        following_frames(drive)

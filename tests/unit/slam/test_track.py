@@ -12,8 +12,8 @@ from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
 from datagen.slam.commands import CommandedMotion, commands_of, delayed, fit_steering
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.odometry.image_pairs import OdometrySettings, Pictures
-from datagen.slam.odometry.odometry import Odometry, usual_way
+from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.odometry import Odometry, typical_step
 from datagen.slam.settings import MotionSettings, SlamSettings
 from datagen.slam.track import motion_about, track
 from datagen.slam.view import RoadView, SegmentView
@@ -174,11 +174,11 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     camera = fisheye()
     edges = pixels(road, camera)
     rng = np.random.default_rng(0)
-    pictures = Pictures(edges, camera, OdometrySettings(), rng)
+    pictures = ImagePairs(edges, camera, OdometrySettings(), rng)
     blank = made_up_drive([np.zeros((camera.height, camera.width, 3), np.uint8)] * n)
     everywhere = np.ones((camera.height, camera.width), np.uint8)
     road_view = RoadView(edges, everywhere, RangeSettings())
-    usual = usual_way(pictures, commands.distance_cm, speed_known, HEIGHT_CM)
+    usual = typical_step(pictures, commands.distance_cm, speed_known)
     seen = SegmentView(blank, camera, commands, road_view, road_view.scans(camera), pictures, usual)
     settings = SlamSettings(filter=FilterSettings(particles=200))
     tracked = track(seen, settings, rng, lambda done, total: calls.append((done, total)))

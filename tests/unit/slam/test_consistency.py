@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.mutual import separate_places, with_supported, without_contradicted
-from datagen.slam.loops.places import Revisit, RevisitSettings, consistent_revisits
+from datagen.slam.loops.consistency import (
+    consistent_revisits,
+    count_places,
+    with_supported,
+    without_contradicted,
+)
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from lanenet.geometry.poses import compose, relative_pose
 
 HEIGHT_CM, LAP = 15.0, 90
@@ -85,9 +90,9 @@ def test_moving_the_world_changes_nothing(slipped):
 
 
 def test_neighbouring_frames_are_one_place():
-    assert separate_places(np.array([100.0, 96.0, 104.0, 130.0]), 15.0) == 1
-    assert separate_places(np.array([100.0, 96.0, 104.0, 145.0, 400.0]), 15.0) == 3
-    assert separate_places(np.empty(0), 15.0) == 0
+    assert count_places(np.array([100.0, 96.0, 104.0, 130.0]), 15.0) == 1
+    assert count_places(np.array([100.0, 96.0, 104.0, 145.0, 400.0]), 15.0) == 3
+    assert count_places(np.empty(0), 15.0) == 0
 
 
 def _along(pose: np.ndarray, ahead_cm: float) -> np.ndarray:

@@ -8,12 +8,12 @@ import pytest
 from picture_road import made_up_drive
 from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
-from datagen.slam.loops.places import (
+from datagen.slam.loops.revisits import (
     RevisitSettings,
-    alike,
     diagonal_mean,
     match_places,
     propose_revisits,
+    similarities,
     thumbnails,
 )
 from datagen.slam.odometry.scans import Scans, pack_scans
@@ -109,7 +109,7 @@ def test_revisits_are_those_of_all_pairs_at_once(frames):
     thumbs /= np.linalg.norm(thumbs, axis=1, keepdims=True)
     poses = np.cumsum(rng.normal(size=(frames, 3)), axis=0)
     bounds = RevisitSettings(min_similarity=0.01, min_gap_heights=1.0, max_pairs=10 * frames)
-    whole = diagonal_mean(alike(thumbs, thumbs))
+    whole = diagonal_mean(similarities(thumbs, thumbs))
     path = path_lengths(poses)
     whole[path[None, :] - path[:, None] < HEIGHT_CM] = -1.0
     before, after = whole.argmax(axis=0), whole.argmax(axis=1)

@@ -1,0 +1,251 @@
+"""Revisits: frames that show the same place, and the relative pose between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from datagen.slam.filter.field import DirectionField
+from datagen.slam.odometry.scans import Scan, Scans, thin_scan
+from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_images
+from lanenet.config import Settings
+from lanenet.data.drives import Drive
+from lanenet.geometry.frames import map_from_car, map_from_car_directions
+from lanenet.geometry.poses import path_lengths, relative_pose
+
+#: Blur, in pixels of a small image, that is taken off for contrast, and the least length of what is left,
+#: gray levels: less than a tenth of a gray level per pixel is rounding, by which blank images would be alike.
+_CONTRAST_PX, _LEAST_CONTRAST = 6.0, 2.0
+#: Sideways shifts, in pixels of a small image, that are tried, since the car comes back with another heading:
+#: a pixel is about 5 degrees.
+_SHIFTS = (-2, -1, 0, 1, 2)
+#: Frames to either side over which the similarity of a pair is averaged.
+_DIAGONAL = 4
+#: Frames whose similarity to all before them is held at once: that of all pairs of a long drive is too much.
+_BLOCK = 256
+#: Frames to either side that make the map of the earlier visit and the edges of the later one: the first must
+#: reach as far as the second may be off. Edge points per frame of the latter, and the fewest of them all.
+_MAP_FRAMES, _QUERY_FRAMES, _QUERY_POINTS, _LEAST_POINTS = 20, 4, 60, 20
+#: The search: cells of the field in camera heights, coarse to fine; the grid's spacing in camera heights and
+#: degrees; the sigma of the samples about its best heading, degrees, by how much it shrinks, and their
+#: number. Chosen: the spacing is about a cell of the coarsest field.
+_CELLS_HEIGHTS, _GRID_HEIGHTS, _GRID_DEG = (0.12, 0.06, 0.04), 0.15, 3.0
+_SAMPLE_DEG, _SHRINK, _SAMPLES = 2.0, 0.35, 600
+#: Cells along each side of the field; frames after which it fades: never.
+_FIELD_SIZE, _NO_FADING = 512, 1e9
+#: The field is an average over frames that do not quite agree: this brings it to about one where they do.
+_FIELD_GAIN = 8.0
+#: Weight of the prior that similar images were taken at about the same place. Weak: it only settles ties
+#: between dashes.
+_PLACE_PRIOR = 0.1
+
+
+class RevisitSettings(Settings):
+    """When two frames count as one place. Lengths are in camera heights.
+
+    Values were chosen on ``donkey_circuit``, ``usi_mat`` and ``garage_tape`` and on simulated drives
+    (docs/mapping.md).
+
+    Attributes:
+        min_gap_heights: Least path between the two visits: less than the shortest lap of a track.
+        min_similarity: Correlation of the thumbnails, averaged over a few frames.
+        max_drift_rad: Heading that the open loop may miss in one lap. Revisits that no common drift explains
+            are not believed: rooms repeat, and one false revisit bends a whole map.
+        drift_tolerance_rad: What a revisit may miss of the common drift, one lap later.
+        min_revisits: Fewer revisits than this are not believed.
+        min_match: Matched share of the edges once aligned.
+        max_pairs: Pairs to verify at most, spread over the drive.
+        pair_heights: A long drive may get more than these: one per so much path.
+        along_heights: Largest offset along the road between the two visits. Images are similar only within a
+            fraction of a camera height, and the next dash of a dashed line is not much further.
+        sideways_heights: Largest offset across the road: about a lane.
+        search_rad: Largest difference of heading.
+    """
+
+    min_gap_heights: float = Field(default=20.0, gt=0.0)
+    min_similarity: float = Field(default=0.6, gt=0.0, lt=1.0)
+    max_drift_rad: float = Field(default=5.0, gt=0.0)
+    drift_tolerance_rad: float = Field(default=0.45, gt=0.0)
+    min_revisits: int = Field(default=3, ge=1)
+    min_match: float = Field(default=0.35, gt=0.0, lt=1.0)
+    max_pairs: int = Field(default=60, ge=1)
+    pair_heights: float = Field(default=4.0, gt=0.0)
+    along_heights: float = Field(default=0.9, gt=0.0)
+    sideways_heights: float = Field(default=2.0, gt=0.0)
+    search_rad: float = Field(default=0.45, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Revisit:
+    """Frame ``later`` shows the place of frame ``earlier``.
+
+    Attributes:
+        relative: Pose of the later frame in the rear-axle frame of the earlier (x ahead, y left).
+        match: Matched share of the later frame's edges.
+        turns: Whole turns to the left between the two.
+    """
+
+    earlier: int
+    later: int
+    relative: Float[np.ndarray, "3"]
+    match: float
+    turns: int = 0
+
+
+def thumbnails(drive: Drive) -> Float[np.ndarray, "n d"]:
+    """Return a small, contrast-normalised image of each frame as a unit vector.
+
+    The whole frame counts, also what is above the road: walls and people tell places apart that have the same
+    markings.
+    """
+    rows = np.empty((len(drive), SMALL_HEIGHT * SMALL_WIDTH), np.float32)
+    for k, small in enumerate(small_images(drive)):
+        flat = small - cv2.GaussianBlur(small, (0, 0), _CONTRAST_PX)
+        rows[k] = flat.ravel() / max(float(np.linalg.norm(flat)), _LEAST_CONTRAST)
+    return rows
+
+
+def propose_revisits(
+    thumbs: Float[np.ndarray, "n d"],
+    poses: Float[np.ndarray, "n 3"],
+    camera_height_cm: float,
+    settings: RevisitSettings,
+) -> list[tuple[int, int]]:
+    """Propose pairs (earlier, later) of frames that are similar and have enough path between them.
+
+    Args:
+        thumbs: See :func:`thumbnails`.
+        poses: Open-loop trajectory, heading unwrapped.
+        camera_height_cm: Sets the scale.
+        settings: Bounds.
+    """
+    n, path = len(thumbs), path_lengths(poses)
+    before, after = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    score, score_after = np.full(n, -1.0, np.float32), np.full(n, -1.0, np.float32)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        # Averaging reaches beyond the block; frames after it are no earlier visits.
+        first, last = max(start - _DIAGONAL, 0), min(stop + _DIAGONAL, n)
+        wider = diagonal_mean(similarities(thumbs[:last], thumbs[first:last]))
+        similarity = wider[:stop, start - first : stop - first]
+        apart = path[start:stop] - path[:stop, None]
+        similarity[apart < settings.min_gap_heights * camera_height_cm] = -1.0
+        before[start:stop], score[start:stop] = similarity.argmax(axis=0), similarity.max(axis=0)
+        best_after = similarity.max(axis=1)
+        higher = np.flatnonzero(best_after > score_after[:stop])
+        score_after[higher], after[higher] = best_after[higher], start + similarity[higher].argmax(axis=1)
+    pairs = [
+        (float(score[later]), int(before[later]), later)
+        for later in range(n)
+        if score[later] >= settings.min_similarity and later == after[before[later]]
+    ]
+    most = max(settings.max_pairs, path[-1] / (settings.pair_heights * camera_height_cm))
+    return best_of_each(pairs, max(1.0, n / most))
+
+
+def best_of_each(pairs: list[tuple[float, int, int]], frames: float) -> list[tuple[int, int]]:
+    """Keep the most similar pair of every so many frames, so that no corner takes all the pairs.
+
+    Args:
+        pairs: Similarity, earlier frame, later frame.
+        frames: Number of frames.
+    """
+    best: dict[int, tuple[float, int, int]] = {}
+    for pair in pairs:
+        key = int(pair[2] / frames)
+        best[key] = max(best.get(key, pair), pair)
+    return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda pair: pair[2])]
+
+
+def similarities(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
+    """Correlation of all thumbnails with all others, at the sideways shift at which it is highest."""
+    images = b.reshape(len(b), SMALL_HEIGHT, SMALL_WIDTH)
+    similarity = np.full((len(a), len(b)), -1.0, np.float32)
+    for shift in _SHIFTS:
+        shifted = np.roll(images, shift, axis=2).reshape(len(b), -1)
+        np.maximum(similarity, a @ shifted.T, out=similarity)
+    return similarity
+
+
+def diagonal_mean(similarity: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    """Average over neighbouring frames of both visits: a pair counts when its neighbours agree."""
+    kernel = np.eye(2 * _DIAGONAL + 1, dtype=np.float32)
+    return np.asarray(cv2.filter2D(similarity, -1, kernel / len(kernel), borderType=cv2.BORDER_REPLICATE))
+
+
+def match_places(
+    scans: Scans,
+    poses: Float[np.ndarray, "n 3"],
+    pair: tuple[int, int],
+    camera_height_cm: float,
+    wheelbase_cm: float,
+    settings: RevisitSettings,
+    rng: np.random.Generator,
+) -> Revisit | None:
+    """Align the later visit's edges with a small map of the earlier one.
+
+    A search over a grid of offsets and headings on a coarse field, then two rounds of samples on finer ones.
+
+    Returns:
+        The revisit, or None where too few edges match.
+    """
+    earlier, later = pair
+    query = _submap(scans, poses, _around(later, _QUERY_FRAMES, len(scans)), later, wheelbase_cm, rng)
+    if len(query.weights) < _LEAST_POINTS:
+        return None
+    near = _around(earlier, _MAP_FRAMES, len(scans))
+    step = _GRID_HEIGHTS * camera_height_cm
+    reach = np.array([settings.along_heights, settings.sideways_heights]) * camera_height_cm
+    along, sideways = (np.arange(-r, r + 1e-9, step) for r in reach)
+    angles = np.arange(-settings.search_rad, settings.search_rad + 1e-9, np.deg2rad(_GRID_DEG))
+    tried = np.stack(np.meshgrid(along, sideways, angles, indexing="ij"), axis=-1).reshape(-1, 3)
+    spread = np.array([step, step, np.deg2rad(_SAMPLE_DEG)])
+    best, share = np.zeros(3), 0.0
+    for cell_heights in _CELLS_HEIGHTS:
+        field = DirectionField.empty(cell_heights * camera_height_cm, _FIELD_SIZE, _NO_FADING)
+        for k in near:
+            scan, pose = scans.scan(k), relative_pose(poses[earlier], poses[k])
+            field.insert(
+                map_from_car(scan.points_cm, pose, wheelbase_cm),
+                map_from_car_directions(scan.normals, pose[2]),
+                scan.weights / len(near),
+                0,
+            )
+        field.vectors[...] *= _FIELD_GAIN
+        scores = field.score(tried, wheelbase_cm, query, 0) / query.weights.sum()
+        chosen = int(np.argmax(scores - _PLACE_PRIOR * np.sum((tried[:, :2] / reach) ** 2, axis=1)))
+        best, share = tried[chosen], float(scores[chosen])
+        tried = best + rng.normal(size=(_SAMPLES, 3)) * spread
+        tried[0] = best
+        spread = spread * _SHRINK
+    return Revisit(earlier, later, best, share) if share >= settings.min_match else None
+
+
+def _around(frame: int, frames: int, count: int) -> range:
+    """Frames within so many of one."""
+    return range(max(0, frame - frames), min(count, frame + frames + 1))
+
+
+def _submap(
+    scans: Scans,
+    poses: Float[np.ndarray, "n 3"],
+    frames: range,
+    reference: int,
+    wheelbase_cm: float,
+    rng: np.random.Generator,
+) -> Scan:
+    """Edges of several frames as points of the reference frame's car frame."""
+    parts = []
+    for k in frames:
+        points, normals, weights = thin_scan(scans.scan(k), _QUERY_POINTS, rng)
+        pose = relative_pose(poses[reference], poses[k])
+        ahead_left = map_from_car(points, pose, wheelbase_cm)
+        directions = map_from_car_directions(normals, pose[2])
+        # Back to x right, y ahead of the front axle.
+        car = np.stack([-ahead_left[:, 1], ahead_left[:, 0] - wheelbase_cm], axis=1)
+        parts.append((car, np.stack([-directions[:, 1], directions[:, 0]], axis=1), weights))
+    return Scan(*(np.concatenate(column) for column in zip(*parts, strict=True)))
