@@ -14,8 +14,8 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.camera.self_calibration import SIGMA_FACTOR
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.loops.pose_graph import loop_pairs, neighbouring_laps, revisit_residuals
+from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
