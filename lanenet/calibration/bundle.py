@@ -20,15 +20,40 @@ from lanenet.calibration.lens import (
 )
 from lanenet.geometry.camera import CameraModel
 
-#: Angle between the axis and the picture's corner, [deg], from which a search starts.
+#: Angles between the axis and the image corner at which a search starts, [deg]. Chosen: from telephoto to the
+#: widest lens of each model, in steps of 20 to 50 %, so that some start is near every lens.
 _START_ANGLES_DEG: dict[CameraModel, tuple[float, ...]] = {
     "fisheye": (15.0, 25.0, 35.0, 50.0, 65.0, 80.0, 95.0, 110.0, 130.0),
     "pinhole": (12.0, 20.0, 28.0, 36.0, 45.0, 54.0, 63.0),
 }
+#: Starts that are refined; chosen: neighbours of the best one, since the ranking is rough.
 _STARTS_KEPT = 3
-_ROUGH_SCALE_PX, _FINE_SCALE_PX = 3.0, 0.5
-#: What the solver may move at first: fx, fy, k1, k2.
+#: Numbers of the lens that the rough search moves: fx, fy, k1, k2.
 _ROUGH = np.array([True, True, False, False, True, True])
+#: Largest correlation between the residuals of neighbouring corners that is believed. Chosen: at 0.8 a corner
+#: still counts for 1/81 of one; without a bound, a bent board would leave no evidence at all.
+_MAX_CORRELATION = 0.8
+
+
+@dataclass(frozen=True)
+class Search:
+    """When residuals count less than quadratically, and when the solver stops.
+
+    Attributes:
+        scale_px: Scale of the soft L1 loss.
+        max_evaluations: Most evaluations.
+        tolerance: Least share by which a step has to lower the cost.
+    """
+
+    scale_px: float
+    max_evaluations: int
+    tolerance: float
+
+
+#: From a start that may be far off: corners count up to a few pixels, and a few digits are enough.
+ROUGH_SEARCH = Search(3.0, 25, 1e-4)
+#: Close to the solution: half a pixel is an error of a corner finder, more is an outlier.
+FINE_SEARCH = Search(0.5, 60, 1e-8)
 
 
 @dataclass(frozen=True)
@@ -76,10 +101,6 @@ class LensFit:
         return float(independent * misfit + np.count_nonzero(self.free) * np.log(max(independent, 2.0)))
 
 
-#: Residuals of one view's neighbouring corners are never taken for more alike than this.
-_MAX_CORRELATION = 0.8
-
-
 def neighbour_correlation(views: Sequence[BoardView], errors_px: Sequence[Float[np.ndarray, "_ 2"]]) -> float:
     """Correlation of the residuals of neighbouring corners, between 0 and the largest that is believed."""
     product = square = 0.0
@@ -94,7 +115,7 @@ def neighbour_correlation(views: Sequence[BoardView], errors_px: Sequence[Float[
 
 
 def free_numbers(model: CameraModel, distortion: Sequence[int]) -> Bool[np.ndarray, "p"]:
-    """Return the mask of a fit that moves fx, fy, cx, cy and these entries of D."""
+    """Return the mask of a fit of fx, fy, cx, cy and these entries of D."""
     free = np.zeros(N_INTRINSIC + N_DISTORTION[model], bool)
     free[:N_INTRINSIC] = True
     free[[N_INTRINSIC + k for k in distortion]] = True
@@ -102,7 +123,7 @@ def free_numbers(model: CameraModel, distortion: Sequence[int]) -> Bool[np.ndarr
 
 
 def start_fit(model: CameraModel, views: Sequence[BoardView]) -> LensFit | None:
-    """Find a lens from nothing: several focal lengths are tried, the best ones refined.
+    """Find a lens without a first guess: try several focal lengths and refine the best.
 
     For a fisheye each start is an equidistant lens (radius = f * angle), up to 260 degrees of view, for a
     pinhole one without distortion.
@@ -130,13 +151,11 @@ def start_fit(model: CameraModel, views: Sequence[BoardView]) -> LensFit | None:
     rough[: len(_ROUGH)] = _ROUGH
     best: LensFit | None = None
     for _, lens, poses in starts[:_STARTS_KEPT]:
-        fit = refine(model, lens, poses, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4)
-        # Poses that fell into the wrong one of a plane's two attitudes get a second chance.
+        fit = refine(model, lens, poses, views, rough, ROUGH_SEARCH)
+        # A plane has two poses that look alike; a board in the wrong one gets a second chance.
         again = poses_of_views(model, fit.lens, views)
         if again is not None:
-            fit = refine(
-                model, fit.lens, again, views, rough, _ROUGH_SCALE_PX, max_evaluations=25, tolerance=1e-4
-            )
+            fit = refine(model, fit.lens, again, views, rough, ROUGH_SEARCH)
         if best is None or fit.robust_cost < best.robust_cost:
             best = fit
     return best
@@ -162,7 +181,7 @@ def view_residuals(
     moved = [
         moved_points(pose, plane_points(view.points_cm))[0] for pose, view in zip(poses, views, strict=True)
     ]
-    # All views in one call: many small ones cost more than their arithmetic.
+    # One call for all views: the call costs more than the arithmetic.
     pixels = project_points(model, lens, np.concatenate(moved))[0]
     ends = np.cumsum([len(points) for points in moved])[:-1]
     return [view.corners_px - part for view, part in zip(views, np.split(pixels, ends), strict=True)]
@@ -174,9 +193,7 @@ def refine(
     poses: Float[np.ndarray, "v 6"],
     views: Sequence[BoardView],
     free: Bool[np.ndarray, "p"],
-    scale_px: float = _FINE_SCALE_PX,
-    max_evaluations: int = 60,
-    tolerance: float = 1e-8,
+    search: Search = FINE_SEARCH,
 ) -> LensFit:
     """Fit lens and poses to all corners.
 
@@ -186,9 +203,7 @@ def refine(
         poses: Where the boards start.
         views: Views of one camera.
         free: Which numbers of the lens may move.
-        scale_px: Residuals beyond this count less than quadratically (soft L1).
-        max_evaluations: The solver stops after this many.
-        tolerance: The solver stops when a step improves the cost by less than this share.
+        search: Loss and stopping rule.
 
     Returns:
         The fit, with standard deviations from its Jacobian and the spread of its residuals.
@@ -226,9 +241,9 @@ def refine(
         jacobian,
         x_scale="jac",
         loss="soft_l1",
-        f_scale=scale_px,
-        max_nfev=max_evaluations,
-        ftol=tolerance,
+        f_scale=search.scale_px,
+        max_nfev=search.max_evaluations,
+        ftol=search.tolerance,
     )
     full, moved = unpack(result.x)
     errors = view_residuals(model, full, moved, views)
@@ -249,8 +264,8 @@ def _lens_sigma(
     free: Bool[np.ndarray, "p"],
     n_free: int,
 ) -> Float[np.ndarray, "p"]:
-    """Standard deviations of the lens, the poses being unknown too; infinite where nothing decides."""
-    # A spread below a twentieth of a pixel is luck or a drawn picture, not knowledge.
+    """Standard deviations of the lens while the poses are unknown too; infinite where undetermined."""
+    # Residuals below a twentieth of a pixel come from luck or a rendered board.
     spread = max(float(np.sqrt(np.sum(errors_px**2) / max(len(errors_px) - jacobian.shape[1], 1))), 0.05)
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     _, singular, rows = np.linalg.svd(jacobian / scale, full_matrices=False)

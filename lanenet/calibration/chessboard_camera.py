@@ -1,4 +1,4 @@
-"""A camera's lens from views of a chessboard: views are judged, the model chosen, nonsense refused."""
+"""A camera's lens from views of a chessboard: check views, choose the model, refuse what no lens is."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ from lanenet.geometry.camera import Camera, Mounting
 
 ModelChoice = Literal["fisheye", "pinhole", "auto"]
 
+#: Largest sigma of the focal length as a share of it, and of the principal point as a share of the image.
+#: Chosen: 2 % of focal length is 6 mm at 30 cm, as exact as six labels are on a real drive.
 _MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.02, 0.03
+#: Least angle between the most different boards. Chosen; 20 to 45 degrees are recommended to users.
 _MIN_NORMAL_SPREAD_DEG = 10.0
 #: Largest believable RMS as a share of the image's diagonal, but never below half a pixel.
 _MAX_RMS, _LEAST_LIMIT_PX = 0.0015, 0.5
@@ -42,7 +45,7 @@ _ASK = "is the board flat, its size right, the focus fixed, and are all views of
 
 @dataclass(frozen=True)
 class ChessboardCalibration:
-    """A calibrated lens and what speaks for it.
+    """A calibrated lens with its evidence.
 
     Attributes:
         camera: The camera; its mounting is the nominal one that was passed in.

@@ -2,9 +2,8 @@
 
 The vector is fx, fy, cx, cy, then D in OpenCV's order. Projections equal those of
 :class:`lanenet.geometry.camera.Camera` (checked in ``tests/unit/calibration/test_lens_and_pose.py``), except
-that nothing is cut off at the largest angle: a solver on its way needs a smooth function.
-
-Where a flat pattern lies before the lens: from rays at once, for rays in any direction.
+that nothing is cut off at the largest angle, since a solver needs a smooth function. A pose is a rotation
+vector and a translation; :func:`pose_of_plane` finds one directly from rays in any direction.
 """
 
 from __future__ import annotations
@@ -19,10 +18,12 @@ from lanenet.geometry.lenses import distort_pinhole, fisheye_radius, fisheye_slo
 #: Numbers in D.
 N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}
 N_INTRINSIC = 4
-#: Where a lens has no mounting yet.
+#: Mounting and car of a lens that has none yet; those of a usual 1:10 car, as in the synthetic drives.
 NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM = 20.0, 26.0
-# Closer to the axis than this, the azimuth of a ray is noise.
+#: Closer to the axis than this, the azimuth of a ray is rounding error.
 _NEAR_AXIS = 1e-9
+#: A homography has eight numbers, a point gives two.
+_MIN_POINTS = 4
 
 
 def camera_of_lens(
@@ -110,7 +111,7 @@ def _pinhole(
     points: Float[np.ndarray, "n 3"], D: Float[np.ndarray, "5"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 5"]]:
     k1, k2, p1, p2, k3 = D
-    # A point at or behind the lens has no picture; a far one keeps the solver's function finite.
+    # A point at or behind the lens has no image; a least depth keeps the solver's function finite.
     depth = np.maximum(points[:, 2], 1e-3)
     x, y = points[:, 0] / depth, points[:, 1] / depth
     r2 = x * x + y * y
@@ -137,9 +138,6 @@ def _pinhole(
         axis=1,
     )
     return flat, by_flat @ flat_by_point, by_distortion
-
-
-_MIN_POINTS = 4
 
 
 def rotation_from_vector(vector_rad: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -1,4 +1,4 @@
-"""Which lens model, how many of its coefficients, which views: by evidence, never an impossible lens."""
+"""Which lens model, how many of its coefficients, which views: by evidence; never an impossible lens."""
 
 from __future__ import annotations
 
@@ -23,19 +23,21 @@ from lanenet.calibration.views import MIN_VIEWS
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel
 
-#: Entries of D that are fitted, in steps: a lens gets the further ones only if the views support them.
+#: Entries of D that are fitted, step by step; a lens gets the later ones only if the views support them.
 _STEPS: dict[CameraModel, tuple[tuple[int, ...], ...]] = {
     "fisheye": ((0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)),
     "pinhole": ((0,), (0, 1), (0, 1, 2, 3), (0, 1, 2, 3, 4)),
 }
-#: A view is dropped if its RMS is beyond this multiple of the median view's, and beyond the floor.
+#: A view is dropped if its RMS exceeds this multiple of the median view's, and the floor. Chosen: more than
+#: three sigma, and above what a sharp photo of a flat board leaves.
 _BAD_VIEW_RATIO, _BAD_VIEW_FLOOR_PX = 3.5, 0.3
-#: A model whose rough fit costs this many times the other's is not refined.
+#: A model whose rough fit costs this many times the other's is not refined. Chosen, with a wide margin.
 _HOPELESS_RATIO = 30.0
-#: In units of the Bayesian information criterion: 20 is overwhelming evidence.
+#: Added to the Bayesian information criterion of a lens that folds back inside the image. Kass and Raftery
+#: 1995 call a difference of 10 very strong; chosen: twice that.
 _FOLD_COST = 20.0
-#: A model asked for is refused if the other one's RMS is smaller by this factor and by this much; it is taken
-#: with a note from the lower factor on.
+#: A requested model is refused if the other one's RMS is smaller by this factor and by this much, and noted
+#: from the lower factor on. Chosen: half again as large an error shows in cm, 15 % hardly.
 _FAR_BETTER_RATIO, _FAR_BETTER_PX, _BETTER_RATIO = 1.5, 0.1, 1.15
 
 
@@ -105,14 +107,14 @@ def judged_fits(
                 current[name] = _best_step(name, replace(fit, poses=poses), subset)
         current = {k: f for k, f in current.items() if _impossible(f, subset) is None} or current
         if not current:
-            # Only views that the lens cannot see at all end here; the first fits speak for the rest.
+            # None of the lenses can see these views at all.
             break
         best = best_supported(list(current.values()), subset)
         chosen = next(name for name, fit in current.items() if fit is best)
         good = _consistent(current[chosen], subset, _BAD_VIEW_FLOOR_PX)
         if len(good) == len(used) or len(good) < MIN_VIEWS:
             return chosen, subset, current
-        # The worst quarter at a time: a bad view spoils the residuals of good ones.
+        # At most a quarter at a time: a bad view also raises the residuals of good ones.
         rms = current[chosen].view_rms_px
         bad = sorted(set(range(len(used))) - set(good), key=lambda k: -rms[k])
         gone = set(bad[: max(1, len(used) // 4)])

@@ -1,9 +1,7 @@
-"""Which views of a chessboard can take part in a calibration at all.
+"""Which views of a chessboard can take part in a calibration: complete, alike in size, distinct, of one lens.
 
-Whether views of a board are of one lens: each view gets a focal length of its own, and they are compared.
-
-Two lenses whose focal lengths differ by a few per cent can be bent into one that misses the corners by a
-fraction of a pixel. What gives them away is that the views ask for two focal lengths and nothing in between.
+Two lenses whose focal lengths differ by a few per cent fit one distorted lens to a fraction of a pixel. They
+are told apart by a focal length per view: the views form two groups with nothing in between.
 """
 
 from __future__ import annotations
@@ -20,11 +18,35 @@ from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import moved_points, plane_points, project_points
 from lanenet.errors import CalibrationError
 
+#: Fewest views. Zhang 2000 needs 3 for the focal lengths and centre alone; chosen: two more for the
+#: distortion.
 MIN_VIEWS = 5
-#: Two views whose corners differ by less than this share of the diagonal are one view.
+#: Views whose corners differ by less than this share of the diagonal are one view. Chosen.
 _SAME_VIEW = 0.01
-#: A grid read the other way round that is shorter by this share is the right one.
+#: The corners are in the wrong order if the other order gives a grid shorter by this factor. For a 9 x 6
+#: board seen from straight ahead the right order is shorter by 0.35.
 _TURNED_SHARE = 0.7
+#: Sigma of a view's focal length against the common one, as a share: keeps a frontal board, which does not
+#: determine it, finite. Views with a larger posterior sigma than the second number take no part. Chosen.
+_PRIOR, _UNKNOWN = 0.15, 0.06
+#: Most Gauss-Newton steps, and the change of log focal length at which they end; chosen: a hundredth of
+#: ``_BREATHING``.
+_STEPS, _STEP_TOLERANCE = 8, 1e-4
+#: Smallest believable error of a corner finder.
+_LEAST_SIGMA_PX = 0.05
+#: Each group has at least this many views: a single odd view is a bad view, not a lens. Few views that know
+#: their focal length fall into two groups by chance.
+_MIN_GROUP, _MIN_KNOWN = 2, 7
+#: Sigma by which a focal length changes from view to view: focus, warmth, a board that is not quite flat.
+_BREATHING = 0.01
+#: Smallest difference that counts, and the evidence it needs. Measured over subsets of real and rendered
+#: views: below 18 for one lens, above 25 for two rendered ones.
+_MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 18.0
+#: Twice the log likelihood ratio per view that the best cut through normal numbers gains.
+_BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
+#: A view that misses its corners by this multiple of the median view's, even with its own focal length, is
+#: bad.
+_BAD_VIEW_RATIO = 3.5
 
 
 def usable_views(views: Sequence[BoardView], dropped: dict[str, str]) -> list[BoardView]:
@@ -119,25 +141,6 @@ def check_count(views: Sequence[BoardView], dropped: dict[str, str]) -> None:
     )
 
 
-#: A view's own focal length is held to the common one as loosely as this, so that a board seen from straight
-#: ahead, which says nothing about it, stays finite; views known no better than the limit take no part.
-_PRIOR, _UNKNOWN = 0.15, 0.06
-_STEPS, _STEP_TOLERANCE = 8, 1e-4
-_LEAST_SIGMA_PX = 0.05
-#: Each group has at least this many views: a single odd view is a bad view, not a lens. Few views that know
-#: their focal length fall into two groups by chance.
-_MIN_GROUP, _MIN_KNOWN = 2, 7
-#: A focal length may breathe by this much from view to view: focus, warmth, a board that is not quite flat.
-_BREATHING = 0.01
-#: Smallest difference that counts, and the evidence that is needed for it. Over subsets of the real and drawn
-#: views of one lens the evidence stayed below 18, for two lenses of drawn views it was above 25.
-_MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 18.0
-#: Twice the log likelihood ratio per view that the best cut through normal numbers gains.
-_BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
-#: After its own focal length a view that misses its corners by this multiple of the others is simply bad.
-_BAD_VIEW_RATIO = 3.5
-
-
 @dataclass(frozen=True)
 class FocalScales:
     """Focal length of each view, relative to the common one.
@@ -175,7 +178,7 @@ class LensSplit:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the views are of two lenses beyond doubt."""
+        """Whether the evidence for two lenses is overwhelming."""
         return self.difference > _MIN_DIFFERENCE and self.evidence > _MIN_EVIDENCE
 
 
@@ -272,15 +275,15 @@ def best_split(scales: FocalScales) -> LensSplit | None:
     apart, difference, cut = best
     if cut == 0:
         return None
-    # What is left inside the groups, beyond noise, is how far this board and this lens model can be trusted.
-    # Where that has to be told from the views themselves, few views tell little, and the best cut through
-    # normal numbers already explains 2 / pi of their variance.
+    # Scatter inside the groups beyond the noise measures how well board and lens model fit at all. Estimated
+    # from few views it is uncertain, and the best cut through normal numbers explains 2 / pi of their
+    # variance.
     scatter = max(apart / (n - 2), 1.0)
     ratio = (together - apart) / scatter
     if scatter > 1.0:
-        told = 1.0 - 1.0 / scatter
-        freedom = (n - 2) / told
-        ratio = freedom * np.log1p(ratio / freedom) - told * n * _BEST_CUT
+        excess = 1.0 - 1.0 / scatter
+        freedom = (n - 2) / excess
+        ratio = freedom * np.log1p(ratio / freedom) - excess * n * _BEST_CUT
     sigma = _sigma(covariance)[index]
     longer = index[values - middle > sigma].tolist()
     shorter = index[middle - values > sigma].tolist()
