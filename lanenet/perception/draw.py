@@ -1,4 +1,4 @@
-"""A detector's answer drawn into its frame, for people."""
+"""A detector's answer drawn into its frame, for people to look at."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lanenet.perception.image_lane import ImageLane, Polyline
 Bgr = tuple[int, int, int]
 #: BGR; the left line is green, the right one orange, the steering arrow yellow.
 LEFT_BGR, RIGHT_BGR, ARROW_BGR, TEXT_BGR = (80, 220, 80), (40, 140, 255), (60, 230, 250), (255, 255, 255)
-#: Lines that a detector remembers from earlier frames are blue, as in Suto's video.
+#: Lines remembered from earlier frames are blue, as in Suto's video.
 MEMORY_BGR, FILL_BGR = (255, 120, 60), (60, 180, 60)
-#: What should have been answered.
+#: Ground truth or labels.
 TRUTH_BGR = (255, 60, 255)
 _FILL_SHARE = 0.35
 FAR_CM = 40.0

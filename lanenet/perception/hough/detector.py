@@ -27,7 +27,7 @@ from lanenet.perception.image_lane import (
     to_bgr,
 )
 
-#: A tracker that finds a line in fewer frames than this share has the wrong settings for them.
+#: A tracker that steers in fewer frames than this share has the wrong settings. Chosen.
 _FEW = 0.05
 
 
@@ -41,7 +41,7 @@ class HoughSettings(Settings):
 
 @dataclass(frozen=True)
 class SideMemory:
-    """What the tracker remembers of one side.
+    """Memory of one side.
 
     Attributes:
         line: Averaged line, eq. 16.
@@ -56,7 +56,7 @@ class SideMemory:
 
 @dataclass(frozen=True)
 class HoughState:
-    """What the tracker remembers: a memory per side and the smoothed angle (eq. 15).
+    """State that is carried from frame to frame: a memory per side and the smoothed angle (eq. 15).
 
     Attributes:
         left: The left side; None before the first left line and when it is forgotten.
@@ -82,11 +82,10 @@ class HoughTracker:
 
     A frame of less than half that size gives an empty estimate.
 
-    With a camera the stretches of the lines that the frame shows are moved to the road. Without one the
-    points are NaN. The confidence is the share of the two lines that this frame shows: 1, 0.5 or 0. A frame
-    without lines keeps the steering of the frames before (the paper's third case) with confidence 0, until
-    both sides are forgotten. A single line changes a steering that is known; before the first pair there is
-    none.
+    With a camera the visible sections of the lines are moved to the road; without one the points are NaN. The
+    confidence is the share of the two lines that this frame shows: 1, 0.5 or 0. A frame without lines keeps
+    the steering of the frames before (the paper's third case) with confidence 0, until both sides are
+    forgotten. A single line changes a known steering; before the first pair there is none.
 
     Attributes:
         last: Lines of the last frame in the image; the remembered ones beside them.
@@ -148,7 +147,7 @@ class HoughTracker:
         settings = self.settings.lines
         edges = self.settings.edges
         if 2 * frame_bgr.shape[1] < edges.width_px or 2 * frame_bgr.shape[0] < edges.height_px:
-            # Enlarged so much, single pixels would turn into lines.
+            # Enlarged by more than 2, single pixels would become lines.
             return None, None
         contours = find_contours(frame_bgr, edges)
         segments = lines.find_lane_segments(contours, settings)
@@ -173,7 +172,7 @@ class HoughTracker:
         angle = state.steering_deg
         current = self._current_deg(left, right)
         if current is not None:
-            # The relative changes of eq. 13 and 14 know no bound where a line passes near c1.
+            # The relative changes of eq. 13 and 14 have no bound where a line passes near c1.
             bounded = min(max(current, -settings.max_angle_deg), settings.max_angle_deg)
             angle = steering.smooth_angle_deg(bounded, angle, settings.angle_smoothing)
         sides = self._remember(left, state.left), self._remember(right, state.right)

@@ -13,11 +13,12 @@ from pydantic import Field, model_validator
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 
-#: Neighbouring pixels that differ by this much belong to a contour or to noise.
+#: Neighbouring pixels that differ by this much belong to a contour or to noise. Chosen: a sixteenth of the
+#: range, above the noise of a camera in daylight.
 _ROUGH_STEP = 16
-#: Stands for the hue of what has no colour.
+#: Hue of pixels without colour: the end of OpenCV's scale, far from yellow markings and brown floors.
 _GRAY_HUE = np.uint8(179)
-#: How crowded a frame is, is counted in blocks of this size.
+#: Size of the blocks in which clutter is counted. Chosen: a marking fills few of them, a texture most.
 _BLOCK_PX = 10
 #: Place of each channel in OpenCV's HSV image.
 _CHANNELS = {"hue": 0, "saturation": 1, "value": 2}
@@ -34,13 +35,13 @@ class HoughEdgeSettings(Settings):
         roi_height_px: Rows of the region of interest.
         channel: Channel of HSV that serves as gray image; the paper's is the hue, 0 to 179 in OpenCV. Hue is
             noise where a colour is nearly gray, so white lines on gray floors need ``value``.
-        min_saturation: A hue of less saturation than this is noise and is taken for 179, the end of the scale
-            that is far from yellow markings and from brown floors. Not in the paper; 0 is the paper's.
+        min_saturation: A hue of less saturation than this is noise and counts as 179, the end of the scale
+            that is far from yellow markings and brown floors. Not in the paper; 0 is the paper's.
         min_value: The same for the hue of a dark pixel.
         blur_px: Size of the Gauss kernel.
         threshold: T of eq. 1, on the absolute response of the 3 x 3 Sobel operator.
-        max_rough_share: Where more than this share of the channel's neighbours differ by 16 or more, the
-            channel is noise and nothing is answered. Not in the paper; 1 is the paper's.
+        max_rough_share: If more than this share of horizontal neighbours differ by 16 or more, the channel is
+            noise and the frame has no contours. Not in the paper; 1 is the paper's.
     """
 
     width_px: int = Field(default=160, ge=16)
@@ -101,7 +102,7 @@ def gray_of(roi_bgr: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) ->
 
 
 def is_coloured(roi_hsv: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) -> Bool[np.ndarray, "r c"]:
-    """Tell where a pixel is colourful and bright enough for its hue to mean something."""
+    """True where a pixel is saturated and bright enough for its hue to be no noise."""
     return (roi_hsv[..., 1] >= settings.min_saturation) & (roi_hsv[..., 2] >= settings.min_value)
 
 
@@ -131,8 +132,8 @@ def horizontal_response(
 def binarise(response: Num[np.ndarray, "r c"], threshold: float) -> UInt8[np.ndarray, "r c"]:
     """Keep responses f(x, y) of at least T: 0 below, 1 from there on.
 
-    The paper does not say what becomes of negative responses; both sides of a line are contours, so that f
-    is taken for the absolute response.
+    The paper does not mention negative responses. Both borders of a line are contours, so f is read as the
+    absolute response.
 
     Source:
         Suto 2021, eq. 1.

@@ -1,12 +1,8 @@
-"""Second stage of Suto's tracker: line segments, gates, left and right lists.
+"""Second and third stage of Suto's tracker: line segments of both sides, and of these the lane's lines.
 
 Coordinates are those of the region of interest: x to the right, y down, the origin at its top left corner.
 c1 = (width / 2, height) is the bottom end of the vertical centre line, c2 = (width / 2, 0) its top end. A
 left line rises to the right and has a negative slope; a right line has a positive one.
-
-Third stage of Suto's tracker: of the left and the right lines of a frame, those of the lane.
-
-Coordinates as in :mod:`lanenet.perception.hough.lines`.
 """
 
 from __future__ import annotations
@@ -35,13 +31,13 @@ class HoughLineSettings(Settings):
         votes: Votes that a line needs.
         min_length_px: Shortest segment.
         max_gap_px: Longest gap within a segment.
-        by_sign: Rising and falling contours are searched apart. Along an edge of a marking the channel only
-            rises or only falls; a line through a texture changes between both. Not in the paper.
-        min_support: Least share of a segment's pixels that are contour. In clutter a segment is found in
-            every direction, but it is full of holes. Not in the paper; 0 is the paper's.
-        crowded_length_px: The contours along a segment's line must be at least this long, times the share of
-            the region's blocks of 10 x 10 px that hold a contour: a line must stand out from its frame's
-            clutter. Not in the paper; 0 is the paper's.
+        by_sign: Search rising and falling contours separately. Along an edge of a marking the channel only
+            rises or only falls; along a line through a texture it does both. Not in the paper.
+        min_support: Least share of a segment's pixels that are contour; segments through clutter are full of
+            gaps. Not in the paper; 0 is the paper's.
+        crowded_length_px: Least length of the contours along a segment's line, times the share of the
+            region's blocks of 10 x 10 px that hold a contour: in clutter a line needs more. Not in the paper;
+            0 is the paper's.
         min_angle_deg: Least angle to the x axis.
         max_angle_deg: Largest angle to the x axis.
         lowest_share: The lower end must lie below this share of the height.
@@ -79,7 +75,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Segment:
-    """A straight piece between p1 and p2 with y1 >= y2: p1 is the lower end in the image."""
+    """A straight segment from p1 to p2 with y1 >= y2: p1 is the lower end in the image."""
 
     x1: float
     y1: float
@@ -147,7 +143,7 @@ def vanishing_point(one: Line, other: Line) -> Point:
 
 
 def is_lane_like(segment: Segment, height: float, settings: HoughLineSettings) -> bool:
-    """Tell whether a segment passes the gates: its angle, and its lower end in the lower region.
+    """Whether a segment passes the gates: its angle, and its lower end in the lower region.
 
     Source:
         Suto 2021, section 4.2: 10 <= alpha <= 80 degrees, y1 >= 0.4 y_c1.
@@ -160,7 +156,7 @@ def is_lane_like(segment: Segment, height: float, settings: HoughLineSettings) -
 
 
 def find_lane_segments(contours: Contours, settings: HoughLineSettings) -> list[Segment]:
-    """Find the segments that pass the gates, in the contours of each sign apart or in all together."""
+    """Find the segments that pass the gates, in the contours of each sign separately or in all together."""
     images = contours.by_sign if settings.by_sign else (contours.binary,)
     least_px = settings.crowded_length_px * crowded_share(contours.binary)
     return [
@@ -227,10 +223,6 @@ def split_sides(
     return left, right
 
 
-Earlier = tuple[Line | None, Line | None]
-Chosen = tuple[Segment | None, Segment | None]
-
-
 def line_distance(line: Line, earlier: Line | None, height: float) -> float:
     """Return dn or dp: how far a line lies from the earlier, averaged one of its side.
 
@@ -266,14 +258,14 @@ def single_cost(dnp: float, dp1: float, settings: HoughLineSettings) -> float:
 def choose_lines(
     left: Sequence[Segment],
     right: Sequence[Segment],
-    earlier: Earlier,
+    earlier: tuple[Line | None, Line | None],
     width: float,
     height: float,
     settings: HoughLineSettings,
-) -> Chosen:
+) -> tuple[Segment | None, Segment | None]:
     """Choose the lane's lines: a pair, else the single line of least cost, else none.
 
-    Of two lines that are no pair, one of a side that earlier frames showed comes first.
+    Of two lines that are no pair, one of a side that earlier frames showed is preferred.
 
     Source:
         Suto 2021, section 4.3; lines that cannot be a pair count as single ones.
@@ -297,7 +289,7 @@ def choose_lines(
 def choose_pair(
     left: Sequence[Segment],
     right: Sequence[Segment],
-    earlier: Earlier,
+    earlier: tuple[Line | None, Line | None],
     width: float,
     height: float,
     settings: HoughLineSettings,

@@ -1,8 +1,7 @@
 """From an edge of a marking to its middle. Not in the paper, which steers by whichever edge it found.
 
-Along a row of the image a marking has two edges of opposite sign. On the road a row without roll is a line
-of equal y, along which pixels are equally wide, so that the middle between both edges in the image is the
-middle of the marking on the road as well.
+Along a row of the image a marking has two edges of opposite sign. Without roll, a row is a line of equal y on
+the road, and its pixels are equally wide: the middle between the edges in the image is that on the road.
 """
 
 from __future__ import annotations
@@ -13,14 +12,18 @@ from jaxtyping import Bool, Float, Int
 from lanenet.perception.hough.edges import Contours
 from lanenet.perception.hough.lines import HoughLineSettings, Segment, slope_of
 
-#: An edge is looked for so far beside the line, and counts as the line's so near to it, [px].
+# Half and double of each of these, one at a time, change the RMSE of hough-value on a synthetic drive by less
+# than 0.1 cm, except for _WEAK: 1 instead of 0.5 adds 0.24 cm.
+#: How far beside the line an edge is searched, and how near an edge belongs to the line, [px]. Chosen: the
+#: error of a Hough line of one degree over the region, and of an edge pixel.
 _SEARCH_PX, _NEAR_PX = 3, 1.0
-#: The other edge may be weaker than the first by this factor: the floors on both sides of it can differ.
+#: Least response of the other edge as a share of the threshold: the floors on both sides can differ.
 _WEAK = 0.5
-#: A gap of more rows than this ends a line; what lies beyond is as likely something else.
+#: A gap of more rows than this ends a line. Chosen: a third of the region, more than between dashes.
 _LONGEST_GAP_PX = 25
-#: Rows that a fit needs, and the share of them that must show the other edge.
+#: Fewest rows of a fit, and the share of them that must show the other edge.
 _LEAST_ROWS, _LEAST_SHARE = 6, 0.5
+#: Rounds of a robust fit, and of following an edge.
 _ROUNDS = 3
 
 
@@ -29,8 +32,8 @@ def centre_on_marking(
 ) -> Segment:
     """Move a segment from an edge of a marking to its middle, as far as the marking is straight.
 
-    The edge is followed beyond the segment's ends while it stays within a pixel of a straight line, across
-    the gaps of a dashed line. Where no second edge is seen, the segment stays on the edge.
+    The edge is followed beyond the segment's ends, across the gaps of a dashed line, while it stays within a
+    pixel of a straight line. Without a second edge the segment stays on the first one.
 
     Args:
         segment: A segment of the region of interest.
@@ -55,7 +58,7 @@ def centre_on_marking(
         0.5 * side * _width_px(rows, x, response, side, _WEAK * threshold, settings.max_marking_px)
         for side in (-1, 1)
     ]
-    # A marking has its other edge on the side where most rows show one.
+    # The other edge is on the side where more rows show one.
     offset = max(offsets, key=lambda o: int(np.isfinite(o).sum()))
     seen = np.isfinite(offset)
     if seen.mean() >= _LEAST_SHARE:
@@ -97,7 +100,7 @@ def _follow(
         kept &= _joined(rows, kept, 0.5 * (segment.y1 + segment.y2))
         found = rows[kept], x[kept]
         length = float(found[0][-1] - found[0][0])
-        # A line known over some length is known well enough to be looked for over as much again.
+        # A line that was followed over some length is known well enough to be followed as far again.
         low, high = found[0][-1] + length, found[0][0] - length
     return found
 
@@ -105,7 +108,7 @@ def _follow(
 def _joined(
     rows: Int[np.ndarray, "rows"], kept: Bool[np.ndarray, "rows"], start: float
 ) -> Bool[np.ndarray, "rows"]:
-    """Tell which rows hang together with the kept one nearest to a start, without a long gap of kept ones."""
+    """True for the rows connected to the kept one nearest to a start, without a long gap of kept ones."""
     seen = rows[kept]
     group = np.concatenate([[0], np.cumsum(np.diff(seen) > _LONGEST_GAP_PX)])
     own = seen[group == group[np.abs(seen - start).argmin()]]
@@ -179,6 +182,6 @@ def _fit(
         p = float(centred @ x_kept) / float(centred @ centred)
         q = mean_x - p * mean_row
         residual = np.abs(x - p * rows - q)
-        # The first fits may be drawn aside by what is cast out later. Sorting so few is faster than a median.
+        # Outliers still bias the first fits, hence the limit by the median; sorting is faster on few values.
         kept = residual <= max(_NEAR_PX, 2.0 * float(np.sort(residual)[len(residual) // 2]))
     return ((p, q), kept) if np.count_nonzero(kept) >= _LEAST_ROWS else None

@@ -1,6 +1,6 @@
-"""Last stage of Suto's tracker: a steering angle in degrees, positive left, and what is remembered.
+"""Last stage of Suto's tracker: the steering angle in degrees, positive left, and averages over frames.
 
-Coordinates as in :mod:`lanenet.perception.hough.lines`. Two places of the paper need a reading:
+Coordinates as in :mod:`lanenet.perception.hough.lines`. Two places of the paper are ambiguous:
 
 - Eq. 11, 13 and 14 measure the horizontal distance between c1 and a line's point pa, whose y is 0: the *top*
   of the region. That is what the text says twice, and it is the default; ``distance_row: bottom`` measures it
@@ -31,7 +31,7 @@ class HoughSteeringSettings(Settings):
         line_smoothing: w2 of eq. 16.
         distance_row: Row on which the distances of eq. 11, 13 and 14 are measured.
         max_jump_px: A single line whose distance differs by more than this from its side's last one is
-            another line, and says nothing about a change (eq. 13, 14). Not in the paper; None is the paper's.
+            another line and changes nothing (eq. 13, 14). Not in the paper; None is the paper's.
         max_angle_deg: Bound of the current angle, that of eq. 11; eq. 13 and 14 have none of their own.
         hold_frames: A side that so many frames did not show is forgotten; with the last side, so is the
             angle, which is held until then. None holds for ever, as the paper does.

@@ -1,7 +1,4 @@
-"""Edge points of the road paired to markings: strips of the right thickness, row by row.
-
-What the lane filter takes for a lane: the paper's distances, and the checks that were added to them.
-"""
+"""Settings of the lane filter, and its first step: edge points of a row paired to markings."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from pydantic import Field
 
 from lanenet.config import Settings
 
-#: Values that leave out every check which is not in the paper.
+#: Settings that switch off every check which is not in the paper.
 PAPER: dict[str, Any] = {
     "polarity": "ignored",
     "agreement_share": 0.0,
@@ -27,41 +24,43 @@ PAPER: dict[str, Any] = {
 
 
 class LaneFilterSettings(Settings):
-    """What the filter takes for a lane.
+    """What the filter accepts as a lane.
 
-    The paper's filter knows distances between edge points and nothing else. In a picture full of texture
-    some points have these distances by chance, so that checks were added: by the directions of the edges,
-    by agreement over neighbouring rows, and by what contradicts itself. :data:`PAPER` switches them off.
+    The paper's filter uses distances between edge points alone. In textured images some points have these
+    distances by chance. The checks that were added look at the directions of the edges, at neighbouring rows
+    and at contradictions; :data:`PAPER` switches them off. On three simulated drives they reduce the RMSE
+    from 3.78 to 0.99 cm, and 70 instead of 62 % of the points are answered
+    (``tests/sim/test_lane_filter_on_simulated_drives.py``).
 
     Attributes:
         lane_width_cm: Distance between the middles of the two lines of the driven lane.
         lane_width_tolerance_cm: How far a pair of markings may be from that.
         marking_cm: Thickness of a marking (tape).
         marking_tolerance_cm: How far a pair of edges may be from that; edges are a pixel of road uncertain.
-        grid_cm: Grid to whose nodes the points are moved.
-        row_cm: Extent along y of the points that count as one row. The paper's grid rows are finer than a
-            pixel (6 mm), so a single one seldom holds all four edges.
-        row_tolerance_cm: How far from the wanted row a row is looked for when that one has no lane.
-        look_ahead_cm: Distance of the point A that is steered at.
-        max_edge_share: With more edge points than this share of the pixels that see the road, every distance
-            occurs by chance, and a frame gives no lane. Not in the paper; 1 leaves it out.
+        grid_cm: Grid to whose nodes the points are moved; the paper's 2 mm.
+        row_cm: Extent along y of one row: a pixel of the paper's camera, 6 mm. The paper's rows of 2 mm
+            seldom hold all four edges.
+        row_tolerance_cm: How far from the wanted row the search goes if that one has no lane.
+        look_ahead_cm: Distance of the aim point A; the paper's 15 cm.
+        max_edge_share: Frames with more edge points than this share of the road's pixels have no lane, since
+            every distance occurs by chance. Not in the paper; 1 switches it off.
         polarity: The two edges of a ``bright`` marking face each other, those of a ``dark`` one away;
-            ``any`` takes both, but one of them in a pair. ``ignored``, as in the paper, takes edges for
-            points without direction, and measures distances along the row instead of across the lines.
-        parallel_rad: Edges of one marking differ in direction by at most this, and so do the two lines of a
-            lane, which are not parallel along a row of a curve. Left out with ``ignored``.
-        agreement_cm: Extent along y, before and behind a row, in which its two lines have to go on. Not in
+            ``any`` takes both, but never one of each in a pair. ``ignored``, as in the paper, uses edges
+            without direction and measures distances along the row instead of across the lines.
+        parallel_rad: Largest difference in direction of the two edges of a marking, and of the two lines of a
+            lane, which differ along a row of a curve. Not used with ``ignored``.
+        agreement_cm: Extent along y, before and behind a row, in which its two lines have to continue. Not in
             the paper.
-        agreement_share: Share of that extent in which both have to be seen; at the end of a dash, and where
-            the picture ends, it is about a half. 0 leaves it out, as does ``ignored``.
-        clear_share: A row gives nothing if less than this share of the edge points from its left line to its
-            right one, over the same extent, lies on the two lines: the floor of a lane is empty beside what
-            bounds it, a texture is not. Not in the paper; 0 leaves it out.
-        max_pairs: A row with more pairs of markings that satisfy all conditions is ambiguous and gives
-            nothing; three lanes beside each other are three pairs. Not in the paper; null leaves it out.
-        max_centre_jump: The far row is dropped if its centre is further than this share of the lane's width
-            to the side of the near row's, or if the widths differ by more than their tolerance. Not in the
-            paper; null leaves it out.
+        agreement_share: Share of that extent in which both have to be seen; about a half at the end of a dash
+            and at the border of the image. 0 switches it off, as does ``ignored``.
+        clear_share: A row has no lane if less than this share of the edge points between its lines, over the
+            same extent, lies on the two lines: the floor of a lane is empty, a texture is not. Not in the
+            paper; 0 switches it off.
+        max_pairs: A row with more pairs that satisfy all conditions is ambiguous and has no lane; three lanes
+            side by side are three pairs. Not in the paper; null switches it off.
+        max_centre_jump: The far row is dropped if its centre is further than this share of the lane width to
+            the side of the near row's, or if the widths differ by more than their tolerance. Not in the
+            paper; null switches it off.
     """
 
     lane_width_cm: float = Field(gt=0.0)
@@ -82,10 +81,11 @@ class LaneFilterSettings(Settings):
     max_centre_jump: float | None = Field(default=0.5, gt=0.0)
 
 
-#: A line that lies flatter than this is not crossed by a row at a place.
+#: A line at a larger angle from straight ahead is not used. Chosen: at 60 degrees an error of the direction
+#: of 3 degrees changes a width by a tenth.
 MAX_OBLIQUE_RAD = math.pi / 3.0
-#: A marking that only has to go on may be off its thickness by this many tolerances: far from the car it is
-#: a few pixels thick.
+#: A marking that only confirms a line may miss the thickness by this many tolerances, since far from the car
+#: it is a few pixels thick.
 _SLACK = 2.0
 
 
@@ -130,8 +130,8 @@ def find_markings(
     Args:
         points_cm: Edge points, [cm], frame car; points that are not finite are ignored.
         normals: Unit vectors across the edges, towards the brighter side. With them the two edges have to
-            face each other or turn their backs, and the thickness is measured across the line; without them
-            it is measured along the row, as in the paper.
+            face each other or point apart, and the thickness is measured across the line; without them it is
+            measured along the row, as in the paper.
         y_cm: The row from which the others are counted, ``row_cm`` apart.
         reach_cm: How far from it markings are looked for.
         settings: Thickness, grid, polarity and their tolerances.
@@ -149,7 +149,7 @@ def find_markings(
     if normals is not None:
         widest_cm = settings.marking_cm + _SLACK * settings.marking_tolerance_cm
         widest_cm /= math.cos(MAX_OBLIQUE_RAD)
-    # Rows far apart on one axis, so that one search serves them all.
+    # All rows on one axis, far apart, so that one search serves them all.
     reach = widest_cm / settings.grid_cm
     span = int(np.ptp(nodes)) + int(reach) + 2 if nodes.size else 1
     keys = rows * span + nodes
@@ -179,14 +179,14 @@ def _facing_edges(
     right_normals: Float[np.ndarray, "n 2"],
     settings: LaneFilterSettings,
 ) -> Markings:
-    """Keep the pairs of edges that are parallel, of opposite direction and the right distance apart."""
-    # Points from the left edge to the right one on a bright marking, and the other way on a dark one.
+    """Keep the pairs of edges that are parallel, of opposite normals and the right distance apart."""
+    # From the left edge to the right one on a bright marking, and back on a dark one.
     facing = left_normals - right_normals
     side = np.copysign(1.0, facing[:, 0])
     direction = np.arctan2(-facing[:, 1] * side, np.abs(facing[:, 0]))
     off_cm = np.abs(gap_cm * np.cos(direction) - settings.marking_cm)
     slack_cm = settings.marking_tolerance_cm + 1e-9
-    # Unit vectors that turn by an angle a from being opposite differ by 2 cos(a / 2).
+    # The difference of unit vectors at an angle of pi - a has the length 2 cos(a / 2).
     length = np.hypot(facing[:, 0], facing[:, 1])
     good = (length >= 2.0 * math.cos(0.5 * settings.parallel_rad)) & (off_cm <= _SLACK * slack_cm)
     good &= np.abs(direction) <= MAX_OBLIQUE_RAD

@@ -1,7 +1,4 @@
-"""Pentek's lane painter as a detector.
-
-Radius of curvature, offset and aim of a lane on the road, from its two lines.
-"""
+"""Pentek's lane painter as a detector."""
 
 from __future__ import annotations
 
@@ -54,16 +51,50 @@ from lanenet.perception.painter.markings import (
     weigh,
 )
 
+#: Smaller frames have too few rows to tell a line from chance; chosen: less than half of the smallest frames
+#: in use (160 x 120 px).
+_MIN_SIDE_PX = 48
+#: Default look-ahead in camera heights; see :class:`PainterSettings`. Beyond 3.5 heights a line seen by one
+#: frame was unreliable on three real drives.
+_LOOK_AHEAD_HEIGHTS = 3.5
+
+
+class PainterSettings(Settings):
+    """Pentek's painter; the defaults are the paper's where it gives one.
+
+    Attributes:
+        mode: ``photo`` takes each frame by itself, ``video`` averages the lines over frames.
+        video_weight: ``video``: weight of the current frame in the average.
+        hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
+        curves: Follow curves by sliding windows; False leaves the paper's straight lines.
+        look_ahead_cm: With a camera: distance of the aim point. None takes 3.5 camera heights: closer to the
+            car, the centre of the lane shows where the car is, not where the lane leads.
+        edges: From frame to edges.
+        lines: From edges to straight lines.
+        curve: From straight lines to curves.
+        evidence: What a line has to show before it is answered.
+    """
+
+    mode: Literal["photo", "video"] = "video"
+    video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
+    hold_frames: int = Field(default=5, ge=0)
+    curves: bool = True
+    look_ahead_cm: float | None = Field(default=None, gt=0.0)
+    edges: PainterEdgeSettings = PainterEdgeSettings()
+    lines: PainterLineSettings = PainterLineSettings()
+    curve: CurveSettings = CurveSettings()
+    evidence: EvidenceSettings = EvidenceSettings()
+
 
 @dataclass(frozen=True)
 class PaintedLane:
-    """What the road of a calibrated camera tells about the last frame.
+    """Radius and offset of the lane on the road in the last frame; needs a calibrated camera.
 
     Attributes:
         radius_cm: Radius of curvature of the lane's middle at its near end; infinite where both lines are
             straight, NaN where a line is unknown.
-        offset_cm: The car's place right of the lane's middle, at the nearest row that both lines reach; NaN
-            where there is none.
+        offset_cm: How far the car is to the right of the lane's centre line, at the nearest row that both
+            lines reach; NaN without one.
     """
 
     radius_cm: float = float("nan")
@@ -83,89 +114,14 @@ class PaintedLane:
         return "  ".join(parts)
 
 
-def measure_lane(found: Pair, rows_cm: Float[np.ndarray, "2 3"]) -> PaintedLane:
-    """Measure radius and offset of a lane on the road.
-
-    The radius is that of the mean of both parabolas. Where only one of the lines is curved, the other one was
-    seen over too short a stretch to bend, and the curved one tells the radius.
-
-    Args:
-        found: The two lines; both are needed.
-        rows_cm: x of both at the label rows, [cm], frame car; NaN where unknown.
-    """
-    left, right = found
-    if left is None or right is None:
-        return PaintedLane()
-    curves = [marking.curve for marking in (left, right) if marking.curve is not None]
-    radius_cm = math.inf
-    if curves:
-        middle = curves[0] if len(curves) == 1 else mean_curve(curves[0], curves[1])
-        radius_cm = curvature_radius(middle, middle.near)
-    middle_cm = rows_cm.mean(axis=0)
-    known = np.flatnonzero(np.isfinite(middle_cm))
-    offset_cm = -float(middle_cm[known[0]]) if len(known) else float("nan")
-    return PaintedLane(radius_cm, offset_cm)
-
-
-def find_aim_cm(found: Pair, look_ahead_cm: float) -> tuple[float, float] | None:
-    """Return the lane's middle at the look-ahead distance, (x, y) in cm, frame car.
-
-    The aim comes nearer or moves away to where both lines are seen; None if there is no such place.
-    """
-    left, right = found
-    if left is None or right is None or len(left.points) == 0 or len(right.points) == 0:
-        return None
-    near = max(float(left.points[0, 1]), float(right.points[0, 1]))
-    far = min(float(left.points[-1, 1]), float(right.points[-1, 1]))
-    y = min(max(look_ahead_cm, near), far)
-    # Behind or beside the axle nothing can be aimed at.
-    if far < near or y < ROWS_CM[1]:
-        return None
-    lines = (left.points, right.points)
-    return 0.5 * sum(float(np.interp(y, line[:, 1], line[:, 0])) for line in lines), y
-
-
-#: Smaller frames hold no line that could be told from chance.
-_MIN_SIDE_PX = 48
-#: Default look-ahead in camera heights; see :class:`PainterSettings`.
-_LOOK_AHEAD_HEIGHTS = 3.5
-
-
-class PainterSettings(Settings):
-    """Pentek's painter; the defaults are the paper's where it gives one.
-
-    Attributes:
-        mode: ``photo`` takes each frame by itself, ``video`` averages the lines over frames.
-        video_weight: ``video``: weight of the current frame in the average.
-        hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
-        curves: Follow curves by sliding windows; False leaves the paper's straight lines.
-        look_ahead_cm: With a camera: distance of the point that is steered at. None takes 3.5 camera heights:
-            nearer to the car the lane's middle tells where the car stands in the lane, not where it leads.
-        edges: From frame to edges.
-        lines: From edges to straight lines.
-        curve: From straight lines to curves.
-        evidence: What a line has to show before it is answered.
-    """
-
-    mode: Literal["photo", "video"] = "video"
-    video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
-    hold_frames: int = Field(default=5, ge=0)
-    curves: bool = True
-    look_ahead_cm: float | None = Field(default=None, gt=0.0)
-    edges: PainterEdgeSettings = PainterEdgeSettings()
-    lines: PainterLineSettings = PainterLineSettings()
-    curve: CurveSettings = CurveSettings()
-    evidence: EvidenceSettings = EvidenceSettings()
-
-
 class LanePainter:
     """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
 
-    With a camera the lines are moved to the road and answered up to where they are seen, and the steering
-    aims at the lane's middle some camera heights ahead. Without one the points are NaN, and the steering is
-    the angle in the image between straight up and the lane's middle, halfway up the region, seen from the
-    middle of its bottom. The confidence is the share of the two lines that this frame shows; a line that is
-    only remembered is drawn as a memory, not answered.
+    With a camera the lines are moved to the road and answered as far as they are seen, and the steering aims
+    at the lane's centre some camera heights ahead. Without one the points are NaN, and the steering is the
+    angle in the image from straight up to the lane's centre halfway up the region, seen from the middle of
+    its bottom. The confidence is the share of the two lines that this frame shows; a remembered line is drawn
+    but not answered.
 
     Attributes:
         last: Lines of the last frame in the image, for drawing.
@@ -239,26 +195,26 @@ class LanePainter:
         curve = chosen.curve if chosen.curves else None
 
         def follow(lines: Sequence[SolidLine]) -> dict[SolidLine, tuple[Marking, Marking | None]]:
-            ways = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
-            return dict(zip(lines, ways, strict=True))
+            followed = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
+            return dict(zip(lines, followed, strict=True))
 
         if not chosen.evidence.required:
             pair = find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
-            ways = follow([line for line in pair if line is not None])
-            left, right = (None if line is None else ways[line][1] or ways[line][0] for line in pair)
+            followed = follow([line for line in pair if line is not None])
+            left, right = (None if line is None else followed[line][1] or followed[line][0] for line in pair)
             return left, right
         field = find_edge_field(frame_bgr, edges, trapezoid_px, chosen.edges)
         tolerance = agree_px(trapezoid_px, chosen.lines)
         both_sides = find_side_lines(
             segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates
         )
-        ways = follow([*both_sides[0], *both_sides[1]])
+        followed = follow([*both_sides[0], *both_sides[1]])
         sides = []
         for lines, before in zip(both_sides, earlier, strict=True):
             known = [before is not None and are_close(line, before, tolerance) for line in lines]
             sides.append(
                 [
-                    weigh(*ways[line], field, again, chosen.evidence)
+                    weigh(*followed[line], field, again, chosen.evidence)
                     for line, again in zip(lines, known, strict=True)
                 ]
             )
@@ -278,7 +234,7 @@ class LanePainter:
                 smooth.append(None)
                 continue
             before = self._earlier[k]
-            # Another line than before; their mean would lie on neither.
+            # A different line than before; their mean would lie on neither.
             if before is not None and not are_close(
                 marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)
             ):
@@ -333,6 +289,48 @@ class LanePainter:
         middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in lines)
         start = 0.5 * float(trapezoid_px[2, 0] + trapezoid_px[3, 0])
         return math.atan2(start - middle, bottom - row)
+
+
+def measure_lane(found: Pair, rows_cm: Float[np.ndarray, "2 3"]) -> PaintedLane:
+    """Measure radius and offset of a lane on the road.
+
+    The radius is that of the mean of both parabolas. If only one line is curved, the other was seen over too
+    short a section to show a bend, and the radius is that of the curved one.
+
+    Args:
+        found: The two lines; both are needed.
+        rows_cm: x of both at the label rows, [cm], frame car; NaN where unknown.
+    """
+    left, right = found
+    if left is None or right is None:
+        return PaintedLane()
+    curves = [marking.curve for marking in (left, right) if marking.curve is not None]
+    radius_cm = math.inf
+    if curves:
+        middle = curves[0] if len(curves) == 1 else mean_curve(curves[0], curves[1])
+        radius_cm = curvature_radius(middle, middle.near)
+    middle_cm = rows_cm.mean(axis=0)
+    known = np.flatnonzero(np.isfinite(middle_cm))
+    offset_cm = -float(middle_cm[known[0]]) if len(known) else float("nan")
+    return PaintedLane(radius_cm, offset_cm)
+
+
+def find_aim_cm(found: Pair, look_ahead_cm: float) -> tuple[float, float] | None:
+    """Return the aim point, (x, y) in cm, frame car: the lane's centre at the look-ahead distance.
+
+    It is moved to the nearest distance at which both lines are seen; None if there is no such distance.
+    """
+    left, right = found
+    if left is None or right is None or len(left.points) == 0 or len(right.points) == 0:
+        return None
+    near = max(float(left.points[0, 1]), float(right.points[0, 1]))
+    far = min(float(left.points[-1, 1]), float(right.points[-1, 1]))
+    y = min(max(look_ahead_cm, near), far)
+    # Behind or beside the axle nothing can be aimed at.
+    if far < near or y < ROWS_CM[1]:
+        return None
+    lines = (left.points, right.points)
+    return 0.5 * sum(float(np.interp(y, line[:, 1], line[:, 0])) for line in lines), y
 
 
 KIND = DetectorKind(

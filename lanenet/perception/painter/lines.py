@@ -1,11 +1,9 @@
-"""Pentek's lane lines: segments of the probabilistic Hough transform joined to one solid line per side.
-
-Whether a line that was joined from segments is a marking, or only the best line through a texture.
+"""Pentek's lane lines: segments of the Hough transform joined to solid lines, and the evidence for each line.
 
 The best of all lines through a carpet, leaves or noise has edges along it too. A marking differs in four
-ways: the edges along it run in its direction, few parallel lines beside it have as many, it goes on over a
-long stretch, and on the road its partner runs beside it. None of this is in the paper, and it can be switched
-off.
+ways: the edges along it run in its direction, few parallel lines beside it have as many, it continues over a
+long section, and on the road its partner runs beside it. The evidence is not in the paper, and it can be
+switched off.
 """
 
 from __future__ import annotations
@@ -21,6 +19,12 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.perception.image_lane import Polyline
 from lanenet.perception.painter.edges import PainterEdgeSettings, value_channel
+
+#: Places of the strips, in half widths beside the line: its own, and those in which clutter is counted.
+#: Chosen: beyond the other border of the marking, on both sides.
+_STRIPS = np.array([0.0, -8.0, -6.0, -4.0, 4.0, 6.0, 8.0])
+#: Keeps the contrast of a line without clutter finite; chosen: one supported row in fifty.
+_LEAST_CLUTTER = 0.02
 
 
 class PainterLineSettings(Settings):
@@ -87,10 +91,9 @@ def join_side(
 ) -> list[SolidLine]:
     """Join the segments of one side to solid lines (the paper's ``getLeftRoadLine``), the best one first.
 
-    Each segment's line y = m x + b gives x at the region's bottom and top. The segment that most length
-    agrees with counts, and the line is the mean of those that agree with it, weighted by length: a mean over
-    all of them would lie between a marking and the kerb beside it. Further lines are joined in the same way
-    from the segments that are left.
+    Each segment's line y = m x + b has an x at the region's bottom and top. The segment with the most
+    agreeing length is chosen, and the line is the length-weighted mean of those that agree with it; a mean
+    over all would lie between a marking and the kerb beside it. Further lines come from the other segments.
 
     Args:
         segments_px: Segments of this side; none is level.
@@ -121,7 +124,7 @@ def join_side(
             score = score + score.max() * _agree(ends, known, tolerance)
         chosen = near[int(np.argmax(score))]
         total = float(length[chosen].sum())
-        # Too short where the line before was, perhaps, but not elsewhere: go on with the others.
+        # A line that is too short is left out; the others may still be long enough.
         if total >= settings.min_support_share * (rows_px[0] - rows_px[1]):
             bottom, top = (length[chosen] / total) @ ends[chosen]
             lines.append(SolidLine(float(bottom), float(top)))
@@ -239,18 +242,12 @@ def blend(current: SolidLine, earlier: SolidLine | None, weight: float) -> Solid
     )
 
 
-#: Places of the strips, in half widths beside the line: its own, and those where clutter is counted.
-_STRIPS = np.array([0.0, -8.0, -6.0, -4.0, 4.0, 6.0, 8.0])
-#: Keeps the contrast of a line without any clutter beside it finite.
-_LEAST_CLUTTER = 0.02
-
-
 class EvidenceSettings(Settings):
     """What a line has to show; the defaults were chosen on frames of texture, roads and three tubs.
 
-    Two lines that run beside each other are answered if both show the ``min`` figures, each is either strong,
-    or long, or has a strong partner, and together they score enough, or nothing at all lies beside them. A
-    line is answered alone if it is strong over most of its rows.
+    Two parallel lines are answered if both reach the ``min`` figures, each is strong or long or has a strong
+    partner, and together they reach the score or have no clutter beside them. A line is answered alone if it
+    is strong over most of its rows.
 
     Attributes:
         required: False answers every line that segments can be joined to, as the paper does.
@@ -262,10 +259,10 @@ class EvidenceSettings(Settings):
         min_aligned: Least share of the edges in the strip that run along it.
         min_support: Least share of the visible rows in which such an edge is found.
         min_contrast: The support over that of the parallel strips beside it is at least this.
-        min_extent: Least stretch between the first and the last supported row, as a share of the rows.
+        min_extent: Least distance between the first and the last supported row, as a share of the rows.
         min_pair_score: Least sum of support times aligned over both lines.
         clear_contrast: Two lines with this contrast are answered whatever their score: dashes on a bare road.
-        strong_aligned: As ``min_aligned``, for a line that proves itself.
+        strong_aligned: As ``min_aligned``, for a strong line.
         strong_support: As ``min_support``.
         strong_contrast: As ``min_contrast``.
         strong_extent: As ``min_extent``.
@@ -320,13 +317,13 @@ class EdgeField:
 
 @dataclass(frozen=True)
 class LineEvidence:
-    """What the edges say about one line.
+    """Evidence for one line, from the edges.
 
     Attributes:
         support: Share of the visible rows with an edge along the line.
         clutter: Mean of that share over parallel strips beside it.
         aligned: Share of the edges in the line's strip that run along it.
-        extent: Stretch between the first and the last supported row, as a share of the visible rows.
+        extent: Distance between the first and the last supported row, as a share of the visible rows.
         far_px: The first supported row of the image; NaN without one.
     """
 
@@ -338,7 +335,7 @@ class LineEvidence:
 
     @property
     def contrast(self) -> float:
-        """The support in relation to the clutter beside the line."""
+        """The support over the clutter beside the line."""
         return self.support / (self.clutter + _LEAST_CLUTTER)
 
     @property
@@ -356,7 +353,7 @@ class LineEvidence:
         )
 
     def is_strong(self, settings: EvidenceSettings) -> bool:
-        """Whether the line is a marking for itself."""
+        """Whether the line is a marking, whatever its partner is."""
         return (
             self.aligned >= settings.strong_aligned
             and self.support >= settings.strong_support
@@ -415,7 +412,7 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
         return LineEvidence()
     first, last = np.searchsorted(field.points_px[:, 1], (rows[0], rows[-1] + 1))
     (u, v), across = field.points_px[first:last].T, field.across[first:last]
-    # Edges are pixels: what depends on the row alone is found once per row.
+    # Computed once per row, since several edge pixels share a row.
     row = (v - rows[0]).astype(np.intp)
     share = (rows - top) / max(bottom - top, 1.0)
     half_width = (
@@ -447,7 +444,7 @@ def measure_evidence(line_px: Polyline, field: EdgeField, settings: EvidenceSett
 
 
 def _slope(u: Float[np.ndarray, "n"], v: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """du/dv at each point, as ``np.gradient`` gives it at a third of its time."""
+    """du/dv at each point: ``np.gradient`` in a third of its time."""
     step = v[1:] - v[:-1]
     secant = (u[1:] - u[:-1]) / step
     inner = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / (step[1:] + step[:-1])

@@ -27,18 +27,22 @@ from lanenet.perception.painter.lines import (
     measure_evidence,
 )
 
+#: Widest inner pair as a share of the pair that holds a neighbouring lane as well. Chosen: between a half,
+#: for lanes of equal width, and 1.
+_INNER_WIDTH = 0.75
+
 
 @dataclass(frozen=True)
 class Marking:
-    """A line of one side with all that is known of it.
+    """A line of one side: where it lies and what supports it.
 
     Attributes:
         line: Where segments put it.
         curve: The parabola through the edges beside it, in the plane; None where it stays straight.
         line_px: The line in the image, near to far.
         points: The line in the plane, by rising y; empty where the plane does not hold it.
-        evidence: What the edges say about it.
-        known: The frame before had it too.
+        evidence: Its support by the edges.
+        known: It was answered in the frame before.
     """
 
     line: SolidLine
@@ -48,9 +52,6 @@ class Marking:
     evidence: LineEvidence = field(default_factory=LineEvidence)
     known: bool = False
 
-
-#: A pair that leaves out a neighbouring lane is narrower than this share of the pair that holds both.
-_INNER_WIDTH = 0.75
 
 Pair = tuple[Marking | None, Marking | None]
 
@@ -69,7 +70,7 @@ def follow_lines(
     half_width: float,
     settings: CurveSettings | None,
 ) -> list[tuple[Marking, Marking | None]]:
-    """Return each straight line as a marking, and the curve that windows along it find, if they find one.
+    """Return each straight line as a marking, with the curve that windows along it find, if any.
 
     Args:
         lines: Joined lines.
@@ -118,9 +119,9 @@ def _find_curve(
 def weigh(
     straight: Marking, curved: Marking | None, edges: EdgeField, known: bool, settings: EvidenceSettings
 ) -> Marking:
-    """Return the curve where it has about as many edges along it as the straight line, with its evidence.
+    """Return the curve if about as many edges support it as the straight line, which else is returned.
 
-    The curve is fitted to both edges of the marking, so that it lies on its middle.
+    The curve is preferred since it is fitted to both borders of the marking and lies on its middle.
     """
     first, *second = (
         Marking(m.line, m.curve, m.line_px, m.points, measure_evidence(m.line_px, edges, settings), known)
@@ -140,10 +141,10 @@ def choose_lane(
     lines: PainterLineSettings,
     settings: EvidenceSettings,
 ) -> Pair:
-    """Choose the lane that the car is in; without one the most convincing line that can stand alone.
+    """Choose the lane that the car is in; without one, the best line that can be answered alone.
 
-    A much narrower pair that convinces about as much as the best one is the car's lane: the wider one reaches
-    over the neighbouring lane.
+    A much narrower pair that scores about as much as the best one is the car's lane: the wider one includes
+    the neighbouring lane.
 
     Args:
         lefts: Lines of the left side.
@@ -151,7 +152,7 @@ def choose_lane(
         trapezoid_px: The region.
         camera_height_cm: Unit of the lane's width in the plane; None where the plane is no road.
         lines: Tolerances of straight lines.
-        settings: What is asked for.
+        settings: Thresholds of the evidence.
     """
     pairs = [
         (left, right)
@@ -176,7 +177,7 @@ def choose_lane(
         for marking in markings:
             evidence = marking.evidence
             alone = evidence.is_strong(settings) and evidence.support >= settings.alone_support
-            # A line that was answered in the frame before needs less.
+            # A line of the frame before needs less evidence.
             alone = alone or (marking.known and evidence.is_likely(settings))
             if alone and marking.evidence.score > best_score:
                 best = (marking, None) if side == 0 else (None, marking)
@@ -213,9 +214,7 @@ def can_bound_the_lane(
     camera_height_cm: float,
     settings: EvidenceSettings,
 ) -> list[Marking]:
-    """Leave out lines that are further beside the car than the widest lane is wide, where they come nearest.
-
-    Only what lies in the image counts: a line that leaves it sideways may go anywhere from there.
+    """Drop lines that are further beside the car than the widest lane, at their nearest visible point.
 
     Args:
         markings: Lines of one side.
