@@ -1,1 +1,1 @@
-"""Finding a camera: its lens from pictures of a chessboard, its mounting from points of the ground."""
+"""Finding a camera: its lens from photos of a chessboard, its mounting from points on the ground."""

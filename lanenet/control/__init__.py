@@ -1,1 +1,1 @@
-"""From a lane to a steering target."""
+"""From lane estimates to steering and speed."""

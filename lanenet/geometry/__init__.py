@@ -1,1 +1,1 @@
-"""Frames, cameras, the bird's-eye grid and parabolas; NumPy only."""
+"""Frames of reference, poses, cameras, the bird's-eye window, and the label contract; NumPy only."""

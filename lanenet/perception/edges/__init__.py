@@ -1,1 +1,1 @@
-"""From an image to edge points on the road: pixels, sub-pixel positions, the bird's-eye plane."""
+"""From an image to edge points on the road; also other views of a frame, and the parts of the car in it."""
