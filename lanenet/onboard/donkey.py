@@ -47,7 +47,7 @@ from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
 from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.draw import draw_estimate
-from lanenet.perception.edges.views import birdseye_view, undistorting_view
+from lanenet.perception.edges.views import View, birdseye_view, undistorting_view
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.registry import build_detector
 
@@ -231,7 +231,21 @@ class CvLaneController:
         self.pilot.shutdown()
 
 
-class BirdseyeTransformer:
+class _Transformer:
+    """One of Donkeycar's image transformations: a fixed view of each image."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+
+    def run(self, image: UInt8[np.ndarray, "h w *c"] | None) -> UInt8[np.ndarray, "rows columns *c"] | None:
+        """Return the view of an image."""
+        return None if image is None else self._view.of(np.ascontiguousarray(image))
+
+    def shutdown(self) -> None:
+        """Do nothing."""
+
+
+class BirdseyeTransformer(_Transformer):
     """The bird's-eye view, for Donkeycar's image transformations.
 
     ``cfg.LANENET_CAMERA`` is the camera file; ``cfg.LANENET_WINDOW`` may be a dictionary with some of
@@ -245,17 +259,10 @@ class BirdseyeTransformer:
             LanenetError: If the camera file or the window cannot be used.
         """
         window = check_settings(_WindowSettings, dict(getattr(cfg, "LANENET_WINDOW", {})), "LANENET_WINDOW")
-        self._view = birdseye_view(_camera_of(cfg), BirdseyeWindow(**window.model_dump()))
-
-    def run(self, image: UInt8[np.ndarray, "h w *c"] | None) -> UInt8[np.ndarray, "rows columns *c"] | None:
-        """Return the view of an image."""
-        return None if image is None else self._view.of(np.ascontiguousarray(image))
-
-    def shutdown(self) -> None:
-        """Do nothing."""
+        super().__init__(birdseye_view(_camera_of(cfg), BirdseyeWindow(**window.model_dump())))
 
 
-class UndistortTransformer:
+class UndistortTransformer(_Transformer):
     """The undistorted image, for Donkeycar's image transformations.
 
     ``cfg.LANENET_CAMERA`` is the camera file.
@@ -267,14 +274,7 @@ class UndistortTransformer:
         Raises:
             LanenetError: If the camera file cannot be used.
         """
-        self._view = undistorting_view(_camera_of(cfg))
-
-    def run(self, image: UInt8[np.ndarray, "h w *c"] | None) -> UInt8[np.ndarray, "rows columns *c"] | None:
-        """Return the view of an image."""
-        return None if image is None else self._view.of(np.ascontiguousarray(image))
-
-    def shutdown(self) -> None:
-        """Do nothing."""
+        super().__init__(undistorting_view(_camera_of(cfg)))
 
 
 class _WindowSettings(Settings):

@@ -294,7 +294,7 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             return RasterAnswers(labels.points_cm + 1.0, np.full((n, 6), 2.0), np.full((n, 2), 0.9))
 
     monkeypatch.setattr("lanenet.evaluation.answers.RasterModel", OneOff)
-    monkeypatch.setattr("lanenet.perception.network.detector.read_model_meta", lambda path: meta)
+    monkeypatch.setattr("lanenet.perception.network.model_file.read_model_meta", lambda path: meta)
     return opened
 
 
