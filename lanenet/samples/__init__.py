@@ -1,5 +1,4 @@
-"""Training samples: label sets in memory, rasters drawn from them, and seeded augmentation.
+"""Samples: label sets in memory, rasters drawn from them, and seeded augmentation, in NumPy and Numba.
 
-NumPy and Numba only; :mod:`lanenet.learn` trains on these samples, and :mod:`lanenet.evaluation` measures
-robustness with them.
+:mod:`lanenet.learn` trains on them, and :mod:`lanenet.evaluation` measures robustness with them.
 """

@@ -1,7 +1,7 @@
-"""Seeded changes of samples on their edge points, in cm, with labels that stay exact.
+"""Augmentation: seeded changes of samples on their edge points, in cm, with exact new labels.
 
 The points are moved, dropped and joined by clutter before they become a raster, so that a turned road has
-edges as sharp as a straight one, and the labels of the moved car follow from the lane lines themselves.
+edges as sharp as a straight one. The labels of the moved car follow from the lane lines.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from lanenet.samples.settings import AugmentSettings
 
 Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
 
-#: Where a camera is taken to be whose label set does not say so: right of, ahead of and above the front axle.
+#: Assumed place of a camera that the label set does not give: right of, ahead of and above the front axle,
+#: [cm]. Chosen: the mean of the project's synthetic cars.
 TYPICAL_CAMERA_CM = (0.0, 0.0, 18.0)
 
 
@@ -37,8 +38,8 @@ class Batch(NamedTuple):
     Attributes:
         rasters: Of 0 and 255.
         points_cm: Labels, [cm]; NaN where masked.
-        present: Whether each line is seen: 1, 0 or NaN for unknown.
-        lane_cm: The lane's width as the network is told it, [cm]; 0 where it is not told.
+        present: Whether each line can be seen: 1, 0 or NaN for unknown.
+        lane_cm: The lane width that the network is given, [cm]; 0 where it is kept back.
     """
 
     rasters: UInt8[np.ndarray, "b 1 r c"]
@@ -49,7 +50,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class _View:
-    """Where the car of a changed sample stands: new point = point @ matrix + offset."""
+    """Pose of the car in a changed sample: new point = point @ matrix + offset."""
 
     mirror: bool
     matrix: Float[np.ndarray, "2 2"]
@@ -61,11 +62,11 @@ class _View:
 
 
 def make_view(mirror: bool, shift_cm: float, turn_rad: float, scale: float = 1.0) -> _View:
-    """Place the car anew: the road is scaled and mirrored, then the car moved to the right and turned left.
+    """Scale and mirror the road, then move the car to the right and turn it left.
 
     Args:
         mirror: Swap left and right.
-        shift_cm: Way of the front axle to the right, [cm].
+        shift_cm: Distance by which the front axle is moved to the right, [cm].
         turn_rad: Turn about the front axle, [rad], positive left.
         scale: Every length of road and camera is multiplied by this.
     """
@@ -83,16 +84,16 @@ def join_frames(
     lane_cm: Float[np.ndarray, "n"] | None = None,
     divides: Bool[np.ndarray, "n 2"] | None = None,
 ) -> Frames:
-    """Lay frames one after the other, as the compiled loops take them.
+    """Concatenate frames, as the compiled loops take them.
 
     Args:
         edges: Edge points of each frame, as label sets hold them: x, y, [cm], normal x, normal y, frame car.
         lines_cm: Left and right lane line of each frame, in the direction of travel, frame car.
         points_cm: Labels of each frame; a point that is masked here stays masked.
-        camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes a typical
-            one for all.
-        lane_cm: Width of the lane of each frame; None where it is not known.
-        divides: Whether there is another lane beyond its left, its right line; None for none anywhere.
+        camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes
+            ``TYPICAL_CAMERA_CM`` for all.
+        lane_cm: Lane width of each frame; None: not known.
+        divides: Whether there is another lane beyond its left and its right line; None: nowhere.
     """
     size = len(edges)
     polylines = [np.asarray(line, np.float64) for pair in lines_cm for line in pair]
@@ -118,7 +119,7 @@ def join_frames(
 
 
 def plain_batch(frames: Frames, indices: Int[np.ndarray, "b"], window: BirdseyeWindow) -> Batch:
-    """Return frames as they are, with the lane's width told."""
+    """Return frames as they are, with their lane width."""
     rasters, present = _empty(len(indices), window)
     rasterise_frames(rasters, np.asarray(indices, np.int64), frames, _grid(window), present)
     labels, lane_cm = (part[indices].astype(np.float32) for part in (frames.points_cm, frames.lane_cm))
@@ -134,29 +135,29 @@ def augment_batch(
     epoch: int,
     streams: Int[np.ndarray, "b"] | None = None,
 ) -> Batch:
-    """Change each sample of a batch by its own draw.
+    """Change each sample of a batch by its own random draw.
 
     Args:
-        frames: What :func:`join_frames` answers.
+        frames: Returned by :func:`join_frames`.
         indices: Frames of the batch.
         window: Grid of the rasters.
-        settings: What is changed, and how much.
+        settings: What is changed, and by how much.
         seed: Of the run.
         epoch: Counted from 0.
-        streams: Number of each sample's draw; None takes its index. A frame that comes twice in an epoch
-            needs two.
+        streams: Number of each sample's random stream; None takes its index. A frame that is shown twice in
+            an epoch needs two.
 
     Returns:
         The changed samples; each follows from seed, epoch, stream and frame alone.
     """
     rasters, present = _empty(len(indices), window)
-    labels, told = np.empty((len(indices), 6), np.float32), np.empty(len(indices), np.float32)
+    labels, given = np.empty((len(indices), 6), np.float32), np.empty(len(indices), np.float32)
     chosen = np.asarray(indices, np.int64)
     augment_frames(
         rasters,
         labels,
         present,
-        told,
+        given,
         chosen,
         chosen if streams is None else np.asarray(streams, np.int64),
         seed,
@@ -165,7 +166,7 @@ def augment_batch(
         _grid(window),
         _amounts(settings),
     )
-    return Batch(rasters, labels, present, told)
+    return Batch(rasters, labels, present, given)
 
 
 def misplaced(
@@ -176,24 +177,24 @@ def misplaced(
     pitch_rad: float = 0.0,
     roll_rad: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
-    """Return where points of the road seem to lie when the camera's mounting is known wrongly.
+    """Return where points of the road appear to be if the camera's mounting is wrong.
 
-    The rays of the camera are turned by the error of its mounting and met with the road again, below a camera
-    of the wrong height. The camera is taken to look straight ahead. A wrong pitch then moves the points alike
-    whatever the pitch is; a wrong roll is one about the level line ahead.
+    The camera's rays are turned by the error of the mounting and intersected with the road again, below a
+    camera of the wrong height. The camera is assumed to look straight ahead: a wrong pitch then moves the
+    points alike whatever the pitch is, and a wrong roll is one about the level line ahead.
 
     Args:
         points_cm: True points, frame car.
         camera_cm: Optical centre: right of, ahead of and above the front axle.
-        height: The height is taken too large by this share.
-        pitch_rad: The camera is taken to look down by so much more than it does.
-        roll_rad: It is taken to lean to the right by so much more.
+        height: The assumed height is too large by this share.
+        pitch_rad: The assumed pitch is too large by this much.
+        roll_rad: The assumed roll is too far to the right by this much.
 
     Returns:
-        Seeming points, [cm], frame car; NaN where the turned ray misses the road.
+        Apparent points, [cm], frame car; NaN where the turned ray misses the road.
 
     Source:
-        Own derivation; ``tests/unit/learn/test_augment.py`` compares it with two cameras.
+        Own derivation; ``tests/unit/samples/test_augment.py`` compares it with two cameras.
     """
     moved = np.empty(points_cm.shape)
     misplace_points(

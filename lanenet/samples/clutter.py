@@ -1,7 +1,4 @@
-"""Edges of things that are not lanes: boxes, cones, other cars, shadows, scratches and dirt.
-
-Dashes along the middle of a lane, compiled: a marking that is not the lane's border.
-"""
+"""Edges of things that do not bound the lane, compiled: objects, shadows, scratches, dashes in its middle."""
 
 from __future__ import annotations
 
@@ -13,33 +10,41 @@ from numba import njit
 from lanenet.samples.random_stream import next_amount, next_between, next_number, next_uniform
 from lanenet.samples.raster import mark, mark_edge
 
-#: Of every outline; a round one looks round enough with so many.
+# All ranges below are chosen: objects, shadows and markings as they occur on model roads, at 1:10.
+#: Corners of every outline; enough for a round one.
 CORNERS = 12
 
+#: Half the width and half the length of a box.
 _BOX_HALF_CM = ((1.5, 12.0), (1.5, 22.0))
-_CONE_CM = (1.5, 6.0)
-#: What stands is smeared away from the camera on the road, the more the taller.
-_STRETCH = (1.0, 5.0)
+#: Radius of a cone's foot, and how many times longer it appears: what stands is smeared away from the camera.
+_CONE_CM, _SMEAR = (1.5, 6.0), (1.0, 5.0)
+#: Radius of a shadow.
 _SHADOW_CM = (8.0, 50.0)
+#: Shares of shadows and of cones among the outlines; the rest are boxes.
 _SHADOW_SHARE, _CONE_SHARE = 0.3, 0.35
-_SEGMENT_CM = (4.0, 40.0)
+#: Length of a straight edge.
+_EDGE_CM = (4.0, 40.0)
+#: Length of a dash and of the gap after it.
+_DASH_CM, _GAP_CM = (5.0, 30.0), (5.0, 30.0)
+#: Offset of the dashes from the middle of the lane, in lane widths.
+_OFF_MIDDLE = 0.04
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def draw_outline(rng, corners, grid):
-    """Draw a closed outline within the window; answers whether it hides the road within it.
+    """Draw a closed outline within the window; return whether it hides the road within it.
 
     Args:
         rng: Stream of random numbers.
-        corners: Its corners, [cm], frame car, to be filled.
+        corners: Its corners, [cm], frame car; written.
         grid: The window.
     """
     x = next_between(rng, grid.left_cm, grid.left_cm + grid.columns * grid.cell_cm)
     y = next_between(rng, grid.far_cm - grid.rows * grid.cell_cm, grid.far_cm)
     kind = next_uniform(rng)
     if kind < _SHADOW_SHARE:
-        # Four corners, none of them right: a shadow, a stain, a rug. The road goes on below it.
+        # An irregular quadrangle: a shadow, a stain, a rug. The road can be seen below it.
         size, turn = next_between(rng, *_SHADOW_CM), next_between(rng, 0.0, 2.0 * np.pi)
         for k in range(CORNERS):
             if k % 3 == 0:
@@ -48,14 +53,14 @@ def draw_outline(rng, corners, grid):
             corners[k, 0], corners[k, 1] = x + radius * np.cos(angle), y + radius * np.sin(angle)
         return False
     if kind < _SHADOW_SHARE + _CONE_SHARE:
-        radius, stretch = next_between(rng, *_CONE_CM), next_between(rng, *_STRETCH)
+        radius, smear = next_between(rng, *_CONE_CM), next_between(rng, *_SMEAR)
         away = np.hypot(x, y)
         ax, ay = (x / away, y / away) if away > 0.0 else (0.0, 1.0)
         for k in range(CORNERS):
             angle = 2.0 * np.pi * k / CORNERS
             along, across = radius * np.sin(angle), radius * np.cos(angle)
             if along > 0.0:
-                along *= stretch
+                along *= smear
             corners[k, 0], corners[k, 1] = x + along * ax - across * ay, y + along * ay + across * ax
         return True
     wide, long = next_between(rng, *_BOX_HALF_CM[0]), next_between(rng, *_BOX_HALF_CM[1])
@@ -96,9 +101,9 @@ def mark_outline(raster, corners, grid):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def add_clutter(rng, raster, count, grid, amounts):
-    """Mark edges of things that are not lanes; ``count`` is how many cells the frame itself has marked."""
+    """Mark edges of things that are not lanes; ``count`` is the number of cells that the frame marked."""
     for _ in range(next_number(rng, amounts.clutter_segments, amounts.limit)):
-        _add_edge(rng, raster, _SEGMENT_CM[1], grid)
+        _add_edge(rng, raster, _EDGE_CM[1], grid)
     for _ in range(next_number(rng, amounts.clutter_points, amounts.limit)):
         _add_point(rng, raster, grid)
     wanted = next_amount(rng, amounts.clutter_share, amounts.limit) * count
@@ -115,12 +120,12 @@ def add_clutter(rng, raster, count, grid, amounts):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _add_edge(rng, raster, longest_cm, grid):
-    """Mark a straight edge at a random place; answers how many cells it added."""
+    """Mark a straight edge at a random place; return how many cells it added."""
     width_cm, depth_cm = grid.columns * grid.cell_cm, grid.rows * grid.cell_cm
     x = grid.left_cm + width_cm * next_uniform(rng)
     y = grid.far_cm - depth_cm * next_uniform(rng)
     angle = next_between(rng, 0.0, np.pi)
-    half = 0.5 * min(next_between(rng, _SEGMENT_CM[0], _SEGMENT_CM[1]), longest_cm)
+    half = 0.5 * min(next_between(rng, _EDGE_CM[0], _EDGE_CM[1]), longest_cm)
     dx, dy = half * np.cos(angle), half * np.sin(angle)
     return mark_edge(raster, x - dx, y - dy, x + dx, y + dy, grid)
 
@@ -128,25 +133,19 @@ def _add_edge(rng, raster, longest_cm, grid):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _add_point(rng, raster, grid):
-    """Mark a cell at a random place; answers how many cells that added."""
+    """Mark a cell at a random place; return how many cells that added."""
     x = grid.left_cm + grid.columns * grid.cell_cm * next_uniform(rng)
     y = grid.far_cm - grid.rows * grid.cell_cm * next_uniform(rng)
     return 1 if mark(raster, x, y, grid) else 0
 
 
-#: Length of a dash and of the gap after it.
-_DASH_CM, _GAP_CM = (5.0, 30.0), (5.0, 30.0)
-#: How far off the middle of the lane they lie, in lane widths.
-_OFF_MIDDLE = 0.04
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def middle_dashes(rng, frames, i):
-    """Copy a line of a frame to the middle of its lane, in dashes; answers their points, [cm], frame car.
+    """Copy a line of a frame to the middle of its lane, in dashes; return their points, [cm], frame car.
 
-    The copy has the blur, the gaps and the range of what the frame shows of that line. It is the line of
-    which the frame shows more. Nothing comes of it where the two lines are not sampled alike.
+    The line of which the frame shows more is copied, with its blur, gaps and range. There are none if the two
+    lines are not sampled alike.
 
     Args:
         rng: Stream of random numbers.
@@ -166,13 +165,13 @@ def middle_dashes(rng, frames, i):
         along[1] += frames.edge_lines[k] >> 3
     side = 0 if along[0] >= along[1] else 1
     line, other = starts[2 * i + side], starts[2 * i + 1 - side]
-    way = np.zeros(n)
+    distance = np.zeros(n)
     for j in range(1, n):
         step = np.hypot(
             frames.lines_cm[line + j, 0] - frames.lines_cm[line + j - 1, 0],
             frames.lines_cm[line + j, 1] - frames.lines_cm[line + j - 1, 1],
         )
-        way[j] = way[j - 1] + (0.0 if np.isnan(step) else step)
+        distance[j] = distance[j - 1] + (0.0 if np.isnan(step) else step)
     points, count = np.empty((along[side], 2)), 0
     for k in range(first, last):
         if not (frames.edge_lines[k] >> (2 + side)) & 1:
@@ -184,7 +183,7 @@ def middle_dashes(rng, frames, i):
             square = (x - frames.lines_cm[line + j, 0]) ** 2 + (y - frames.lines_cm[line + j, 1]) ** 2
             if square < nearest:
                 nearest, at = square, j
-        if (way[at] + phase * (dash + gap)) % (dash + gap) > dash:
+        if (distance[at] + phase * (dash + gap)) % (dash + gap) > dash:
             continue
         px = x + (0.5 + off) * (frames.lines_cm[other + at, 0] - frames.lines_cm[line + at, 0])
         py = y + (0.5 + off) * (frames.lines_cm[other + at, 1] - frames.lines_cm[line + at, 1])

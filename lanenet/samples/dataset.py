@@ -1,4 +1,4 @@
-"""Label sets in memory, and the seeded batches of rasters and labels drawn from them."""
+"""Label sets in memory, and the seeded batches of rasters and labels that are drawn from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lanenet.perception.network.model_file import ANY_CAMERA
 from lanenet.samples.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
 from lanenet.samples.settings import AugmentSettings, Balance
 
-#: From more cameras than this on, what was learned holds for any.
+#: A network that learned from more cameras than this is for any camera. Chosen.
 _MANY_CAMERAS = 8
 
 
@@ -30,12 +30,12 @@ class LaneSamples:
         window: The bird's-eye window that all sets share.
         wheelbase_cm: Mean wheelbase over the frames; labels are in the frame of the front axle, so that it
             matters for steering only.
-        perception: How all sets' edge points were found; where the sets leave out different rows of the image
-            (their cars see different parts of themselves), no row is left out here.
+        perception: How all sets' edge points were found; without hidden rows where these differ between sets,
+            since cars see different parts of themselves.
         lane_width_cm: Mean lane width over the frames.
         lane_widths_cm: Narrowest and widest lane of a set.
         camera_hashes: Of the cameras that took the frames, sorted; ``any`` alone where they are so many that
-            the network has to do with any calibrated camera.
+            the network is for any calibrated camera.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
         points_cm: Labels of each frame, NaN where masked, n x 6.
         frames: Edge points, lane lines and labels, as the compiled loops take them.
@@ -48,7 +48,7 @@ class LaneSamples:
         """Join label sets.
 
         Args:
-            label_sets: What :func:`read_labels` answers.
+            label_sets: Returned by :func:`read_labels`.
             names: Where each set came from, for messages.
             min_quality: Frames of a lower quality are left out, and so are frames without any label.
 
@@ -99,7 +99,7 @@ class LaneSamples:
         return self.camera_hashes == [ANY_CAMERA]
 
     def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
-        """Return frames as they are, with the lane's width told."""
+        """Return frames as they are, with their lane width."""
         return plain_batch(self.frames, indices, self.window)
 
     def augmented_batch(
@@ -110,33 +110,33 @@ class LaneSamples:
         epoch: int,
         streams: Int[np.ndarray, "b"] | None = None,
     ) -> Batch:
-        """Return frames, each changed by its own draw.
+        """Return frames, each changed by its own random draw.
 
-        The draw depends on ``seed``, ``epoch`` and the index of the frame alone (or on its number in
-        ``streams``), so a sample is the same whatever the batch, the order and the number of workers.
+        The draw depends only on ``seed``, ``epoch`` and the index of the frame (or its stream in
+        ``streams``): a sample is the same whatever the batch, the order and the number of workers.
         """
         return augment_batch(self.frames, indices, self.window, settings, seed, epoch, streams)
 
     def order(
         self, seed: int, epoch: int, balance: Balance = "none"
     ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Return the frames of an epoch in a shuffled order, and the number of each one's draw.
+        """Return the frames of an epoch in a shuffled order, and the number of each one's random stream.
 
         Args:
             seed: Of the run.
             epoch: Counted from 0.
-            balance: ``none`` shows each frame once; ``drive`` shows each label set equally often, and within
-                it no frame twice as long as another one is left.
+            balance: ``none`` shows each frame once; ``drive`` shows each label set equally often, and a frame
+                again only after all others of its set.
         """
         n = len(self)
-        # The number after the last sample's: a stream of its own.
+        # A stream of its own: the number after the last sample's.
         rng = np.random.default_rng((seed, epoch, n))
         if balance == "none":
             frames = rng.permutation(n)
             return frames, frames
         sets = [np.arange(a, b) for a, b in pairwise(self.set_start.tolist()) if b > a]
         shown, streams = [], []
-        # The first sets get what the division leaves over.
+        # The first sets get the remainder of the division.
         for number, rows in enumerate(sets):
             wanted = n // len(sets) + (number < n % len(sets))
             rounds = -(-wanted // len(rows))
@@ -163,7 +163,7 @@ class LaneSamples:
             seed: Of the run.
             epoch: Counted from 0.
             batch_size: Samples per batch.
-            workers: Threads that prepare batches ahead; 0 prepares each when it is asked for.
+            workers: Threads that prepare batches ahead; 0 prepares each batch when it is needed.
             balance: How often each label set is shown, see :meth:`order`.
         """
         order, streams = self.order(seed, epoch, balance)
@@ -192,7 +192,7 @@ class LaneSamples:
         return full + (rest > 1)
 
     def normalisation(self, mirrored: bool) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
-        """Return mean and spread of each label, [cm], so that the network's outputs are of order one.
+        """Return mean and standard deviation of each label, [cm]; they scale the outputs to order one.
 
         Args:
             mirrored: Count each frame once more with left and right swapped.
@@ -202,7 +202,7 @@ class LaneSamples:
             points = np.concatenate([points, mirror_points(points)])
         known = np.isfinite(points)
         count = np.maximum(known.sum(axis=0), 1)
-        # Robust against the few frames of a sharp bend whose line lies a metre to the side.
+        # Robust against the few frames in sharp bends whose line lies a metre to the side.
         clipped = np.where(known, np.clip(points, -200.0, 200.0), 0.0)
         mean = clipped.sum(axis=0) / count
         variance = (np.where(known, clipped - mean, 0.0) ** 2).sum(axis=0) / count
@@ -210,7 +210,7 @@ class LaneSamples:
 
 
 def compile_kernels(path: Path) -> None:
-    """Draw one sample of a label set, so that numba keeps on disk what training draws its batches with."""
+    """Draw one sample of a label set, so that numba caches what the training needs."""
     samples = LaneSamples([read_labels(path)], [str(path)])
     samples.augmented_batch(np.arange(1), AugmentSettings(), 0, 0)
 
@@ -228,13 +228,13 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
     unlike = b.perception.unlike(a.perception)
     if unlike:
         raise LabelFormatError(
-            f"{name_b}: its edges were found in another way than those of {name_a} ({unlike}); label both "
-            "with the same settings"
+            f"{name_b}: its edges were found with other settings than those of {name_a} ({unlike}); label "
+            "both with the same settings"
         )
 
 
 def reference_of(label_sets: Sequence[LabelSet]) -> str:
-    """Say where labels come from: ``truth``, ``map`` or ``map and truth``."""
+    """Return where labels come from: ``truth``, ``map`` or ``map and truth``."""
     return " and ".join(sorted({labels.meta.source for labels in label_sets}))
 
 

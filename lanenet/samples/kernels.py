@@ -1,11 +1,8 @@
-"""The loops of the loader: frames are changed point by point and written into rasters, compiled.
+"""The compiled loops of the augmentation: frames are changed point by point and written into rasters.
 
-Every sample draws from a stream of its own, so that it is the same whatever else is in its batch and
-whichever thread prepares it. numba's cache notices a change of the file that a function stands in, and not of
-one that it calls into: after a change of the modules that this one imports, delete
-``lanenet/learn/__pycache__``.
-
-What a wrongly known mounting of the camera does to points of the road, compiled.
+Every sample has its own random stream, so that it is the same whatever else is in its batch and whichever
+thread prepares it. Numba's cache notices changes of a function's own file only: after a change of the modules
+that this one imports, delete ``lanenet/samples/__pycache__``.
 """
 
 from __future__ import annotations
@@ -28,15 +25,21 @@ from lanenet.samples.random_stream import (
 )
 from lanenet.samples.raster import count_cells, mark, presence
 
+#: Radius of a disc without paint, and width of a ring. Chosen: glare and worn paint on model roads.
+_UNPAINTED_CM = (4.0, 20.0)
+#: The second of two edge points lies this close to the first, along each axis. Chosen: a blurred border.
+_DOUBLE_CM = 1.5
+_LABEL_ROWS_CM = np.array(ROWS_CM)
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
-    """Answer where a point of the road seems to lie when the camera's mounting is known wrongly.
+    """Return where a point of the road appears to be if the camera's mounting is wrong.
 
     See :func:`lanenet.samples.augment.misplaced`.
     """
-    # The ray in the level frame of the car, as the wrong mounting turns it: first pitch, then roll.
+    # The ray in the car's level frame, turned by the error of the mounting: first pitch, then roll.
     dx, dy, dz = x - camera_x, y - camera_y, -camera_z
     c, s = np.cos(pitch), np.sin(pitch)
     dy, dz = c * dy + s * dz, c * dz - s * dy
@@ -44,27 +47,22 @@ def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
     dx, dz = c * dx + s * dz, c * dz - s * dx
     if not dz < 0.0:
         return np.nan, np.nan
-    way = -height * camera_z / dz
-    return camera_x + dx * way, camera_y + dy * way
+    scale = -height * camera_z / dz
+    return camera_x + dx * scale, camera_y + dy * scale
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def misplace_points(points_cm, camera_cm, height, pitch, roll, out):
-    """Do :func:`misplace` for many points of one camera."""
+    """Apply :func:`misplace` to many points of one camera."""
     right, ahead, up = camera_cm
     for k in range(len(points_cm)):
         x, y = points_cm[k]
         out[k, 0], out[k, 1] = misplace(x, y, right, ahead, up, height, pitch, roll)
 
 
-_STRETCH_CM = (4.0, 20.0)
-_DOUBLE_CM = 1.5
-_LABEL_ROWS_CM = np.array(ROWS_CM)
-
-
 class Amounts(NamedTuple):
-    """:class:`lanenet.learn.config.AugmentSettings` as numbers; ``limit`` is 1 for draws at the limit."""
+    """:class:`lanenet.samples.settings.AugmentSettings` as numbers; ``limit`` is 1 for draws at the limit."""
 
     mirror: float
     shift_cm: float
@@ -90,9 +88,10 @@ class Amounts(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """Frames one after the other; the attributes of :class:`lanenet.samples.dataset.LaneSamples`.
+    """Frames, concatenated: frame i owns the edges from ``edge_start[i]`` on, its lines 2 i and 2 i + 1.
 
-    ``edge_lines`` is what :func:`lanenet.samples.raster.near_lines` answers.
+    ``edge_lines`` are the bits of :func:`lanenet.samples.raster.near_lines`; the others are explained at
+    :func:`lanenet.samples.augment.join_frames`.
     """
 
     edges_cm: np.ndarray
@@ -109,7 +108,7 @@ class Frames(NamedTuple):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def rasterise_frames(out, indices, frames, grid, present):
-    """Fill rasters with frames as they are, and say which lines they show."""
+    """Write frames as they are into rasters, and which lines they show into ``present``."""
     cells = np.zeros(2, np.int64)
     for slot in range(len(indices)):
         i = indices[slot]
@@ -124,11 +123,11 @@ def rasterise_frames(out, indices, frames, grid, present):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def augment_frames(out, labels, present, told, indices, streams, seed, epoch, frames, grid, amounts):
-    """Change frames, each by its own draw; write rasters, labels, which lines are seen, the width to tell.
+def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch, frames, grid, amounts):
+    """Change frames, each by its own draw; write rasters, labels, visible lines and the given lane width.
 
-    The order is that of the world: paint comes off, the car is put elsewhere, things stand in its way, and
-    then all of it is seen through a camera whose mounting is known wrongly.
+    The order is that of the world: paint comes off, the car moves, objects stand on the road, and all is seen
+    through a camera with a wrong mounting.
     """
     rng = np.empty(1, np.uint64)
     cells = np.empty(2, np.int64)
@@ -163,24 +162,26 @@ def augment_frames(out, labels, present, told, indices, streams, seed, epoch, fr
         n_objects = next_number(rng, amounts.objects, amounts.limit)
         for k in range(n_objects):
             opaque[k] = draw_outline(rng, corners[k], grid)
-        gone = _missing_lines(rng, amounts)
+        missing = _missing_lines(rng, amounts)
         share = next_amount(rng, amounts.drop_points, amounts.limit)
         doubled = next_amount(rng, amounts.double_points, amounts.limit)
         first, last = frames.edge_start[i], frames.edge_start[i + 1]
-        kind, place_x, place_y, radius = _stretch(rng, amounts.missing_stretch, frames.edges_cm, first, last)
-        is_told, error = (
+        kind, place_x, place_y, radius = _unpainted(
+            rng, amounts.missing_stretch, frames.edges_cm, first, last
+        )
+        is_given, error = (
             next_uniform(rng) >= amounts.untold_width,
             next_spread(rng, amounts.width_error, amounts.limit),
         )
-        told[slot] = frames.lane_cm[i] * scale * (1.0 + error) if is_told else 0.0
+        given_cm[slot] = frames.lane_cm[i] * scale * (1.0 + error) if is_given else 0.0
         dashes = nothing
-        # Where the width is not known nobody could tell them from the border of a narrower lane.
-        if told[slot] > 0.0 and next_uniform(rng) < amounts.middle_dashes:
+        # Without the width they could be the border of a narrower lane.
+        if given_cm[slot] > 0.0 and next_uniform(rng) < amounts.middle_dashes:
             dashes = middle_dashes(rng, frames, i)
         count = 0
         for k in range(first, last + len(dashes)):
             lines = frames.edge_lines[k] if k < last else 0
-            if lines & gone or (share > 0.0 and next_uniform(rng) < share):
+            if lines & missing or (share > 0.0 and next_uniform(rng) < share):
                 continue
             if k < last:
                 px, py = np.float64(frames.edges_cm[k, 0]), np.float64(frames.edges_cm[k, 1])
@@ -218,10 +219,10 @@ def augment_frames(out, labels, present, told, indices, streams, seed, epoch, fr
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _room(frames, i, mirror, scale, most_cm):
-    """How far the car can be put to the left and to the right without a change of lane.
+    """Return how far the car can move to the left and to the right without leaving its lane.
 
-    Across a line at which another lane begins it would be in that one, and its labels those of a lane that it
-    is not in; close beside it a picture shows too little to tell. Beyond other lines it stays in its lane.
+    Beyond a line that divides lanes it would be in the other one, and have the labels of a lane that it is
+    not in; close to such a line the image does not show which. Other lines do not limit it.
     """
     room_left, room_right = most_cm, most_cm
     margin_cm = BESIDE_DIVIDER_LANES * scale * frames.lane_cm[i]
@@ -239,9 +240,9 @@ def _room(frames, i, mirror, scale, most_cm):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _label(labels, frames, i, view, grid):
-    """Labels of the moved car: where its lines cross the rows, for points that the label set vouches for.
+    """Write the labels of the moved car: where its lines cross the rows, for points that the label set has.
 
-    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`, and points beside the window have no
+    The rule is that of :func:`lanenet.geometry.lane.rows_of_polyline`; points outside the window have no
     label, as in :meth:`BirdseyeWindow.labelled`.
     """
     mirror, xx, xy, yx, yy, x0, y0 = view
@@ -270,7 +271,7 @@ def _label(labels, frames, i, view, grid):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _missing_lines(rng, amounts):
-    """Bits of the lines that are wholly gone."""
+    """Draw which lines are missing, as bits."""
     chance, side = next_uniform(rng), next_uniform(rng)
     if chance < amounts.missing_both:
         return 3
@@ -281,16 +282,16 @@ def _missing_lines(rng, amounts):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def _stretch(rng, chance, edges_cm, first, last):
-    """Draw a stretch without paint: kind (0 none, 1 disc, 2 ring about the car), its place and its size.
+def _unpainted(rng, chance, edges_cm, first, last):
+    """Draw an area without paint: kind (0 none, 1 disc, 2 ring about the car), place and size.
 
-    A ring hides a band of road right across; a disc hides a piece of one line.
+    A ring hides a band across the whole road; a disc hides a section of one line.
     """
     draw, which, kind, size = (
         next_uniform(rng),
         next_uniform(rng),
         next_uniform(rng),
-        next_between(rng, _STRETCH_CM[0], _STRETCH_CM[1]),
+        next_between(rng, _UNPAINTED_CM[0], _UNPAINTED_CM[1]),
     )
     if draw >= chance or last == first:
         return 0, 0.0, 0.0, 0.0

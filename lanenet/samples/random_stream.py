@@ -1,7 +1,7 @@
 """Random numbers from a counter, for compiled loops: one stream per sample, the same on every machine.
 
-A stream is an array of one unsigned number; every draw moves it on. NumPy's generators take longer to be
-made than a whole sample takes to be changed.
+A stream is an array of one unsigned number, which every draw advances. Making a NumPy generator takes longer
+than changing a whole sample.
 
 Source:
     Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators" (SplitMix64).
@@ -27,7 +27,7 @@ _BELL_SCALE = (4.0 * (65536.0**2 - 1.0) / 12.0) ** -0.5
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def start_stream(stream, seed, epoch, number):
-    """Put a stream at the beginning that belongs to three whole numbers."""
+    """Start a stream from three integers."""
     stream[0] = np.uint64(seed)
     stream[0] = _next(stream) + np.uint64(epoch)
     stream[0] = _next(stream) + np.uint64(number)
@@ -37,21 +37,21 @@ def start_stream(stream, seed, epoch, number):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_uniform(stream):
-    """Draw evenly from 0 (included) to 1 (not included)."""
+    """Draw uniformly from [0, 1)."""
     return np.float64(_next(stream) >> _11) * _UNIT
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_between(stream, low, high):
-    """Draw evenly from ``low`` to ``high``."""
+    """Draw uniformly from ``low`` to ``high``."""
     return low + (high - low) * next_uniform(stream)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_spread(stream, most, limit):
-    """Draw evenly from ``-most`` to ``most``; with ``limit`` one of the two ends."""
+    """Draw uniformly from ``-most`` to ``most``; with ``limit`` one of the two ends."""
     draw = 2.0 * next_uniform(stream) - 1.0
     if limit:
         draw = -1.0 if draw < 0.0 else 1.0
@@ -61,7 +61,7 @@ def next_spread(stream, most, limit):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_amount(stream, most, limit):
-    """Draw evenly from 0 to ``most``; with ``limit`` all of it."""
+    """Draw uniformly from 0 to ``most``; with ``limit`` always ``most``."""
     draw = next_uniform(stream)
     return most if limit else draw * most
 
@@ -69,7 +69,7 @@ def next_amount(stream, most, limit):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_number(stream, most, limit):
-    """Draw one of 0, 1 ... ``most``; with ``limit`` the last."""
+    """Draw an integer from 0 to ``most``; with ``limit`` always ``most``."""
     draw = next_uniform(stream)
     return most if limit else int(draw * (most + 1))
 
@@ -77,10 +77,10 @@ def next_number(stream, most, limit):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def next_bell(stream):
-    """Draw from a bell curve of mean 0 and standard deviation 1: a sum of four even numbers.
+    """Draw from a bell curve of mean 0 and standard deviation 1: a sum of four uniform numbers.
 
-    No draw lies beyond 3.5; a normal one would need a logarithm and a sine, and noise of edges has no tails
-    that would be worth them.
+    No draw lies beyond 3.5. A normal distribution would take a logarithm and a sine, and the noise of edges
+    has no such tails.
     """
     bits = _next(stream)
     total = np.float64(bits & _LOW_16)

@@ -1,7 +1,4 @@
-"""Cells of a raster, marked point by point in compiled loops.
-
-Which lines of the lane a raster shows, compiled.
-"""
+"""Cells of a raster, marked point by point, and which lines of the lane it shows; compiled."""
 
 from __future__ import annotations
 
@@ -10,9 +7,17 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
+#: Edge points this close to a line belong to it. Chosen: both borders of a wide tape and their blur.
+LINE_REACH_CM = 4.0
+#: Sine of the largest angle between a marking's border and its line. Chosen: 30 degrees.
+_LEAN = 0.5
+#: A line that marks cells over the first length can be seen; over less than the second it cannot. Chosen;
+#: both borders of a tape count, so the first is 9 cm of it.
+SEEN_CM, UNSEEN_CM = 18.0, 3.0
+
 
 class Grid(NamedTuple):
-    """A bird's-eye window in the single precision that edge points have; labels have double."""
+    """A bird's-eye window, in the single precision of edge points and the double precision of labels."""
 
     left_cm: np.float32
     far_cm: np.float32
@@ -26,7 +31,7 @@ class Grid(NamedTuple):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def mark(raster, x_cm, y_cm, grid):
-    """Mark the cell of a point; answers whether it lay in the window and was not marked before.
+    """Mark the cell of a point; return whether it lies in the window and was not marked before.
 
     In single precision, as :meth:`BirdseyeWindow.rasterise` does it with edge points.
     """
@@ -43,7 +48,7 @@ def mark(raster, x_cm, y_cm, grid):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def mark_edge(raster, ax, ay, bx, by, grid):
-    """Mark a straight edge without holes; answers how many cells it added."""
+    """Mark a straight edge without holes; return how many cells it added."""
     steps = 1 + int(np.hypot(bx - ax, by - ay) / (0.7 * grid.cell_cm))
     added = 0
     for k in range(steps + 1):
@@ -53,24 +58,15 @@ def mark_edge(raster, ax, ay, bx, by, grid):
     return added
 
 
-#: Both edges of a wide tape, and what a blurred frame puts beside them.
-LINE_REACH_CM = 4.0
-#: Sine of the angle by which an edge of a marking may turn from its line: 30 degrees.
-_LEAN = 0.5
-#: A line that marks cells over this length is there for everybody; over less than the second it is not. Both
-#: borders of a tape count: 9 cm of it.
-SEEN_CM, UNSEEN_CM = 18.0, 3.0
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def near_lines(edges, left_cm, right_cm, out):
-    """Tell which lines edge points belong to, and which go with a line that is missing.
+    """Find which lines edge points belong to, and which points go with a line that is missing.
 
     Bit 0 is set for points within ``LINE_REACH_CM`` of the left line, and for those that run along it farther
-    to the left: the other borders of the road, which would be taken for it once it is gone. Bit 1 is set
+    to the left: other borders of the road, which would be taken for the line if it were missing. Bit 1 is set
     likewise for the right line. Bits 2 and 3 are set for points within ``LINE_REACH_CM`` that run along the
-    line, as the borders of a marking do, and not across it, as most of what lies on the road.
+    line, as a marking's borders do, and not across it, as most other edges.
     """
     reach = LINE_REACH_CM * LINE_REACH_CM
     for k in range(len(edges)):
@@ -101,7 +97,7 @@ def near_lines(edges, left_cm, right_cm, out):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def count_cells(cells, lines):
-    """Count a fresh cell for the lines along which its point runs."""
+    """Count a newly marked cell for the lines along which its point runs."""
     cells[0] += (lines >> 2) & 1
     cells[1] += lines >> 3
 
@@ -109,7 +105,7 @@ def count_cells(cells, lines):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def presence(cells, frames, line, grid):
-    """1 for a line that is seen, 0 for one that is not, NaN between them or where its place is unknown."""
+    """Return 1 for a line that can be seen, 0 for one that cannot, NaN between or if its place is unknown."""
     known = False
     for k in range(frames.line_start[line], frames.line_start[line + 1]):
         known = known or not np.isnan(frames.lines_cm[k, 0])

@@ -8,14 +8,14 @@ from pydantic import Field, model_validator
 
 from lanenet.config import Settings
 
-#: How often each label set is shown in an epoch: as often as it has frames, or as often as every other one.
+#: How often each label set is shown in an epoch: in proportion to its frames, or as often as every other one.
 Balance = Literal["none", "drive"]
 
-
-#: Named amounts of augmentation.
+#: Named amounts of augmentation. Measured on the validation lap of garage_tape: docs/learning.md, "On one's
+#: own road".
 _PRESETS: dict[str, dict[str, object]] = {
-    # Learned for one car on its road, in one direction: the camera was found from the drive itself, and the
-    # frames show the clutter that there is. What is made up beside is less than for a network for any road.
+    # For one car on its road, in one direction: the camera was found from the drive itself, and the frames
+    # show the clutter that there is.
     "own_road": {
         "mirror": 0.0,
         "drop_points": 0.2,
@@ -36,40 +36,38 @@ _PRESETS: dict[str, dict[str, object]] = {
 class AugmentSettings(Settings):
     """How a sample is changed before it becomes a raster; all of it in cm, on the edge points.
 
-    The defaults are for a network that meets other cars and roads. ``preset: own_road`` stands for less, as
-    it suits one car on its own road; the keys beside it change that. Once read, only its values are left.
-
-    What the car was told (speed, steering) is not changed: labels and rasters do not depend on it.
+    The defaults are for a network that meets other cars and roads; they were chosen, and what some of them
+    bring was measured in docs/learning.md. ``preset: own_road`` stands for less, for one car on its own road;
+    keys beside it change that. Once read, only the values are left.
 
     Attributes:
         mirror: Probability that left and right are swapped.
-        shift_cm: The car is moved sideways by up to this much, evenly in both directions.
+        shift_cm: The car is moved sideways by up to this much, in either direction.
         rotate_rad: The car is turned about its front axle by up to this much.
-        scale: All lengths, those of the labels too, become larger or smaller by up to this share: another
-            lane width, another tape, another height of the camera.
-        drop_points: Up to this share of the edge points is dropped, a new share for every sample.
-        double_points: Up to this share of the edge points comes twice, the second within 1.5 cm.
-        jitter_cm: Standard deviation of the noise on each edge point.
+        scale: All lengths, those of the labels too, grow or shrink by up to this share: another lane width,
+            another tape, another height of the camera.
+        drop_points: Up to this share of the edge points is dropped; the share is drawn for every sample.
+        double_points: Up to this share of the edge points is doubled, the second within 1.5 cm.
+        jitter_cm: Sigma of the noise on each edge point.
         missing_stretch: Probability that the points in a disc or ring are dropped (glare, worn paint).
-        missing_line: Probability that the points of one of the two lines are dropped, and with them what
-            runs along it farther out: nobody could tell the next lane's border from a line that is gone.
+        missing_line: Probability that the points of one of the two lines are dropped, and with them edges
+            that run along it farther out: the next lane's border would be taken for the missing line.
         missing_both: Probability that the points of both are.
         middle_dashes: Probability that a dashed line runs along the middle of the lane, where the network is
-            told the lane's width.
+            given the lane width.
         objects: Up to this many closed outlines of unknown things; boxes, cones and cars hide the road below
             them, shadows do not.
         clutter_segments: Up to this many straight edges of things that are not lanes.
         clutter_points: Up to this many single points.
-        clutter_share: Points and straight edges are added until they mark up to this share of what the frame
-            itself marks.
-        height: The camera's height is taken wrong by up to this share; the points move as they would, the
-            labels do not.
-        pitch_rad: Its pitch is taken wrong by up to this much.
-        roll_rad: Its roll likewise.
-        untold_width: Probability that the lane's width is kept from a network that can be told it.
-        width_error: It is told wrongly by up to this share.
-        draw: ``even`` draws every amount anew for each sample; ``limit`` takes all amounts at their limits,
-            with either sign, for tests of robustness.
+        clutter_share: Points and straight edges are added until they mark up to this share of the cells that
+            the frame itself marks.
+        height: The camera's assumed height is wrong by up to this share; the points move, the labels do not.
+        pitch_rad: Its assumed pitch is wrong by up to this much.
+        roll_rad: Its assumed roll likewise.
+        untold_width: Probability that the lane width is kept from a network that takes it.
+        width_error: The given lane width is wrong by up to this share.
+        draw: ``even`` draws every amount for each sample; ``limit`` takes all amounts at their limits, with
+            either sign, for tests of robustness.
     """
 
     mirror: float = Field(default=0.5, ge=0.0, le=1.0)
