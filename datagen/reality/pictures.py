@@ -13,7 +13,6 @@ from jaxtyping import UInt8
 from datagen.reality.drives import RealitySettings
 from datagen.reality.measure import MeasuredDrive
 from datagen.reality.report import Row, nearest_synthetic
-from datagen.reality.statistics import STATISTICS
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 
@@ -114,9 +113,7 @@ def histograms(
         for i, value in enumerate(row.real):
             if math.isfinite(value):
                 axes.axvline(value, color=f"C{i}", label=real[i].name)
-        unit = STATISTICS[row.name][0]
-        title = row.name.removesuffix("_px").replace("_", " ") + (f", {unit}" if unit else "")
-        axes.set_title(title, fontsize=8)
+        axes.set_title(row.label, fontsize=8)
         axes.tick_params(labelsize=7)
         axes.set_yticks([])
         if k == 0 and real:

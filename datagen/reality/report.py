@@ -41,6 +41,12 @@ class Row:
     below: tuple[float, ...]
 
     @property
+    def label(self) -> str:
+        """Name and unit, for people."""
+        unit = STATISTICS[self.name][0]
+        return self.name.removesuffix("_px").replace("_", " ") + (f", {unit}" if unit else "")
+
+    @property
     def inside(self) -> tuple[bool, ...]:
         """Whether each real drive lies within the synthetic spread; NaN does not."""
         return tuple(self.low <= value <= self.high for value in self.real)
@@ -83,12 +89,10 @@ def table(rows: Sequence[Row], names: Sequence[str]) -> list[list[str]]:
     headers = ["statistic", "2.5 %", "median", "97.5 %", *names]
     lines = [headers]
     for row in rows:
-        unit = STATISTICS[row.name][0]
-        label = row.name.removesuffix("_px").replace("_", " ") + (f", {unit}" if unit else "")
         cells = [_figure(value) for value in (row.low, row.median, row.high)]
         for value, inside in zip(row.real, row.inside, strict=True):
             cells.append(_figure(value) + ("" if inside else " out"))
-        lines.append([label, *cells])
+        lines.append([row.label, *cells])
     return lines
 
 

@@ -44,7 +44,7 @@ class Runs:
     extent_cm: Float[np.ndarray, "k"]
 
     def are_short(self, camera_height_cm: float) -> Bool[np.ndarray, "k"]:
-        """Tell which runs are too short to be distinguished from clutter.
+        """Return which runs are too short to be distinguished from clutter.
 
         These are shorter than half a camera height on the road, or of fewer than six points. Ends of dashes
         are among them, on real roads as on synthetic ones.

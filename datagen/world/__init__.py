@@ -1,1 +1,4 @@
-"""Synthetic drives with exact truth: tracks, a fisheye renderer, a car with errors, a scripted driver."""
+"""Synthetic drives with exact ground truth.
+
+``road`` is what is driven on, ``render`` draws it, ``car`` drives it; ``world`` puts the three together.
+"""

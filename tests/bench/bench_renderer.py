@@ -1,14 +1,13 @@
 """Time and memory of the renderer: ``python tests/bench/bench_renderer.py [--seeds N] [--processes N]``.
 
-Looks and lengths of road are drawn in turn, a few frames at a time, so that a busy machine is busy for all
-of them. Each length is several roads, each driven at several places that are spread over its whole length, as
-one place has more in view than another. The first frame at a place is not counted: no car jumps there. A long
-road folds, and more stands around a place on it than on a short one, as ``solids`` says, the mean number near
-the car; ``no things`` is every effect without what stands, lies or shines beside the road, and therefore
-compares lengths like with like.
+Appearances and lengths of road are drawn in turn, a few frames at a time, so that a busy machine slows all of
+them alike. Each length is several roads, each driven at several places along it, since one place has more in
+view than another. The first frame at a place does not count: no car jumps there. A long road folds, and more
+things stand around a place on it than on a short one (``solids``: mean number near the car); ``no things`` is
+every effect without things beside the road, and compares lengths on equal terms.
 
 Times are CPU time of the drawing thread, with the wall clock beside. ``held_mb`` is what a renderer's arrays
-take, without the camera's rays, which renderers share. Prints JSON, a line per look and length.
+take, without the camera's rays, which renderers share. Prints JSON, a line per appearance and length.
 """
 
 from __future__ import annotations
@@ -50,12 +49,12 @@ LOOKS = {"plain": Appearance(), "no things": NO_THINGS, "every effect": EVERY_EF
 LENGTHS_CM = (1000.0, 20000.0)
 SPEED_CM_S, YAW_RATE_RAD_S, INTERVAL_S = 60.0, 0.5, 0.05
 PLACES, BLOCK = 4, 10  # places on a road, and frames in a row at each
-SHORTEST_WAY_CM = 100.0  # what lies before the first place and after the last
+MARGIN_CM = 100.0  # before the first place and after the last
 
 
 @dataclass
 class Job:
-    """One look of one length of road."""
+    """One appearance on one length of road."""
 
     look: str
     length_cm: float
@@ -67,8 +66,8 @@ class Job:
     def draw(self, seed: int, place: int, timed: bool) -> None:
         """Draw one block of frames."""
         track, renderer = self.roads[seed]
-        free_cm = track.length_cm - 3.0 * SHORTEST_WAY_CM - BLOCK * SPEED_CM_S * INTERVAL_S
-        start_cm = SHORTEST_WAY_CM + free_cm * place / (PLACES - 1)
+        free_cm = track.length_cm - 3.0 * MARGIN_CM - BLOCK * SPEED_CM_S * INTERVAL_S
+        start_cm = MARGIN_CM + free_cm * place / (PLACES - 1)
         for frame in range(-1, BLOCK):
             xy, heading = track.point(start_cm + frame * SPEED_CM_S * INTERVAL_S)
             pose = np.array([*xy, heading])
@@ -81,7 +80,7 @@ class Job:
 
 
 def measure(seeds: int) -> list[dict[str, float | str]]:
-    """Draw frames of every look on roads of every length, in turn."""
+    """Draw frames of every appearance on roads of every length, in turn."""
     cv2.setNumThreads(1)
     camera = CameraSettings().build(26.0)
     ground = PixelGround.of(camera)

@@ -1,1 +1,1 @@
-"""The simulated car: its motion, its camera, its scripted driver, and who else may steer it."""
+"""The simulated car: its motion, its camera, its scripted driver, and the pilots of closed-loop drives."""

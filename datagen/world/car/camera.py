@@ -79,7 +79,7 @@ class CameraSettings(Settings):
 
 
 def sees_lane(camera: CameraSettings, track: TrackSettings, wheelbase_cm: float) -> bool:
-    """Tell whether the camera sees enough of the lane from the middle of it.
+    """Return whether the camera sees enough of the lane from the middle of it.
 
     That is, on a straight, both lines at the farthest label row. In the tightest bend, to either side: 10 cm
     of one of the lines between the front axle and 45 cm ahead, wherever its dashes are. Of a line that may be

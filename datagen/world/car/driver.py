@@ -71,29 +71,19 @@ class DriverSettings(Settings):
     lane_change_cm: float = Field(default=150.0, gt=0.0)
 
     @model_validator(mode="after")
-    def _waves_in_order(self) -> DriverSettings:
-        if self.shortest_wander_cm > self.longest_wander_cm:
-            raise ValueError(
-                f"shortest_wander_cm {self.shortest_wander_cm:g} exceeds longest_wander_cm "
-                f"{self.longest_wander_cm:g}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _changes_end_before_the_next(self) -> DriverSettings:
+    def _lengths_in_order(self) -> DriverSettings:
         every_cm = self.change_lanes_every_cm
-        if every_cm is not None and self.lane_change_cm > every_cm:
-            raise ValueError(
-                f"lane_change_cm {self.lane_change_cm:g} exceeds change_lanes_every_cm {every_cm:g}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _a_first_change_has_others(self) -> DriverSettings:
-        if self.first_change_cm is not None and self.change_lanes_every_cm is None:
+        if self.first_change_cm is not None and every_cm is None:
             raise ValueError(
                 f"first_change_cm {self.first_change_cm:g} needs change_lanes_every_cm, found none"
             )
+        for shorter, longer in (
+            ("shortest_wander_cm", "longest_wander_cm"),
+            ("lane_change_cm", "change_lanes_every_cm"),
+        ):
+            least, most = getattr(self, shorter), getattr(self, longer)
+            if most is not None and least > most:
+                raise ValueError(f"{shorter} {least:g} exceeds {longer} {most:g}")
         return self
 
     def chosen_speed_cm_s(self, rate_hz: float) -> float:

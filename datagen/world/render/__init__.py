@@ -1,1 +1,1 @@
-"""The renderer: what the camera of a simulated car sees of the floor, the road and what stands on it."""
+"""Frames of a synthetic drive: floor, light, things, walls and sensor, pixel by pixel."""

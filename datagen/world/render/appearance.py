@@ -220,18 +220,16 @@ def _other_floor(rng: np.random.Generator) -> dict[str, Any]:
         gray = 40.0 + 85.0 * brightness
         colour = (gray * float(hue[0]), gray * float(hue[1]), gray * float(hue[2]))
         dull = {"lamp_level": 15.0 * (1.0 + tint)}
-        return _floor("carpet", colour, 3.0 + 6.0 * texture, 0.4, 1.0, 0.0, 0.0) | dull
+        return _floor("carpet", colour, 3.0 + 6.0 * texture, 0.4) | dull
     if kind < 0.3:  # printed mat: a gray road on another colour
         gray = 50.0 + 60.0 * brightness
-        floor = _floor(
-            "mat", (gray, gray, gray * (1.0 + 0.05 * tint)), 1.0 + 4.0 * texture, 1.0, 1.0, 0.0, 0.0
-        )
+        floor = _floor("mat", (gray, gray, gray * (1.0 + 0.05 * tint)), 1.0 + 4.0 * texture, 1.0)
         return {**floor, "verge_bgr": tuple(float(v) for v in verge)}
     if kind < 0.4:  # artificial grass
         gray = 50.0 + 50.0 * brightness
         colour = (gray * 0.6, gray * 1.25, gray * (0.75 + 0.2 * tint))
         dull = {"lamp_level": 15.0 * (1.0 + tint)}
-        return _floor("grass", colour, 5.0 + 8.0 * texture, 0.4, 1.0, 0.0, 0.0) | dull
+        return _floor("grass", colour, 5.0 + 8.0 * texture, 0.4) | dull
     return {}
 
 
@@ -260,32 +258,24 @@ def _random_floor(rng: np.random.Generator) -> dict[str, Any]:
     if kind == 0:  # dark asphalt: coarse grain, no joints
         gray = 35.0 + 45.0 * brightness
         floor = (gray * (1.0 + 0.08 * tint), gray, gray * (1.0 - 0.05 * tint))
-        return _floor("asphalt", floor, 4.0 + 9.0 * texture, 0.4, 1.0, 0.0, 0.0)
+        return _floor("asphalt", floor, 4.0 + 9.0 * texture, 0.4)
     if kind == 1:  # gray concrete: soft stains, wide joints on every other floor
         gray = 85.0 + 55.0 * brightness
         joint_cm = 80.0 + 120.0 * joints if joints > 0.5 else 0.0
-        return _floor(
-            "plain",
-            (gray, gray, gray * (1.0 + 0.04 * tint)),
-            3.0 + 7.0 * texture,
-            1.5,
-            1.0,
-            joint_cm,
-            joint_cm,
-        )
+        floor = (gray, gray, gray * (1.0 + 0.04 * tint))
+        return _floor("plain", floor, 3.0 + 7.0 * texture, 1.5, joint_cm=joint_cm)
     if kind == 2:  # wood: long grains, planks
         gray = 75.0 + 55.0 * brightness
         floor = (gray * (0.62 + 0.1 * tint), gray, gray * 1.35)
-        return _floor("wood", floor, 3.0 + 7.0 * texture, 0.5, 12.0, 0.0, 0.0)
+        return _floor("wood", floor, 3.0 + 7.0 * texture, 0.5, stretch=12.0)
     gray = 115.0 + 40.0 * brightness  # light tile
     tile_cm = 25.0 + 35.0 * joints
-    return _floor(
-        "tile", (gray * (1.0 + 0.05 * tint), gray, gray), 1.0 + 3.0 * texture, 1.0, 1.0, tile_cm, tile_cm
-    )
+    floor = (gray * (1.0 + 0.05 * tint), gray, gray)
+    return _floor("tile", floor, 1.0 + 3.0 * texture, 1.0, joint_cm=tile_cm)
 
 
 def _floor(
-    kind: FloorKind, bgr: Bgr, level: float, scale_cm: float, stretch: float, u_cm: float, v_cm: float
+    kind: FloorKind, bgr: Bgr, level: float, scale_cm: float, stretch: float = 1.0, joint_cm: float = 0.0
 ) -> dict[str, Any]:
     return {
         "floor": kind,
@@ -293,7 +283,7 @@ def _floor(
         "texture_level": level,
         "texture_scale_cm": scale_cm,
         "texture_stretch": stretch,
-        "joint_u_cm": u_cm,
-        "joint_v_cm": v_cm,
+        "joint_u_cm": joint_cm,
+        "joint_v_cm": joint_cm,
         "joint_level": 8.0 + 2.0 * level,
     }

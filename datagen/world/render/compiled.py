@@ -38,8 +38,8 @@ NOT_FLOOR, FAR = 255, 8
 
 #: Columns that all things in a scene begin with: place and direction, frame map, and half their size, [cm].
 X, Y, COS, SIN, HALF_LENGTH, HALF_WIDTH = range(6)
-#: Further columns of flat rectangles.
-BLUE, GREEN, RED = 6, 7, 8
+#: The column at which the colour of a flat rectangle begins: blue, green, red.
+BLUE = 6
 
 
 @compiled_bare

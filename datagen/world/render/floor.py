@@ -18,11 +18,9 @@ from datagen.world.render.compiled import (
     BLUE,
     FAR,
     FLOOR_NUMBERS,
-    GREEN,
     MOVE_X,
     MOVE_Y,
     NOT_FLOOR,
-    RED,
     TILE,
     U_X,
     U_Y,
@@ -86,8 +84,8 @@ class Surface(NamedTuple):
 
 #: Columns of ``Road.nodes``.
 NODE_X, NODE_Y, NODE_COS, NODE_SIN, NODE_CURVATURE, NODE_S = range(6)
-#: Columns of ``Road.markings``; the last two are rows of ``Road.painted``.
-OFFSET, WIDTH, MARKING_BLUE, MARKING_GREEN, MARKING_RED, FIRST, LAST = range(7)
+#: Columns of ``Road.markings``: three hold the colour; the last two are rows of ``Road.painted``.
+OFFSET, WIDTH, MARKING_BLUE, _, _, FIRST, LAST = range(7)
 
 
 class Road(NamedTuple):
@@ -230,9 +228,11 @@ def _paint_tile(canvas, ground, view, top, left, box, numbers, surface, road, th
                 across = widths_along(pixel, -road_s, road_c)
                 if road.has_verge:
                     verge = _verge_share(offset, across, reach, road)
-            blue = floor[0] + verge * (verge_bgr[0] - floor[0]) + shade * pattern_bgr[0]
-            green = floor[1] + verge * (verge_bgr[1] - floor[1]) + shade * pattern_bgr[1]
-            red = floor[2] + verge * (verge_bgr[2] - floor[2]) + shade * pattern_bgr[2]
+            bgr = (
+                floor[0] + verge * (verge_bgr[0] - floor[0]) + shade * pattern_bgr[0],
+                floor[1] + verge * (verge_bgr[1] - floor[1]) + shade * pattern_bgr[1],
+                floor[2] + verge * (verge_bgr[2] - floor[2]) + shade * pattern_bgr[2],
+            )
             fresh = 1.0
             if surface.wear > 0.0 and (candidate >= 0 or n_boxes > 0):
                 a, b = row[ALONG + j] / TEXTURE_CELL_CM, row[ACROSS + j] / TEXTURE_CELL_CM
@@ -241,10 +241,7 @@ def _paint_tile(canvas, ground, view, top, left, box, numbers, surface, road, th
                 fresh = 1.0 - min(max(1.5 * (worn - 3.0 + 3.2 * surface.wear), 0.0), 1.0)
             for k in range(n_boxes):
                 q = near_boxes[k]
-                alpha = fresh * rectangle_share(pixel, boxes[q])
-                blue += alpha * (boxes[q, BLUE] - blue)
-                green += alpha * (boxes[q, GREEN] - green)
-                red += alpha * (boxes[q, RED] - red)
+                bgr = _blend(bgr, fresh * rectangle_share(pixel, boxes[q]), boxes[q], BLUE)
             if candidate >= 0:
                 scale = 1.0 / max(1.0 - curvature * offset, 0.2)
                 wu, wv, wm = widths_along(pixel, road_c, road_s)
@@ -257,16 +254,23 @@ def _paint_tile(canvas, ground, view, top, left, box, numbers, surface, road, th
                     if alpha > 0.0:
                         first, last = int(markings[m, FIRST]), int(markings[m, LAST])
                         alpha *= fresh * painted_share(place, along, road.painted, first, last)
-                        blue += alpha * (markings[m, MARKING_BLUE] - blue)
-                        green += alpha * (markings[m, MARKING_GREEN] - green)
-                        red += alpha * (markings[m, MARKING_RED] - red)
+                        bgr = _blend(bgr, alpha, markings[m], MARKING_BLUE)
             for k in range(n_clutter):
                 q = near_clutter[k]
-                alpha = rectangle_share(pixel, clutter[q])
-                blue += alpha * (clutter[q, BLUE] - blue)
-                green += alpha * (clutter[q, GREEN] - green)
-                red += alpha * (clutter[q, RED] - red)
-            colours[j, 0], colours[j, 1], colours[j, 2] = blue, green, red
+                bgr = _blend(bgr, rectangle_share(pixel, clutter[q]), clutter[q], BLUE)
+            colours[j, 0], colours[j, 1], colours[j, 2] = bgr
+
+
+@compiled_bare
+@no_type_check
+def _blend(bgr, alpha, row, first):
+    """Cover a colour by that of a row, which begins at column ``first``, with the opacity ``alpha``."""
+    blue, green, red = bgr
+    return (
+        blue + alpha * (row[first] - blue),
+        green + alpha * (row[first + 1] - green),
+        red + alpha * (row[first + 2] - red),
+    )
 
 
 @compiled_bare

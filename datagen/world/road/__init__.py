@@ -1,1 +1,1 @@
-"""Synthetic roads: centre line, lane lines, furniture, and the truth that follows from them."""
+"""Synthetic roads: centre line, lane lines, road furniture, and the ground truth that follows from them."""

@@ -339,7 +339,7 @@ def subtract(
 
 
 def is_painted(painted_cm: Float[np.ndarray, "k 2"], s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
-    """Tell for each distance along the road whether it lies on a painted section."""
+    """Return for each distance along the road whether it lies on a painted section."""
     if not len(painted_cm):
         return np.zeros(len(s_cm), bool)
     i = np.searchsorted(painted_cm[:, 0], s_cm, side="right") - 1

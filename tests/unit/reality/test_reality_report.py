@@ -149,7 +149,7 @@ def test_the_verb_draws_drives_by_a_config(drives: list[Path], tmp_path: Path):
     ("words", "message"),
     [
         (["{video}"], "no such drive"),
-        (["{bare}"], "pass --camera bare=camera.yaml"),
+        (["{bare}"], "--camera bare=camera.yaml"),
         (["{d1}", "--camera", "other=x.yaml"], "no such drive, expected one of d1"),
         (["{d1}", "--camera", "a.yaml", "--camera", "b.yaml"], "a camera was given for all drives before"),
         (["{d1}", "--camera", "{big}"], "images of 64x48 px, but"),
