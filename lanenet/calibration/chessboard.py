@@ -15,10 +15,13 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import CalibrationError, ConfigError
 
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-#: A board that is cut off counts from this many rows and columns of corners.
+#: Fewest rows and columns of corners of a board that is cut off. Chosen: 16 corners for the six numbers of a
+#: pose.
 _MIN_SIDE = 4
+#: Smallest photo. Chosen: the smallest board, 3 x 3 corners, then has squares of 10 px.
 _MIN_PICTURE_PX = 40
-#: Small pictures are searched enlarged to this width, large ones first reduced to it.
+#: Widths at which a photo is searched as well: enlarged if it is small, reduced if it is large. Chosen: the
+#: sizes at which OpenCV's finder is fast and still sees boards held far away.
 _SEARCH_WIDTHS_PX = (640, 1280)
 _SB_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 

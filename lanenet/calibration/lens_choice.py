@@ -19,7 +19,7 @@ from lanenet.calibration.bundle import (
 )
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.lens import N_INTRINSIC, camera_of_lens, moved_points, plane_points
-from lanenet.calibration.views import MIN_VIEWS
+from lanenet.calibration.views import BAD_VIEW_RATIO, MIN_VIEWS
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel
 
@@ -28,9 +28,9 @@ _STEPS: dict[CameraModel, tuple[tuple[int, ...], ...]] = {
     "fisheye": ((0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)),
     "pinhole": ((0,), (0, 1), (0, 1, 2, 3), (0, 1, 2, 3, 4)),
 }
-#: A view is dropped if its RMS exceeds this multiple of the median view's, and the floor. Chosen: more than
-#: three sigma, and above what a sharp photo of a flat board leaves.
-_BAD_VIEW_RATIO, _BAD_VIEW_FLOOR_PX = 3.5, 0.3
+#: A view is dropped if its RMS exceeds ``BAD_VIEW_RATIO`` times the median view's, and this floor. Chosen:
+#: above what a sharp photo of a flat board leaves.
+_BAD_VIEW_FLOOR_PX = 0.3
 #: A model whose rough fit costs this many times the other's is not refined. Chosen, with a wide margin.
 _HOPELESS_RATIO = 30.0
 #: Added to the Bayesian information criterion of a lens that folds back inside the image. Kass and Raftery
@@ -179,7 +179,7 @@ def _consistent(fit: LensFit, views: Sequence[BoardView], floor_px: float | None
     """Views whose residuals are of the size of the others'."""
     floor = 0.004 * np.hypot(views[0].width, views[0].height) if floor_px is None else floor_px
     rms = fit.view_rms_px
-    return [int(k) for k in np.flatnonzero(rms <= max(_BAD_VIEW_RATIO * float(np.median(rms)), floor))]
+    return [int(k) for k in np.flatnonzero(rms <= max(BAD_VIEW_RATIO * float(np.median(rms)), floor))]
 
 
 def _best_step(model: CameraModel, start: LensFit, views: Sequence[BoardView]) -> LensFit:

@@ -46,7 +46,7 @@ _MIN_DIFFERENCE, _MIN_EVIDENCE = 0.04, 18.0
 _BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
 #: A view that misses its corners by this multiple of the median view's, even with its own focal length, is
 #: bad.
-_BAD_VIEW_RATIO = 3.5
+BAD_VIEW_RATIO = 3.5
 
 
 def usable_views(views: Sequence[BoardView], dropped: dict[str, str]) -> list[BoardView]:
@@ -298,7 +298,7 @@ def best_split(scales: FocalScales) -> LensSplit | None:
 
 def _known(covariance: Float[np.ndarray, "v v"], rms_px: Float[np.ndarray, "v"]) -> Bool[np.ndarray, "v"]:
     """Views that are no bad ones and whose focal length is known."""
-    bad = rms_px > max(_BAD_VIEW_RATIO * float(np.median(rms_px)), 0.1)
+    bad = rms_px > max(BAD_VIEW_RATIO * float(np.median(rms_px)), 0.1)
     return np.asarray((_sigma(covariance) < _UNKNOWN) & ~bad)
 
 

@@ -1,7 +1,4 @@
-"""Estimate after estimate to steering and speed; the one place with memory between frames of a drive.
-
-How fast to go: straight on at the cruising speed, in bends by the sideways acceleration.
-"""
+"""From lane estimates to steering and speed, with memory from frame to frame."""
 
 from __future__ import annotations
 
@@ -17,16 +14,19 @@ from lanenet.geometry.lane import parabola_through
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.lane_memory import LaneMemory
 
+#: The width is learned from frames of at least this confidence; chosen: those at which the car does not slow.
+_WIDTH_CONFIDENCE = 0.5
+
 
 class SpeedSettings(Settings):
-    """Speeds, and the throttle that gives them; nothing on the car measures its speed.
+    """Speeds, and the throttle for each; no sensor of the car measures its speed.
 
     Attributes:
-        cruise_cm_s: On a straight.
-        least_cm_s: In the tightest bend.
-        max_lateral_cm_s2: Sideways acceleration in a bend.
+        cruise_cm_s: Speed on a straight.
+        least_cm_s: Speed in the tightest bend.
+        max_lateral_cm_s2: Largest lateral acceleration in a bend.
         throttle_at_rest: Throttle at which the car just begins to roll.
-        cm_s_per_throttle: Speed that a throttle of 1 above that would give, from a timed stretch.
+        cm_s_per_throttle: Speed per throttle above that, from a timed distance.
     """
 
     cruise_cm_s: float = Field(default=60.0, gt=0.0)
@@ -45,7 +45,7 @@ class SpeedSettings(Settings):
 
 
 def lane_curvature_per_cm(estimate: LaneEstimate, y_cm: float) -> float:
-    """Return how sharply the lane bends at a distance ahead, [1/cm], never negative.
+    """Return the curvature of the lane at a distance ahead, [1/cm], never negative.
 
     Args:
         estimate: The lane of one frame.
@@ -65,10 +65,10 @@ def lane_curvature_per_cm(estimate: LaneEstimate, y_cm: float) -> float:
 
 
 def curve_speed_cm_s(curvature_per_cm: float, settings: SpeedSettings) -> float:
-    """Return the speed for a bend: v = sqrt(sideways acceleration / curvature), between least and cruise.
+    """Return the speed for a bend: v = sqrt(lateral acceleration / curvature), between least and cruise.
 
     Args:
-        curvature_per_cm: Of the car's way; NaN, where nobody knows, goes at the least speed.
+        curvature_per_cm: Curvature of the car's path; NaN, unknown, gives the least speed.
         settings: Speeds and acceleration.
     """
     if not math.isfinite(curvature_per_cm):
@@ -80,27 +80,22 @@ def curve_speed_cm_s(curvature_per_cm: float, settings: SpeedSettings) -> float:
 
 
 def throttle_of(speed_cm_s: float, settings: SpeedSettings) -> float:
-    """Return the throttle, 0 to 1, that gives a speed; 0 for a car that is to stand."""
+    """Return the throttle, 0 to 1, for a speed; 0 to stand still."""
     if not speed_cm_s > 0.0:
         return 0.0
     return min(1.0, settings.throttle_at_rest + speed_cm_s / settings.cm_s_per_throttle)
 
 
-#: Frames of less confidence teach no width.
-_WIDTH_CONFIDENCE = 0.5
-
-
 class ControlSettings(Settings):
-    """From what is seen to what the car does.
+    """From the lane to steering and speed.
 
     Attributes:
         steering: Law, look-ahead, wheelbase and lock.
-        smoothing: Over time; can be switched off.
-        speed: On straights and in bends.
-        own_target: Follow the detector's own steering target instead of a law, for detectors that know no
-            centimetres.
-        width_memory: Remember the lane's width where none is given, so that one line is enough where the
-            other is not seen.
+        smoothing: Of the points over time; can be switched off.
+        speed: Speed on straights and in bends.
+        own_target: Follow the detector's own steering target instead of a law, for detectors without points
+            in cm.
+        width_memory: Remember the lane's width if none is given, so that one visible line is enough.
     """
 
     steering: SteeringSettings
@@ -112,7 +107,7 @@ class ControlSettings(Settings):
 
 @dataclass(frozen=True)
 class Wish:
-    """What the lane asks for, before any limit.
+    """Steering and speed for the lane, before any limit.
 
     Attributes:
         steering_rad: Steering, positive left; NaN when the lane is unknown.
@@ -129,7 +124,7 @@ class LaneController:
     """Turns the lane of each frame into steering and speed."""
 
     def __init__(self, settings: ControlSettings) -> None:
-        """Take the settings; nothing is known of the lane yet."""
+        """Take the settings; the lane is unknown at first."""
         self._settings = settings
         self._smoother = LaneSmoother(settings.smoothing, settings.steering.wheelbase_cm)
         self._steering = settings.steering
@@ -138,7 +133,7 @@ class LaneController:
 
     @property
     def lane_width_cm(self) -> float | None:
-        """Width of the lane: given, or learnt from frames with both lines; None when neither is there."""
+        """Width of the lane, given or learned from frames with both lines; None while unknown."""
         return self._memory.width_cm
 
     def reset(self) -> None:
@@ -149,13 +144,13 @@ class LaneController:
     def wish(
         self, estimate: LaneEstimate, t_s: float, speed_cm_s: float = 0.0, steering_rad: float = 0.0
     ) -> Wish:
-        """Answer to a frame.
+        """Return steering and speed for a frame.
 
         Args:
-            estimate: Its lane.
-            t_s: Its time, after the one before.
-            speed_cm_s: How fast the car went since then, as far as that is known; 0 when it stands.
-            steering_rad: How it steered, positive left.
+            estimate: The frame's lane.
+            t_s: The frame's time, later than that of the one before.
+            speed_cm_s: Speed since the frame before, as far as it is known; 0 at standstill.
+            steering_rad: Steering since then, positive left.
 
         Returns:
             Steering and speed; NaN steering when the lane is unknown at the look-ahead distance.
@@ -163,13 +158,13 @@ class LaneController:
         dt_s = t_s - self._t_s if math.isfinite(self._t_s) else 0.0
         self._t_s = t_s
         smooth = self._smoother.update(estimate, dt_s, speed_cm_s * dt_s, steering_rad)
-        # Points of the frame itself: a line that is only carried on knows nothing new.
+        # The frame's own points: a line that is only held adds no information.
         if self._settings.width_memory and estimate.confidence >= _WIDTH_CONFIDENCE:
             self._memory.learn(estimate.points_cm, estimate.presence)
         steering = self._target_rad(estimate, smooth)
         curvature = lane_curvature_per_cm(smooth, self._steering.look_ahead_cm)
         if math.isfinite(steering):
-            # A car that turns back into a straight lane is in a bend of its own.
+            # A car that returns to a straight lane drives a bend of its own.
             own = abs(math.tan(steering)) / self._steering.wheelbase_cm
             curvature = own if not math.isfinite(curvature) else max(curvature, own)
         return Wish(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth)
@@ -178,10 +173,10 @@ class LaneController:
         if self._settings.own_target:
             limit, wished = self._steering.max_steering_rad, estimate.steering_rad
             return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
-        # Smoothing carries one line on, and never a frame that shows none.
+        # Smoothing may hold one line, but a frame without any line has no target.
         if not any(map(math.isfinite, estimate.points_cm.tolist())):
             return math.nan
-        # The width counts only where a line is missing.
+        # The width matters only if a line is missing.
         complete = all(map(math.isfinite, smooth.points_cm.tolist()))
         width_cm = None if complete else self._memory.width_cm
         return steering_target_rad(smooth, self._steering, width_cm)

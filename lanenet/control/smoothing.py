@@ -1,4 +1,4 @@
-"""Lane points over time: a small Kalman filter per point, carried along with the car's own motion."""
+"""Lane points over time: a scalar Kalman filter per point, moved with the car between frames."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from lanenet.config import Settings
 from lanenet.geometry.lane import N_POINTS, ROWS_CM, parabola_through
 from lanenet.perception.estimate import LaneEstimate
 
-#: A confidence below this weighs no less, so that the weight stays finite.
+#: Least confidence in the weight of a frame, which stays finite by it; chosen.
 _MIN_CONFIDENCE = 0.05
-#: Nothing is known more exactly.
+#: Least sigma, which keeps variances above 0; chosen: far below any measurement.
 _MIN_SIGMA_CM = 1e-3
-#: Rows that come nearer together belong to a line that runs across the way.
+#: Least distance ahead between the points of a moved line; closer, the line runs across the car's path.
+#: Chosen: a fifteenth of the distance between the label rows.
 _MIN_STEP_CM = 1.0
-#: Of times of frames, so that a line is held for the same number of them whatever the time of day.
+#: Rounding error of frame times: a line is held for the same number of frames at any time of day.
 _ROUNDING_S = 1e-6
 
 
 class SmoothingSettings(Settings):
-    """How much earlier frames count.
+    """Weight of earlier frames.
 
     Attributes:
-        enabled: False hands every estimate on as it is.
-        drift_cm_per_sqrt_s: What is not known of the car's motion: t seconds without a frame add this times
-            sqrt(t) to a point's standard deviation. Larger follows faster and smooths less.
-        default_sigma_cm: Standard deviation of a point whose detector does not tell one.
-        hold_s: A line that is no longer seen is carried on for this long.
+        enabled: False returns every estimate unchanged.
+        drift_cm_per_sqrt_s: Uncertainty of the car's motion: t seconds without a frame add this squared times
+            t to a point's variance. Larger values follow faster and smooth less.
+        default_sigma_cm: Sigma of a point whose detector gives none; about that of the baselines on synthetic
+            drives.
+        hold_s: A line that is no longer seen is held for this long.
     """
 
     enabled: bool = True
@@ -41,16 +43,16 @@ class SmoothingSettings(Settings):
 
 
 class LaneSmoother:
-    """Keeps the lane of the frames before, moved to where the car is now."""
+    """The lane of earlier frames in the car's present frame."""
 
     def __init__(self, settings: SmoothingSettings, wheelbase_cm: float) -> None:
-        """Take the settings; ``wheelbase_cm`` turns steering into motion."""
+        """Take the settings; ``wheelbase_cm`` converts steering to motion."""
         self._settings, self._wheelbase_cm = settings, wheelbase_cm
         self.reset()
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
-        # Plain numbers: six of them are not worth the cost of arrays at every frame.
+        # Plain numbers: for six of them arrays cost more than they save.
         self._points_cm = [math.nan] * N_POINTS
         self._variance = [math.inf] * N_POINTS
         self._unseen_s = [0.0] * N_POINTS
@@ -58,19 +60,19 @@ class LaneSmoother:
     def update(
         self, estimate: LaneEstimate, dt_s: float, travel_cm: float = 0.0, steering_rad: float = 0.0
     ) -> LaneEstimate:
-        """Join a frame's lane with those before it.
+        """Fuse a frame's lane with those before it.
 
-        A point weighs by its variance over the frame's confidence against the variance of what is carried on.
+        A point's variance, divided by the frame's confidence, is weighed against that of the prediction.
 
         Args:
             estimate: The lane of the new frame.
             dt_s: Time since the frame before.
-            travel_cm: Way of the rear axle since then, as far as it is known.
-            steering_rad: Steering on that way, positive left.
+            travel_cm: Distance of the rear axle since then, as far as it is known.
+            steering_rad: Steering since then, positive left.
 
         Returns:
-            The estimate with smoothed points and their standard deviations; a line that the frame lacks is
-            filled in for ``hold_s``. All else is the frame's own.
+            The estimate with smoothed points and their standard deviations; a missing line is held for
+            ``hold_s``. All else is the frame's own.
         """
         if not self._settings.enabled:
             return estimate
@@ -107,14 +109,14 @@ class LaneSmoother:
 def move_points(
     points_cm: Sequence[float], travel_cm: float, turn_rad: float, wheelbase_cm: float
 ) -> list[float]:
-    """Tell where the lane lies after the car has moved.
+    """Return the lane's points after the car has moved.
 
-    The rear axle goes ``travel_cm`` along a chord while the heading turns; three points of each parabola move
-    into the new car frame, and the parabola through them is read at the label rows again.
+    The rear axle moves by ``travel_cm`` along a chord while the heading turns. Three points of each parabola
+    move into the new car frame, and the parabola through them is evaluated at the label rows.
 
     Args:
         points_cm: Six points, frame car before the motion; NaN where unknown.
-        travel_cm: Way of the rear axle, ahead positive.
+        travel_cm: Distance of the rear axle, positive ahead.
         turn_rad: Change of heading, positive left.
         wheelbase_cm: Distance between the axles.
 

@@ -19,12 +19,12 @@ class SteeringSettings(Settings):
     """How the lane's centre becomes a steering angle.
 
     Attributes:
-        law: ``proportional`` is the paper's: the front wheels point at the aim point, so that the front axle
-            keeps to the lane's centre. ``pure-pursuit`` steers the rear axle onto the circle through it; in
+        law: ``proportional`` is the paper's: the front wheels point at the aim point, which keeps the front
+            axle on the lane's centre. ``pure-pursuit`` steers the rear axle along the circle through it; in
             bends the front axle then runs outside.
-        look_ahead_cm: Distance of the aim point ahead of the front axle.
+        look_ahead_cm: Distance of the aim point ahead of the front axle; the paper's 15 cm.
         wheelbase_cm: Distance between the axles.
-        max_steering_rad: The target stays within plus and minus this.
+        max_steering_rad: Bound of the target. Chosen: the steering lock of common 1:10 cars, 26 degrees.
         lane_width_cm: Distance between the two lines; with it one line is enough. None: both are needed.
     """
 
@@ -43,8 +43,7 @@ def steering_target_rad(
     Args:
         estimate: The lane of one frame.
         settings: Law, look-ahead, wheelbase and limit.
-        seen_width_cm: Width that the frames before showed, for a frame with one line; goes before that of
-            the settings.
+        seen_width_cm: Width in earlier frames, for a frame with one line; replaces that of the settings.
 
     Returns:
         Steering angle, [rad], positive left, within the limit; NaN when the lane is unknown there.
@@ -91,7 +90,7 @@ def lane_centre_cm(estimate: LaneEstimate, y_cm: float, lane_width_cm: float | N
 def _line_at(x_rows_cm: Float[np.ndarray, "3"], y_cm: float) -> tuple[float, float]:
     """Return x and dx/dy of a line at a distance: parabola, else chord between two rows, else its one row.
 
-    Two known rows are not extended beyond themselves, one not beyond itself: NaN there.
+    Two rows are not extrapolated, nor is one: NaN outside them.
     """
     x_rows = x_rows_cm.tolist()
     if math.isfinite(sum(x_rows)):

@@ -4,7 +4,7 @@ Rows are y = 0, 15, 30 cm ahead of the front axle. The order of the six numbers 
 far, then the right line near to far. A line's position is the middle of its marking. A missing value is NaN.
 Three points and the parabola x = a y^2 + b y + c are one-to-one (Kozlowski et al. 2024, eq. 7-8).
 
-The other line of a lane from one line and the lane's width: a curve at a constant distance.
+With the lane's width, one line determines the other: a curve at a constant distance.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ ROWS_CM: tuple[float, float, float] = (0.0, 15.0, 30.0)
 SIDES: tuple[str, str] = ("left", "right")
 POINT_NAMES: tuple[str, ...] = tuple(f"{side}_{row:.0f}_cm" for side in SIDES for row in ROWS_CM)
 N_POINTS = len(POINT_NAMES)
-#: Beside a line between two lanes nobody can tell from a picture which lane is meant: so far from it the
-#: front axle's middle has to be for the lane to count as the car's, in lane widths.
+#: Least distance of the front axle's middle from a line between two lanes, in lane widths; closer, the image
+#: does not show which lane is the car's. Chosen: 2 cm of a lane of 40 cm.
 BESIDE_DIVIDER_LANES = 0.05
 
 #: x at the three rows = POINTS_FROM_PARABOLA @ (a, b, c).
 POINTS_FROM_PARABOLA: Float[np.ndarray, "3 3"] = np.array([[y * y, y, 1.0] for y in ROWS_CM])
 #: (a, b, c) = PARABOLA_FROM_POINTS @ x at the three rows.
 PARABOLA_FROM_POINTS: Float[np.ndarray, "3 3"] = np.linalg.inv(POINTS_FROM_PARABOLA)
+#: Newton steps towards a parallel curve, the longest step, and the error at which it is found. Chosen: steps
+#: of a row's distance at most, so that a tight bend does not send the search away; six steps leave less than
+#: the tolerance.
+_STEPS, _MAX_STEP_CM, _TOLERANCE_CM = 6, 30.0, 1e-3
 
 
 def parabolas_from_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 2 3"]:
@@ -100,25 +104,18 @@ def lane_width_cm(points_cm: Float[np.ndarray, "6"]) -> float:
     return float((right_15 - left_15) / math.hypot(1.0, slope))
 
 
-_STEPS = 6
-#: A step of the search is at most this long.
-_MAX_STEP_CM = 30.0
-_TOLERANCE_CM = 1e-3
-
-
 def parallel_points(
     points_cm: Float[np.ndarray, "3"], distance_cm: float, beyond_cm: float = math.inf
 ) -> Float[np.ndarray, "3"]:
     """Return the three label points of the curve at a constant distance from a line.
 
-    The line is the parabola through its three points, also beyond them. Each point of the parallel lies
-    across the line from one of its points, which for a line at an angle is in another row: Newton's method
-    finds it.
+    The line is the parabola through its three points, also beyond them. A point of the parallel lies
+    perpendicular to a point of the line, for an oblique line one in another row: Newton's method finds it.
 
     Args:
         points_cm: x of the line at the label rows, frame car.
         distance_cm: To the right of the line in the direction of travel; negative to its left.
-        beyond_cm: How far beyond its first and its last point the line is believed.
+        beyond_cm: How far beyond its first and last point the line is extrapolated.
 
     Returns:
         x of the parallel at the label rows; NaN where there is none, because the line bends more tightly than

@@ -1,4 +1,4 @@
-"""What stays at the same place of the picture while the car drives: the car itself."""
+"""What stays in place in the image while the car drives: the car itself."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.errors import DriveFormatError
-from lanenet.perception.edges.canny import to_gray
+from lanenet.perception.edges.canny import EdgeSettings, to_gray
 
-#: Canny's thresholds: low, since a dark bumper on a dim floor shows faintly.
-_LOW, _HIGH = 40.0, 80.0
-#: Frames that differ by less than this from the last one used show the same place [gray levels].
+#: Least mean difference to the last used frame, [gray levels]; below, both show the same place. Chosen: above
+#: the noise of a camera that stands still.
 _LEAST_CHANGE = 4.0
+#: Fewest different frames. Chosen: by chance an edge of the road is in 70 % of 20 frames only if it hardly
+#: moves.
 _LEAST_FRAMES = 20
-#: An edge that is there in this share of the frames is the car's.
+#: An edge in at least this share of the frames belongs to the car. Chosen: blur and reflections hide it in
+#: some.
 _STATIC_SHARE = 0.7
-#: What never moves but covers more of the rows than this is not taken for the car: it may as well be a lane
-#: that the car follows without a curve.
+#: What never moves but covers a larger share of the rows is not taken for the car; it may be a lane that the
+#: car follows without a bend. Chosen.
 _MAX_CAR_SHARE = 0.2
-#: The car is looked for in this share of the rows, from the bottom.
+#: Share of the rows, from the bottom, in which the car is searched. Chosen: twice the share above.
 _CAR_SHARE = 0.4
-#: So many frames, from all over a drive, tell the car from the road.
+#: Frames, spread over a drive, that are enough. Chosen: more than seven times the fewest.
 _ENOUGH_FRAMES = 150
 
 
@@ -61,11 +63,11 @@ def find_static(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> StaticPart:
 def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarray, "h w"]:
     """Find the car's own parts at the bottom of a drive's frames.
 
-    Edges that are at the same place, to a pixel, in most frames of a moving car belong to the car. Where
-    they hang together with the lower border, everything below them is the car too.
+    Edges that stay in place, to a pixel, in most frames of a moving car belong to the car. Where they are
+    connected to the lower border, everything below them is the car too.
 
     Args:
-        frames: Frames from all over a drive, some hundred at best; standing still does no harm.
+        frames: Frames from all over a drive, best about a hundred; standing still does no harm.
 
     Returns:
         255 on the car, 0 elsewhere; all 0 if nothing at the bottom stays in place.
@@ -80,6 +82,7 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
     last: np.ndarray | None = None
     used = seen = 0
     near = np.ones((3, 3), np.uint8)
+    plain = EdgeSettings()
     for seen, frame in enumerate(frames, start=1):
         gray = to_gray(frame)
         if counts is None:
@@ -92,7 +95,7 @@ def static_mask(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> UInt8[np.ndarr
         if last is not None and cv2.absdiff(gray, last).mean() < _LEAST_CHANGE:
             continue
         last = gray
-        edges = cv2.Canny(cv2.GaussianBlur(gray, (3, 3), 0), _LOW, _HIGH, L2gradient=True)
+        edges = cv2.Canny(cv2.GaussianBlur(gray, (3, 3), 0), plain.low, plain.high, L2gradient=True)
         counts += cv2.dilate(edges, near) > 0
         used += 1
     if counts is None or used < _LEAST_FRAMES:
@@ -120,5 +123,5 @@ def _down_to_the_border(static: np.ndarray) -> np.ndarray:
     car = (labels == labels[-1, 0])[:height] & (closed[:height] > 0)
     car = np.maximum.accumulate(car, axis=0) if car.any() else car
     mask = np.where(car, 255, 0).astype(np.uint8)
-    # A pixel more: the blur of an edge reaches beyond it.
+    # One pixel more, since the blur of an edge reaches beyond it.
     return cv2.dilate(mask, np.ones((3, 3), np.uint8)) if car.any() else mask

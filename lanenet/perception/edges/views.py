@@ -1,4 +1,4 @@
-"""Other views of a frame: as a lens without distortion would show it, and from above."""
+"""Other views of a frame: without distortion, and from above."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from lanenet.errors import CalibrationError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 
+#: Largest half field of an undistorted image. Chosen: a flat image of 120 degrees already shows the road at
+#: half the scale of its middle.
 _MAX_HALF_FIELD_RAD = float(np.deg2rad(60.0))
-#: Far outside the frame: OpenCV paints black what comes from there.
+#: Far outside the frame; OpenCV fills such pixels with black.
 _NOWHERE_PX = -1e4
 
 
 class View:
-    """Looks up, for each pixel of a new picture, where in the frame it comes from; made once, used often."""
+    """For each pixel of a new image, its place in the frame; computed once, used often."""
 
     def __init__(self, camera: Camera, pixels_px: Float[np.ndarray, "rows columns 2"]) -> None:
         """Take the places in the frame.
@@ -35,7 +37,7 @@ class View:
         return View(camera, camera.project_rays(rays).reshape(rows, columns, 2))
 
     def of(self, frame: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "rows columns *c"]:
-        """Return the new picture; black where the camera does not see. The order of colours is kept.
+        """Return the new image, black where the camera does not see; the order of channels stays.
 
         Raises:
             CalibrationError: If the frame is not of the camera's size.
@@ -49,16 +51,15 @@ class View:
 
 
 def undistorting_view(camera: Camera) -> View:
-    """Return the view of a lens without distortion: what is straight becomes straight.
+    """Return the view of a lens without distortion: straight lines appear straight.
 
-    It has the frames' size and direction, and their field up to 120 degrees across: a flat picture can show
-    no more of the road at a useful size.
+    It has the frames' size and direction, and their field of view up to 120 degrees.
     """
     width, height = camera.width, camera.height
     rim = np.array([[0.0, camera.K[1, 2]], [width - 1.0, camera.K[1, 2]]])
     rays = camera.unproject(rim)
     angles = np.arctan2(np.abs(rays[:, 0]), rays[:, 2])
-    # Where the lens does not see the image's rim, as much as a flat picture can show.
+    # If the lens does not reach the image's border, the largest field.
     half = min(float(np.nan_to_num(angles, nan=np.pi).max()), _MAX_HALF_FIELD_RAD)
     focal = 0.5 * width / np.tan(half)
     v, u = np.mgrid[:height, :width].astype(np.float64)

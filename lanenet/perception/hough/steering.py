@@ -90,11 +90,7 @@ def distance_angle_deg(dnx: float, dpx: float, gain_deg: float) -> float:
         Suto 2021, eq. 11.
     """
     total = dpx + dnx
-    if total <= 0.0:
-        return 0.0
-    if dpx > dnx:
-        return -gain_deg * (dpx - dnx) / total
-    return gain_deg * (dnx - dpx) / total
+    return gain_deg * (dnx - dpx) / total if total > 0.0 else 0.0
 
 
 def angle_of_one_line_deg(previous_deg: float, change_deg: float) -> float:
@@ -114,11 +110,8 @@ def change_by_left_line_deg(distance: float, previous: float, gain_deg: float) -
     Source:
         Suto 2021, eq. 13.
     """
-    if previous <= 0.0:
-        return 0.0
-    if distance > previous:
-        return gain_deg * (distance - previous) / previous
-    return -gain_deg * (previous - distance) / previous
+    # The paper's two cases are one formula.
+    return gain_deg * (distance - previous) / previous if previous > 0.0 else 0.0
 
 
 def change_by_right_line_deg(distance: float, previous: float, gain_deg: float) -> float:
@@ -127,11 +120,7 @@ def change_by_right_line_deg(distance: float, previous: float, gain_deg: float) 
     Source:
         Suto 2021, eq. 14.
     """
-    if previous <= 0.0:
-        return 0.0
-    if distance > previous:
-        return -gain_deg * (distance - previous) / previous
-    return gain_deg * (previous - distance) / previous
+    return -change_by_left_line_deg(distance, previous, gain_deg)
 
 
 def smooth_angle_deg(current_deg: float, previous_deg: float | None, w1: float) -> float:
