@@ -151,14 +151,14 @@ class SegmentSolver:
         find_camera: bool,
         prior_camera: Camera | None,
     ) -> SolvedSegment:
-        seen = view_segment(drive, camera, commands, self.settings, self.rng)
-        keys = choose_keyframes(seen.steps_heights)
+        view = view_segment(drive, camera, commands, self.settings, self.rng)
+        keys = choose_keyframes(view.steps_heights)
         if len(keys) == len(drive):
-            return _DenseSegment(seen, self, find_camera, prior_camera or camera).solve()
+            return _DenseSegment(view, self, find_camera, prior_camera or camera).solve()
         # The keyframes show the step length better: if the car is still slow, they are thinned again.
         between = commands_between(commands, keys)
         solved = self._solve(drive.subset(keys), between, camera, find_camera, prior_camera)
-        return self.place_between(solved, keys, seen.steps_heights, drive, commands)
+        return self.place_between(solved, keys, view.steps_heights, drive, commands)
 
     def place_between(
         self,
@@ -223,30 +223,30 @@ class _DenseSegment:
     """A segment that is tracked by all of its frames."""
 
     def __init__(
-        self, seen: SegmentView, solver: SegmentSolver, find_camera: bool, prior_camera: Camera
+        self, view: SegmentView, solver: SegmentSolver, find_camera: bool, prior_camera: Camera
     ) -> None:
-        self.seen, self.solver = seen, solver
+        self.view, self.solver = view, solver
         self.find_camera, self.prior_camera = find_camera, prior_camera
         self.revisit_settings = solver.settings.revisits
-        self.height = seen.camera.mounting.height_cm
+        self.height = view.camera.mounting.height_cm
         self.free = _OPEN_LOOP if find_camera else ()
-        self.observed = seen.road.observed(seen.commands)
+        self.observed = view.road.observed(view.commands)
 
     def solve(self) -> SolvedSegment:
         """Take the segment through all stages."""
-        seen, solver = self.seen, self.solver
-        tracked = track(seen, solver.settings, solver.rng, solver.progress)
-        start = BundleEstimate.level(tracked.trajectory.poses, seen.camera)
+        view, solver = self.view, self.solver
+        tracked = track(view, solver.settings, solver.rng, solver.progress)
+        start = BundleEstimate.level(tracked.trajectory.poses, view.camera)
         opened = self.adjust(self.observed, start, self.free)
         closure = self.close_loops(opened, self.find_revisits(opened))
-        road, bundle = seen.road, opened
+        road, bundle = view.road, opened
         if closure is not None and self.find_camera:
             road, bundle = self.adjust_with_camera(closure)
         elif closure is not None:
             closure = self.without_outliers(opened, closure)
             bundle = closure.bundle
         return SolvedSegment(
-            rows=np.arange(len(seen.drive)),
+            rows=np.arange(len(view.drive)),
             camera=bundle.camera,
             scans=road.scans(bundle.camera, bundle.tilt),
             trajectory=tracked.trajectory,
@@ -260,10 +260,10 @@ class _DenseSegment:
 
     def find_revisits(self, opened: BundleResult) -> list[Revisit]:
         """Propose pairs of frames that look alike, and align each with the map around the earlier one."""
-        scans = self.seen.road.scans(opened.camera, opened.tilt)
+        scans = self.view.road.scans(opened.camera, opened.tilt)
         s, rng = self.revisit_settings, self.solver.rng
-        pairs = propose_revisits(thumbnails(self.seen.drive), opened.poses, self.height, s)
-        wheelbase_cm = self.seen.camera.wheelbase_cm
+        pairs = propose_revisits(thumbnails(self.view.drive), opened.poses, self.height, s)
+        wheelbase_cm = self.view.camera.wheelbase_cm
         found = [match_places(scans, opened.poses, p, self.height, wheelbase_cm, s, rng) for p in pairs]
         return [revisit for revisit in found if revisit is not None]
 
@@ -302,14 +302,14 @@ class _DenseSegment:
 
     def adjust_with_camera(self, closure: _Closure) -> tuple[RoadView, BundleResult]:
         """Adjust all of the camera with the poses, in rounds: another camera sees other edges on the road."""
-        drive, bundle = self.seen.drive, closure.bundle
+        drive, bundle = self.view.drive, closure.bundle
         for _ in range(_MAX_CAMERA_ROUNDS):
             road = view_road(drive, bundle.camera, self.solver.settings)
             before = bundle.camera.K[0, 0]
             inliers = inlier_revisits(bundle.poses, closure.revisits, self.height)
             loops = loop_pairs(inliers, len(drive))
             loops += neighbouring_laps(bundle.poses, self.height, self.revisit_settings)
-            bundle = self.adjust(road.observed(self.seen.commands), bundle, CAMERA_NAMES, loops)
+            bundle = self.adjust(road.observed(self.view.commands), bundle, CAMERA_NAMES, loops)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
         return road, bundle

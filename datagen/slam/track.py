@@ -25,7 +25,7 @@ class Tracked:
 
 
 def track(
-    seen: SegmentView, settings: SlamSettings, rng: np.random.Generator, progress: Progress | None = None
+    view: SegmentView, settings: SlamSettings, rng: np.random.Generator, progress: Progress | None = None
 ) -> Tracked:
     """Estimate all poses of a segment without closing loops.
 
@@ -33,23 +33,23 @@ def track(
     steering then predicts what the images leave open, and the filter puts the steps together.
 
     Args:
-        seen: What the images of the segment show.
+        view: What the images of the segment show.
         settings: Settings of all stages.
         rng: Source of randomness.
         progress: Called with (done, total).
     """
-    camera, commands, n = seen.camera, seen.commands, len(seen.scans)
+    camera, commands, n = view.camera, view.commands, len(view.scans)
     height = camera.mounting.height_cm
     compared = None if progress is None else lambda k, _: progress(k, 2 * n)
-    far_rad = far_turns(seen.drive, camera)
-    evidence = Evidence(seen.pictures, seen.usual, compared, far_rad)
+    far_rad = far_turns(view.drive, camera)
+    evidence = Evidence(view.images, view.typical, compared, far_rad)
     odometry = evidence.motion()
     steering = fit_steering(odometry.poses, commands, height)
     if steering is not None and commands.turn is not None:
         odometry = evidence.motion(steering.curvature_per_cm(commands.turn))
     motion = motion_about(odometry, settings.motion, height)
     filtered = None if progress is None else lambda k, _: progress(n + k, 2 * n)
-    trajectory = run_filter(seen.scans, motion, settings.filter, height, camera.wheelbase_cm, rng, filtered)
+    trajectory = run_filter(view.scans, motion, settings.filter, height, camera.wheelbase_cm, rng, filtered)
     return Tracked(trajectory, steering)
 
 

@@ -94,8 +94,8 @@ class SegmentView:
         commands: What was commanded.
         road: Edges of the road.
         scans: The same on the road.
-        pictures: The same, ready to be compared from image to image.
-        usual: The typical step length, and what the commands mean in centimetres.
+        images: The same, ready to be compared from image to image.
+        typical: The typical step length, and what the commands mean in centimetres.
     """
 
     drive: Drive
@@ -103,13 +103,13 @@ class SegmentView:
     commands: CommandedMotion
     road: RoadView
     scans: Scans
-    pictures: ImagePairs
-    usual: TypicalStep
+    images: ImagePairs
+    typical: TypicalStep
 
     @property
     def steps_heights(self) -> Float[np.ndarray, "n"]:
         """Rough step length of each frame, in camera heights."""
-        return self.usual.step_heights * self.usual.relative
+        return self.typical.step_heights * self.typical.relative
 
 
 def view_segment(
@@ -131,6 +131,6 @@ def view_segment(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
             f"road; mapping needs {_LEAST_POINTS}"
         )
-    pictures = ImagePairs(road.edges, camera, settings.odometry, rng)
-    usual = typical_step(pictures, commands.distance_cm, commands.speed_known)
-    return SegmentView(drive, camera, commands, road, scans, pictures, usual)
+    images = ImagePairs(road.edges, camera, settings.odometry, rng)
+    typical = typical_step(images, commands.distance_cm, commands.speed_known)
+    return SegmentView(drive, camera, commands, road, scans, images, typical)

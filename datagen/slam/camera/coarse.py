@@ -22,7 +22,7 @@ from datagen.slam.settings import GuessSettings
 from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.edges.canny import EdgePixels, find_edges
+from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RoadTable
 
 #: Step lengths to try with each camera, relative to that of the best camera so far, and those among them that
@@ -84,48 +84,63 @@ def coarse_camera(
     Returns:
         The camera, and all candidates for the report.
     """
-    count = min(guess.frames, len(drive))
-    start = max(0, (len(drive) - count) // 3)
-    pixels = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
-    scale = drive.width / _REFERENCE_WIDTH
-    seed = int(rng.integers(2**31))
-    tried: dict[tuple[float, float], Candidate] = {}
-    grid = [(f * scale, p) for f in guess.focal_px for p in guess.pitch_deg]
-    total = len(grid) + 9
-    relative = np.ones(count)
+    search = _Search(drive, perception, guess, seed=int(rng.integers(2**31)))
+    focals, pitches = [f * search.scale for f in guess.focal_px], guess.pitch_deg
+    grid = [(focal, pitch) for focal in focals for pitch in pitches]
     # Every second camera of the grid, like the black squares of a chessboard.
-    spread = [
-        guessed_camera(drive.width, drive.height, f * scale, p, guess)
-        for i, f in enumerate(guess.focal_px)
-        for j, p in enumerate(guess.pitch_deg)
-        if (i + j) % 2 == 0
-    ]
-    usual = clearest_step((_pictures(pixels, camera, perception, seed) for camera in spread), relative)
-    usual_focal = float(np.exp(np.mean(np.log(guess.focal_px)))) * scale
-    # Two rounds: the given grid, then half its steps around the best.
-    for round_index in range(2):
-        for focal, pitch in grid:
-            if (focal, pitch) not in tried:
-                camera = guessed_camera(drive.width, drive.height, focal, pitch, guess)
-                pictures = _pictures(pixels, camera, perception, seed)
-                steps = usual * _AROUND
-                _, fits = best_step(pictures, relative, steps, _PAIRS)
-                # The fit itself decides nothing: with too much pitch, standing still fits better than the
-                # true motion with the right camera.
-                clear = prominence(fits, steps)[_INNER] / pictures.points_per_frame
-                fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal / usual_focal) ** 2)
-                step = float(steps[_INNER][np.argmax(clear)])
-                tried[focal, pitch] = Candidate(focal, pitch, step, fit)
+    spread = [(f, p) for i, f in enumerate(focals) for j, p in enumerate(pitches) if (i + j) % 2 == 0]
+    step = clearest_step((search.images(*camera) for camera in spread), search.relative)
+    tried: dict[tuple[float, float], Candidate] = {}
+    total = len(grid) + 9
+    # The given grid, then half its steps around the best.
+    for last in (False, True):
+        for camera in grid:
+            if camera not in tried:
+                tried[camera] = search.try_camera(*camera, step)
             if progress is not None:
                 progress(min(len(tried), total), total)
         best = max(tried.values(), key=lambda candidate: candidate.fit)
-        usual = best.step_heights
-        if round_index == 0:
-            df = 0.5 * _spacing(guess.focal_px) * scale
-            dp = 0.5 * _spacing(guess.pitch_deg)
+        step = best.step_heights
+        if not last:
+            df, dp = 0.5 * _spacing(guess.focal_px) * search.scale, 0.5 * _spacing(pitches)
             grid = [(best.focal_px + i * df, best.pitch_deg + j * dp) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    camera = guessed_camera(drive.width, drive.height, best.focal_px, best.pitch_deg, guess)
-    return camera, list(tried.values())
+    return search.camera(best.focal_px, best.pitch_deg), list(tried.values())
+
+
+class _Search:
+    """Edges of some consecutive frames, seen with one camera after the other."""
+
+    def __init__(self, drive: Drive, perception: PerceptionSettings, guess: GuessSettings, seed: int) -> None:
+        count = min(guess.frames, len(drive))
+        start = max(0, (len(drive) - count) // 3)
+        self.edges = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
+        self.size = drive.width, drive.height
+        self.scale = drive.width / _REFERENCE_WIDTH
+        self.limits, self.guess, self.seed = perception.range, guess, seed
+        #: Step lengths of the frames relative to the typical one.
+        self.relative = np.ones(count)
+        self.typical_focal_px = float(np.exp(np.mean(np.log(guess.focal_px)))) * self.scale
+
+    def camera(self, focal_px: float, pitch_deg: float) -> Camera:
+        return guessed_camera(*self.size, focal_px, pitch_deg, self.guess)
+
+    def images(self, focal_px: float, pitch_deg: float) -> ImagePairs:
+        """The edges that see the road with a camera; the same points are drawn for every camera."""
+        camera = self.camera(focal_px, pitch_deg)
+        table = RoadTable(camera, mapping_range(camera.mounting.height_cm, self.limits))
+        edges = [seen_edges(pixels, table) for pixels in self.edges]
+        return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(self.seed))
+
+    def try_camera(self, focal_px: float, pitch_deg: float, step_heights: float) -> Candidate:
+        """Rate a camera by how clear the motion is with it, around a step length."""
+        images = self.images(focal_px, pitch_deg)
+        steps = step_heights * _AROUND
+        _, fits = best_step(images, self.relative, steps, _PAIRS)
+        # The fit itself decides nothing: with too much pitch, standing still fits better than the true motion
+        # with the right camera.
+        clear = prominence(fits, steps)[_INNER] / images.points_per_frame
+        fit = float(clear.max() - _FOCAL_PRIOR * np.log(focal_px / self.typical_focal_px) ** 2)
+        return Candidate(focal_px, pitch_deg, float(steps[_INNER][np.argmax(clear)]), fit)
 
 
 def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"]) -> float:
@@ -140,9 +155,9 @@ def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"
     """
     steps = np.array(STEPS_HEIGHTS)
     best, most = float(np.sqrt(steps[0] * steps[-1])), 0.0
-    for pictures in cameras:
-        step, fit = best_step(pictures, relative, steps, _FIRST_PAIRS)
-        clear = float(prominence(fit, steps).max()) / pictures.points_per_frame
+    for images in cameras:
+        step, fit = best_step(images, relative, steps, _FIRST_PAIRS)
+        clear = float(prominence(fit, steps).max()) / images.points_per_frame
         if clear > most and not at_limit(step, steps):
             best, most = step, clear
     return best
@@ -150,12 +165,3 @@ def clearest_step(cameras: Iterable[ImagePairs], relative: Float[np.ndarray, "n"
 
 def _spacing(values: tuple[float, ...]) -> float:
     return float(np.min(np.diff(np.sort(values)))) if len(values) > 1 else 0.1 * values[0]
-
-
-def _pictures(
-    pixels: list[EdgePixels], camera: Camera, perception: PerceptionSettings, seed: int
-) -> ImagePairs:
-    """The edges that see the road with a camera; the same points are drawn for every camera."""
-    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
-    edges = [seen_edges(frame, table) for frame in pixels]
-    return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(seed))

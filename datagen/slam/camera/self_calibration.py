@@ -112,7 +112,7 @@ class FoundCamera:
         """How the camera was found, for the files."""
         if self.refined:
             return "given, then bundle adjustment of camera and poses"
-        return "from the drive: coarse by pairs of pictures, then bundle adjustment of camera and poses"
+        return "from the drive: coarse from pairs of images, then bundle adjustment of camera and poses"
 
     @property
     def figures(self) -> dict[str, Any]:
