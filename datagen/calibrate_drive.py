@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from datagen.lanes.scale import LaneScale, measure_lane
 from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
-from datagen.quality.pictures import straight_frames
 from datagen.settings import MapSettings
 from datagen.slam.camera.changes import with_known_scale
 from datagen.slam.camera.coarse import Candidate
@@ -28,6 +28,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.poses import path_lengths
 
 #: Called with (stage, done, total).
 StageProgress = Callable[[str, int, int], None]
@@ -282,3 +283,21 @@ def _sigma_with_units(
         "ahead_of_front_axle_cm": float(ahead),
     }
     return with_units if height_sigma is None else {**with_units, "height_cm": height_sigma * m.height_cm}
+
+
+def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int) -> tuple[int, ...]:
+    """Pick the frame with the straightest path ahead in each of several equal parts of a drive.
+
+    Args:
+        poses: Poses, heading unwrapped.
+        ahead_cm: Distance over which the path should be straight.
+        count: Number of parts.
+    """
+    n = len(poses)
+    path = path_lengths(poses)
+    last = np.minimum(np.searchsorted(path, path + ahead_cm), n - 1)
+    turn = np.array([np.ptp(poses[k : last[k] + 1, 2]) for k in range(n)])
+    # Near the end, less than the whole distance is known.
+    turn[path + ahead_cm > path[-1]] += 2.0 * np.pi
+    parts = np.array_split(np.arange(n), count)
+    return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))

@@ -1,4 +1,4 @@
-"""The lane lines of a solved segment: the edges along the driven path, traced and fitted."""
+"""Find the lane lines of a segment: edges along the driven path, traced and fitted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.follow import TraceSettings
 from datagen.lanes.path import lap_path, without_frames
 from datagen.lanes.profile import without_crossings
-from datagen.lanes.scale import STEP_HEIGHTS, edges_beside
+from datagen.lanes.scale import STEP_HEIGHTS, edges_of_segment
 from datagen.lanes.trace import (
     LEAST_SEEN,
     MAYBE_LINE,
@@ -26,8 +26,9 @@ from lanenet.data.maps.line import LaneLine
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.lane import SIDES
 
-#: Lane widths ahead of a frame up to which its edges count in any case: in a wide lane the further line only
-#: comes into view a lane's width ahead, the far line of the next lane another half of one.
+#: Distance ahead of a frame up to which its edges count in any case, in lane widths. Derived: in a wide lane,
+#: the further line only comes into view one width ahead, the far line of the adjacent lane half a width
+#: later.
 _OWN_LANE_REACH, _NEXT_LANE_REACH = 1.2, 1.6
 #: Share of the path above which a line is certain. Chosen: interruptions and worn places take a tenth at
 #: most.
@@ -69,31 +70,31 @@ def find_lane(
 
     Args:
         segment: The segment.
-        lane_width_cm: Width of the driven lane in that scale; None where it is not known.
+        lane_width_cm: Width of the driven lane in that scale; None if unknown.
         held_out: Frames of the segment that are held out from the lines.
-        trace: How lane lines are looked for.
-        fit: Cubics through them.
+        trace: How lane lines are traced.
+        fit: How cubics are fitted to them.
 
     Raises:
         TrackingLostError: If no two lines run along the drive.
-        CalibrationError: If there are two, but not so far apart.
+        CalibrationError: If two do, but at another distance than the lane width.
     """
     height = segment.camera.mounting.height_cm
     revisits = [(revisit.earlier, revisit.later) for revisit in segment.uninterrupted_revisits]
     lap = lap_path(segment.poses, revisits, STEP_HEIGHTS * height, height)
     scans, side_cm = without_frames(segment.scans, held_out), trace.side_heights * height
-    path, edges = edges_beside(segment, scans, lap, _OWN_LANE_REACH * (lane_width_cm or 0.0))
+    path, edges = edges_of_segment(segment, scans, lap, _OWN_LANE_REACH * (lane_width_cm or 0.0))
     edges = without_crossings(path, edges, height, side_cm)
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, trace)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, trace)
-    # The next lane's line is looked for also where the car drives near the line between the lanes.
-    _, beside = edges_beside(segment, scans, path, _NEXT_LANE_REACH * lane.lane_cm)
-    beside = without_crossings(path, beside, height, side_cm)
-    lane = trace_adjacent(path, beside, lane, height, trace)
-    lines = fit_lines(path, edges, lane, height, fit, beside)
+    # Also where the car drives near the line between the lanes.
+    _, adjacent = edges_of_segment(segment, scans, path, _NEXT_LANE_REACH * lane.lane_cm)
+    adjacent = without_crossings(path, adjacent, height, side_cm)
+    lane = trace_adjacent(path, adjacent, lane, height, trace)
+    lines = fit_lines(path, edges, lane, height, fit, adjacent)
     return MappedSegment(segment, path.s_frames_cm, lane, lines, free_cm)
 
 

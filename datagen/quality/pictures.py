@@ -19,7 +19,6 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
-from lanenet.geometry.poses import path_lengths
 
 #: Colours, BGR.
 _LEFT, _RIGHT, _ADJACENT, _POINT = (80, 220, 80), (220, 80, 220), (200, 200, 80), (60, 60, 255)
@@ -158,24 +157,6 @@ def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
     if not done:
         raise LanenetError(f"{path}: the picture could not be encoded")
     path.write_bytes(data.tobytes())
-
-
-def straight_frames(poses: Float[np.ndarray, "n 3"], ahead_cm: float, count: int) -> tuple[int, ...]:
-    """Pick the frame with the straightest path ahead in each of several equal parts of a drive.
-
-    Args:
-        poses: Poses, heading unwrapped.
-        ahead_cm: Distance over which the path should be straight.
-        count: Number of parts.
-    """
-    n = len(poses)
-    path = path_lengths(poses)
-    last = np.minimum(np.searchsorted(path, path + ahead_cm), n - 1)
-    turn = np.array([np.ptp(poses[k : last[k] + 1, 2]) for k in range(n)])
-    # Near the end, less than the whole distance is known.
-    turn[path + ahead_cm > path[-1]] += 2.0 * np.pi
-    parts = np.array_split(np.arange(n), count)
-    return tuple(int(part[np.argmin(turn[part])]) for part in parts if len(part))
 
 
 def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import datagen.slam.camera.self_calibration
-from datagen.calibrate_drive import calibrate_drive, starting_camera
+from datagen.calibrate_drive import calibrate_drive, starting_camera, straight_frames
 from datagen.lanes.scale import fitted_width_cm, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
-from datagen.quality.pictures import straight_frames
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult, BundleSettings
 from datagen.slam.camera.changes import nudged

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lanenet.data.segments import equal_runs, true_runs
+from lanenet.data.segments import equal_runs, map_segments, true_runs
 
 
 def plain(runs: list[np.ndarray]) -> list[list[int]]:
@@ -41,3 +41,13 @@ def test_runs_are_all_of_it_in_order_and_none_can_be_longer(seed: int):
     flags = values > 0
     kept = np.concatenate([*true_runs(flags), np.empty(0, int)])
     np.testing.assert_array_equal(kept, np.flatnonzero(flags))
+
+
+def test_segments_begin_where_poses_jump():
+    frames = np.array([0, 1, 2, 12, 13, 14, 15])
+    x = np.array([0.0, 3.0, 6.0, 36.0, 39.0, 500.0, 503.0])
+    poses = np.stack([x, 0 * x, 0 * x], axis=1)
+    # Ten frames without labels were driven; five metres in one frame were not.
+    np.testing.assert_array_equal(map_segments(frames, poses), [0, 0, 0, 0, 0, 1, 1])
+    np.testing.assert_array_equal(map_segments(frames[:1], poses[:1]), [0])
+    assert map_segments(frames[:0], poses[:0]).shape == (0,)
