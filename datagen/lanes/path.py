@@ -21,13 +21,11 @@ _SHORTEST_CM = 20.0
 #: cars that follow a lane stay below 30 degrees, roads that cross are at 90.
 _MIN_COSINE = 0.5
 #: A frame further than this from the lap, in camera heights, is on another road; a drive with a larger share
-#: of such frames is no lap. Chosen: about the widest lane that is
-#: looked for (6.5 heights).
+#: of such frames is no lap. Chosen: about the widest lane that is looked for (6.5 heights).
 _OFF_HEIGHTS, _MAX_OFF = 6.0, 0.15
-#: Smoothing of the lap. Chosen: longer than the noise of poses from frame to frame (a few cm), a tenth of the
-#: tightest bends' radius, so that a line's offset is a smooth function of the position.
+#: Smoothing of the lap. Chosen: removes the jitter of poses. A bend of 50 cm radius moves inwards by less
+#: than 1 cm, which the offsets of the lines take up.
 _SMOOTH_CM = 6.0
-
 
 #: A value at each sample of a path, and a choice of samples.
 Samples = Float[np.ndarray, "m"]

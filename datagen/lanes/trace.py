@@ -21,9 +21,9 @@ from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, TrackingLostError
 
-#: A bulge is a short section off the line's median offset by more than the first of these, and as far as it
-#: is off by the second, in lane widths; the third is the half length of the median's window. Chosen: dashes
-#: lie on one curve, and lanes widen over more than their own width.
+#: Deviations from the line's median offset, in lane widths: a run beyond the second is dropped as a bulge if
+#: it exceeds the first. The third is half the length of the median's window. Chosen: dashes lie on one curve,
+#: and lanes widen over more than their own width.
 _BULGE, _BULGE_BASE, _BULGE_WINDOW_LANES = 0.08, 0.04, 1.5
 #: Least share of the path along which a line is seen that bounds a lane. Chosen: short dashes leave a third.
 LEAST_SEEN = 0.2
@@ -35,7 +35,8 @@ _WEAKER = 0.4
 #: Offsets from a line between two lanes at which a car drives in the further lane, in lane widths. Chosen:
 #: clearly beyond the line, and not beyond that lane.
 _VISITS = (0.1, 1.0)
-#: Shortest piece of paint that counts, in lane widths. Chosen: about a marking's length across, 3 cm.
+#: Shortest piece of paint that counts, in lane widths. Chosen: 3 to 4 cm, shorter than any
+#: dash.
 _SPECK = 0.1
 
 

@@ -32,7 +32,7 @@ _ALONE_PX = 2.0
 _KNOWN_LANES = 0.02
 #: Least number of samples of a frame: in view, and with an edge. Chosen: one border over 15 cm.
 _MIN_VIEW, _MIN_MET = 15, 8
-#: Samples up to this distance ahead count. Chosen: beyond it, a pixel is more than a centimetre on most cars.
+#: Samples up to this distance ahead count. Chosen: twice the farthest label row.
 _REACH_CM = 60.0
 #: Distance along the path up to which frames count for a place, and the share that has to contradict the map.
 #: Chosen: a single bad frame is outvoted, and an error over 20 cm of road is not.

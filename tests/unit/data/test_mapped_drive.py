@@ -152,8 +152,8 @@ def test_why_a_frame_gets_no_labels(folder):
     window = BirdseyeWindow()
     assert label_frame(mapped, 5, window) == UNCERTAIN
     assert not isinstance(label_frame(mapped, 6, window), str)
-    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
-    assert label_frame(replace(mapped, drive_map=doubted), 6, window) == CONTRADICTED
+    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
+    assert label_frame(replace(mapped, drive_map=contradicting), 6, window) == CONTRADICTED
     assert not isinstance(label_frame(mapped, 0, window), str)
     dashed = [replace(line, unpainted=0.4) for line in mapped.drive_map.lines[0][:1]]
     on_dashes = replace(
@@ -180,8 +180,8 @@ def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folde
     for side, name in enumerate(("left_cm", "right_cm")):
         contradicted = np.zeros((len(MAPPED), 2), dtype=bool)
         contradicted[6, side] = True
-        doubted = replace(mapped, drive_map=replace(mapped.drive_map, contradicted=contradicted))
-        masked = label_frame(doubted, 6, BirdseyeWindow())
+        contradicting = replace(mapped, drive_map=replace(mapped.drive_map, contradicted=contradicted))
+        masked = label_frame(contradicting, 6, BirdseyeWindow())
         assert not isinstance(masked, str)
         own, others = np.split(np.arange(6), 2)[:: 1 - 2 * side]
         assert np.isnan(masked[1][own]).all()
@@ -190,8 +190,8 @@ def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folde
         assert np.isnan(getattr(masked[0], name)).all() and np.isfinite(getattr(whole[0], name)).any()
     # Nothing is left where the other line is not known.
     far = BirdseyeWindow(left_cm=-48.0, columns=64)
-    doubted = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, -1])
-    assert label_frame(replace(mapped, drive_map=doubted), 6, far) == CONTRADICTED
+    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, -1])
+    assert label_frame(replace(mapped, drive_map=contradicting), 6, far) == CONTRADICTED
 
 
 def test_a_frame_lacks_a_line_that_ends_before_its_first_label_row(folder):

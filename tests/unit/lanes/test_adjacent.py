@@ -1,4 +1,4 @@
-"""A road of two lanes with dashes between them, and a driver who spends part of the way in the other one."""
+"""A road of two lanes with dashes between them, and a driver who sometimes drives in the other one."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _depth_cm(poses: np.ndarray) -> np.ndarray:
 
 
 def _check(frames: list[FrameLines], poses: np.ndarray, bounds_cm: tuple[float, float]) -> np.ndarray:
-    """Compare labels with what bounds the lane on the left and on the right; tell which there are."""
+    """Compare labels with what bounds the lane on the left and on the right; return which there are."""
     truth = np.array([np.concatenate([_true_rows(pose, d) for d in bounds_cm]) for pose in poses])
     error = np.array([frame.points_cm for frame in frames]) - truth
     assert np.nanmax(np.abs(error)) < 1.0
@@ -89,7 +89,7 @@ def _check(frames: list[FrameLines], poses: np.ndarray, bounds_cm: tuple[float, 
 def _checked(
     lines: list[LaneLine], forward: bool, path: Path, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Check the lane of all frames and labels of some; tell which are known, of far line and dashes."""
+    """Check the lane of all frames and labels of some; return which are known, of far line and dashes."""
     lanes = assign_lanes(lines, poses, path.s_frames_cm, WHEELBASE_CM)
     assert (lanes.forward == forward).all()
     depth = _depth_cm(poses)

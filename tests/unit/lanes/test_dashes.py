@@ -1,4 +1,4 @@
-"""Dashes are told from a solid line by what single frames see of it."""
+"""Dashed and solid lines are distinguished by what single frames see of them."""
 
 from __future__ import annotations
 

@@ -18,8 +18,10 @@ def _offset_of(path: Path, points_cm: np.ndarray) -> np.ndarray:
     nearest = np.argmin(np.sum(away**2, axis=2), axis=1)
     away = away[np.arange(len(path.xy_cm)), nearest]
     ahead = away[:, 0] * path.left[:, 1] - away[:, 1] * path.left[:, 0]
-    way = np.gradient(points_cm, axis=0)[nearest]
-    slope = np.sum(way * path.left, axis=1) / (way[:, 0] * path.left[:, 1] - way[:, 1] * path.left[:, 0])
+    along = np.gradient(points_cm, axis=0)[nearest]
+    slope = np.sum(along * path.left, axis=1) / (
+        along[:, 0] * path.left[:, 1] - along[:, 1] * path.left[:, 0]
+    )
     return np.sum(away * path.left, axis=1) - slope * ahead
 
 
@@ -36,10 +38,10 @@ def test_a_straight_line_oblique_to_a_straight_path(apart_cm):
 
 def test_an_oblique_line_along_a_bend():
     path = arc_path(200.0, 200.0)
-    start, way = np.array([0.0, -30.0]), np.array([np.cos(0.5), np.sin(0.5)])
+    start, along = np.array([0.0, -30.0]), np.array([np.cos(0.5), np.sin(0.5)])
     t = np.arange(-100.0, 500.0, 0.5)
     line, other = (
-        start + t[:, None] * way + shift * np.array([-way[1], way[0]]) for shift in (0.0, APART_CM)
+        start + t[:, None] * along + shift * np.array([-along[1], along[0]]) for shift in (0.0, APART_CM)
     )
     found = parallel_offset(path, _offset_of(path, line), np.full(len(path.s_cm), APART_CM))
     part = (path.s_cm > 70.0) & (path.s_cm < 130.0)

@@ -11,7 +11,7 @@ from lanenet.errors import CalibrationError, TrackingLostError
 
 
 def traced(lane_cm: float, centre_cm: float, left: float, right: float) -> TracedLane:
-    """A lane whose lines were seen along these shares of the way."""
+    """A lane whose lines were seen along these shares of the path."""
     n = 100
     sides = [
         np.where(np.arange(n) < share * n, centre_cm + sign * 0.5 * lane_cm, np.nan)

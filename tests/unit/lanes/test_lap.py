@@ -169,7 +169,7 @@ def test_a_lane_change_and_back():
     going = slice(0, 80)
     np.testing.assert_array_equal(found.lane[going], np.where(y[going] > 18.0 + 1.8, -1, 0))
     np.testing.assert_array_equal(found.lane[80:], np.where(y[80:] < 18.0 - 1.8, 0, -1))
-    # As far on either side of the line nobody can tell which lane is meant.
+    # Close to the line on either side, the lane is ambiguous.
     np.testing.assert_array_equal(found.between, np.abs(y - 18.0) < 1.8)
     # It is the left line of the one lane and the right line of the other.
     np.testing.assert_array_equal(found.divides, np.stack([found.lane == 0, found.lane == -1], axis=1))

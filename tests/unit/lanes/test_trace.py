@@ -338,7 +338,7 @@ def test_dashes_stay_also_beside_a_strip_and_where_the_lane_becomes_wider():
     assert np.isnan(found[200:210]).all()
     kept = np.setdiff1d(s, np.arange(200, 210))
     np.testing.assert_array_equal(found[kept], line[kept])
-    # A single piece, or none, is left as it is; so is a bulge that lasts.
+    # A single section, or none, is left as it is; so is a bulge that lasts.
     bay = np.where((s > 60) & (s < 160), -24.0, -18.0)
     for alone in (np.full(n, np.nan), np.where(s < 15, -18.0, np.nan), bay):
         np.testing.assert_array_equal(_without_bulges(path, alone, np.zeros(n), LANE_CM), alone)

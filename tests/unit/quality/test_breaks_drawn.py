@@ -21,7 +21,7 @@ from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
-#: Frames of the drive; of its four stretches the third is not on the map, and the second in one of its own.
+#: Frames of the drive; of its four runs the third is not on the map, and the second in one of its own.
 N, BREAKS = 40, [10, 20, 25]
 ROWS = np.delete(np.arange(N), np.arange(20, 25))
 STARTS = [0, 10, 20]
@@ -29,10 +29,10 @@ STARTS = [0, 10, 20]
 
 @pytest.fixture
 def mapped() -> MappedDrive:
-    """The stretches start 200 cm apart, on parallel ways, 2 cm per frame."""
-    stretch = np.repeat([0, 1, 3], [10, 10, 15])
+    """The runs start 200 cm apart, on parallel paths, 2 cm per frame."""
+    run = np.repeat([0, 1, 3], [10, 10, 15])
     since = np.concatenate([np.arange(10), np.arange(10), np.arange(15)])
-    poses = np.column_stack([2.0 * since, 200.0 * stretch, 0.0 * since])
+    poses = np.column_stack([2.0 * since, 200.0 * run, 0.0 * since])
     n = len(ROWS)
     drive_map = DriveMap(
         meta=MapMeta(
@@ -49,7 +49,7 @@ def mapped() -> MappedDrive:
         t_s=0.05 * ROWS,
         poses=poses,
         lap=np.zeros(n, np.int64),
-        segment=np.where(stretch == 1, 1, 0),
+        segment=np.where(run == 1, 1, 0),
         s_cm=2.0 * np.arange(n),
         match=np.full(n, 0.6),
         lines={},
@@ -91,7 +91,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return figures
 
 
-def test_a_stretch_starts_at_a_break_and_after_one_that_was_left_out(mapped):
+def test_a_run_starts_at_a_break_and_after_one_that_was_left_out(mapped):
     np.testing.assert_array_equal(np.flatnonzero(mapped.starts), STARTS)
 
 
@@ -119,11 +119,11 @@ def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):
         assert np.nanmax(np.abs(np.diff(y))) == 0.0
 
 
-def test_ways_and_curvature_across_a_break_are_left_out(mapped, drawn):
+def test_steps_and_curvature_across_a_break_are_left_out(mapped, drawn):
     plots.speed_plot(mapped)
     step = np.asarray(drawn[0].axes[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(step)) + 1, STARTS[1:])
     np.testing.assert_allclose(step[np.isfinite(step)], 2.0)
     plots.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
-    # Of the first segment's 25 frames, two begin a stretch.
+    # Of the first segment's 25 frames, two begin a run.
     assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23

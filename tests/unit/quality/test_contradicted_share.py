@@ -1,4 +1,4 @@
-"""Lines with which the pictures disagree count where the driver kept the frames."""
+"""Contradicted lines count where the driver kept the frames."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def test_twenty_frames(tmp_path):
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 8.0])
 def test_standing_still(tmp_path, both_lines, noise):
-    """The same picture over and over, with the sensor's noise, and a lamp that flickers."""
+    """The same image over and over, with the sensor's noise, and a lamp that flickers."""
     rng = np.random.default_rng(0)
     still = open_drive(both_lines).image(20).astype(float)
     frames = [
@@ -148,7 +148,7 @@ def test_one_line_only(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "frames"), [(7, 300), (9, 200)])
 def test_one_line_beside_which_a_streak_or_bare_floor_is_traced(tmp_path, seed, frames):
-    """Where a second line is traced that is none, held-out frames tell."""
+    """Held-out frames show where a second line was traced that is none."""
     settings = {"seed": seed, "frames": frames, "track": {"left": {"kind": "none"}}}
     drive = simulate_drive(SimulationSettings.model_validate(settings), tmp_path / "drive")
     assert "one line only" in refusal(drive, tmp_path / "map")
