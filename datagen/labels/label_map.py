@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from datagen.quality.figures import Report
 from datagen.quality.page import PAGE_NAME
@@ -124,12 +124,8 @@ def label_map(
     write_labels(out, labels)
     write_json(out.with_suffix(".json"), report)
     if pictures:
-        order = np.argsort(np.nan_to_num(residual_cm, nan=9.0))
-        middle = len(order) // 2
-        half = _SHOWN // 2
-        picks = np.concatenate([order[:_SHOWN], order[middle - half : middle + half], order[-_SHOWN:]])
         with atomic_file(out.with_suffix(".png")) as temporary:
-            draw_contact_sheet(temporary, mapped, rows[picks])
+            draw_contact_sheet(temporary, mapped, rows[_shown(residual_cm)])
     residual = report["residual_cm"]
     text = [
         f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",
@@ -139,6 +135,13 @@ def label_map(
         f"{residual['p95']:.2f} cm (p95)",
     ]
     return Report(tuple(text), report)
+
+
+def _shown(residual_cm: Float[np.ndarray, "n"]) -> Int[np.ndarray, "s"]:
+    """Choose the best, the median and the worst frames; frames without a residual count as worst."""
+    order = np.argsort(np.nan_to_num(residual_cm, nan=9.0))
+    first = len(order) // 2 - _SHOWN // 2
+    return np.concatenate([order[:_SHOWN], order[first : first + _SHOWN], order[-_SHOWN:]])
 
 
 def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, tape_cm: float) -> float:
