@@ -126,13 +126,7 @@ class Comparison:
                 **self.breakdown.of(name),
             }
         sources = [
-            {
-                "name": source.name,
-                "kind": source.kind,
-                "reference": source.reference,
-                "frames": source.frames,
-                "detectors": {name: stats.as_dict() for name, stats in source.detectors.items()},
-            }
+            vars(source) | {"detectors": {name: stats.as_dict() for name, stats in source.detectors.items()}}
             for source in self.sources
         ]
         return {

@@ -37,14 +37,8 @@ class ErrorStats:
 
     def as_dict(self) -> dict[str, float]:
         """Return plain values for JSON; every length carries its unit."""
-        return {
-            "rmse_cm": self.rmse_cm,
-            "median_cm": self.median_cm,
-            "p95_cm": self.p95_cm,
-            "worst_cm": self.worst_cm,
-            "count": self.count,
-            "coverage": self.coverage,
-        }
+        values = {name: value for name, value in vars(self).items() if name != "truth_count"}
+        return values | {"coverage": self.coverage}
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ command, has none of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,11 +14,8 @@ from lanenet.evaluation.sources import Opened
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
-    from lanenet.evaluation.answers import Answers, Compared
+    from lanenet.evaluation.answers import Answers, Compared, Progress
     from lanenet.evaluation.comparison import Comparison, SourceAnswers
-
-#: Called with (source, frames done, frames).
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

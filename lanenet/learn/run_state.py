@@ -171,15 +171,8 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
 
 def write_state(path: Path, state: RunState, run_hash: str) -> None:
     """Write the state; a kill while writing leaves the previous one."""
-    data = {
-        "run_hash": run_hash,
-        "network": state.network,
-        "ema": state.ema,
-        "optimizer": state.optimizer,
-        "step": state.step,
-        "history": [list(vars(record).values()) for record in state.history],
-        "best": state.best,
-    }
+    history = [list(vars(record).values()) for record in state.history]
+    data = {"run_hash": run_hash, **vars(state), "history": history}
     with atomic_file(path) as temporary:
         torch.save(data, temporary)
 
@@ -194,15 +187,8 @@ def read_state(path: Path, run_hash: str) -> RunState | None:
         return None
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
-        found = data["run_hash"]
-        state = RunState(
-            network=data["network"],
-            ema=data["ema"],
-            optimizer=data["optimizer"],
-            step=int(data["step"]),
-            history=[EpochRecord(*values) for values in data["history"]],
-            best=data["best"],
-        )
+        found = data.pop("run_hash")
+        state = RunState(**data | {"history": [EpochRecord(*values) for values in data["history"]]})
     except Exception as error:  # the unpickler raises whatever damaged bytes lead it to
         reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise CheckpointError(

@@ -93,11 +93,6 @@ class LaneSamples:
     def __len__(self) -> int:
         return len(self.points_cm)
 
-    @property
-    def any_camera(self) -> bool:
-        """Whether the frames come from so many cameras that the network has to do with any calibrated one."""
-        return self.camera_hashes == [ANY_CAMERA]
-
     def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
         """Return frames as they are, with their lane width."""
         return plain_batch(self.frames, indices, self.window)

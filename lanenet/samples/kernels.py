@@ -7,7 +7,8 @@ that this one imports, delete ``lanenet/samples/__pycache__``.
 
 from __future__ import annotations
 
-from typing import NamedTuple, no_type_check
+from collections import namedtuple
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
@@ -24,6 +25,7 @@ from lanenet.samples.random_stream import (
     start_stream,
 )
 from lanenet.samples.raster import count_cells, mark, presence
+from lanenet.samples.settings import AugmentSettings
 
 #: Radius of a disc without paint, and width of a ring. Chosen: glare and worn paint on model roads.
 _UNPAINTED_CM = (4.0, 20.0)
@@ -61,30 +63,10 @@ def misplace_points(points_cm, camera_cm, height, pitch, roll, out):
         out[k, 0], out[k, 1] = misplace(x, y, right, ahead, up, height, pitch, roll)
 
 
-class Amounts(NamedTuple):
-    """:class:`lanenet.samples.settings.AugmentSettings` as numbers; ``limit`` is 1 for draws at the limit."""
-
-    mirror: float
-    shift_cm: float
-    rotate_rad: float
-    scale: float
-    drop_points: float
-    double_points: float
-    jitter_cm: float
-    missing_stretch: float
-    missing_line: float
-    missing_both: float
-    middle_dashes: float
-    objects: int
-    clutter_segments: int
-    clutter_points: int
-    clutter_share: float
-    height: float
-    pitch_rad: float
-    roll_rad: float
-    untold_width: float
-    width_error: float
-    limit: int
+#: :class:`AugmentSettings` as numbers, by the same names; ``limit`` is 1 for draws at the limit.
+Amounts: Any = namedtuple(  # type: ignore[misc]
+    "Amounts", [*(name for name in AugmentSettings.model_fields if name != "draw"), "limit"]
+)
 
 
 class Frames(NamedTuple):
