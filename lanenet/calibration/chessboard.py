@@ -1,4 +1,4 @@
-"""The corners of a chessboard in pictures, also of one that the picture cuts off."""
+"""The corners of a chessboard in images, also of one that the image cuts off."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class Board:
 
 @dataclass(frozen=True)
 class BoardView:
-    """One picture's corners.
+    """One image's corners.
 
     Attributes:
-        name: The picture.
+        name: The image.
         width: Its width, [px].
         height: Its height, [px].
         points_cm: Corners on the board.
-        corners_px: The same corners in the picture.
+        corners_px: The same corners in the image.
         complete: Whether the whole board was seen.
     """
 
@@ -78,17 +78,17 @@ def parse_board(text: str, square_cm: float = 2.5) -> Board:
         raise ConfigError(f"--board {text!r}: expected inner corners as COLUMNSxROWS, for example 9x6")
     columns, rows = int(match[1]), int(match[2])
     if min(columns, rows) < 3 or max(columns, rows) > 60:
-        raise ConfigError(f"--board {text}: expected 3 to 60 inner corners each way")
+        raise ConfigError(f"--board {text}: expected 3 to 60 inner corners in each direction")
     if not square_cm > 0.0:
         raise ConfigError(f"--square {square_cm:g}: expected a length above 0 cm")
     return Board(columns, rows, square_cm)
 
 
 def list_pictures(words: Sequence[str]) -> list[Path]:
-    """Turn files, folders and patterns into picture files, each once, in the order of their names.
+    """Turn files, folders and patterns into image files, each once, in the order of their names.
 
     Raises:
-        CalibrationError: If a word names nothing, or a folder holds no picture.
+        CalibrationError: If a word names nothing, or a folder holds no image.
     """
     found: list[Path] = []
     for word in words:
@@ -96,7 +96,7 @@ def list_pictures(words: Sequence[str]) -> list[Path]:
         if path.is_dir():
             inside = [p for p in path.iterdir() if p.suffix.lower() in PICTURE_ENDINGS and p.is_file()]
             if not inside:
-                raise CalibrationError(f"{path}: no pictures in this folder ({', '.join(PICTURE_ENDINGS)})")
+                raise CalibrationError(f"{path}: no images in this folder ({', '.join(PICTURE_ENDINGS)})")
         elif path.is_file():
             inside = [path]
         else:
@@ -104,48 +104,46 @@ def list_pictures(words: Sequence[str]) -> list[Path]:
             pattern = str(path.relative_to(anchor)) if path.anchor else word
             inside = [p for p in anchor.glob(pattern) if p.is_file()] if any(c in word for c in "*?[") else []
             if not inside:
-                raise CalibrationError(f"{word}: no such picture, folder or pattern")
+                raise CalibrationError(f"{word}: no such image, folder or pattern")
         found += sorted(inside, key=_natural)
     return list(dict.fromkeys(found))
 
 
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read a picture as BGR; the orientation in its metadata is not applied, as a camera knows none.
+    """Read an image as BGR; the orientation in its metadata is not applied, as a camera knows none.
 
     Raises:
-        CalibrationError: If it cannot be read as a picture.
+        CalibrationError: If it cannot be read as an image.
     """
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error})") from None
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(data, flags) if data.size else None
-    if picture is None:
-        raise CalibrationError(f"{path}: cannot be read as a picture")
-    return np.asarray(picture)
+    image = cv2.imdecode(data, flags) if data.size else None
+    if image is None:
+        raise CalibrationError(f"{path}: cannot be read as an image")
+    return np.asarray(image)
 
 
-def find_view(name: str, picture: np.ndarray, board: Board) -> BoardView | str:
-    """Find the board in a picture.
+def find_view(name: str, image: np.ndarray, board: Board) -> BoardView | str:
+    """Find the board in an image.
 
     Args:
-        name: Names the picture in messages.
-        picture: Gray or BGR, uint8.
+        name: Names the image in messages.
+        image: Gray or BGR, uint8.
         board: The board.
 
     Returns:
         The corners, or the reason why there are none.
     """
-    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[2:] not in ((), (1,), (3,)):
-        return f"expected a gray or BGR picture of uint8, found {picture.dtype} of shape {picture.shape}"
-    height, width = picture.shape[:2]
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,)):
+        return f"expected a gray or BGR image of uint8, found {image.dtype} of shape {image.shape}"
+    height, width = image.shape[:2]
     if min(height, width) < _MIN_PICTURE_PX:
         return f"only {width}x{height} px, too small for a board"
     gray = (
-        cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        if picture.shape[2:] == (3,)
-        else picture.reshape(height, width)
+        cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.shape[2:] == (3,) else image.reshape(height, width)
     )
     if int(gray.max()) - int(gray.min()) < 16:
         return "an even surface without contrast"
@@ -163,18 +161,18 @@ def find_view(name: str, picture: np.ndarray, board: Board) -> BoardView | str:
 def find_views(
     paths: Sequence[Path], board: Board, progress: Callable[..., Any] | None = None
 ) -> tuple[list[BoardView], dict[str, str]]:
-    """Find the board in picture files.
+    """Find the board in image files.
 
     Args:
-        paths: The pictures.
+        paths: The images.
         board: The board.
-        progress: Called with pictures done and their number.
+        progress: Called with images done and their number.
 
     Returns:
-        The views, and for each other picture the reason why it is none.
+        The views, and for each other image the reason why it is none.
 
     Raises:
-        CalibrationError: If no picture shows the whole board; says which other board the first ones show.
+        CalibrationError: If no image shows the whole board; says which other board the first ones show.
     """
     views: list[BoardView] = []
     left_out: dict[str, str] = {}
@@ -191,7 +189,7 @@ def find_views(
             progress(done + 1, len(paths))
     if not any(view.complete for view in views):
         raise CalibrationError(
-            f"none of {len(paths)} pictures shows a whole board with {board.columns}x{board.rows} inner "
+            f"none of {len(paths)} images shows a whole board with {board.columns}x{board.rows} inner "
             f"corners{_hint(paths, board)}"
         )
     return views, left_out
@@ -216,7 +214,7 @@ def _find_complete(gray: UInt8[np.ndarray, "h w"], board: Board) -> Float[np.nda
 def _find_part(
     gray: UInt8[np.ndarray, "h w"], board: Board
 ) -> tuple[int, int, Float[np.ndarray, "n 2"]] | None:
-    """A board that the picture cuts off: any rectangle of its corners is a board as well."""
+    """A board that the image cuts off: any rectangle of its corners is a board as well."""
     least = (min(_MIN_SIDE, board.columns), min(_MIN_SIDE, board.rows))
     for scaled, scale in _scales(gray)[:1]:
         flags = _SB_FLAGS | cv2.CALIB_CB_LARGER
@@ -244,7 +242,7 @@ def _scales(gray: UInt8[np.ndarray, "h w"]) -> list[tuple[UInt8[np.ndarray, "sh 
 
 
 def _unscaled(corners: np.ndarray, scale: float) -> Float[np.ndarray, "n 2"]:
-    # Pixel centres lie at integers, so that a scaled picture's centres are shifted by half a pixel.
+    # Pixel centres lie at integers, so that a scaled image's centres are shifted by half a pixel.
     return (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
 
 
@@ -271,7 +269,7 @@ def _spacing(corners_px: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> flo
 def _checked(
     corners_px: Float[np.ndarray, "n 2"], gray: UInt8[np.ndarray, "h w"], size: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"] | None:
-    """None for corners that cannot be a board: outside the picture, or on top of each other."""
+    """None for corners that cannot be a board: outside the image, or on top of each other."""
     height, width = gray.shape
     inside = (corners_px > -0.5).all() and (corners_px < [width - 0.5, height - 0.5]).all()
     return corners_px if inside and _spacing(corners_px, size) > 2.0 else None

@@ -239,7 +239,7 @@ def points_of_floor_board(
         Ground points, [cm], frame car, and their pixels.
 
     Raises:
-        CalibrationError: If the board is cut off, or turned so far that its sides cannot be told apart.
+        CalibrationError: If the board is cut off, or turned so far that its sides cannot be distinguished.
     """
     if not view.complete:
         raise CalibrationError(f"{view.name}: the board on the floor is cut off, expected all its corners")

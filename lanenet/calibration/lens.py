@@ -12,8 +12,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.camera import Camera, CameraModel, Mounting
-from lanenet.geometry.lenses import distort_pinhole, fisheye_radius, fisheye_slope
+from lanenet.geometry.camera import (
+    Camera,
+    CameraModel,
+    Mounting,
+    distort_pinhole,
+    fisheye_radius,
+    fisheye_slope,
+)
 
 #: Numbers in D.
 N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}

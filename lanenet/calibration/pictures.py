@@ -1,4 +1,4 @@
-"""Pictures by which a person judges a calibration: without the lens, and from above with a grid in cm."""
+"""Images by which a person judges a calibration: without the lens, and from above with a grid in cm."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def undistorted_picture(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -
         camera: The camera.
 
     Returns:
-        A picture of the same size and direction, with the field of the frame up to 120 degrees across.
+        An image of the same size and direction, with the field of the frame up to 120 degrees across.
     """
     return undistorting_view(camera).of(frame_bgr)
 
@@ -47,7 +47,7 @@ def plane_picture(
         px_per_cm: Scale; by default so that the longer side has 800 px.
 
     Returns:
-        The picture: x to the right, y upwards.
+        The image: x to the right, y upwards.
     """
     left, near, right, far = area_cm
     scale = 800.0 / max(right - left, far - near) if px_per_cm is None else px_per_cm
@@ -56,9 +56,9 @@ def plane_picture(
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
     x, y = left + (u + 0.5) / scale, far - (v + 0.5) / scale
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    picture = View.of_rays(camera, moved_points(pose, plane)[0], rows, columns).of(frame_bgr)
-    _draw_grid(picture, area_cm, scale)
-    return picture
+    image = View.of_rays(camera, moved_points(pose, plane)[0], rows, columns).of(frame_bgr)
+    _draw_grid(image, area_cm, scale)
+    return image
 
 
 def points_picture(
@@ -67,8 +67,8 @@ def points_picture(
     projected_px: Float[np.ndarray, "n 2"],
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw measured points (green rings) and where the calibration puts them (red dots) into a frame."""
-    picture = frame_bgr.copy()
-    size = max(2, round(picture.shape[1] / 200))
+    image = frame_bgr.copy()
+    size = max(2, round(image.shape[1] / 200))
     for points, colour, radius, thickness in (
         (measured_px, MEASURED_BGR, 2 * size, 1),
         (projected_px, PROJECTED_BGR, size, -1),
@@ -76,8 +76,8 @@ def points_picture(
         for point in points[np.isfinite(points).all(axis=1)]:
             if (np.abs(point) < 1e4).all():
                 centre = (round(float(point[0])), round(float(point[1])))
-                cv2.circle(picture, centre, radius, colour, thickness, cv2.LINE_AA)
-    return picture
+                cv2.circle(image, centre, radius, colour, thickness, cv2.LINE_AA)
+    return image
 
 
 def grid_spacing_cm(px_per_cm: float) -> float:
@@ -89,22 +89,22 @@ def grid_spacing_cm(px_per_cm: float) -> float:
 
 
 def _draw_grid(
-    picture: UInt8[np.ndarray, "rows columns 3"], area_cm: tuple[float, float, float, float], scale: float
+    image: UInt8[np.ndarray, "rows columns 3"], area_cm: tuple[float, float, float, float], scale: float
 ) -> None:
     left, near, right, far = area_cm
-    rows, columns = picture.shape[:2]
+    rows, columns = image.shape[:2]
     spacing = grid_spacing_cm(scale)
     for k in range(int(np.ceil(left / spacing)), int(np.floor(right / spacing)) + 1):
         u = round((k * spacing - left) * scale - 0.5)
-        cv2.line(picture, (u, 0), (u, rows - 1), AXIS_BGR if k == 0 else GRID_BGR, 1)
-        _write(picture, f"{k * spacing:g}", (u + 2, rows - 4))
+        cv2.line(image, (u, 0), (u, rows - 1), AXIS_BGR if k == 0 else GRID_BGR, 1)
+        _write(image, f"{k * spacing:g}", (u + 2, rows - 4))
     for k in range(int(np.ceil(near / spacing)), int(np.floor(far / spacing)) + 1):
         v = round((far - k * spacing) * scale - 0.5)
-        cv2.line(picture, (0, v), (columns - 1, v), AXIS_BGR if k == 0 else GRID_BGR, 1)
-        _write(picture, f"{k * spacing:g}", (2, v - 3))
-    _write(picture, "cm", (columns - 28, 14))
+        cv2.line(image, (0, v), (columns - 1, v), AXIS_BGR if k == 0 else GRID_BGR, 1)
+        _write(image, f"{k * spacing:g}", (2, v - 3))
+    _write(image, "cm", (columns - 28, 14))
 
 
-def _write(picture: UInt8[np.ndarray, "rows columns 3"], text: str, place: tuple[int, int]) -> None:
+def _write(image: UInt8[np.ndarray, "rows columns 3"], text: str, place: tuple[int, int]) -> None:
     for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)
+        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)

@@ -1,7 +1,7 @@
 """Which views of a chessboard can take part in a calibration: complete, alike in size, distinct, of one lens.
 
 Two lenses whose focal lengths differ by a few per cent fit one distorted lens to a fraction of a pixel. They
-are told apart by a focal length per view: the views form two groups with nothing in between.
+are recognised by a focal length per view: the views form two groups with nothing in between.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _of_one_size(views: list[BoardView], dropped: dict[str, str]) -> list[BoardV
     width, height = sizes.most_common(1)[0][0]
     for view in views:
         if (view.width, view.height) != (width, height):
-            dropped[view.name] = f"{view.width}x{view.height} px, most pictures have {width}x{height}"
+            dropped[view.name] = f"{view.width}x{view.height} px, most images have {width}x{height}"
     return [view for view in views if (view.width, view.height) == (width, height)]
 
 

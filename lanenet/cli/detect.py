@@ -12,7 +12,7 @@ from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, ModelOption
 from lanenet.cli.shared.outputs import check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError
-from lanenet.perception.detector_kind import DetectorInputs
+from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed, refuse_mask
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from lanenet.config import Settings
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.geometry.lane import parabola_through
-from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.estimate import LaneEstimate, LaneMemory
 
 #: The width is learned from frames of at least this confidence; chosen: those at which the car does not slow.
 _WIDTH_CONFIDENCE = 0.5
@@ -106,7 +105,7 @@ class ControlSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Wish:
+class Target:
     """Steering and speed for the lane, before any limit.
 
     Attributes:
@@ -141,9 +140,9 @@ class LaneController:
         self._smoother.reset()
         self._t_s = math.nan
 
-    def wish(
+    def target(
         self, estimate: LaneEstimate, t_s: float, speed_cm_s: float = 0.0, steering_rad: float = 0.0
-    ) -> Wish:
+    ) -> Target:
         """Return steering and speed for a frame.
 
         Args:
@@ -167,12 +166,12 @@ class LaneController:
             # A car that returns to a straight lane drives a bend of its own.
             own = abs(math.tan(steering)) / self._steering.wheelbase_cm
             curvature = own if not math.isfinite(curvature) else max(curvature, own)
-        return Wish(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth)
+        return Target(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth)
 
     def _target_rad(self, estimate: LaneEstimate, smooth: LaneEstimate) -> float:
         if self._settings.own_target:
-            limit, wished = self._steering.max_steering_rad, estimate.steering_rad
-            return min(max(wished, -limit), limit) if math.isfinite(wished) else math.nan
+            limit, target = self._steering.max_steering_rad, estimate.steering_rad
+            return min(max(target, -limit), limit) if math.isfinite(target) else math.nan
         # Smoothing may hold one line, but a frame without any line has no target.
         if not any(map(math.isfinite, estimate.points_cm.tolist())):
             return math.nan

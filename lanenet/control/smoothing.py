@@ -126,7 +126,7 @@ def move_points(
     Source:
         Own derivation; exact for straight lines (``tests/unit/control/test_smoothing.py``).
     """
-    # The new front axle in the old frame, by way of the rear axle, which lies a wheelbase behind.
+    # The new front axle in the old frame, through the rear axle, which lies a wheelbase behind.
     front_x = -travel_cm * math.sin(0.5 * turn_rad) - wheelbase_cm * math.sin(turn_rad)
     front_y = travel_cm * math.cos(0.5 * turn_rad) + wheelbase_cm * (math.cos(turn_rad) - 1.0)
     sine, cosine = math.sin(turn_rad), math.cos(turn_rad)

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.geometry.lane import ROWS_CM, parabola_through
-from lanenet.geometry.steering import proportional_angle_rad, pure_pursuit_angle_rad
+from lanenet.geometry.lane import ROWS_CM, parabola_through, proportional_angle_rad, pure_pursuit_angle_rad
 from lanenet.perception.estimate import LaneEstimate
 
 

@@ -16,9 +16,8 @@ from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.evaluation.run import run_detectors
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, SIDES
-from lanenet.perception.detector_kind import DetectorInputs, EdgeDetector
 from lanenet.perception.edges.road import PerceptionSettings
-from lanenet.perception.estimate import Detector
+from lanenet.perception.estimate import Detector, DetectorInputs, EdgeDetector
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, open_model
 from lanenet.perception.registry import build_detector, build_on_edges, compared_names, kind_of
 from lanenet.processes import run_jobs

@@ -21,7 +21,7 @@ from lanenet.evaluation.breakdown import (
 )
 from lanenet.evaluation.errors import ErrorStats, error_stats
 from lanenet.evaluation.tables import TextTable, show_cm, show_share
-from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.estimate import LaneMemory
 from lanenet.samples.dataset import LaneSamples
 from lanenet.samples.settings import AugmentSettings
 

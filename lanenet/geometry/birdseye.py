@@ -53,7 +53,7 @@ class BirdseyeWindow:
     def labelled(self, points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6"]:
         """Return labels with NaN where a point lies beside the window.
 
-        A line that leaves the window sideways before it reaches a row has no place in the picture there, and
+        A line that leaves the window sideways before it reaches a row has no place in the raster there, and
         a network that guesses it would be judged by where the map ends.
         """
         with np.errstate(invalid="ignore"):

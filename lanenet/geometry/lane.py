@@ -4,7 +4,8 @@ Rows are y = 0, 15, 30 cm ahead of the front axle. The order of the six numbers 
 far, then the right line near to far. A line's position is the middle of its marking. A missing value is NaN.
 Three points and the parabola x = a y^2 + b y + c are one-to-one (Kozlowski et al. 2024, eq. 7-8).
 
-With the lane's width, one line determines the other: a curve at a constant distance.
+With the lane's width, one line determines the other: a curve at a constant distance. From an aim point in the
+lane follows the angle of the front wheels, [rad], positive to the left.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
     """Find x where a lane line crosses the label rows.
 
     The line is walked in the order of its points, which is the direction of travel; of several crossings of
-    one row the first that goes upwards (the line recedes from the car) counts. NaN where no stretch does,
-    so that a line that turns away or back is not answered with another stretch of itself.
+    one row the first that goes upwards (the line recedes from the car) counts. NaN where no section does,
+    so that a line that turns away or back is not answered with another section of itself.
 
     Args:
         line_car_cm: Polyline in the direction of travel, [cm], frame car; NaN rows break it.
@@ -143,3 +144,41 @@ def parallel_points(
     ahead = 2.0 * a * distance_cm / length**3 < 1.0
     believed = (y >= rows[0] - beyond_cm) & (y <= rows[-1] + beyond_cm)
     return np.where(found & ahead & believed, (a * y + b) * y + c + distance_cm / length, np.nan)
+
+
+def proportional_angle_rad(aim_right_cm: float, aim_ahead_cm: float) -> float:
+    """Aim the front wheels at a point: atan of lateral over ahead.
+
+    Args:
+        aim_right_cm: Lateral position of the lane centre A, [cm], frame car, positive right.
+        aim_ahead_cm: Distance of A ahead of the front axle, [cm], > 0.
+
+    Returns:
+        Steering angle, [rad], positive left.
+
+    Source:
+        Kozlowski et al. 2024, eq. 3, with the sign of REP 103.
+    """
+    return math.atan2(-aim_right_cm, aim_ahead_cm)
+
+
+def pure_pursuit_angle_rad(aim_right_cm: float, aim_ahead_cm: float, wheelbase_cm: float) -> float:
+    """Steer the rear axle onto the circle through a point.
+
+    The circle through the rear axle, tangent to the heading, that meets the aim point has curvature
+    2 * lateral / distance^2; the bicycle's front wheel makes it with atan(wheelbase * curvature).
+
+    Args:
+        aim_right_cm: Lateral position of the aim point, [cm], frame car, positive right.
+        aim_ahead_cm: Distance of the aim point ahead of the front axle, [cm].
+        wheelbase_cm: Distance between the axles, [cm].
+
+    Returns:
+        Steering angle, [rad], positive left.
+
+    Source:
+        Coulter 1992, "Implementation of the Pure Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01.
+    """
+    forward = aim_ahead_cm + wheelbase_cm
+    curvature = -2.0 * aim_right_cm / (forward * forward + aim_right_cm * aim_right_cm)
+    return math.atan(wheelbase_cm * curvature)

@@ -22,11 +22,10 @@ from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
-from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.estimate import Detector
-from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings
+from lanenet.perception.estimate import Detector, DetectorInputs
+from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.registry import build_detector, detector_names
 
@@ -312,8 +311,8 @@ class _Path:
         for i in range(count):
             wall_s, cpu_s = time.perf_counter(), time.thread_time()
             estimate = self._detector.detect(frames[i % len(frames)])
-            wish = self._controller.wish(estimate, self._t_s, 60.0, self._limiter.steering_rad)
-            self._limiter.limit(wish.steering_rad, 0.2, self._t_s)
+            target = self._controller.target(estimate, self._t_s, 60.0, self._limiter.steering_rad)
+            self._limiter.limit(target.steering_rad, 0.2, self._t_s)
             self._cpu_s.append(time.thread_time() - cpu_s)
             self._wall_s.append(time.perf_counter() - wall_s)
             self._t_s += _PERIOD_S

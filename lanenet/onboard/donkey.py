@@ -45,10 +45,9 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
-from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.edges.views import View, birdseye_view, undistorting_view
-from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.estimate import Detector, DetectorInputs, LaneEstimate
 from lanenet.perception.registry import build_detector
 
 #: Donkeycar calls its pilot in every turn of its loop (20 Hz by default) unless a person drives: after a
@@ -124,7 +123,7 @@ class LanePilot:
         self._clock = clock
         self._before: UInt8[np.ndarray, "h w 3"] | None = None
         self._run_s = self._seen_s = -math.inf
-        self._wish = (0.0, 0.0)
+        self._target = (0.0, 0.0)
 
     @staticmethod
     def from_file(path: str | Path) -> LanePilot:
@@ -160,8 +159,8 @@ class LanePilot:
                 self.estimate = self._detector.detect(bgr)
                 self._follow(now_s)
         if now_s - self._seen_s > self._settings.hold_s:
-            self._wish = (self._wish[0], 0.0)
-        steering_rad, speed_cm_s = self._wish
+            self._target = (self._target[0], 0.0)
+        steering_rad, speed_cm_s = self._target
         throttle = throttle_of(speed_cm_s, self._settings.control.speed)
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
@@ -173,10 +172,10 @@ class LanePilot:
         return not same_image(before, bgr)
 
     def _follow(self, now_s: float) -> None:
-        wish = self._controller.wish(self.estimate, now_s, self._wish[1], self._limiter.steering_rad)
-        if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(wish.steering_rad):
+        target = self._controller.target(self.estimate, now_s, self._target[1], self._limiter.steering_rad)
+        if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(target.steering_rad):
             self._seen_s = now_s
-            self._wish = (wish.steering_rad, wish.speed_cm_s)
+            self._target = (target.steering_rad, target.speed_cm_s)
 
     def run_threaded(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
         """Same as :meth:`run`: the pilot is faster than the camera and needs no thread."""

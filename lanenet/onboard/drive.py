@@ -26,8 +26,7 @@ from lanenet.onboard.drive_report import Step
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
 from lanenet.onboard.safety import LimitSettings, SafetySettings
-from lanenet.perception.detector_kind import DetectorInputs
-from lanenet.perception.estimate import Detector
+from lanenet.perception.estimate import Detector, DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector
 
 #: In a dry run a fault stops the car but does not end the drive: this is longer than any dry run.

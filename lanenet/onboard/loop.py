@@ -198,10 +198,10 @@ class DriveLoop:
             self._count(frame)
         if frame is not None and not fault:
             estimate = self._parts.detector.detect(frame.image_bgr)
-            wish = self._parts.controller.wish(
+            target = self._parts.controller.target(
                 estimate, frame.t_s, self._speed_cm_s(), self._limiter.steering_rad
             )
-            steering_rad, speed_cm_s = wish.steering_rad, wish.speed_cm_s
+            steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
             now_s = self._clock()
             fault = self._fault_of_answer(frame, steering_rad, now_s)
         verdict = self._judge.judge(now_s, fault, estimate.confidence)

@@ -23,7 +23,7 @@ TRUTH_BGR = (255, 60, 255)
 _FILL_SHARE = 0.35
 FAR_CM = 40.0
 _SAMPLES = 41
-# Nothing is drawn further outside the picture than this share of its size.
+# Nothing is drawn further outside the image than this share of its size.
 _MARGIN = 0.25
 # OpenCV draws in fixed point: this many bits below a pixel.
 _SHIFT = 4
@@ -44,31 +44,31 @@ def draw_estimate(
         frame_bgr: Colour or gray frame; it is not changed.
         estimate: What a detector answered; what it does not know is not drawn.
         camera: Camera of the frame; without one the points on the road are not drawn.
-        scale: Whole factor by which the picture is enlarged, so that lines stay thin on small frames.
+        scale: Whole factor by which the image is enlarged, so that lines stay thin on small frames.
         caption: Text for the top left corner.
         image_lane: Lines of the image, drawn under the rest.
         truth_cm: Six points to compare with, drawn in magenta under the estimate.
 
     Returns:
-        A new picture, ``scale`` times the frame's size.
+        A new image, ``scale`` times the frame's size.
     """
-    picture = _enlarged(frame_bgr, scale)
-    thickness = max(1, round(picture.shape[1] / 320))
+    image = _enlarged(frame_bgr, scale)
+    thickness = max(1, round(image.shape[1] / 320))
     if image_lane is not None:
-        _draw_image_lane(picture, image_lane, scale, 2 * thickness)
+        _draw_image_lane(image, image_lane, scale, 2 * thickness)
         caption = f"{caption}  {image_lane.text}".strip()
     if camera is not None:
         if truth_cm is not None:
-            _draw_road(picture, LaneEstimate(truth_cm), camera, scale, thickness, (TRUTH_BGR, TRUTH_BGR))
-        _draw_road(picture, estimate, camera, scale, thickness, (LEFT_BGR, RIGHT_BGR))
-    _draw_arrow(picture, estimate.steering_rad, 2 * thickness)
+            _draw_road(image, LaneEstimate(truth_cm), camera, scale, thickness, (TRUTH_BGR, TRUTH_BGR))
+        _draw_road(image, estimate, camera, scale, thickness, (LEFT_BGR, RIGHT_BGR))
+    _draw_arrow(image, estimate.steering_rad, 2 * thickness)
     if caption:
-        _draw_text(picture, caption, thickness)
-    return picture
+        _draw_text(image, caption, thickness)
+    return image
 
 
 def _draw_road(
-    picture: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
     estimate: LaneEstimate,
     camera: Camera,
     scale: int,
@@ -79,41 +79,39 @@ def _draw_road(
     y_cm = np.linspace(0.0, FAR_CM, _SAMPLES)
     for side, colour in enumerate(colours):
         x_cm = np.polyval(estimate.parabolas[side], y_cm)
-        _draw_polyline(picture, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
+        _draw_polyline(image, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
     rows_cm = np.tile(ROWS_CM, len(SIDES))
     points = _pixels(np.stack([estimate.points_cm, rows_cm], axis=1), camera, scale)
     for index, point in enumerate(points):
         if np.isfinite(point).all():
             colour = colours[index // len(ROWS_CM)]
             centre = _fixed(point)
-            cv2.circle(picture, centre, (3 * thickness) << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
-            cv2.circle(picture, centre, (3 * thickness) << _SHIFT, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(image, centre, (3 * thickness) << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(image, centre, (3 * thickness) << _SHIFT, (0, 0, 0), 1, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_image_lane(
-    picture: UInt8[np.ndarray, "h w 3"], lane: ImageLane, scale: int, thickness: int
-) -> None:
+def _draw_image_lane(image: UInt8[np.ndarray, "h w 3"], lane: ImageLane, scale: int, thickness: int) -> None:
     def enlarged(line_px: Polyline) -> Polyline:
         return np.asarray((line_px + 0.5) * scale - 0.5)
 
     if lane.filled and lane.left_px is not None and lane.right_px is not None:
-        _fill_between(picture, enlarged(lane.left_px), enlarged(lane.right_px))
+        _fill_between(image, enlarged(lane.left_px), enlarged(lane.right_px))
     for line_px in lane.memory_px:
-        _draw_polyline(picture, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
+        _draw_polyline(image, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
     for side_px, colour in ((lane.left_px, LEFT_BGR), (lane.right_px, RIGHT_BGR)):
         if side_px is not None:
-            _draw_polyline(picture, enlarged(side_px), colour, thickness)
+            _draw_polyline(image, enlarged(side_px), colour, thickness)
 
 
-def _fill_between(picture: UInt8[np.ndarray, "h w 3"], left_px: Polyline, right_px: Polyline) -> None:
+def _fill_between(image: UInt8[np.ndarray, "h w 3"], left_px: Polyline, right_px: Polyline) -> None:
     left_px, right_px = (line[np.isfinite(line).all(axis=1)] for line in (left_px, right_px))
     if min(len(left_px), len(right_px)) < 2:
         return
-    outline = _clipped_area(np.concatenate([left_px, right_px[::-1]]), *_bounds(picture))
+    outline = _clipped_area(np.concatenate([left_px, right_px[::-1]]), *_bounds(image))
     if len(outline) >= 3:
-        filled = picture.copy()
+        filled = image.copy()
         cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], FILL_BGR)
-        cv2.addWeighted(filled, _FILL_SHARE, picture, 1.0 - _FILL_SHARE, 0.0, dst=picture)
+        cv2.addWeighted(filled, _FILL_SHARE, image, 1.0 - _FILL_SHARE, 0.0, dst=image)
 
 
 def _enlarged(frame_bgr: UInt8[np.ndarray, "h w *c"], scale: int) -> UInt8[np.ndarray, "sh sw 3"]:
@@ -124,7 +122,7 @@ def _enlarged(frame_bgr: UInt8[np.ndarray, "h w *c"], scale: int) -> UInt8[np.nd
 
 
 def _pixels(points_cm: Float[np.ndarray, "n 2"], camera: Camera, scale: int) -> Float[np.ndarray, "n 2"]:
-    """Pixels of the enlarged picture; NaN where unknown or so far outside that fixed point overflows."""
+    """Pixels of the enlarged image; NaN where unknown or so far outside that fixed point overflows."""
     known = np.isfinite(points_cm).all(axis=1)
     pixels = np.full_like(points_cm, np.nan)
     pixels[known] = (camera.project_ground(points_cm[known]) + 0.5) * scale - 0.5
@@ -139,23 +137,23 @@ def _fixed(point_px: Float[np.ndarray, "2"]) -> tuple[int, int]:
 
 
 def _draw_polyline(
-    picture: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
     points_px: Float[np.ndarray, "n 2"],
     colour: tuple[int, int, int],
     thickness: int,
 ) -> None:
     seen = np.isfinite(points_px).all(axis=1)
     for k in np.flatnonzero(seen[:-1] & seen[1:]):
-        ends = _clipped_line(points_px[k], points_px[k + 1], *_bounds(picture))
+        ends = _clipped_line(points_px[k], points_px[k + 1], *_bounds(image))
         if ends is not None:
-            cv2.line(picture, _fixed(ends[0]), _fixed(ends[1]), colour, thickness, cv2.LINE_AA, _SHIFT)
+            cv2.line(image, _fixed(ends[0]), _fixed(ends[1]), colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def _bounds(
-    picture: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Lowest and highest place at which anything is drawn: the picture and a margin wider than any line."""
-    size = np.array([picture.shape[1], picture.shape[0]], np.float64)
+    """Lowest and highest place at which anything is drawn: the image and a margin wider than any line."""
+    size = np.array([image.shape[1], image.shape[0]], np.float64)
     return -_MARGIN * size, (1.0 + _MARGIN) * size
 
 
@@ -165,7 +163,7 @@ def _clipped_line(
     low_px: Float[np.ndarray, "2"],
     high_px: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """The part of a line within a box, or None: OpenCV's fixed point overflows far outside the picture.
+    """The part of a line within a box, or None: OpenCV's fixed point overflows far outside the image.
 
     Source:
         Liang and Barsky 1984, "A new concept and method for line clipping", ACM Transactions on Graphics 3.
@@ -209,21 +207,21 @@ def _clipped_area(
     return points
 
 
-def _draw_arrow(picture: UInt8[np.ndarray, "h w 3"], steering_rad: float, thickness: int) -> None:
+def _draw_arrow(image: UInt8[np.ndarray, "h w 3"], steering_rad: float, thickness: int) -> None:
     """An arrow from the middle of the bottom edge: up is straight on, left is positive."""
     if not math.isfinite(steering_rad):
         return
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     length = 0.25 * height
     tail = (0.5 * width, height - 1.0)
     tip = (tail[0] - length * math.sin(steering_rad), tail[1] - length * math.cos(steering_rad))
     cv2.arrowedLine(
-        picture, (round(tail[0]), round(tail[1])), (round(tip[0]), round(tip[1])), ARROW_BGR, thickness
+        image, (round(tail[0]), round(tail[1])), (round(tip[0]), round(tip[1])), ARROW_BGR, thickness
     )
 
 
-def _draw_text(picture: UInt8[np.ndarray, "h w 3"], text: str, thickness: int) -> None:
-    size = picture.shape[1] / 800.0
+def _draw_text(image: UInt8[np.ndarray, "h w 3"], text: str, thickness: int) -> None:
+    size = image.shape[1] / 800.0
     origin = (round(12 * size), round(30 * size))
     for colour, width in (((0, 0, 0), 3 * thickness), (TEXT_BGR, thickness)):
-        cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
+        cv2.putText(image, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)

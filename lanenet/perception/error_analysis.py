@@ -1,7 +1,4 @@
-"""How exactly a camera sees the road: pixels per ground cell, and the steering error that follows.
-
-The error analysis as a picture: pixels per ground cell, seen from above.
-"""
+"""How exactly a camera sees the road: pixels per ground cell, and the steering error that follows."""
 
 from __future__ import annotations
 
@@ -53,7 +50,7 @@ class ErrorAnalysis:
             at the middle of each cell; NaN where the camera does not see it.
         ahead_cm_per_px: The same along the direction of travel.
         line_pixels: Pixel centres in the cells of the left and the right line's point at the look-ahead.
-        line_cm_per_px: Sideways, at these two points; NaN outside the picture.
+        line_cm_per_px: Sideways, at these two points; NaN outside the image.
         position_error_cm: Worst sideways error of the lane's centre: a pixel and the filter's grid.
         steering_error_rad: Steering error of that at the look-ahead.
     """
@@ -204,7 +201,7 @@ def draw_analysis(analysis: ErrorAnalysis) -> UInt8[np.ndarray, "h w 3"]:
         analysis: What :func:`lanenet.perception.error_analysis.analyse_errors` found.
 
     Returns:
-        The picture.
+        The image.
     """
     pixels = analysis.pixels[::-1]  # The far edge on top.
     rows, columns = pixels.shape
@@ -213,28 +210,28 @@ def draw_analysis(analysis: ErrorAnalysis) -> UInt8[np.ndarray, "h w 3"]:
     colours = cv2.applyColorMap(shade, cv2.COLORMAP_VIRIDIS)
     colours[pixels == 0] = _MISSING_BGR
     grid = cv2.resize(colours, (columns * _CELL_PX, rows * _CELL_PX), interpolation=cv2.INTER_NEAREST)
-    picture = np.full((rows * _CELL_PX + _FOOT_PX, columns * _CELL_PX, 3), 255, np.uint8)
-    picture[: rows * _CELL_PX] = grid
+    image = np.full((rows * _CELL_PX + _FOOT_PX, columns * _CELL_PX, 3), 255, np.uint8)
+    image[: rows * _CELL_PX] = grid
     for row, column in np.ndindex(rows, columns):
         text = str(pixels[row, column])
         (width, height), _ = cv2.getTextSize(text, _FONT, 0.38, 1)
         at = (column * _CELL_PX + (_CELL_PX - width) // 2, row * _CELL_PX + (_CELL_PX + height) // 2)
         dark = shade[row, column] > 150 or pixels[row, column] == 0
-        cv2.putText(picture, text, at, _FONT, 0.38, _DARK_BGR if dark else (255, 255, 255), 1, cv2.LINE_AA)
-    _mark_points(picture, analysis, rows, columns)
-    _write_figures(picture, analysis, rows * _CELL_PX)
-    return picture
+        cv2.putText(image, text, at, _FONT, 0.38, _DARK_BGR if dark else (255, 255, 255), 1, cv2.LINE_AA)
+    _mark_points(image, analysis, rows, columns)
+    _write_figures(image, analysis, rows * _CELL_PX)
+    return image
 
 
-def _mark_points(picture: np.ndarray, analysis: ErrorAnalysis, rows: int, columns: int) -> None:
+def _mark_points(image: np.ndarray, analysis: ErrorAnalysis, rows: int, columns: int) -> None:
     chosen = analysis.settings
     scale = _CELL_PX / chosen.cell_cm
     half_lane = 0.5 * chosen.lane_width_cm
     v = round(rows * _CELL_PX - chosen.lookahead_cm * scale)
     for name, x_cm in (("L", -half_lane), ("A", 0.0), ("R", half_lane)):
         u = round(columns * _CELL_PX / 2 + x_cm * scale)
-        cv2.circle(picture, (u, v), 6, _LINE_BGR, 2, cv2.LINE_AA)
-        cv2.putText(picture, name, (u + 8, v - 6), _FONT, 0.6, _LINE_BGR, 2, cv2.LINE_AA)
+        cv2.circle(image, (u, v), 6, _LINE_BGR, 2, cv2.LINE_AA)
+        cv2.putText(image, name, (u + 8, v - 6), _FONT, 0.6, _LINE_BGR, 2, cv2.LINE_AA)
 
 
 def figure_lines(analysis: ErrorAnalysis) -> list[str]:
@@ -259,6 +256,6 @@ def figure_lines(analysis: ErrorAnalysis) -> list[str]:
     return lines
 
 
-def _write_figures(picture: np.ndarray, analysis: ErrorAnalysis, top: int) -> None:
+def _write_figures(image: np.ndarray, analysis: ErrorAnalysis, top: int) -> None:
     for index, line in enumerate(figure_lines(analysis)):
-        cv2.putText(picture, line, (8, top + 19 + 20 * index), _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)
+        cv2.putText(image, line, (8, top + 19 + 20 * index), _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)

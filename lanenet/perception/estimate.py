@@ -1,14 +1,21 @@
-"""What a detector is, and what it answers."""
+"""What a detector is: what it answers, how it is built, and the lane's width that it remembers."""
 
 from __future__ import annotations
 
+import statistics
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lanenet.geometry.lane import N_POINTS, SIDES, parabolas_from_points
+from lanenet.config import Settings, SettingsT, check_settings, load_settings
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import N_POINTS, SIDES, lane_width_cm, parabolas_from_points, parallel_points
+from lanenet.perception.edges.road import PerceptionSettings
 
 
 def _no_points() -> Float[np.ndarray, "6"]:
@@ -66,3 +73,176 @@ class Detector(Protocol):
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         ...
+
+
+@runtime_checkable
+class EdgeDetector(Protocol):
+    """A detector that works on edge points, so that label sets, which hold no frames, can be its input."""
+
+    def estimate(
+        self, points_cm: Float[np.ndarray, "n 2"], normals: Float[np.ndarray, "n 2"]
+    ) -> LaneEstimate:
+        """Find the lane in the edge points of one frame, [cm], frame car, and their unit normals."""
+        ...
+
+    def reset(self) -> None:
+        """Forget what earlier frames showed."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorInputs:
+    """What a detector may be built from; each kind uses what it needs.
+
+    Attributes:
+        camera: Camera of the frames.
+        model: ONNX file or checkpoint folder.
+        any_camera: Accept a model that was trained with another camera.
+        lane_width_cm: Between the middles of the two lines; goes before the settings file's.
+        drive_lane_width_cm: The source's lane width; counts where neither of those two is given.
+        marking_cm: Thickness of the tape; goes before the settings file's.
+        mask: Nonzero on the car itself.
+        perception: How edge points are found in these frames; None takes the settings file's.
+        config: Settings file (YAML) or its content; None takes the defaults.
+    """
+
+    camera: Camera | None = None
+    model: Path | None = None
+    any_camera: bool = False
+    lane_width_cm: float | None = None
+    drive_lane_width_cm: float | None = None
+    marking_cm: float | None = None
+    mask: UInt8[np.ndarray, "h w"] | None = None
+    perception: PerceptionSettings | None = None
+    config: Path | Mapping[str, Any] | None = None
+
+    def settings(self, schema: type[SettingsT]) -> SettingsT:
+        """Return ``config`` checked against a schema.
+
+        Raises:
+            ConfigError: If the file cannot be read, or a key or value is not the schema's.
+        """
+        if isinstance(self.config, Path):
+            return load_settings(schema, self.config)
+        return check_settings(schema, dict(self.config or {}), "detector")
+
+
+@dataclass(frozen=True)
+class DetectorKind:
+    """A detector as :mod:`lanenet.perception.registry` lists it; its module defines it.
+
+    Attributes:
+        name: On the command line and in settings files.
+        build: Builds it; called with a camera and a model where those are needed.
+        settings: Schema of its settings file; None if it takes none.
+        needs_camera: It cannot do without a camera.
+        needs_model: It cannot do without a model.
+        takes_lane_width: It uses the lane width.
+        takes_marking: It uses the thickness of the tape.
+        takes_mask: It can leave out the car itself.
+        build_on_edges: Builds it for edge points without a camera; None if it looks at frames.
+        variants: The same detector with other settings, by name; compared with the others in ``val``.
+    """
+
+    name: str
+    build: Callable[[DetectorInputs], Detector]
+    settings: type[Settings] | None = None
+    needs_camera: bool = True
+    needs_model: bool = False
+    takes_lane_width: bool = False
+    takes_marking: bool = False
+    takes_mask: bool = False
+    build_on_edges: Callable[[DetectorInputs], EdgeDetector] | None = None
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def on_label_sets(self) -> bool:
+        """It can answer label sets, which hold edge points and no frames; a network sees their rasters."""
+        return self.needs_model or self.build_on_edges is not None
+
+
+#: Presence below which a line is missing, and above which it is certain. Chosen: more likely than not, and
+#: nine in ten.
+_SEEN, _SURE = 0.5, 0.9
+#: Frames whose widths are remembered, and how many are needed. Chosen: 5 s and half a second at 20 frames/s.
+_LENGTH, _ENOUGH = 100, 10
+#: Sigma of a remembered width as a share of it. Chosen: 0.8 cm of a lane of 40 cm, laid by hand.
+_WIDTH_SIGMA = 0.02
+#: How far beyond its label rows a parabola is extrapolated; chosen: the distance of two rows.
+_BEYOND_CM = 15.0
+
+
+class LaneMemory:
+    """The median width of the frames that showed both lines.
+
+    With a known width, one line determines the other. A network trained on lanes of many widths cannot infer
+    it from one line, but from earlier frames.
+
+    Attributes:
+        given_cm: A known width, used instead of the remembered one; None without one.
+    """
+
+    def __init__(self, given_cm: float | None = None) -> None:
+        self.given_cm = given_cm
+        self._widths_cm: deque[float] = deque(maxlen=_LENGTH)
+
+    @property
+    def width_cm(self) -> float | None:
+        """The lane's width; None while it is unknown."""
+        if self.given_cm is not None:
+            return self.given_cm
+        return statistics.median(self._widths_cm) if len(self._widths_cm) >= _ENOUGH else None
+
+    def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> None:
+        """Remember the width of a frame in which both lines are certain; other frames are ignored.
+
+        Args:
+            points_cm: The six points, frame car; NaN where unknown.
+            presence: Probability that each line can be seen; NaN from a detector that answers only the lines
+                it sees.
+        """
+        left, right = presence.tolist()
+        if left <= _SURE or right <= _SURE:
+            return
+        width_cm = lane_width_cm(points_cm)
+        if width_cm > 0.0:
+            self._widths_cm.append(width_cm)
+
+    def reset(self) -> None:
+        """Forget the frames; a given width stays."""
+        self._widths_cm.clear()
+
+    def complete(
+        self,
+        points_cm: Float[np.ndarray, "6"],
+        sigma_cm: Float[np.ndarray, "6"],
+        presence: Float[np.ndarray, "2"],
+    ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
+        """Learn from a frame with both lines; rebuild the missing line of a frame with one.
+
+        The rebuilt line is parallel to the visible one. It replaces the network's own guess only if its sigma
+        is smaller, and if it needs no extrapolation far beyond the visible line's points. A missing line
+        never replaces a visible one, whatever its sigma: a network has learned nothing of lines beside its
+        window.
+
+        Args:
+            points_cm: The six points, frame car.
+            sigma_cm: Their standard deviations.
+            presence: Probability that each line can be seen.
+
+        Returns:
+            Points and standard deviations, changed for the missing line only.
+        """
+        width_cm = self.width_cm
+        self.learn(points_cm, presence)
+        if width_cm is None or (presence < _SEEN).sum() != 1:
+            return points_cm, sigma_cm
+        missing = int(np.argmin(presence))
+        # The right line, 1, lies to the right of the left one, 0.
+        side = 1.0 if missing == 1 else -1.0
+        lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
+        rebuilt = parallel_points(lines[1 - missing], side * width_cm, _BEYOND_CM)
+        rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
+        if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
+            lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
+        return lines.reshape(6), sigmas.reshape(6)

@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from lanenet.errors import CalibrationError, ConfigError
-from lanenet.perception.detector_kind import DetectorInputs, DetectorKind, EdgeDetector
+from lanenet.perception.estimate import DetectorInputs, DetectorKind, EdgeDetector
 from lanenet.perception.estimate import Detector
 
 from lanenet.perception.network.detector import KIND as NETWORK
-from lanenet.perception.lane_filter.detector import KIND as LANE_FILTER
+from lanenet.perception.lane_filter import KIND as LANE_FILTER
 from lanenet.perception.hough.detector import KIND as HOUGH
 from lanenet.perception.painter.detector import KIND as PAINTER
 

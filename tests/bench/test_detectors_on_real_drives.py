@@ -11,8 +11,7 @@ import pytest
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.sources import find_mask, open_source
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.detector_kind import DetectorInputs
-from lanenet.perception.estimate import Detector
+from lanenet.perception.estimate import Detector, DetectorInputs
 from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.painter.detector import LanePainter, PainterSettings
 from lanenet.perception.registry import build_detector

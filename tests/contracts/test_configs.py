@@ -36,8 +36,8 @@ def read_camera_file(path: Path) -> Any:
 
 
 def read_detector_settings(path: Path) -> Any:
-    from lanenet.perception.detector_kind import DetectorInputs
-    from lanenet.perception.lane_filter.detector import lane_filter_settings
+    from lanenet.perception.estimate import DetectorInputs
+    from lanenet.perception.lane_filter import lane_filter_settings
     from lanenet.perception.registry import build_detector
 
     # The detector's name comes first in the file's.
@@ -196,7 +196,7 @@ def read_labels_of(path: Path) -> Any:
 
 def test_the_lane_filters_files_are_the_default_and_the_paper() -> None:
     from lanenet.perception.edges.road import PerceptionSettings
-    from lanenet.perception.lane_filter.detector import PAPER, LaneFilterSettings
+    from lanenet.perception.lane_filter import PAPER, LaneFilterSettings
 
     default = read_detector_settings(CONFIGS / "detectors" / "lane_filter.yaml")
     assert default == (LaneFilterSettings(lane_width_cm=40.0), PerceptionSettings())

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from wire_log import guarded_wire, note, settings_of
 
-from lanenet.control.controller import ControlSettings, LaneController, Wish
+from lanenet.control.controller import ControlSettings, LaneController, Target
 from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
@@ -168,8 +168,8 @@ ends |= {
 }
 detector.detect = at_fault("detector", detect_well, ends)  # type: ignore[method-assign]
 controller = LaneController(control)
-lost = {"control answers NaN": lambda estimate, *_: Wish(math.nan, math.nan, estimate)}
-controller.wish = at_fault("control", controller.wish, lost)  # type: ignore[method-assign]
+lost = {"control answers NaN": lambda estimate, *_: Target(math.nan, math.nan, estimate)}
+controller.target = at_fault("control", controller.target, lost)  # type: ignore[method-assign]
 loop = DriveLoop(
     CarParts(Camera(), detector, controller, sink, Recorder()),
     safety,

@@ -41,7 +41,7 @@ class NoisyEyes:
             points_cm[3:] = np.nan
         estimate = LaneEstimate(points_cm, np.full(6, NOISE_CM), confidence=1.0)
         self._frame += 1
-        return self._controller.wish(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
+        return self._controller.target(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
 
     def reset(self) -> None:
         self._controller.reset()

@@ -10,7 +10,7 @@ from synthetic_roads import frames_of
 
 from datagen.world.world import SimulationSettings, build_world
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.lane_filter.detector import PAPER, LaneFilter, LaneFilterSettings
+from lanenet.perception.lane_filter import PAPER, LaneFilter, LaneFilterSettings
 
 pytestmark = pytest.mark.slow
 LOG = logging.getLogger(__name__)

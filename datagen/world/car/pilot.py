@@ -96,7 +96,7 @@ class DetectorPilot:
         if sight.image_bgr is None:
             raise ValueError("a detector needs an image")
         estimate = self._detector.detect(sight.image_bgr)
-        return self._controller.wish(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
+        return self._controller.target(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
 
     def reset(self) -> None:
         """Reset the detector and forget earlier frames."""

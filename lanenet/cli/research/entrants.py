@@ -11,7 +11,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.errors import ConfigError
-from lanenet.perception.detector_kind import DetectorInputs
+from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.network.model_file import find_model
 from lanenet.perception.registry import KINDS, build_detector, kind_of
 

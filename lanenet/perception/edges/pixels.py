@@ -123,7 +123,7 @@ def _subpixel_offset(
     np.maximum(neighbours, 0, out=neighbours)
     np.minimum(neighbours, [[width - 1], [height - 1]], out=neighbours)
     at = neighbours[:, 1] * width + neighbours[:, 0]
-    # Only what points the same way counts: the other edge of a thin line must not pull this one.
+    # Only gradients of the same direction count: the other edge of a thin line must not pull this one.
     along = dx.reshape(-1).take(at) * normals[0] + dy.reshape(-1).take(at) * normals[1]
     before, after = np.maximum(along, 0.0, out=along)
     curvature = before - 2.0 * strength + after

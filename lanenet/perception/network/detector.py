@@ -11,12 +11,9 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM, lane_width_cm
-from lanenet.geometry.steering import proportional_angle_rad
-from lanenet.perception.detector_kind import DetectorInputs, DetectorKind
+from lanenet.geometry.lane import ROWS_CM, lane_width_cm, proportional_angle_rad
 from lanenet.perception.edges.road import RoadEdgeExtractor
-from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 
 #: A frame with more edges than this share of its road pixels is noise. Chosen: above the lane filter's 0.1,

@@ -134,7 +134,7 @@ class ModelMeta:
             where: Names the model's file in the error.
 
         Raises:
-            ModelMismatchError: Naming both cameras, and the way out.
+            ModelMismatchError: Naming both cameras, and what to do.
         """
         if not self.any_camera and camera_hash not in self.camera_hashes:
             raise ModelMismatchError(

@@ -13,11 +13,9 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import N_POINTS, ROWS_CM
-from lanenet.geometry.steering import proportional_angle_rad
-from lanenet.perception.detector_kind import DetectorKind
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, proportional_angle_rad
 from lanenet.perception.edges.canny import check_size
-from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.estimate import DetectorKind, LaneEstimate
 from lanenet.perception.image_lane import ImageLane, rows_of_points, to_bgr
 from lanenet.perception.painter.curves import (
     CurveSettings,
@@ -28,17 +26,19 @@ from lanenet.perception.painter.curves import (
     finite_rows,
     mean_curve,
 )
-from lanenet.perception.painter.edges import PainterEdgeSettings, find_painter_edges, find_trapezoid
 from lanenet.perception.painter.lines import (
     EvidenceSettings,
+    PainterEdgeSettings,
     PainterLineSettings,
     SolidLine,
     agree_px,
     are_close,
     blend,
     find_edge_field,
+    find_painter_edges,
     find_painter_segments,
     find_side_lines,
+    find_trapezoid,
     find_two_lines,
 )
 from lanenet.perception.painter.markings import (

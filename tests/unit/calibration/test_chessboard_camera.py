@@ -9,10 +9,15 @@ from boards import fisheye_of, views_of
 
 from lanenet.calibration.bundle import LensFit
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.chessboard_camera import calibrate_lens, view_errors_px
+from lanenet.calibration.chessboard_camera import (
+    calibrate_lens,
+    check_wanted_model,
+    folds_inside,
+    miss_text,
+    view_errors_px,
+)
 from lanenet.calibration.ground import calibrate_ground
 from lanenet.calibration.lens import camera_of_lens
-from lanenet.calibration.lens_choice import check_wanted_model, folds_inside, miss_text
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
 

@@ -58,7 +58,7 @@ def test_words_become_pictures(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"x")
     named = [path.name for path in list_pictures([str(tmp_path), str(tmp_path / "a*.png")])]
     assert named == ["a2.png", "a10.png"]
-    with pytest.raises(CalibrationError, match="no such picture"):
+    with pytest.raises(CalibrationError, match="no such image"):
         list_pictures([str(tmp_path / "missing.png")])
     with pytest.raises(CalibrationError, match="whole board with 9x6"):
         find_views([tmp_path / "a2.png"], BOARD)

@@ -18,8 +18,8 @@ from lanenet.data.drives.sources import Source, find_mask, read_mask
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.drive import DriveSettings, build_drive_detector
-from lanenet.perception.detector_kind import DetectorInputs
-from lanenet.perception.lane_filter.detector import LaneFilter, lane_filter_settings
+from lanenet.perception.estimate import DetectorInputs
+from lanenet.perception.lane_filter import LaneFilter, lane_filter_settings
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.registry import build_detector
 

@@ -74,60 +74,62 @@ def test_one_line_is_enough_once_the_width_is_known() -> None:
     no_smoothing = {"smoothing": {"enabled": False}}
     forgetful = LaneController(settings(**no_smoothing, width_memory=False))
     for k in range(20):
-        forgetful.wish(LaneEstimate(lane(), confidence=1.0), 0.03 * k)
-    assert math.isnan(forgetful.wish(LaneEstimate(one, confidence=1.0), 0.6).steering_rad)
+        forgetful.target(LaneEstimate(lane(), confidence=1.0), 0.03 * k)
+    assert math.isnan(forgetful.target(LaneEstimate(one, confidence=1.0), 0.6).steering_rad)
     controller = LaneController(settings(**no_smoothing))
     for k in range(10):
         assert controller.lane_width_cm is None
-        both = controller.wish(LaneEstimate(lane(5.0), confidence=1.0), 0.03 * k)
+        both = controller.target(LaneEstimate(lane(5.0), confidence=1.0), 0.03 * k)
     assert controller.lane_width_cm == pytest.approx(40.0)
-    fallback = controller.wish(LaneEstimate(one, confidence=1.0), 0.3)
+    fallback = controller.target(LaneEstimate(one, confidence=1.0), 0.3)
     assert fallback.steering_rad == pytest.approx(both.steering_rad)
     controller.reset()
-    assert controller.wish(LaneEstimate(one, confidence=1.0), 0.0).steering_rad == fallback.steering_rad
+    assert controller.target(LaneEstimate(one, confidence=1.0), 0.0).steering_rad == fallback.steering_rad
 
 
 def test_a_wrong_width_moves_the_memory_little() -> None:
     controller = LaneController(settings())
     for k in range(200):
-        controller.wish(LaneEstimate(lane(width_cm=80.0 if k % 10 == 0 else 40.0), confidence=1.0), 0.03 * k)
+        controller.target(
+            LaneEstimate(lane(width_cm=80.0 if k % 10 == 0 else 40.0), confidence=1.0), 0.03 * k
+        )
     assert controller.lane_width_cm == pytest.approx(40.0, abs=1.0)
     doubtful = LaneController(settings())
     guessed = LaneController(settings())
     for k in range(20):
-        doubtful.wish(LaneEstimate(lane(), confidence=0.2), 0.03 * k)
+        doubtful.target(LaneEstimate(lane(), confidence=0.2), 0.03 * k)
         # Six points of a network that does not see the right line.
-        guessed.wish(LaneEstimate(lane(), confidence=1.0, presence=np.array([1.0, 0.2])), 0.03 * k)
+        guessed.target(LaneEstimate(lane(), confidence=1.0, presence=np.array([1.0, 0.2])), 0.03 * k)
     assert doubtful.lane_width_cm is None and guessed.lane_width_cm is None
 
 
 def test_a_given_width_stays() -> None:
     controller = LaneController(settings(steering={"wheelbase_cm": 26.0, "lane_width_cm": 35.0}))
     for k in range(20):
-        controller.wish(LaneEstimate(lane(width_cm=40.0), confidence=1.0), 0.03 * k)
+        controller.target(LaneEstimate(lane(width_cm=40.0), confidence=1.0), 0.03 * k)
     assert controller.lane_width_cm == 35.0
 
 
 def test_a_bend_slows_down_and_an_unknown_lane_has_no_answer() -> None:
     controller = LaneController(settings(speed={"cruise_cm_s": 200.0}))
-    straight = controller.wish(LaneEstimate(lane(), confidence=1.0), 0.0)
+    straight = controller.target(LaneEstimate(lane(), confidence=1.0), 0.0)
     assert straight.steering_rad == pytest.approx(0.0) and straight.speed_cm_s == 200.0
     controller.reset()
-    bend = controller.wish(LaneEstimate(lane(bend=-0.01), confidence=1.0), 0.0)
+    bend = controller.target(LaneEstimate(lane(bend=-0.01), confidence=1.0), 0.0)
     assert bend.steering_rad > 0.0 and 30.0 <= bend.speed_cm_s < 100.0
     controller.reset()
-    nothing = controller.wish(LaneEstimate(), 0.0)
+    nothing = controller.target(LaneEstimate(), 0.0)
     assert math.isnan(nothing.steering_rad) and nothing.speed_cm_s == 30.0
 
 
 def test_smoothing_does_not_carry_a_blind_frame() -> None:
     controller = LaneController(settings())
-    controller.wish(LaneEstimate(lane(), confidence=1.0), 0.0)
-    assert math.isnan(controller.wish(LaneEstimate(confidence=1.0), 0.03).steering_rad)
+    controller.target(LaneEstimate(lane(), confidence=1.0), 0.0)
+    assert math.isnan(controller.target(LaneEstimate(confidence=1.0), 0.03).steering_rad)
 
 
 def test_the_detectors_own_target_stays_within_the_lock() -> None:
     controller = LaneController(settings(own_target=True))
-    assert controller.wish(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1
-    assert controller.wish(LaneEstimate(steering_rad=-2.0), 0.03).steering_rad == -0.45
-    assert math.isnan(controller.wish(LaneEstimate(), 0.06).steering_rad)
+    assert controller.target(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1
+    assert controller.target(LaneEstimate(steering_rad=-2.0), 0.03).steering_rad == -0.45
+    assert math.isnan(controller.target(LaneEstimate(), 0.06).steering_rad)

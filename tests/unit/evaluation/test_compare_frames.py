@@ -17,7 +17,7 @@ from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.hough.detector import HoughTracker
-from lanenet.perception.lane_filter.detector import LaneFilter
+from lanenet.perception.lane_filter import LaneFilter
 from lanenet.perception.registry import compared_names
 
 NAN = float("nan")

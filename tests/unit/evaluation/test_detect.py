@@ -15,7 +15,7 @@ from lanenet.evaluation.detect import run_detector
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneEstimate
-from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings
+from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
 
 CAMERA = example_camera()
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lanenet.geometry.steering import proportional_angle_rad, pure_pursuit_angle_rad
+from lanenet.geometry.lane import proportional_angle_rad, pure_pursuit_angle_rad
 
 WHEELBASE_CM = 26.0
 

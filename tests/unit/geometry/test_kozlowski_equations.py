@@ -7,8 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from lanenet.geometry.lane import ROWS_CM, parabola_x_cm, parabolas_from_points, points_from_parabolas
-from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.geometry.lane import (
+    ROWS_CM,
+    parabola_x_cm,
+    parabolas_from_points,
+    points_from_parabolas,
+    proportional_angle_rad,
+)
 
 #: Left: a = (x0 - 2 x15 + x30) / 450 = (-21.5 + 38.5 - 11) / 450 = 6 / 450,
 #: b = (-3 x0 + 4 x15 - x30) / 30 = (64.5 - 77 + 11) / 30 = -0.05, c = x0.

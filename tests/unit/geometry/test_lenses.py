@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lanenet.geometry.lenses import (
+from lanenet.geometry.camera import (
     distort_pinhole,
     fisheye_radius,
     fisheye_slope,

@@ -4,8 +4,7 @@ import torch
 
 from lanenet.errors import CheckpointError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import parabolas_from_points
-from lanenet.geometry.steering import proportional_angle_rad
+from lanenet.geometry.lane import parabolas_from_points, proportional_angle_rad
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.network import SIGMA_RANGE_CM, DeployedLaneNet, LaneNet, input_of_rasters, new_network
 

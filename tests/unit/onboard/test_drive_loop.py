@@ -231,8 +231,8 @@ def test_an_exception_is_neutral_first_and_goes_on_up(where: str, caplog: pytest
         car.loop._parts = replace(car.loop._parts, detector=failing)
     elif where == "controller":
         calls = iter(range(31))
-        whole = car.loop._parts.controller.wish
-        car.loop._parts.controller.wish = lambda *words: (  # type: ignore[method-assign]
+        whole = car.loop._parts.controller.target
+        car.loop._parts.controller.target = lambda *words: (  # type: ignore[method-assign]
             whole(*words) if next(calls) < 30 else fail()
         )
     elif where == "actuator":

@@ -20,8 +20,7 @@ from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.perception.detector_kind import DetectorInputs
-from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.estimate import Detector, DetectorInputs, LaneEstimate
 from lanenet.perception.hough.detector import HoughSettings, HoughTracker
 from lanenet.perception.registry import build_detector
 

@@ -12,11 +12,11 @@ from lanenet.perception.hough.edges import Contours, HoughEdgeSettings, binarise
 from lanenet.perception.hough.lines import (
     HoughLineSettings,
     Segment,
+    centre_on_marking,
     find_lane_segments,
     length_along,
     x_at,
 )
-from lanenet.perception.hough.marking import centre_on_marking
 
 LINES = HoughLineSettings()
 ROWS = np.array([0.0, 15.0, 30.0])

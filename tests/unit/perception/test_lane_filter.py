@@ -14,7 +14,7 @@ from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.lane_filter.detector import LaneFilter, LaneFilterSettings, find_row
+from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings, find_row
 
 SETTINGS = LaneFilterSettings(lane_width_cm=40.0)
 

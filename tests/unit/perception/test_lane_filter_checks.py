@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
 from lanenet.geometry.lane import ROWS_CM
-from lanenet.perception.lane_filter.detector import PAPER, LaneFilter, LaneFilterSettings, find_row
+from lanenet.perception.lane_filter import PAPER, LaneFilter, LaneFilterSettings, find_row
 
 Edges = tuple[np.ndarray, np.ndarray]
 

@@ -11,11 +11,10 @@ from textured_frames import GENERATORS
 
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
-from lanenet.perception.detector_kind import DetectorInputs
 from lanenet.perception.edges.canny import EdgeSettings
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.estimate import Detector
-from lanenet.perception.lane_filter.detector import PAPER, LaneFilter, LaneFilterSettings
+from lanenet.perception.estimate import Detector, DetectorInputs
+from lanenet.perception.lane_filter import PAPER, LaneFilter, LaneFilterSettings
 from lanenet.perception.registry import build_detector
 
 SIZES = {"320x240": 1.0, "160x120": 0.5}

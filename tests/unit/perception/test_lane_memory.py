@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.estimate import LaneMemory
 
 LANE = np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0])
 SIGMA = np.full(6, 0.5)

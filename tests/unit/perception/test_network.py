@@ -14,7 +14,7 @@ from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.lane_memory import LaneMemory
+from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.model_file import ModelMeta, read_model_meta
 

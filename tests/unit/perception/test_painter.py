@@ -26,22 +26,20 @@ from lanenet.perception.painter.curves import (
     slide_windows,
 )
 from lanenet.perception.painter.detector import LanePainter, PainterSettings, find_aim_cm, measure_lane
-from lanenet.perception.painter.edges import (
-    PainterEdgeSettings,
-    find_painter_edges,
-    find_trapezoid,
-    value_channel,
-)
 from lanenet.perception.painter.lines import (
     EdgeField,
     EvidenceSettings,
     LineEvidence,
+    PainterEdgeSettings,
     PainterLineSettings,
     SolidLine,
     find_edge_field,
+    find_painter_edges,
+    find_trapezoid,
     find_two_lines,
     join_side,
     measure_evidence,
+    value_channel,
 )
 from lanenet.perception.painter.markings import Marking, can_bound_the_lane, choose_lane, straight_px
 

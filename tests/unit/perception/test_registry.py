@@ -11,7 +11,7 @@ import pytest
 
 from lanenet.errors import ConfigError
 from lanenet.onboard.bench import example_camera
-from lanenet.perception.detector_kind import DetectorInputs
+from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
     KINDS,
     build_detector,
@@ -25,7 +25,7 @@ from lanenet.perception.registry import (
 FAKE = """
 from lanenet.config import Settings
 from lanenet.perception import registry
-from lanenet.perception.detector_kind import DetectorKind
+from lanenet.perception.estimate import DetectorKind
 from lanenet.perception.estimate import LaneEstimate
 
 class Fake:

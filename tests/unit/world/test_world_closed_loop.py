@@ -116,7 +116,7 @@ def test_a_detector_steers_as_the_controller_of_the_car_does():
         detector.estimate = LaneEstimate(points_cm, np.full(6, 0.5), confidence=rng.uniform())
         told = (60.0 * (frame > 0), rng.normal(0.0, 0.1))
         steered.append(pilot.steer(Sight(image, np.zeros(3), 3.0 * frame, 0.05 * frame, *told)))
-        wished.append(controller.wish(detector.estimate, 0.05 * frame, *told).steering_rad)
+        wished.append(controller.target(detector.estimate, 0.05 * frame, *told).steering_rad)
         if frame == 20:
             pilot.reset()
             controller.reset()
