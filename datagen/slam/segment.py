@@ -32,8 +32,8 @@ from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
 
-#: Numbers of the camera that an open loop can show. The focal length runs away before a loop is closed, as it
-#: did on two of three real drives.
+#: Camera parameters that are observable without a loop closure. The focal length is not: before the loop was
+#: closed it diverged on two of three real drives.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Median residuals of revisits after closure along and across the road, in camera heights, and misfit of the
 #: frames relative to before, at most. True closures leave 0.08 and 0.03 heights on the real drives; places
@@ -237,8 +237,8 @@ class _DenseSegment:
         view, solver = self.view, self.solver
         tracked = track(view, solver.settings, solver.rng, solver.progress)
         start = BundleEstimate.level(tracked.trajectory.poses, view.camera)
-        opened = self.adjust(self.observed, start, self.free)
-        closure = self.close_loops(opened, self.find_revisits(opened))
+        opened = self.adjust_all(self.observed, start, self.free)
+        closure = self.choose_closure(opened, self.find_revisits(opened))
         road, bundle = view.road, opened
         if closure is not None and self.find_camera:
             road, bundle = self.adjust_with_camera(closure)
@@ -267,37 +267,38 @@ class _DenseSegment:
         found = [match_places(scans, opened.poses, p, self.height, wheelbase_cm, s, rng) for p in pairs]
         return [revisit for revisit in found if revisit is not None]
 
-    def close_loops(self, opened: BundleResult, matched: list[Revisit]) -> _Closure | None:
+    def choose_closure(self, opened: BundleResult, matched: list[Revisit]) -> _Closure | None:
         """Close the loops with each set of revisits that one drift explains; the lowest misfit wins."""
         best: _Closure | None = None
         s = self.revisit_settings
         for explained, drift in consistent_revisits(opened.poses, matched, s):
             supported = with_supported(opened.poses, explained, matched, self.height, s)
-            # Where the supported ones do not fit, those that the drift explains are enough.
-            for group in [supported, explained][: 1 + (len(supported) > len(explained))]:
+            # Neighbours may support more than the drift explains. Where these do not fit, the explained may.
+            groups = [supported, explained] if len(supported) > len(explained) else [supported]
+            for group in groups:
                 left = without_contradicted(opened.poses, group, self.height)
-                closure = self.close_with(left if len(left) >= s.min_revisits else group, drift, opened)
+                closure = self.try_closure(left if len(left) >= s.min_revisits else group, drift, opened)
                 if closure is not None:
                     if best is None or closure.bundle.misfit < best.bundle.misfit:
                         best = closure
                     break
         return best
 
-    def close_with(self, revisits: list[Revisit], drift: float, opened: BundleResult) -> _Closure | None:
+    def try_closure(self, revisits: list[Revisit], drift: float, opened: BundleResult) -> _Closure | None:
         """Close the loops with these revisits; None where they do not meet, or the frames agree less."""
         poses, missed = close_loops(opened.poses, revisits, self.height)
         along, across = np.median(np.abs(missed[:, :2]), axis=0) / self.height
         if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
             return None
         loops = loop_pairs(revisits, len(poses))
-        closed = self.adjust(self.observed, replace(opened, poses=poses), self.free, loops)
+        closed = self.adjust_all(self.observed, replace(opened, poses=poses), self.free, loops)
         return _Closure(revisits, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
     def without_outliers(self, opened: BundleResult, closure: _Closure) -> _Closure:
         """Close the loops again without the revisits that the adjusted map contradicts: they still pull."""
         inliers = inlier_revisits(closure.bundle.poses, closure.revisits, self.height)
         if self.revisit_settings.min_revisits <= len(inliers) < len(closure.revisits):
-            return self.close_with(inliers, closure.drift_rad_per_cm, opened) or closure
+            return self.try_closure(inliers, closure.drift_rad_per_cm, opened) or closure
         return closure
 
     def adjust_with_camera(self, closure: _Closure) -> tuple[RoadView, BundleResult]:
@@ -309,12 +310,12 @@ class _DenseSegment:
             inliers = inlier_revisits(bundle.poses, closure.revisits, self.height)
             loops = loop_pairs(inliers, len(drive))
             loops += neighbouring_laps(bundle.poses, self.height, self.revisit_settings)
-            bundle = self.adjust(road.observed(self.view.commands), bundle, CAMERA_NAMES, loops)
+            bundle = self.adjust_all(road.observed(self.view.commands), bundle, CAMERA_NAMES, loops)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
         return road, bundle
 
-    def adjust(
+    def adjust_all(
         self,
         observed: Observations,
         start: BundleEstimate,
