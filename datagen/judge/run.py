@@ -18,8 +18,8 @@ from datagen.world.car.pilot import (
     TruePointsPilot,
     control_settings,
 )
-from datagen.world.driving import ClosedLoop, LoopFrame
 from datagen.world.road.track import Track
+from datagen.world.simulate import ClosedLoop, LoopFrame
 from datagen.world.world import SimulationSettings, World, assemble_world
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car

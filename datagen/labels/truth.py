@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from datagen.world.road.track_file import read_track
+from datagen.world.road.track import read_track
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.errors import DriveFormatError

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from datagen.reality.measure import MeasuredDrive, Sampling, measure_frames
-from datagen.world.driving import draw_state, scripted_states
+from datagen.world.simulate import draw_state, scripted_states
 from datagen.world.variety import camera_like, first_world, vary_simulation
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings

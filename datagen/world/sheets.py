@@ -39,7 +39,7 @@ _SPEED_CM_S = 60.0
 #: From the front axle to the thing that a frame shows; and from the middle of the lane to the car.
 _BEFORE_CM, _BESIDE_CM = 45.0, 2.0
 _TRUTH_BGR: tuple[Bgr, Bgr] = ((255, 200, 0), (60, 60, 255))  # left, right
-_TEXT_BGR, _PAPER_BGR = (30, 30, 30), (245, 245, 245)
+_TEXT_BGR, _PAPER = (30, 30, 30), 245
 _GAP_PX, _TITLE_PX = 4, 18
 _ROAD_COLUMNS, _ROAD_ROWS = 2, 4
 #: Qualities of the JPEG files that are tried, and the factor on their size where all are too large.
@@ -68,8 +68,6 @@ class Effect:
 _DULL: dict[str, Any] = {"texture_level": 2.0, "wall_level": 25.0}
 _LAMPS: dict[str, Any] = {"lamps_per_m": 0.7, "lamp_level": 150.0}
 _THINGS: dict[str, Any] = {"objects_per_m": 3.0, "objects_on_road": 0.0, "shadow_depth": 0.45}
-
-
 _SHAKE: dict[str, Any] = {"shake_pitch_rad": 0.02, "shake_roll_rad": 0.02}
 _WOOD: dict[str, Any] = {
     "texture_level": 7.0, "texture_scale_cm": 0.5, "texture_stretch": 12.0, "floor_bgr": (70, 100, 135)
@@ -272,17 +270,13 @@ def _draw_line(image: Image, points_px: Float[np.ndarray, "n 2"], colour: Bgr) -
 
 
 def _titled(tile: Image, title: str) -> Image:
-    bar = np.full((_TITLE_PX, tile.shape[1], 3), _PAPER_BGR, np.uint8)
+    bar = np.full((_TITLE_PX, tile.shape[1], 3), _PAPER, np.uint8)
     cv2.putText(bar, title, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _TEXT_BGR, 1, cv2.LINE_AA)
     return np.concatenate([bar, tile], axis=0)
 
 
 def _grid(tiles: list[Image], columns: int) -> Image:
-    height, width = tiles[0].shape[:2]
-    rows = -(-len(tiles) // columns)
-    size = (rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX, 3)
-    sheet = np.full(size, _PAPER_BGR, np.uint8)
-    for index, tile in enumerate(tiles):
-        top, left = index // columns * (height + _GAP_PX), index % columns * (width + _GAP_PX)
-        sheet[top : top + height, left : left + width] = tile
-    return sheet
+    gap = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
+    padded = [np.pad(tile, gap, constant_values=_PAPER) for tile in tiles]
+    rows = [np.concatenate(padded[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
+    return np.concatenate(rows)[:-_GAP_PX, :-_GAP_PX]

@@ -7,8 +7,8 @@ import pytest
 
 from datagen.world.car.camera import CameraSettings
 from datagen.world.car.pilot import PilotSettings, Sight
-from datagen.world.driving import ClosedLoop
 from datagen.world.road.track_settings import TrackSettings
+from datagen.world.simulate import ClosedLoop
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
 from lanenet.control.controller import ControlSettings, LaneController

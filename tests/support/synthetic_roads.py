@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from datagen.world.driving import DriveState, draw_state, scripted_states
 from datagen.world.road.build import random_track
 from datagen.world.road.track import Side, Track, is_painted
 from datagen.world.road.track_settings import load_track_settings
+from datagen.world.simulate import DriveState, draw_state, scripted_states
 from datagen.world.world import SimulationSettings, World, build_world
 
 

@@ -17,13 +17,14 @@ from datagen.world.render.ground import (
     NEAR_CM,
     WALL_CM,
     Canvas,
+    Nearby,
+    NearestGrid,
     PixelGround,
     View,
     row_poses,
     shake_rotation,
 )
 from datagen.world.render.light import Lights, mirror_lamps, moved
-from datagen.world.render.nearest import Nearby, NearestGrid
 from datagen.world.render.scene import Scene, build_scene
 from datagen.world.render.sensor import Steps, Wander, as_jpeg, corner_falloff, develop, paint_room
 from datagen.world.render.solids import SOLID_COLUMNS, paint_solids

@@ -8,11 +8,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from datagen.world.road.centre_line import CentreLine, check_slack_cm, comes_near_itself
-from datagen.world.road.furniture import COLOURS, Colour
-from datagen.world.road.furniture_layout import Painted, listed_furniture, random_furniture
+from datagen.world.road.centre_line import (
+    CentreLine,
+    check_slack_cm,
+    closed_centre_line,
+    comes_near_itself,
+    open_centre_line,
+)
+from datagen.world.road.furniture import COLOURS, Colour, Painted, listed_furniture, random_furniture
 from datagen.world.road.pieces import lay_out, length_of
-from datagen.world.road.random_line import closed_centre_line, open_centre_line
 from datagen.world.road.track import Marking, Track, cut, interrupt, length_beside, paint_dashes, wear_off
 from datagen.world.road.track_settings import LOOP_CM, LineName, MarkingSettings, TrackSettings
 from lanenet.errors import ConfigError

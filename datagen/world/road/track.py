@@ -1,16 +1,21 @@
 """The road of a synthetic drive: one object that is painted and that gives the ground truth.
 
-Its lines are painted in sections: intervals along the road.
+Its lines are painted in sections: intervals along the road. On disk, as ``track.json``, it is the truth that
+a map is compared with.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lanenet.data.files import write_json
+from lanenet.errors import DriveFormatError
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import rows_of_polyline
 from lanenet.geometry.poses import arc_chord
@@ -25,6 +30,8 @@ _BEHIND_CM, _AHEAD_CM = 60.0, 150.0
 _MIN_INTERRUPTION_CM = 10.0
 #: Mean length of what flakes off a worn line; chosen: about the width of the tape.
 _FLAKE_CM = 1.5
+FORMAT = "lanenet-track/2"
+_COLUMNS = ("s_cm", "xy_cm", "heading_rad", "curvature_per_cm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,3 +355,62 @@ def is_painted(painted_cm: Float[np.ndarray, "k 2"], s_cm: Float[np.ndarray, "m"
 
 def _without_slivers(sections_cm: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "m 2"]:
     return sections_cm[sections_cm[:, 1] - sections_cm[:, 0] > 1e-9]
+
+
+def write_track(path: Path, track: Track) -> None:
+    """Write a track; lengths in cm, angles in rad, frame map."""
+    data = {
+        "format": FORMAT,
+        "closed": track.closed,
+        "lane_width_cm": track.lane_width_cm,
+        "oncoming_cm": track.oncoming_cm,
+        **{name: getattr(track, name) for name in _COLUMNS},
+        "markings": [vars(marking) for marking in track.markings],
+        "boxes": track.boxes,
+    }
+    write_json(path, data)
+
+
+def read_track(path: Path) -> Track:
+    """Read a track.
+
+    Raises:
+        DriveFormatError: If the file is missing, is not a track of this version, or its columns do not fit.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DriveFormatError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DriveFormatError(f"{path}: not valid JSON ({error})") from None
+    found = data.get("format") if isinstance(data, dict) else type(data).__name__
+    if found != FORMAT:
+        raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
+    try:
+        columns: dict[str, Any] = {name: np.asarray(data[name], dtype=np.float64) for name in _COLUMNS}
+        columns["xy_cm"] = columns["xy_cm"].reshape(-1, 2)
+        markings = []
+        for m in data["markings"]:
+            blue, green, red = map(float, m["colour_bgr"])
+            painted_cm = np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2)
+            bgr = (blue, green, red)
+            markings.append(Marking(float(m["offset_cm"]), float(m["width_cm"]), bgr, painted_cm))
+        rest: dict[str, Any] = {
+            "closed": bool(data["closed"]),
+            "lane_width_cm": float(data["lane_width_cm"]),
+            "boxes": np.asarray(data["boxes"], dtype=np.float64).reshape(-1, 9),
+            "oncoming_cm": None if data["oncoming_cm"] is None else float(data["oncoming_cm"]),
+        }
+    except KeyError as error:
+        raise DriveFormatError(f"{path}: key {error} is missing") from None
+    except (TypeError, ValueError, IndexError) as error:
+        raise DriveFormatError(f"{path}: not the numbers of a track ({error})") from None
+    lengths = [len(column) if column.ndim else 0 for column in columns.values()]
+    if min(lengths) < 2 or len(set(lengths)) > 1:
+        raise DriveFormatError(
+            f"{path}: expected {', '.join(_COLUMNS)} of one length of at least 2, "
+            f"found {', '.join(map(str, lengths))}"
+        )
+    if not all(np.isfinite(column).all() for column in (*columns.values(), rest["boxes"])):
+        raise DriveFormatError(f"{path}: a number of the centre line or of a box is missing or not finite")
+    return Track(**columns, markings=tuple(markings), **rest)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from datagen.world import sheets
 from datagen.world.render.appearance import Appearance
-from datagen.world.render.objects import place_objects
+from datagen.world.render.scene import place_objects
 from datagen.world.road.build import random_track
 from datagen.world.road.furniture import COLOURS, Furniture, Junction
 from datagen.world.road.track_settings import TrackSettings, preset, preset_names
@@ -109,7 +109,7 @@ def test_a_thing_without_room_leaves_the_others_as_they_are(monkeypatch: pytest.
         return {row.tobytes() for row in place_objects(track, Appearance(objects_per_m=6.0), *rngs).solids}
 
     apart = rows()
-    monkeypatch.setattr("datagen.world.render.objects._overlap", lambda one, other: False)
+    monkeypatch.setattr("datagen.world.render.scene._overlap", lambda one, other: False)
     assert apart < rows()
 
 

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from synthetic_roads import line_painted, mirror_track, move_track
 from typer.testing import CliRunner
 
-from datagen.world.render.nearest import NearestGrid
+from datagen.world.render.ground import NearestGrid
 from datagen.world.road.build import random_track
 from datagen.world.road.furniture import Furniture, Junction, StopLine
-from datagen.world.road.track import Track, is_painted, subtract, wear_off
-from datagen.world.road.track_file import read_track, write_track
+from datagen.world.road.track import Track, is_painted, read_track, subtract, wear_off, write_track
 from datagen.world.road.track_picture import draw_track, picture_scale
 from datagen.world.road.track_settings import MarkingSettings, TrackSettings, preset
 from lanenet.cli.app import app

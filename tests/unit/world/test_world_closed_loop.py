@@ -19,10 +19,9 @@ from datagen.world.car.pilot import (
     TruePointsPilot,
     control_settings,
 )
-from datagen.world.driving import ClosedLoop
 from datagen.world.render.appearance import Appearance
 from datagen.world.road.track_settings import TrackSettings
-from datagen.world.simulate import simulate_drive
+from datagen.world.simulate import ClosedLoop, simulate_drive
 from datagen.world.world import SimulationSettings, World, assemble_world
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.data.drives import open_drive

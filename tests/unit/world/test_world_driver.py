@@ -16,8 +16,8 @@ from datagen.world.car.driver import (
     shortest_excursion_spacing_cm,
     shortest_lane_change_cm,
 )
-from datagen.world.driving import scripted_states
 from datagen.world.road.track_settings import TrackSettings
+from datagen.world.simulate import scripted_states
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import check_settings
 from lanenet.data.drives import open_drive

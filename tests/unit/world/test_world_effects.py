@@ -13,8 +13,7 @@ from datagen.world.car.camera import CameraSettings
 from datagen.world.render.appearance import Appearance, random_appearance
 from datagen.world.render.compiled import FAR, NOT_FLOOR, TILE
 from datagen.world.render.floor import ROW_INDICES, ROW_NUMBERS, SHADE, place_row, shade_row
-from datagen.world.render.ground import TEXTURE_SIDE, PixelGround, row_poses, shake_rotation
-from datagen.world.render.nearest import Nearby
+from datagen.world.render.ground import TEXTURE_SIDE, Nearby, PixelGround, row_poses, shake_rotation
 from datagen.world.render.renderer import Renderer
 from datagen.world.render.sensor import Steps, Wander
 from datagen.world.render.textures import PATTERN_BGR, floor_pattern, level_starts, pack_levels

@@ -9,7 +9,7 @@ from synthetic_roads import drive_frames, frames_of
 from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import CarSettings, advance
 from datagen.world.render.appearance import Appearance
-from datagen.world.road.track_file import read_track
+from datagen.world.road.track import read_track
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings, build_world

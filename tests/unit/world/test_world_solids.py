@@ -8,9 +8,9 @@ import pytest
 
 from datagen.world.car.camera import CameraSettings
 from datagen.world.render.appearance import Appearance
-from datagen.world.render.nearest import Nearby
-from datagen.world.render.objects import place_objects
+from datagen.world.render.ground import Nearby
 from datagen.world.render.renderer import Renderer
+from datagen.world.render.scene import place_objects
 from datagen.world.render.solids import BOX, CONE, CYLINDER, SOLID_COLUMNS
 from datagen.world.road.build import random_track
 from datagen.world.road.track_settings import TrackSettings

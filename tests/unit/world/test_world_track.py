@@ -12,8 +12,7 @@ from synthetic_roads import line_xy, mirror_track, move_track
 
 from datagen.world.road.build import random_track
 from datagen.world.road.centre_line import comes_near_itself, integrate_curvature
-from datagen.world.road.track import Marking, Track, interrupt, paint_dashes
-from datagen.world.road.track_file import read_track, write_track
+from datagen.world.road.track import Marking, Track, interrupt, paint_dashes, read_track, write_track
 from datagen.world.road.track_settings import MarkingSettings, TrackSettings
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError, DriveFormatError
