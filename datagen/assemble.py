@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
 from datagen.prepare import PreparedDrive
-from datagen.slam.camera.changes import with_known_scale
+from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.geometry.camera import Camera

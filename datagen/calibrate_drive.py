@@ -12,8 +12,7 @@ from jaxtyping import Float
 from datagen.lanes.scale import LaneScale, measure_lane
 from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
 from datagen.settings import MapSettings
-from datagen.slam.camera.changes import with_known_scale
-from datagen.slam.camera.coarse import Candidate
+from datagen.slam.camera.coarse import Candidate, with_known_scale
 from datagen.slam.camera.self_calibration import (
     DRIVE_INSTEAD,
     MIN_FRAMES,

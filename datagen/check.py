@@ -8,10 +8,9 @@ from typing import Any
 from datagen.assemble import AssembledMap
 from datagen.lanes.trace import other_lane
 from datagen.prepare import PreparedDrive
-from datagen.quality.agreement import contradicted_lines
 from datagen.quality.figures import free_lane_cm, map_evidence, map_figures, map_notes
 from datagen.quality.measure import MapQuality, measure_map, quality_figures
-from datagen.quality.residuals import REFERENCE_WIDTH, summarise
+from datagen.quality.residuals import REFERENCE_WIDTH, contradicted_lines, summarise
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text

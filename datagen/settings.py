@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pydantic import Field, field_validator
 
 from datagen.lanes.fit import FitSettings
-from datagen.lanes.follow import TraceSettings
+from datagen.lanes.markings import TraceSettings
 from datagen.quality.verdict import VerdictSettings
 from datagen.slam.settings import GuessSettings, SlamSettings
 from lanenet.geometry.camera import Camera

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.fit import FitSettings, fit_lines
-from datagen.lanes.follow import TraceSettings
+from datagen.lanes.markings import TraceSettings
 from datagen.lanes.path import lap_path, without_frames
 from datagen.lanes.profile import without_crossings
 from datagen.lanes.scale import STEP_HEIGHTS, edges_of_segment

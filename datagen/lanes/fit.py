@@ -13,9 +13,16 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from scipy.ndimage import gaussian_filter1d
 
-from datagen.lanes.offset import Borders, CubicBasis, FittedOffset, Prior, adapted_breaks, fit_offset
+from datagen.lanes.offset import (
+    Borders,
+    CubicBasis,
+    FittedOffset,
+    Prior,
+    adapted_breaks,
+    fit_offset,
+    supported_sections,
+)
 from datagen.lanes.path import Path, PathEdges, SampleMask, Samples, left_of
-from datagen.lanes.support import supported_sections
 from datagen.lanes.trace import TracedLane
 from lanenet.config import Settings
 from lanenet.data.maps.line import LaneLine, Side

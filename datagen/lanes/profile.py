@@ -31,7 +31,7 @@ _PAINT = 0.5
 #: Least length of a crossing's stripes, in camera heights. Chosen: half of the shortest usual stripe (20 cm).
 _LONG_HEIGHTS = 0.5
 #: Cells and smoothing along the path, in camera heights, and alignment, of the profile in which stripes are
-#: found: as for lines, see :class:`datagen.lanes.follow.TraceSettings`.
+#: found: as for lines, see :class:`datagen.lanes.markings.TraceSettings`.
 _CELL_HEIGHTS, _ALONG_HEIGHTS, _MIN_SIDE = 0.03, 0.25, 0.75
 
 

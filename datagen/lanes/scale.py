@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.lanes.fit import FitSettings, fit_lines
-from datagen.lanes.follow import TraceSettings
+from datagen.lanes.markings import TraceSettings
 from datagen.lanes.path import Path, PathEdges, edges_along_path, path_of_poses
 from datagen.lanes.trace import TracedLane, trace_lane
-from datagen.slam.camera.changes import nudged
+from datagen.slam.camera.coarse import nudged
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.line import LaneLine

@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.lanes.follow import Markings, TraceSettings
+from datagen.lanes.markings import Markings, TraceSettings, find_lane_width, find_tape_width
 from datagen.lanes.path import Path, PathEdges, Samples
 from datagen.lanes.profile import EdgeProfile, edge_profile, long_runs
-from datagen.lanes.width import find_lane_width, find_tape_width
 from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, TrackingLostError

@@ -1,26 +1,31 @@
-"""The report page of a map: one self-contained HTML file, readable on a phone."""
+"""The report page of a map: one self-contained HTML file, readable on a phone.
+
+The plots are PNG images; without Matplotlib they raise ImportError.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
+import io
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from string import Template
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from datagen.quality import plots
-from datagen.quality.measure import MapQuality
+from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
 from datagen.quality.pictures import contact_sheets
-from datagen.quality.residuals import REFERENCE_WIDTH
+from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
 from datagen.quality.verdict import Verdict, VerdictSettings
-from datagen.slam.commands import SteeringFit
-from lanenet.data.maps.folder import MapMeta
-from lanenet.data.maps.mapped_drive import MappedDrive
+from datagen.slam.commands import SteeringFit, commands_of, delayed
+from lanenet.data.drives import Drive
+from lanenet.data.maps.folder import DriveMap, MapMeta
+from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 
@@ -91,28 +96,28 @@ def report_page(
             f"an edge. In the middle of the lane it is {_percent(chance)}: by chance, or because of paint."
         ),
         _table(residual_rows(held, drive.width)),
-        _plot(plots.residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
+        _plot(residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
         *(
             f"<h3>{title.capitalize()} held-out frames</h3>{_jpeg(sheet)}"
             for title, sheet in contact_sheets(mapped, quality).items()
         ),
         _section("Labels"),
         _table(share_rows(figures["labelled"])),
-        _plot(plots.frames_plot, quality, drive, drive_map, drive.width),
+        _plot(frames_plot, quality, drive, drive_map, drive.width),
         _section("Map"),
         _note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
         _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
         _section("Path and loops"),
         _table(loop_rows(figures["segments_mapped"])),
-        _plot(plots.trajectory_plot, mapped, opened_poses),
+        _plot(trajectory_plot, mapped, opened_poses),
         _section("Camera and scale"),
         _table(camera_rows(drive_map.camera, figures.get("calibration"))),
         _table(scale_rows(drive_map.meta)),
         _list(verdict.remarks),
         _section("Steering and speed"),
-        _plot(plots.steering_plot, mapped, fits)
+        _plot(steering_plot, mapped, fits)
         or _note("There is no steering command, or it does not explain the path."),
-        _plot(plots.speed_plot, mapped),
+        _plot(speed_plot, mapped),
     ]
     return _PAGE.substitute(
         title=html.escape(f"Map of {drive.name}"),
@@ -264,3 +269,166 @@ def scale_rows(meta: MapMeta) -> list[Row]:
         ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
         ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
     ]
+
+
+#: Colours of the lines, as in the pictures.
+_COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
+#: Distance bins of the residuals. Chosen: three per label row.
+_BIN_CM = 5.0
+
+
+def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]]:
+    """Make a figure with panels one below the other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # Without pyplot, which selects a window system and keeps global state.
+    figure = Figure(figsize=(width, height), dpi=110)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(panels, 1, sharex=panels > 1, squeeze=False)[:, 0]
+    for ax in axes:
+        ax.grid(True, alpha=0.3)
+    return figure, list(axes)
+
+
+def _png(figure: Any) -> bytes:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", bbox_inches="tight")
+    return data.getvalue()
+
+
+def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
+    """Insert a row of NaN before each row that does not continue the one before: no line is drawn there."""
+    return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
+
+
+def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes:
+    """Driven path before and after the loops were closed."""
+    figure, (axes,) = _figure(6.5, 5.0)
+    drive_map = mapped.drive_map
+    for poses, style, name in (
+        (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
+        (drive_map.poses, {"color": "#2060c0", "lw": 1.3}, "closed"),
+    ):
+        axes.plot(*_interrupted(0.01 * poses[:, :2], mapped.starts).T, label=name, **style)
+    axes.plot(*(0.01 * drive_map.poses[0, :2]), "ko", ms=4)
+    axes.annotate(" start", 0.01 * drive_map.poses[0, :2], fontsize=8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes:
+    """Residuals and coverage over the distance ahead, by line."""
+    figure, (axes, below) = _figure(6.5, 4.6, 2)
+    every = join_samples(quality.samples)
+    scale = REFERENCE_WIDTH / width
+    edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
+    centres = 0.5 * (edges[:-1] + edges[1:])
+    for side in SIDES:
+        part = every.select(every.right == (side == "right"))
+        bins = [
+            summarise(part.select((part.ahead_cm >= a) & (part.ahead_cm < b)))
+            for a, b in pairwise(edges.tolist())
+        ]
+        for name, style, values in (
+            ("p95", ".--", [scale * b.p95_px for b in bins]),
+            ("robust sd", "o-", [scale * b.robust_sd_px for b in bins]),
+        ):
+            axes.plot(centres, values, style, color=_COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
+        below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=_COLOURS[side], label=side, ms=3)
+    for bound in (max_sd_px, max_p95_px):
+        axes.axhline(bound, color="gray", lw=0.8, ls=":")
+    for ax in (axes, below):
+        ax.axvline(VERDICT_REACH_CM, color="gray", lw=0.8, ls=":")
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("px at 160 px width")
+    axes.legend(fontsize=7, ncol=2)
+    below.set_ylim(0.0, 105.0)
+    below.set_ylabel("edge found, %")
+    below.set_xlabel("ahead of the front axle, cm")
+    return _png(figure)
+
+
+def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
+    """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
+    figure, (axes, strip) = _figure(6.5, 3.8, 2)
+    axes.plot(
+        drive_map.frames[quality.held_out],
+        quality.frame_median_px * REFERENCE_WIDTH / width,
+        ".",
+        color="#2060c0",
+        ms=4,
+    )
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("median residual\nof held-out frame, px", fontsize=8)
+    status = np.array(quality.status)
+    names = [LABELLED, *(reason for reason in quality.not_labelled)]
+    for i, name in enumerate(names):
+        colour = "#2e9e2e" if name == LABELLED else "#999999" if name == DELETED else f"C{(i + 2) % 10}"
+        at = drive.frames[status == name]
+        strip.plot(at, np.full(len(at), i), "|", color=colour, ms=9)
+    strip.set_yticks(range(len(names)), [f"{n} ({int((status == n).sum())})" for n in names], fontsize=8)
+    strip.set_ylim(len(names) - 0.5, -0.5)
+    strip.set_xlabel("frame")
+    return _png(figure)
+
+
+def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
+    """Curvature of the driven path over the steering command, with a fitted line; None without a fit."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
+    if turn is None or not any(fits):
+        return None
+    figure, (axes,) = _figure(6.5, 3.6)
+    for segment, fit in enumerate(fits):
+        part = np.flatnonzero(drive_map.segment == segment)
+        if fit is None or len(part) < 3:
+            continue
+        delta = np.diff(drive_map.poses[part], axis=0)
+        step = np.hypot(delta[:, 0], delta[:, 1])
+        moving = (step > 0.3 * np.median(step)) & ~mapped.starts[part[1:]]
+        command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
+        curvature = 100.0 * delta[moving, 2] / step[moving]
+        axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
+        if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
+            continue
+        # Fitted again: the filter's own fit preceded the adjustment of camera and poses.
+        gain, trim = np.polyfit(command, curvature, 1)
+        r = float(np.corrcoef(command, curvature)[0, 1])
+        ends = np.array([command.min(), command.max()])
+        axes.plot(
+            ends,
+            gain * ends + trim,
+            "k-",
+            lw=1.0,
+            label=f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}",
+        )
+    axes.set_xlabel("steering command, positive left")
+    axes.set_ylabel("curvature, 1/m")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
+    return _png(figure)
+
+
+def speed_plot(mapped: MappedDrive) -> bytes:
+    """Step length of each frame, with the commanded speed or throttle."""
+    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
+    figure, (axes,) = _figure(6.5, 2.8)
+    step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
+    # A step across a break was not driven by the car.
+    step[mapped.starts[1:]] = np.nan
+    axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("step length, cm", color="#2060c0")
+    commands = drive.commands
+    for values, name in ((commands.speed_cm_s, "commanded speed, cm/s"), (commands.throttle, "throttle")):
+        if values is not None:
+            other = axes.twinx()
+            other.plot(drive.frames[rows], values[rows], "-", color="#d08020", lw=0.6, alpha=0.7)
+            other.set_ylabel(name, color="#d08020")
+            break
+    return _png(figure)

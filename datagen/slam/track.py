@@ -9,7 +9,7 @@ import numpy as np
 from datagen.slam.commands import SteeringFit, fit_steering
 from datagen.slam.filter.dp_slam import Trajectory, run_filter
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.odometry.far_view import far_turns
+from datagen.slam.odometry.motion_grid import far_turns
 from datagen.slam.odometry.odometry import Evidence, Odometry
 from datagen.slam.odometry.scans import Progress
 from datagen.slam.settings import MotionSettings, SlamSettings

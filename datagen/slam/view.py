@@ -12,8 +12,8 @@ from datagen.slam.commands import CommandedMotion
 from datagen.slam.keyframes import interleaved_rows
 from datagen.slam.odometry.image_pairs import ImagePairs
 from datagen.slam.odometry.odometry import TypicalStep, typical_step
-from datagen.slam.odometry.reflections import without_reflections
 from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
+from datagen.slam.odometry.stillness import without_reflections
 from datagen.slam.settings import SlamSettings
 from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError

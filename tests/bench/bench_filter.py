@@ -16,10 +16,15 @@ import time
 
 import numpy as np
 
-from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter
+from datagen.slam.filter.dp_slam import (
+    FilterSettings,
+    ParticleFilter,
+    effective_number,
+    reweigh,
+    systematic_resample,
+)
 from datagen.slam.filter.field import DirectionField
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import Scan, Scans, condense, pack_scans
 from lanenet.geometry.frames import car_from_map, map_from_car, map_from_car_directions
 from lanenet.perception.edges.road import RoadEdges

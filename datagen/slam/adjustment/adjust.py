@@ -3,6 +3,10 @@
 An edge point of one frame is moved over the road into another frame, where it must lie on an edge. Its
 distance across that edge is the residual. It is taken in pixels: in cm the cost falls as the scene shrinks.
 
+The unknowns are five numbers per frame (x, y, heading, pitch, roll) and the camera's free numbers. With
+residuals e, Jacobian J and weights W, a step solves H dx = -g, where H = J^T W J and g = J^T W e. H has a
+sparse block of the frames, bordered by a few dense columns of the camera.
+
 Source:
     Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment: a modern synthesis":
     Levenberg-Marquardt steps, a robust loss, and the camera eliminated last (Schur complement). Poses and
@@ -14,10 +18,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import SuperLU, splu
 
-from datagen.slam.adjustment.problem import BundleProblem
+from datagen.slam.adjustment.kernels import (
+    N_CAMERA,
+    N_FRAME,
+    Links,
+    Pixels,
+    accumulate,
+    associate,
+    lift_points,
+)
 from datagen.slam.adjustment.state import (
     CAMERA_NAMES,
     BundleEstimate,
@@ -119,3 +134,307 @@ def adjust(
         misfit=float(misfit),
         pairs=len(problem.pairs),
     )
+
+
+#: Shares of its frames in which a point meets an edge by chance, and in which it is taken for a mark on the
+#: road; weight of a point below the first. Chosen between noise, which meets an edge now and then, and marks,
+#: which meet one in nearly every image (tests/unit/slam/test_bundle.py); not zero, so that the system stays
+#: determined.
+_CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
+#: Trust in a point that is in view of fewer than two frames, whose share says little. Chosen between the two.
+_TRUST_ONCE = 0.3
+#: Margin at the rim of the pixels in which edges are looked for, [px] for images 160 px wide: edges are found
+#: with a kernel that reaches one pixel further.
+_RIM_PX = 1.0
+#: Image width for which settings in pixels are given: that of a Donkeycar tub.
+_REFERENCE_WIDTH = 160.0
+#: Commanded steps that are shorter than this share of the typical one count as this long: a car that hardly
+#: moves says little about its gain.
+_LEAST_STEP = 0.1
+#: Sigma of the first pose, which only fixes the map: far below anything that is measured.
+_FIXED_SIGMA = 1e-6
+
+_Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Normal equations at a state.
+
+    Attributes:
+        cost: Robust cost there, priors included.
+        frames: H between the frames' numbers.
+        border: H between the frames' numbers and the camera's free ones.
+        camera: H between the camera's free numbers.
+        descent: -g, frames first.
+        residual_px: Residual of each link; NaN where it has none.
+    """
+
+    cost: float
+    frames: csc_matrix
+    border: Float[np.ndarray, "u f"]
+    camera: Float[np.ndarray, "f f"]
+    descent: Float[np.ndarray, "v"]
+    residual_px: Float[np.ndarray, "r"]
+
+    def step(self, damping: float) -> Float[np.ndarray, "v"]:
+        """Solve for a Levenberg-Marquardt step; the camera is eliminated last, by its Schur complement.
+
+        Args:
+            damping: Share of the diagonal that is added to it.
+        """
+        count = len(self.border)
+        frames = (self.frames + damping * diags(self.frames.diagonal())).tocsc()
+        reduced = _factorised(frames).solve(np.column_stack([self.descent[:count], self.border]))
+        if not self.border.shape[1]:
+            return np.asarray(reduced[:, 0])
+        camera = self.camera + damping * np.diag(np.diag(self.camera))
+        schur = camera - self.border.T @ reduced[:, 1:]
+        found = np.linalg.solve(schur, self.descent[count:] - self.border.T @ reduced[:, 0])
+        return np.concatenate([reduced[:, 0] - reduced[:, 1:] @ found, found])
+
+    def camera_sigma(self) -> Float[np.ndarray, "f"]:
+        """Sigmas of the camera's free numbers, with all other unknowns free too."""
+        if not self.border.shape[1]:
+            return np.zeros(0)
+        schur = self.camera - self.border.T @ _factorised(self.frames).solve(self.border)
+        return np.sqrt(np.maximum(np.diag(np.linalg.inv(schur)), 0.0))
+
+
+def _factorised(matrix: csc_matrix) -> SuperLU:
+    """Factorise a positive definite matrix: no pivoting, and an order that suits symmetry."""
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+class BundleProblem:
+    """Points, edges and pairs of frames, which stay; see :func:`datagen.slam.adjustment.adjust.adjust`.
+
+    Attributes:
+        pairs: Pairs of frames; points of the first are moved into the second.
+        points: Pixels that are compared.
+        edges: All edges, those of each frame sorted by row, as the kernels search them.
+        compared: Number of comparisons: points times pairs.
+        free: Which of the camera's numbers may change.
+    """
+
+    def __init__(
+        self,
+        observed: Observations,
+        camera: Camera,
+        settings: BundleSettings,
+        rng: np.random.Generator,
+        free: Sequence[str] = CAMERA_NAMES,
+        loops: Sequence[tuple[int, int]] = (),
+        prior_camera: Camera | None = None,
+    ) -> None:
+        self.settings, self.observed, self.frames = settings, observed, len(observed.edges)
+        self.scale = camera.width / _REFERENCE_WIDTH
+        self.prior_camera = camera if prior_camera is None else prior_camera
+        self.free = np.array([name in free for name in CAMERA_NAMES])
+        counts = np.array([len(e.uv_px) for e in observed.edges])
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        uv = np.concatenate([e.uv_px for e in observed.edges]).astype(np.float64)
+        normals = np.concatenate([e.normals for e in observed.edges]).astype(np.float64)
+        chosen = [
+            start + np.sort(rng.choice(count, min(count, settings.points), replace=False))
+            for start, count in zip(starts[:-1], counts, strict=True)
+        ]
+        point_starts = np.concatenate([[0], np.cumsum([len(c) for c in chosen])]).astype(np.int64)
+        index = np.concatenate(chosen)
+        self.points = Pixels(point_starts, uv[index], normals[index])
+        by_row = np.lexsort((uv[:, 1], np.repeat(np.arange(self.frames), counts)))
+        self.edges = Pixels(starts, uv[by_row], normals[by_row])
+        breaks = observed.breaks
+        segment = np.zeros(self.frames, int) if breaks is None else np.cumsum(breaks)
+        self.pairs = _pairs(settings.lags, segment, loops, rng)
+        #: Unknowns of the two frames of each pair.
+        self.unknowns = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
+        self.inner = inner_pixels(camera, observed.keep)
+        self.compared = int(np.diff(point_starts)[self.pairs[:, 0]].sum())
+        self.joined = np.flatnonzero(segment[1:] == segment[:-1])
+        self.weight = np.full(len(index), 1.0 / settings.pixel_sigma**2)
+        self._lifted: tuple[BundleState, _Lifted] | None = None
+        s, centre = settings, settings.centre_px * self.scale
+        self.camera_sigmas = np.array([s.focal, centre, centre, s.k1, s.pitch, s.roll, s.yaw, s.lever])
+
+    def lift(self, state: BundleState) -> _Lifted:
+        """Lift the compared points to the road.
+
+        Returns:
+            The points (ahead of the rear axle, left); their Jacobian by the camera's numbers; and points half
+            a pixel further along the gradient.
+        """
+        if self._lifted is not None and self._lifted[0] is state:
+            # Association and residuals start from the same state.
+            return self._lifted[1]
+        count = len(self.points.uv)
+        lifted = np.empty((count, 2)), np.empty((count, N_CAMERA, 2)), np.empty((count, 2))
+        lift_points(state, self.points, *lifted)
+        self._lifted = state, lifted
+        return lifted
+
+    def associate(self, state: BundleState, gate_px: float) -> Links:
+        """Find the nearest edge of every compared point, and weigh the points by how often they have one."""
+        lifted, _, half_px = self.lift(state)
+        links = Links(
+            *(np.empty(self.compared, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64))
+        )
+        in_view, matched = (np.zeros(len(self.points.uv), np.int64) for _ in range(2))
+        count = associate(
+            state, self.pairs, self.points, lifted, half_px, self.edges,
+            gate_px * self.scale, self.inner, in_view, matched, links,
+        )  # fmt: skip
+        self.weight = point_trust(in_view, matched) / self.settings.pixel_sigma**2
+        return Links(*(column[:count] for column in links))
+
+    def equations(self, state: BundleState, links: Links) -> Equations:
+        """Build the normal equations of all residuals and priors."""
+        lifted, lifted_by, _ = self.lift(state)
+        both, count = 2 * N_FRAME, N_FRAME * self.frames
+        blocks = np.zeros((len(self.pairs), both + N_CAMERA, both + N_CAMERA))
+        descents = np.zeros((len(self.pairs), both + N_CAMERA))
+        residual_px = np.empty(len(links.point))
+        cost = accumulate(
+            state, self.pairs, self.edges, lifted, lifted_by, links,
+            self.weight, self.settings.cauchy_px, blocks, descents, residual_px,
+        )  # fmt: skip
+        prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.joined, self.observed)
+        at, free = self.unknowns.ravel(), self.free
+        border = [
+            np.bincount(at, blocks[:, :both, both + k].ravel(), minlength=count) for k in np.flatnonzero(free)
+        ]
+        off = (state.camera_minus(self.prior_camera) / self.camera_sigmas)[free]
+        camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(free, free)]
+        camera_descent = descents[:, both:].sum(axis=0)[free] - off / self.camera_sigmas[free]
+        frames_descent = np.bincount(at, descents[:, :both].ravel(), minlength=count) + prior_descent
+        return Equations(
+            cost=cost + prior_cost + 0.5 * float(off @ off),
+            frames=(sum_blocks(self.unknowns, blocks[:, :both, :both], count) + prior).tocsc(),
+            border=np.stack(border, axis=1) if border else np.empty((count, 0)),
+            camera=camera + np.diag(self.camera_sigmas[free] ** -2.0),
+            descent=np.concatenate([frames_descent, camera_descent]),
+            residual_px=residual_px,
+        )
+
+
+def sum_blocks(unknowns: Int[np.ndarray, "p k"], blocks: Float[np.ndarray, "p k k"], size: int) -> csc_matrix:
+    """Add up small dense blocks in a sparse matrix, each at the rows and columns of its unknowns."""
+    rows = np.broadcast_to(unknowns[:, :, None], blocks.shape)
+    columns = np.broadcast_to(unknowns[:, None, :], blocks.shape)
+    return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsc()
+
+
+def frame_priors(
+    state: BundleState, settings: BundleSettings, joined: Int[np.ndarray, "m"], observed: Observations
+) -> tuple[float, csc_matrix, Float[np.ndarray, "u"]]:
+    """What is assumed of the frames: they are nearly level, and the car rolls on arcs that change slowly.
+
+    Args:
+        state: Where to linearise.
+        settings: Sigmas.
+        joined: Frames that are followed by the next one.
+        observed: What was commanded.
+
+    Returns:
+        Cost, H and -g of the priors by the frames' numbers.
+    """
+    s, n = settings, len(state.poses)
+    i, j = joined, joined + 1
+    own = N_FRAME * np.arange(n)[:, None]
+    step_at = np.concatenate(
+        [N_FRAME * i[:, None] + np.arange(3), N_FRAME * j[:, None] + np.arange(3)], axis=1
+    )
+    # On an arc the rear axle moves along the heading at half of the turn. The motion along and across it,
+    # with Jacobians by both poses:
+    c, si = np.cos(state.poses[i, 2]), np.sin(state.poses[i, 2])
+    dx, dy = (state.poses[j] - state.poses[i])[:, :2].T
+    ahead, left = c * dx + si * dy, c * dy - si * dx
+    turn = state.poses[j, 2] - state.poses[i, 2]
+    half, middle = 0.5 * turn, state.poses[i, 2] + 0.5 * turn
+    along = np.cos(half) * ahead + np.sin(half) * left
+    across = np.cos(half) * left - np.sin(half) * ahead
+    cm, sm = np.cos(middle), np.sin(middle)
+    along_by = np.stack([-cm, -sm, 0.5 * across, cm, sm, 0.5 * across], axis=1)
+    across_by = np.stack([sm, -cm, -0.5 * along, -sm, cm, -0.5 * along], axis=1)
+    turn_by = np.broadcast_to([0.0, 0.0, -1.0, 0.0, 0.0, 1.0], along_by.shape)
+    # Neighbouring steps: a is followed by b.
+    a = np.flatnonzero(j[:-1] == i[1:])
+    b = a + 1
+    both_at = np.concatenate([step_at[b], step_at[a]], axis=1)
+    # Steps per commanded step; nothing is assumed of steps for which the car was commanded to stand.
+    commanded = (np.ones(n) if observed.relative_steps is None else observed.relative_steps)[j]
+    per = np.where(commanded > 0.0, 1.0 / np.maximum(commanded, _LEAST_STEP), 0.0)
+    per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
+    speed_by = np.concatenate([per_b[:, None] * along_by[b], -per_a[:, None] * along_by[a]], axis=1)
+    # Each prior: residual, sigma, and the unknowns that it depends on with the Jacobian by them.
+    priors = [
+        (state.tilt[:, 0], s.frame_pitch, own + 3, np.ones((n, 1))),
+        (state.tilt[:, 1], s.frame_roll, own + 4, np.ones((n, 1))),
+        (across, s.slip, step_at, across_by),
+        (per_b * along[b] - per_a * along[a], s.speed_change, both_at, speed_by),
+        (turn[b] - turn[a], s.turn_change, both_at, np.concatenate([turn_by[b], -turn_by[a]], axis=1)),
+        (np.zeros(3), _FIXED_SIGMA, np.arange(3)[:, None], np.ones((3, 1))),
+    ]
+    known = np.flatnonzero(commanded >= _LEAST_STEP) if observed.speed_recorded else np.zeros(0, np.int64)
+    if known.size:
+        # The gain of the speed is that of the median step: what all steps share is left to the images.
+        gain = max(float(np.median(per[known] * along[known])), 1e-6)
+        share = per[known] / gain
+        priors.append(
+            (share * along[known] - 1.0, s.recorded_speed, step_at[known], share[:, None] * along_by[known])
+        )
+    e = np.concatenate([residual / sigma for residual, sigma, _, _ in priors])
+    counts = np.concatenate([np.full(len(columns), columns.shape[1]) for _, _, columns, _ in priors])
+    values = np.concatenate([(by / sigma).ravel() for _, sigma, _, by in priors])
+    columns = np.concatenate([at.ravel() for _, _, at, _ in priors])
+    jacobian = coo_matrix(
+        (values, (np.repeat(np.arange(len(e)), counts), columns)), shape=(len(e), N_FRAME * n)
+    ).tocsc()
+    return 0.5 * float(e @ e), (jacobian.T @ jacobian).tocsc(), -(jacobian.T @ e)
+
+
+def _pairs(
+    lags: Sequence[int],
+    segment: Int[np.ndarray, "n"],
+    loops: Sequence[tuple[int, int]],
+    rng: np.random.Generator,
+) -> Int[np.ndarray, "p 2"]:
+    """Pairs of frames of one segment, a lag apart, and those of loops in both directions."""
+    pairs = []
+    for lag in lags:
+        i = np.arange(len(segment) - lag)
+        i = i[segment[i] == segment[i + lag]]
+        # Forwards or backwards: points that leave the view in one direction stay in view in the other.
+        back = rng.random(len(i)) < 0.5
+        pairs.append(np.where(back[:, None], np.stack([i + lag, i], 1), np.stack([i, i + lag], 1)))
+    both = [(a, b) for a, b in loops] + [(b, a) for a, b in loops]
+    pairs.append(np.array(both, dtype=np.int64).reshape(-1, 2))
+    return np.concatenate(pairs).astype(np.int64)
+
+
+def inner_pixels(camera: Camera, keep: UInt8[np.ndarray, "h w"] | None) -> Bool[np.ndarray, "h w"]:
+    """True for pixels around which edges were looked for on all sides.
+
+    Args:
+        camera: For the size of its images.
+        keep: Pixels in which edges were looked for; None for all.
+    """
+    seen = np.zeros((camera.height + 2, camera.width + 2), np.uint8)
+    seen[1:-1, 1:-1] = 1 if keep is None else keep > 0
+    rim_px = cv2.distanceTransform(seen, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    return np.asarray(rim_px > _RIM_PX * camera.width / _REFERENCE_WIDTH)
+
+
+def point_trust(in_view: Int[np.ndarray, "m"], matched: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Return the trust in each compared point, from the share of frames in which it met an edge.
+
+    Noise meets an edge by chance, wherever it is moved, and its residual only says that all may stay as it
+    is. A mark on the road is met again in nearly every image.
+
+    Args:
+        in_view: In how many frames each point fell into the inner pixels.
+        matched: In how many of them it met an edge.
+    """
+    share = matched / np.maximum(in_view, 1)
+    trust = np.clip((share - _CHANCE) / (_SURE - _CHANCE), _LEAST_TRUST, 1.0)
+    return np.where(in_view >= 2, trust, np.minimum(trust, _TRUST_ONCE))

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
-from datagen.slam.camera.changes import looking_alike, nudged
-from datagen.slam.camera.coarse import Candidate, coarse_camera
+from datagen.slam.camera.coarse import Candidate, coarse_camera, looking_alike, nudged
 from datagen.slam.odometry.scans import Progress
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive

@@ -5,6 +5,17 @@ What a frame showed is entered once for each particle that survived its resampli
 tree). A particle sees what its own ancestors entered. Once all particles descend from a node, its entries
 belong to all of them; once none does, they are dropped.
 
+Resampling keeps the order of the particles (systematic resampling draws ascending indices). The living
+descendants of a node are therefore neighbours: one interval of particles. Whether a particle descends from a
+node is two comparisons, and what a cell holds for each particle is a sum over intervals.
+
+An entry whose interval is empty is dead. One whose interval holds everybody is the same for all particles and
+moves into the root of its cell. Both are dealt with when a cell is visited, and at the latest when the
+frame's row leaves the tree.
+
+The entries of a cell are stored in pages, each of which is contiguous, and the loops over points are
+outermost: following entries one by one through memory would take longer than all the arithmetic.
+
 Source:
     Eliazar and Parr 2003 and 2004 (see :mod:`datagen.slam.filter.dp_slam`).
 """
@@ -12,22 +23,12 @@ Source:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32, Int64
+from numba import njit
 
-from datagen.slam.filter.ancestry_kernels import (
-    PAGE_SIZE,
-    AncestryTree,
-    Cells,
-    MapArrays,
-    Pages,
-    collapse,
-    grow,
-    score,
-    write,
-)
 from datagen.slam.odometry.scans import Scan
 
 Likelihood = Literal["direction", "count"]
@@ -170,3 +171,457 @@ class AncestryMap:
             write(self.arrays, row, 0)
             collapse(self.arrays, row)
         self._oldest += 1
+
+
+#: Entries per page. Chosen: a page of vectors is four cache lines.
+PAGE_SIZE = 16
+#: A node's number in an entry: its row in the bits above these, its place in the row below.
+PLACE_BITS = 16
+PLACE = (1 << PLACE_BITS) - 1
+#: Type of an index: unsigned, so that numba need not check for indices from the end.
+U = np.uint32
+#: Columns of a cell's state.
+OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
+
+
+class AncestryTree(NamedTuple):
+    """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
+
+    Attributes:
+        span: First living particle that descends from the node, and one behind the last; the same for a
+            dead node.
+        nodes: Nodes per row.
+        frame: Frame that the row belongs to.
+        pose: Rear-axle pose of each node, frame map.
+        points: Edge points that each frame wrote: x right, y ahead, normal x, normal y (frame car), weight.
+        size: How many points each frame wrote.
+        version: How often intervals have changed, and how many cells were pruned.
+        fades: Fade by age in frames, from minus the window (what is newer counts more) to the window.
+        mark: For pruning, by the particle that an entry's interval begins with: the last pruned cell with
+            such an entry, and the interval's end, the frame and the place of that entry.
+    """
+
+    span: Int32[np.ndarray, "w p 2"]
+    nodes: Int32[np.ndarray, "w"]
+    frame: Int32[np.ndarray, "w"]
+    pose: Float[np.ndarray, "w p 3"]
+    points: Float[np.ndarray, "w m 5"]
+    size: Int32[np.ndarray, "w"]
+    version: Int64[np.ndarray, "2"]
+    fades: Float[np.ndarray, "w21"]
+    mark: Int64[np.ndarray, "p 4"]
+
+
+class Cells(NamedTuple):
+    """A wrapping grid; each cell has a root, which all particles share, and entries of single lineages.
+
+    Attributes:
+        state: Per cell: which cell of the unbounded plane it holds (ix, iy), its first page (-1: none), the
+            frame of the newest content of its root (-1: none), and the version of the tree for which it was
+            pruned.
+        root: Sum of what all particles agree on, faded to the frame of its newest content.
+    """
+
+    state: Int32[np.ndarray, "s s 8"]
+    root: Float[np.ndarray, "s s 2"]
+
+
+class Pages(NamedTuple):
+    """Entries of the cells, by the page: what one node saw in one cell.
+
+    Attributes:
+        following: Next page of the cell, or of the free ones; -1 at the end.
+        used: Entries in each page.
+        node: Who saw it: row << PLACE_BITS | place in the row.
+        vector: What was seen: weighted normal, or weight.
+        free: First free page, and how many are free.
+    """
+
+    following: Int32[np.ndarray, "n"]
+    used: Int32[np.ndarray, "n"]
+    node: Int32[np.ndarray, "n e"]
+    vector: Float[np.ndarray, "n e 2"]
+    free: Int32[np.ndarray, "2"]
+
+
+class MapArrays(NamedTuple):
+    """The shared map as the kernels take it.
+
+    Attributes:
+        tree: The living ancestry.
+        cells: The grid.
+        pages: Entries of single lineages.
+        cell_cm: Side of a cell.
+        wheelbase_cm: Distance between the axles.
+        memory_frames: Frames after which an entry has faded to 1/e.
+        counting: Whether (weight, 0) is entered into a point's own cell, and occupied cells are counted; else
+            blurred normals are entered, and directions scored.
+    """
+
+    tree: AncestryTree
+    cells: Cells
+    pages: Pages
+    cell_cm: float
+    wheelbase_cm: float
+    memory_frames: float
+    counting: bool
+
+
+#: Cells along each side of the square in which a node's last entries are remembered. Chosen: neighbouring
+#: points are at most a patch apart, which is a cell.
+_RECENT = 4
+_NOWHERE = -(1 << 31)  # no cell has this number
+#: A cell counts as occupied until what was seen in it has faded to this share: three memories, exp(-3).
+_OCCUPIED = 0.05
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def grow(tree, row, frame, states, chosen):
+    """Follow a resampling: give every node its new interval, and the survivors nodes of their own.
+
+    Args:
+        tree: The tree.
+        row: Row of the new nodes.
+        frame: Their frame.
+        states: Particles before resampling; the first three columns are poses.
+        chosen: Ascending index of each new particle's parent among them.
+    """
+    span, particles = tree.span, len(chosen)
+    # How many new particles stand before the copies of each old one.
+    before = np.zeros(particles + 1, np.int32)
+    for p in range(particles):
+        before[chosen[p] + 1] += 1
+    for p in range(particles):
+        before[p + 1] += before[p]
+    for r in range(span.shape[0]):
+        for i in range(tree.nodes[r]):
+            span[r, i, 0] = before[span[r, i, 0]]
+            span[r, i, 1] = before[span[r, i, 1]]
+    count = 0
+    for p in range(particles):
+        if before[p + 1] > before[p]:
+            span[row, count, 0] = before[p]
+            span[row, count, 1] = before[p + 1]
+            tree.pose[row, count] = states[p, :3]
+            count += 1
+    tree.nodes[row] = count
+    tree.frame[row] = frame
+    tree.version[0] += 1
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def prune(tree, cells, pages, a, b, memory):
+    """Prune a cell: drop dead entries, and move those that all particles share into its root.
+
+    Entries with the same descendants keep the same descendants: they are merged.
+    """
+    state, root = cells.state, cells.root
+    following, used = pages.following, pages.used
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    span, frames, fades, mark = tree.span, tree.frame, tree.fades, tree.mark
+    window, particles = span.shape[0], span.shape[1]
+    state[a, b, PRUNED] = tree.version[0]
+    tree.version[1] += 1
+    serial = tree.version[1]
+    # Entries that stay move to the front; ``into`` is the page that is being filled, ``out`` the place.
+    page = into = state[a, b, PAGE]
+    out = into * PAGE_SIZE
+    while page >= 0:
+        first, stop_at = page * PAGE_SIZE, page * PAGE_SIZE + used[page]
+        page = following[page]
+        for at in range(first, stop_at):
+            e = U(at)
+            node = entered[e]
+            row, place = U(node >> PLACE_BITS), U(node & PLACE)
+            start, stop = U(span[row, place, 0]), np.int64(span[row, place, 1])
+            size, frame = stop - np.int64(start), np.int64(frames[row])
+            if size == particles:
+                stamp, fade = state[a, b, STAMP], 1.0
+                if stamp < frame:
+                    old = np.exp((stamp - frame) / memory) if stamp >= 0 else 0.0
+                    root[a, b, 0] *= old
+                    root[a, b, 1] *= old
+                    state[a, b, STAMP] = frame
+                elif stamp > frame:
+                    fade = np.exp((frame - stamp) / memory)
+                root[a, b, 0] += fade * vector[e, 0]
+                root[a, b, 1] += fade * vector[e, 1]
+            elif size > 0:
+                if mark[start, 0] == serial and mark[start, 1] == stop:
+                    like, fade = U(mark[start, 3]), fades[U(window + mark[start, 2] - frame)]
+                    vector[like, 0] += fade * vector[e, 0]
+                    vector[like, 1] += fade * vector[e, 1]
+                    continue
+                if out == (into + 1) * PAGE_SIZE:
+                    used[into] = PAGE_SIZE
+                    into = following[into]
+                    out = into * PAGE_SIZE
+                entered[U(out)] = node
+                vector[U(out), 0], vector[U(out), 1] = vector[e, 0], vector[e, 1]
+                mark[start, 0], mark[start, 1], mark[start, 2], mark[start, 3] = serial, stop, frame, out
+                out += 1
+    rest, filled = state[a, b, PAGE], out - into * PAGE_SIZE
+    if filled > 0:
+        used[into] = filled
+        rest = following[into]
+        following[into] = -1
+    else:
+        state[a, b, PAGE] = -1
+    _free(pages, rest)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _free(pages, page):
+    """Return a chain of pages to the free ones."""
+    while page >= 0:
+        following = pages.following[page]
+        pages.following[page] = pages.free[0]
+        pages.free[0] = page
+        pages.free[1] += 1
+        page = following
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def write(shared, row, start):
+    """Enter the points of a row, seen from each of its nodes.
+
+    Args:
+        shared: The map.
+        row: Row to enter.
+        start: First point to enter.
+
+    Returns:
+        First point that was not entered, because the pages might not suffice for it.
+    """
+    tree, cells, pages = shared.tree, shared.cells, shared.pages
+    wheelbase, cell_cm, plain = shared.wheelbase_cm, shared.cell_cm, shared.counting
+    pose, points, state, root = tree.pose, tree.points, cells.state, cells.root
+    following, used, free = pages.following, pages.used, pages.free
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    nodes, mask = tree.nodes[row], state.shape[0] - 1
+    wx, wy = np.ones(2), np.ones(2)
+    reach, half = (1, 0.0) if plain else (2, 0.5)
+    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    # Neighbouring points share cells: the last entry of a node in each of a few cells takes both.
+    recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
+    for i in range(start, tree.size[row]):
+        if free[1] < reach * reach * nodes:
+            return i
+        right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
+        weight = points[row, i, 4]
+        for node in range(nodes):
+            c, s = cosines[node], sines[node]
+            gx = (pose[row, node, 0] + forward * c + right * s) / cell_cm - half
+            gy = (pose[row, node, 1] + forward * s - right * c) / cell_cm - half
+            cx, cy = int(np.floor(gx)), int(np.floor(gy))
+            nx, ny = 1.0, 0.0
+            if not plain:
+                nx = points[row, i, 3] * c + points[row, i, 2] * s
+                ny = points[row, i, 3] * s - points[row, i, 2] * c
+                # Shared among the four nearest cells by distance.
+                tx, ty = gx - cx, gy - cy
+                wx[0], wx[1] = 1.0 - tx, tx
+                wy[0], wy[1] = 1.0 - ty, ty
+            for jy in range(reach):
+                for jx in range(reach):
+                    share = weight * wx[jx] * wy[jy]
+                    ix, iy = cx + jx, cy + jy
+                    a, b = U(iy & mask), U(ix & mask)
+                    slot = U((iy & (_RECENT - 1)) * _RECENT + (ix & (_RECENT - 1)))
+                    if state[a, b, OWNER_X] != ix or state[a, b, OWNER_Y] != iy:
+                        # The cell is taken over by another patch of road; what it held is dropped.
+                        if state[a, b, PAGE] >= 0:
+                            _free(pages, state[a, b, PAGE])
+                            recent[:] = _NOWHERE
+                        state[a, b, PAGE], state[a, b, STAMP] = -1, -1
+                        root[a, b, 0], root[a, b, 1] = 0.0, 0.0
+                        state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
+                    elif recent[node, slot, 0] == ix and recent[node, slot, 1] == iy:
+                        like = U(recent[node, slot, 2])
+                        vector[like, 0] += share * nx
+                        vector[like, 1] += share * ny
+                        continue
+                    page = state[a, b, PAGE]
+                    if page < 0 or used[U(page)] == PAGE_SIZE:
+                        fresh = free[0]
+                        free[0] = following[fresh]
+                        free[1] -= 1
+                        following[fresh] = page
+                        used[fresh] = 0
+                        state[a, b, PAGE] = page = fresh
+                    out = page * PAGE_SIZE + used[U(page)]
+                    used[U(page)] += 1
+                    entered[U(out)] = row << PLACE_BITS | node
+                    vector[U(out), 0] = share * nx
+                    vector[U(out), 1] = share * ny
+                    recent[node, slot, 0], recent[node, slot, 1], recent[node, slot, 2] = ix, iy, out
+    return tree.size[row]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def collapse(shared, row):
+    """Collapse a row of the tree: its entries move into the roots or are dropped.
+
+    Where lineages still differ, one node at their ancestors' mean pose is left in the row, to be entered and
+    collapsed in turn.
+
+    Args:
+        shared: The map.
+        row: Row to free.
+
+    Returns:
+        Whether lineages still differed.
+    """
+    tree, cells, pages = shared.tree, shared.cells, shared.pages
+    wheelbase, cell_cm, plain = shared.wheelbase_cm, shared.cell_cm, shared.counting
+    span, pose, points, state = tree.span, tree.pose, tree.points, cells.state
+    particles, nodes, mask = span.shape[1], tree.nodes[row], state.shape[0] - 1
+    reach, half = (1, 0.0) if plain else (2, 0.5)
+    forced, mean = True, np.zeros(3)
+    for node in range(nodes):
+        size = span[row, node, 1] - span[row, node, 0]
+        forced &= size < particles
+        mean += size / particles * pose[row, node]
+    if forced:
+        span[row, :nodes] = 0
+        tree.version[0] += 1
+    version = tree.version[0]
+    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    for i in range(tree.size[row]):
+        right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
+        for node in range(nodes):
+            c, s = cosines[node], sines[node]
+            cx = int(np.floor((pose[row, node, 0] + forward * c + right * s) / cell_cm - half))
+            cy = int(np.floor((pose[row, node, 1] + forward * s - right * c) / cell_cm - half))
+            for iy in range(cy, cy + reach):
+                for ix in range(cx, cx + reach):
+                    a, b = U(iy & mask), U(ix & mask)
+                    if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != version:
+                        prune(tree, cells, pages, a, b, shared.memory_frames)
+    if forced:
+        # No entry of single lineages is left; one node that everybody descends from takes their place.
+        pose[row, 0] = mean
+        span[row, 0, 1] = particles
+        tree.nodes[row] = 1
+        tree.version[0] += 1
+    else:
+        tree.nodes[row] = 0
+        tree.size[row] = 0
+    return forced
+
+
+#: Cells that the particles' views of one point may spread over to be looked up together. Chosen: 64 x 64
+#: cells, far more than particles spread over while they track.
+_BOX = 4096
+#: Particles with the same cell up to which each is looked up singly. Chosen: it only changes the time.
+_FEW = 4
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def score(shared, poses, points, frame):
+    """Score each particle's view of a frame against the map of its own lineage.
+
+    Args:
+        shared: The map.
+        poses: Predicted poses, frame map.
+        points: Edge points as in :class:`AncestryTree`.
+        frame: Number of the frame, one more than the newest in the tree.
+
+    Returns:
+        About the weighted number of matched points, one number per particle.
+
+    """
+    tree, cells, pages, cell_cm = shared.tree, shared.cells, shared.pages, shared.cell_cm
+    wheelbase, memory, particles = shared.wheelbase_cm, shared.memory_frames, len(poses)
+    state, root, mask = cells.state, cells.root, cells.state.shape[0] - 1
+    following, used = pages.following, pages.used
+    entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
+    span, window = tree.span, tree.span.shape[0]
+    fade_of = np.empty(window)
+    for row in range(window):
+        fade_of[row] = tree.fades[window + min(frame - tree.frame[row], window)]
+    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    values = np.empty((particles // _FEW + 1, particles + 1, 2))
+    asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
+    ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
+    seen_x, seen_y = np.empty(particles), np.empty(particles)
+    scores = np.zeros(particles)
+    for i in range(len(points)):
+        right, forward, weight = points[i, 0], points[i, 1] + wheelbase, points[i, 4]
+        for p in range(particles):
+            ix[p] = int(np.floor((poses[p, 0] + forward * cosines[p] + right * sines[p]) / cell_cm))
+            iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
+        low_x, low_y = ix.min(), iy.min()
+        wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
+        boxed, filled = wide * high <= _BOX, 0
+        if boxed:
+            asked[: wide * high] = 0
+            for p in range(particles):
+                asked[(iy[p] - low_y) * wide + ix[p] - low_x] += 1
+        for p in range(particles):
+            x, y = 0.0, 0.0
+            box = (iy[p] - low_y) * wide + ix[p] - low_x if boxed else 0
+            if boxed and asked[box] == 0:
+                # Looked up before for all particles.
+                x, y = values[rows[box], p, 0], values[rows[box], p, 1]
+            else:
+                a, b = U(iy[p] & mask), U(ix[p] & mask)
+                mine = state[a, b, OWNER_X] == ix[p] and state[a, b, OWNER_Y] == iy[p]
+                page = -1
+                if mine:
+                    if state[a, b, PAGE] >= 0 and state[a, b, PRUNED] != tree.version[0]:
+                        prune(tree, cells, pages, a, b, memory)
+                    if state[a, b, STAMP] >= 0:
+                        fade = np.exp((state[a, b, STAMP] - frame) / memory)
+                        x, y = fade * root[a, b, 0], fade * root[a, b, 1]
+                    page = state[a, b, PAGE]
+                if boxed and asked[box] > _FEW:
+                    held = values[filled]
+                    held[:, :] = 0.0
+                    while page >= 0:
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
+                            start, stop = U(span[row, place, 0]), U(span[row, place, 1])
+                            vx, vy = fade_of[row] * vector[e, 0], fade_of[row] * vector[e, 1]
+                            # Steps at both ends of the interval; the running sum makes them plateaus.
+                            held[start, 0] += vx
+                            held[start, 1] += vy
+                            held[stop, 0] -= vx
+                            held[stop, 1] -= vy
+                        page = following[page]
+                    for q in range(particles):
+                        x += held[q, 0]
+                        y += held[q, 1]
+                        held[q, 0], held[q, 1] = x, y
+                    rows[box], asked[box] = filled, 0
+                    filled += 1
+                    x, y = held[p, 0], held[p, 1]
+                else:
+                    while page >= 0:
+                        for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
+                            e = U(at)
+                            row, place = U(entered[e] >> PLACE_BITS), U(entered[e] & PLACE)
+                            if span[row, place, 0] <= p < span[row, place, 1]:
+                                x += fade_of[row] * vector[e, 0]
+                                y += fade_of[row] * vector[e, 1]
+                        page = following[page]
+            seen_x[p], seen_y[p] = x, y
+        if shared.counting:
+            for p in range(particles):
+                scores[p] += weight * (seen_x[p] >= _OCCUPIED)
+            continue
+        # A loop of its own, so that it is vectorised.
+        for p in range(particles):
+            x, y = seen_x[p], seen_y[p]
+            nx = points[i, 3] * cosines[p] + points[i, 2] * sines[p]
+            ny = points[i, 3] * sines[p] - points[i, 2] * cosines[p]
+            # Saturate: an edge that was seen often counts once.
+            scores[p] += weight * (nx * x + ny * y) / (1.0 + np.sqrt(x * x + y * y))
+    return scores

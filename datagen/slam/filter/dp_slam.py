@@ -9,15 +9,15 @@ Source:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
+from numba import njit
 from pydantic import Field
 
 from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
 from datagen.slam.filter.motion import FACTOR, MotionModel, widen_steps
-from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import Progress, Scan, Scans, condense
 from lanenet.config import Settings
 
@@ -244,3 +244,78 @@ def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> 
         if k > 0:
             weights = np.bincount(history[k].parents, weights, minlength=len(history[k - 1].states))
     return smoothed
+
+
+#: Factor between the temperatures that are tried, and how many: 1.4^20 = 840 flattens any scores of 80
+#: points.
+_COOLER, _TEMPERATURES = 1.4, 20
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def reweigh(weights, scores, effective_share):
+    """Turn match scores into weights, as sharply as the particles can bear.
+
+    Edge points of one line are not independent, and the plain likelihood would leave one particle. The scores
+    are tempered until the effective number of particles is at least ``effective_share`` of them.
+
+    Args:
+        weights: Weights before, one per particle.
+        scores: Log likelihoods.
+        effective_share: Least effective share of the particles, 0 to 1.
+
+    Returns:
+        Weights that add up to 1.
+    """
+    new = np.empty(len(weights))
+    highest, temperature = scores[0], 1.0
+    for p in range(len(weights)):
+        highest = max(highest, scores[p])
+    for _ in range(_TEMPERATURES):
+        total = 0.0
+        for p in range(len(weights)):
+            new[p] = weights[p] * np.exp((scores[p] - highest) / temperature)
+            total += new[p]
+        for p in range(len(weights)):
+            new[p] /= total
+        if effective_number(new) >= effective_share * len(new):
+            break
+        temperature *= _COOLER
+    return new
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def effective_number(weights):
+    """Return how many equally weighted particles would be as good: 1 / sum of squares."""
+    total = 0.0
+    for p in range(len(weights)):
+        total += weights[p] * weights[p]
+    return 1.0 / total
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def systematic_resample(weights, uniform):
+    """Draw as many particles as there are, each N times its weight on average, with one random number.
+
+    Args:
+        weights: Weights that add up to 1.
+        uniform: The random number, in [0, 1).
+
+    Returns:
+        Indices in ascending order. The ancestry relies on it: descendants of a particle stay neighbours.
+
+    Source:
+        Kitagawa 1996; copies of each particle differ from N * weight by less than one.
+    """
+    n = len(weights)
+    chosen = np.empty(n, np.int64)
+    at, cumulative = 0, weights[0]
+    for k in range(n):
+        position = (k + uniform) / n
+        while at < n - 1 and cumulative <= position:
+            at += 1
+            cumulative += weights[at]
+        chosen[k] = at
+    return chosen

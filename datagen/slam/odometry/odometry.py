@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float16, Float32
 
-from datagen.slam.odometry.far_view import SeenTurns, seen_turns
 from datagen.slam.odometry.image_pairs import ImagePairs, turns_up_to
-from datagen.slam.odometry.motion_grid import MotionGrid, follow_motion
+from datagen.slam.odometry.motion_grid import MotionGrid, SeenTurns, follow_motion, seen_turns
 from datagen.slam.odometry.scans import Progress
 
 #: Steps that are tried where no speed was recorded, in camera heights per frame: from a crawl up to a fast
@@ -197,7 +196,7 @@ class Evidence:
             images: The drive.
             typical: What its commands mean in centimetres.
             progress: Called with (done, total).
-            far_rad: Turn of each frame as the distance shows it (:mod:`datagen.slam.odometry.far_view`).
+            far_rad: Turn of each frame as the distance shows it (:mod:`datagen.slam.odometry.motion_grid`).
         """
         s, n = images.settings, len(images)
         self.settings, self.height_cm, self.relative = s, images.height_cm, typical.relative

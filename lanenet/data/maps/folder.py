@@ -82,7 +82,7 @@ class DriveMap:
         tilt_rad: Pitch and roll of each frame, added to the camera's mounting.
         held_out: Frames whose edge points were not used for the lines.
         contradicted: Whether the images around a frame contradict its left, its right line, see
-            :mod:`datagen.quality.agreement`.
+            :mod:`datagen.quality.residuals`.
     """
 
     meta: MapMeta

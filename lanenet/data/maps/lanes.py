@@ -12,7 +12,7 @@ from lanenet.data.segments import equal_runs, true_runs
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES
 
 #: How far the car enters another lane at least, in lane widths; less is a swerve. Chosen: half of the 0.4 by
-#: which a car may be off the centre of its own lane (datagen/lanes/width.py).
+#: which a car may be off the centre of its own lane (datagen/lanes/markings.py).
 _ENTERED = 0.2
 #: How far beyond a line a car that means to stay in its lane may get, in lane widths. Chosen: the whole car
 #: is beyond the line then, since a 1:10 car is about half as wide as its lane.

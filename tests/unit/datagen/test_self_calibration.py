@@ -15,8 +15,7 @@ from datagen.lanes.scale import fitted_width_cm, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult, BundleSettings
-from datagen.slam.camera.changes import nudged
-from datagen.slam.camera.coarse import guessed_camera
+from datagen.slam.camera.coarse import guessed_camera, nudged
 from datagen.slam.camera.self_calibration import (
     SIGMA_FACTOR,
     FoundCamera,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datagen.lanes.support import unpainted_share
+from datagen.lanes.offset import unpainted_share
 
 CELL_CM, REACH_CM = 1.5, 60.0
 

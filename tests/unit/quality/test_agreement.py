@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.quality.agreement import contradicted_lines
+from datagen.quality.residuals import contradicted_lines
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.data.maps.line import LaneLine, Side

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from datagen.slam.filter.dp_slam import FilterSettings
+from datagen.slam.filter.dp_slam import FilterSettings, effective_number, reweigh, systematic_resample
 from datagen.slam.filter.motion import MotionModel, widen_steps
-from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import Scans, condense
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 

@@ -10,9 +10,8 @@ from reference_filter import reference_filter
 from tape_road import HEIGHT_CM, STEP_CM, WHEELBASE_CM, tape_road
 
 from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
-from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter
+from datagen.slam.filter.dp_slam import FilterSettings, ParticleFilter, systematic_resample
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.filter.resampling import systematic_resample
 from datagen.slam.odometry.scans import Scan
 
 CELL_CM = 0.8

@@ -7,9 +7,17 @@ import pytest
 from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixels
 from tape_road import tape_road
 
-from datagen.slam.adjustment import problem as bundle_problem
-from datagen.slam.adjustment.adjust import BundleEstimate, BundleSettings, Observations, adjust
-from datagen.slam.adjustment.problem import BundleProblem, frame_priors, inner_pixels, point_trust
+from datagen.slam.adjustment import adjust as bundle_adjust
+from datagen.slam.adjustment.adjust import (
+    BundleEstimate,
+    BundleProblem,
+    BundleSettings,
+    Observations,
+    adjust,
+    frame_priors,
+    inner_pixels,
+    point_trust,
+)
 from datagen.slam.adjustment.state import BundleState
 from lanenet.geometry.poses import path_lengths
 
@@ -115,7 +123,7 @@ def test_noise_that_stays_in_the_picture_does_not_hold_the_car_back(monkeypatch,
 
     trusting_some = error()
     assert trusting_some < 3e-3
-    monkeypatch.setattr(bundle_problem, "point_trust", lambda in_view, matched: np.ones(len(in_view)))
+    monkeypatch.setattr(bundle_adjust, "point_trust", lambda in_view, matched: np.ones(len(in_view)))
     assert error() > 1.5 * trusting_some
 
 

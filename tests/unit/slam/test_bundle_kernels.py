@@ -9,9 +9,8 @@ import pytest
 from pixel_road import HEIGHT, WIDTH, fisheye, pinhole, pixels
 from tape_road import HEIGHT_CM, tape_road
 
-from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleProblem, BundleSettings
 from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_jacobian, set_view
-from datagen.slam.adjustment.problem import BundleProblem
 from datagen.slam.adjustment.state import BundleEstimate, BundleState, Observations
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgePixels

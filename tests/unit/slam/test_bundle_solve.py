@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datagen.slam.adjustment.adjust import Equations, sum_blocks
 from datagen.slam.adjustment.kernels import N_FRAME
-from datagen.slam.adjustment.problem import Equations, sum_blocks
 
 FRAMES = 9
 

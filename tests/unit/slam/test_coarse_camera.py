@@ -9,8 +9,14 @@ import pytest
 from picture_road import loop_drive
 from pixel_road import fisheye
 
-from datagen.slam.camera.changes import looking_alike, with_known_scale
-from datagen.slam.camera.coarse import NOMINAL_HEIGHT_CM, clearest_step, coarse_camera, guessed_camera
+from datagen.slam.camera.coarse import (
+    NOMINAL_HEIGHT_CM,
+    clearest_step,
+    coarse_camera,
+    guessed_camera,
+    looking_alike,
+    with_known_scale,
+)
 from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
 from datagen.slam.odometry.odometry import STEPS_HEIGHTS, best_step
 from datagen.slam.odometry.scans import seen_edges

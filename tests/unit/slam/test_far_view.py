@@ -10,7 +10,7 @@ import pytest
 from picture_road import made_up_drive
 from pixel_road import fisheye
 
-from datagen.slam.odometry.far_view import far_turns, seen_turns
+from datagen.slam.odometry.motion_grid import far_turns, seen_turns
 from lanenet.geometry.camera import Camera
 
 

@@ -16,11 +16,13 @@ from datagen.slam.filter.dp_slam import (
     ParticleFilter,
     Survivors,
     Trajectory,
+    effective_number,
+    reweigh,
     run_filter,
     smooth_lineages,
+    systematic_resample,
 )
 from datagen.slam.filter.motion import MotionModel
-from datagen.slam.filter.resampling import effective_number, reweigh, systematic_resample
 from datagen.slam.odometry.scans import thin_scan
 
 SETTINGS = FilterSettings(particles=250)

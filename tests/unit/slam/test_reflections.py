@@ -8,7 +8,7 @@ import tape_road as tape_road_module
 from pixel_road import fisheye, pixels
 from tape_road import HEIGHT_CM, STEP_CM, tape_road
 
-from datagen.slam.odometry.reflections import without_reflections
+from datagen.slam.odometry.stillness import without_reflections
 from lanenet.perception.edges.canny import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
