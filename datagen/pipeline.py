@@ -23,7 +23,7 @@ from datagen.slam.segment import SegmentSolver
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_folder, check_replaceable, clear_unfinished, write_text
 from lanenet.data.maps.folder import SETTINGS_NAME, kept_map, write_map
-from lanenet.data.trajectory import write_tum
+from lanenet.data.tables import write_tum
 from lanenet.errors import CalibrationError, TrackingLostError
 
 __all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive"]

@@ -20,7 +20,7 @@ from datagen.quality.pictures import draw_metre, write_png
 from datagen.settings import MapSettings
 from datagen.slam.commands import SteeringFit
 from lanenet.data.files import atomic_file, check_destination
-from lanenet.data.trajectory import TUM_HEADER, tum_lines
+from lanenet.data.tables import TUM_HEADER, tum_lines
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car

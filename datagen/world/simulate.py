@@ -24,7 +24,7 @@ from datagen.world.render.sensor import as_jpeg
 from datagen.world.road.track import write_track
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import dump_settings
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.files import write_text
 from lanenet.errors import LanenetError
 from lanenet.geometry.frames import map_from_car

@@ -1,6 +1,6 @@
 """The command ``lanenet``: puts the verbs together, and turns errors of the input into one line.
 
-Each verb is a module with a Typer ``app``, listed in ``_VERBS`` in the order of the help. Verbs import
+A module of verbs has a Typer ``app`` and stands in ``_VERBS`` in the order of the help. Verbs import
 ``datagen`` and ``lanenet.learn`` inside their functions, since the car has neither torch nor numba.
 """
 
@@ -14,12 +14,12 @@ from typer.core import TyperGroup
 
 from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive
-from lanenet.cli.research import judge, localise, reality, sheets, simulate, track
+from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.errors import LanenetError
 
 _VERBS = (
     *(simulate, map, label, train, sweep, calibrate, detect, bench, analyse, doctor, drive, export),
-    *(localise, val, track, sheets, judge, reality),
+    *(localise, val, worlds, judge, reality),
 )
 #: The extra that brings a package, for the message when the package is missing.
 _EXTRA_OF = {

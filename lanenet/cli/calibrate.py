@@ -11,8 +11,13 @@ import numpy as np
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import DriveArgument, MappingOption, WheelbaseOption
-from lanenet.cli.shared.outputs import check_ending, check_not_source
+from lanenet.cli.shared.options import (
+    DriveArgument,
+    MappingOption,
+    WheelbaseOption,
+    check_ending,
+    check_not_source,
+)
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
 
@@ -337,7 +342,7 @@ def _drive_pictures(out: Path, result: CalibratedDrive) -> list[Path]:
 
 def _write_picture(out: Path, what: str, picture: np.ndarray) -> Path:
     from lanenet.data.files import write_bytes
-    from lanenet.data.parquet import png_bytes
+    from lanenet.data.tables import png_bytes
 
     path = out.with_name(f"{out.stem}-{what}.png")
     write_bytes(path, png_bytes(picture))

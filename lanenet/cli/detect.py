@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, ModelOption
-from lanenet.cli.shared.outputs import check_ending, check_not_source
+from lanenet.cli.shared.options import (
+    AnyCameraOption,
+    MarkingOption,
+    ModelOption,
+    check_ending,
+    check_not_source,
+)
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed, refuse_mask

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.outputs import check_ending
+from lanenet.cli.shared.options import check_ending
 from lanenet.errors import ConfigError
 
 app = typer.Typer()

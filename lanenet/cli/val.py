@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption, MarkingOption
-from lanenet.cli.shared.outputs import check_not_source
+from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source
 from lanenet.errors import ConfigError
 from lanenet.evaluation.report import default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from lanenet.data.files import check_destination, require
-from lanenet.data.parquet import float_array, write_parquet
-from lanenet.data.tables import write_csv
+from lanenet.data.tables import float_array, write_csv, write_parquet
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 from lanenet.perception.estimate import LaneEstimate

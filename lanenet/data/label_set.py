@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lanenet.config import Settings, check_settings
 from lanenet.data.files import require
-from lanenet.data.parquet import ParquetTable, float_array, list_array, png_bytes, png_size, write_parquet
+from lanenet.data.tables import ParquetTable, float_array, list_array, png_bytes, png_size, write_parquet
 from lanenet.errors import ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lanenet.data.label_set import LabelSet
-from lanenet.data.maps.labelled_frames import LabelledFrames
+from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.evaluation.run import run_detectors
 from lanenet.geometry.birdseye import BirdseyeWindow

@@ -15,7 +15,7 @@ from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.perception.estimate import Detector, LaneEstimate
 
 if TYPE_CHECKING:
-    from lanenet.data.maps.labelled_frames import LabelledFrames
+    from lanenet.data.maps.mapped_drive import LabelledFrames
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from lanenet.perception.network.model_file import without_model
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
-    from lanenet.data.maps.labelled_frames import LabelledFrames
+    from lanenet.data.maps.mapped_drive import LabelledFrames
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.edges.road import PerceptionSettings
 
@@ -42,7 +42,7 @@ class Opened:
     @property
     def frames(self) -> LabelledFrames | None:
         """The frames, if the source has any."""
-        from lanenet.data.maps.labelled_frames import LabelledFrames
+        from lanenet.data.maps.mapped_drive import LabelledFrames
 
         return self.content if isinstance(self.content, LabelledFrames) else None
 
@@ -114,10 +114,10 @@ def _check_folder(path: Path) -> None:
 def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
     """Open a map folder or a simulated drive."""
     if (path / "map.yaml").is_file():
-        from lanenet.data.maps.labelled_frames import read_map_frames
+        from lanenet.data.maps.mapped_drive import read_map_frames
 
         return read_map_frames(path, window)
-    from lanenet.data.maps.labelled_frames import read_truth_frames
+    from lanenet.data.maps.mapped_drive import read_truth_frames
 
     return read_truth_frames(path, window)
 

@@ -22,9 +22,8 @@ from lanenet.onboard.actuators import ActuatorSettings, make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
-from lanenet.onboard.drive_report import Step
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
-from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.estimate import Detector, DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector

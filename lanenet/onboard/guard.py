@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from lanenet.errors import HardwareError
-from lanenet.onboard.actuators.actuator import Actuator
+from lanenet.onboard.devices import Actuator
 
 log = logging.getLogger(__name__)
 

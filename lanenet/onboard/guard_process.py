@@ -27,7 +27,7 @@ from pydantic import TypeAdapter
 
 from lanenet.errors import LanenetError
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator
-from lanenet.onboard.actuators.actuator import Actuator
+from lanenet.onboard.devices import Actuator
 from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT
 
 log = logging.getLogger("lanenet.onboard.guard")

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
-from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.devices import Frame
 
 #: A frame time further ahead than this comes from another clock; chosen: more than rounding, less than two
 #: frames.

@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 
 from lanenet.onboard.drive import DriveSettings, build_loop
-from lanenet.onboard.drive_report import LatencyHistogram, Step
+from lanenet.onboard.loop import LatencyHistogram, Step
 
 RATE_HZ = 30.0
 

@@ -30,7 +30,7 @@ from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.maps.folder import read_map
-from lanenet.data.maps.labelled_frames import read_map_frames
+from lanenet.data.maps.mapped_drive import read_map_frames
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from lanenet.cli.app import app
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.geometry.camera import Camera, Mounting
 
 

@@ -11,9 +11,8 @@ from bad_input import Bad, each
 from drives import edit, frame_image, record, write_drive, write_tub, write_video
 
 from lanenet.data.drives import open_drive, read_truth
-from lanenet.data.drives.folder import TRUTH_NAMES
+from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
 from lanenet.data.drives.sources import open_source
-from lanenet.data.drives.writer import DriveWriter
 from lanenet.errors import CalibrationError, DriveFormatError
 
 Open = Callable[[Path], Any]

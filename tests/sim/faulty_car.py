@@ -23,7 +23,7 @@ from lanenet.control.controller import ControlSettings, LaneController, Target
 from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
-from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.devices import Frame
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
 from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.edges import road as birdseye

@@ -13,9 +13,8 @@ from datagen.pipeline import MapRequest, MapSettings, map_drive
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
-from lanenet.data.drives.writer import DriveWriter
-from lanenet.data.maps.labelled_frames import read_map_frames
-from lanenet.data.maps.mapped_drive import open_mapped_drive
+from lanenet.data.drives.folder import DriveWriter
+from lanenet.data.maps.mapped_drive import open_mapped_drive, read_map_frames
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.onboard.actuators.serial_board import REPORT_S, VERSION, LineReader, encode
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 

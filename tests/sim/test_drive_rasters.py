@@ -14,7 +14,7 @@ from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.data.drives import open_drive
 from lanenet.data.label_set import read_labels, write_labels
-from lanenet.data.parquet import ParquetTable
+from lanenet.data.tables import ParquetTable
 from lanenet.onboard.cameras.replay import ReplaySettings, ReplaySource
 from lanenet.onboard.guard import NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode

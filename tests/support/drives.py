@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.geometry.camera import Camera, Mounting
 
 #: Frames of a video.

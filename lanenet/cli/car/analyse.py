@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.outputs import check_ending
+from lanenet.cli.shared.options import check_ending
 
 app = typer.Typer()
 
@@ -21,7 +21,7 @@ def analyse(
     """Show how accurately a camera sees the road: cm per pixel and the worst steering error."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.files import write_bytes
-    from lanenet.data.parquet import png_bytes
+    from lanenet.data.tables import png_bytes
     from lanenet.perception.error_analysis import analyse_errors, draw_analysis, figures
 
     if out is not None:

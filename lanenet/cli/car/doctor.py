@@ -65,8 +65,7 @@ def doctor(
 def _try_wheels(config: Path, settings: DriveSettings) -> None:
     """Ask about the wheels on the terminal, and write the result into the car's file."""
     from lanenet.data.files import write_text
-    from lanenet.onboard.doctor.wheel_trial import pulses_of, try_wheels
-    from lanenet.onboard.doctor.yaml_edit import set_values
+    from lanenet.onboard.doctor.wheel_trial import pulses_of, set_values, try_wheels
     from lanenet.onboard.drive import build_sink
 
     def ask(question: str, letters: str) -> str:

@@ -31,7 +31,7 @@ def drive(
 ) -> None:
     """Drive the car by what its camera sees; without --arm the motor stays in neutral."""
     from lanenet.onboard.drive import build_loop, load_drive_settings
-    from lanenet.onboard.drive_report import Step
+    from lanenet.onboard.loop import Step
 
     settings = load_drive_settings(config, overrides)
     with console.live_line() as show:

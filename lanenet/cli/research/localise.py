@@ -12,13 +12,13 @@ import numpy as np
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.outputs import check_ending, check_not_source
+from lanenet.cli.shared.options import check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError, HardwareError
 
 if TYPE_CHECKING:
     from datagen.localise.live_filter import LiveFrame
     from datagen.localise.localise import LiveReport
-    from lanenet.onboard.cameras.source import FrameSource
+    from lanenet.onboard.devices import FrameSource
 
 app = typer.Typer()
 log = logging.getLogger(__name__)
@@ -184,7 +184,7 @@ class CameraFrames:
     def _frames(self) -> Iterator[LiveFrame]:
         from datagen.localise.live_filter import LiveFrame
         from lanenet.data.drives.recording import Commands
-        from lanenet.onboard.cameras.source import SourceEnded
+        from lanenet.onboard.devices import SourceEnded
 
         commands = Commands(speed_cm_s=np.array([self._speed_cm_s]))
         taken, number, t_s = 0, -1, -math.inf

@@ -59,7 +59,7 @@ def reality(
     from datagen.reality.report import compare, summary, table, write_report
     from lanenet.data.drives import open_drive
     from lanenet.data.files import write_bytes
-    from lanenet.data.parquet import png_bytes
+    from lanenet.data.tables import png_bytes
 
     settings, given = _synthetic(synthetic or [], {"count": count, "frames": frames, "seed": seed})
     opened = [open_drive(path) for path in drives]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lanenet.cli.research.entrants import pilot_builder
+from lanenet.cli.research.judge import pilot_builder
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import ConfigArgument, ModelOption, OverridesArgument
 from lanenet.config import load_settings

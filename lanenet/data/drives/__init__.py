@@ -9,8 +9,7 @@ from pathlib import Path
 
 from lanenet.data.drives import folder, tub, video
 from lanenet.data.drives.folder import read_truth
-from lanenet.data.drives.reading import DriveFormat, assemble_drive
-from lanenet.data.drives.recording import Commands, Drive
+from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
 from lanenet.errors import DriveFormatError
 
 __all__ = ["FORMATS", "Commands", "Drive", "find_format", "formats_text", "open_drive", "read_truth"]

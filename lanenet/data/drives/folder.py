@@ -1,14 +1,33 @@
-"""The project's own drive format: a folder with ``frames.csv``, images, drive.yaml and perhaps truth.csv."""
+"""The project's own drive format, read and written: ``frames.csv``, images, drive.yaml, perhaps truth.csv."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from lanenet.data.drives.reading import DRIVE_FILE, DriveFormat, RecordedFrames, read_times
-from lanenet.data.drives.recording import ImageFiles
-from lanenet.data.tables import ColumnSpec, is_torn, read_csv
+from lanenet.config import check_settings
+from lanenet.data.camera_file import write_camera
+from lanenet.data.drives.recording import (
+    COMMAND_NAMES,
+    DRIVE_FILE,
+    DRIVE_FORMAT,
+    DriveFile,
+    DriveFormat,
+    ImageFiles,
+    RecordedFrames,
+    read_times,
+    write_drive_file,
+)
+from lanenet.data.files import atomic_folder
+from lanenet.data.tables import ColumnSpec, is_torn, read_csv, write_csv
+from lanenet.errors import DriveFormatError
+from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES
 
 FRAMES_FILE = "frames.csv"
@@ -68,3 +87,170 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
     specs = {"frame": ColumnSpec("int", low=0.0, increasing=True)}
     specs |= {name: ColumnSpec(allow_empty=name in POINT_NAMES) for name in TRUTH_NAMES}
     return read_csv(file, specs)
+
+
+class DriveWriter:
+    """Writes a drive; the folder appears when the ``with`` block ends without an error, else not at all.
+
+    To keep what was written before an error, catch the error inside the block.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera | None = None,
+        lane_width_cm: float | None = None,
+        notes: str = "",
+        jpeg_quality: int = 92,
+        max_steering_rad: float | None = None,
+        camera_method: str = "",
+    ) -> None:
+        """Prepare a drive; nothing is written yet.
+
+        Args:
+            path: Folder to write; an earlier drive there is replaced at the end.
+            camera: Stored beside the images as ``camera.yaml``.
+            lane_width_cm: Distance between the middles of the driven lane's lines.
+            notes: Free text.
+            jpeg_quality: 1 to 100.
+            max_steering_rad: Steering angle at Donkeycar's angle -1.
+            camera_method: How the camera was found, for its file.
+        """
+        self.path = Path(path)
+        self._camera = camera
+        self._camera_method = camera_method
+        self._jpeg_quality = jpeg_quality
+        data = {
+            "format": DRIVE_FORMAT,
+            "camera": None if camera is None else "camera.yaml",
+            "lane_width_cm": lane_width_cm,
+            "max_steering_rad": max_steering_rad,
+            "notes": notes,
+        }
+        self._file = check_settings(DriveFile, data, str(path))
+        self._stack = ExitStack()
+        self._folder: Path | None = None
+        self._rows: list[dict[str, float]] = []
+        self._truth: list[dict[str, float]] = []
+        self._size: tuple[int, int] | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Temporary folder of the drive until it is complete; further files may be written into it."""
+        if self._folder is None:
+            raise DriveFormatError(f"{self.path}: the drive is not open for writing (use a with block)")
+        return self._folder
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __enter__(self) -> DriveWriter:
+        self._folder = self._stack.enter_context(atomic_folder(self.path, "drive"))
+        (self._folder / "images").mkdir()
+        return self
+
+    def add(
+        self,
+        frame_bgr: UInt8[np.ndarray, "h w 3"],
+        t_s: float,
+        truth: Mapping[str, float] | None = None,
+        **commands: float,
+    ) -> None:
+        """Append a frame.
+
+        Args:
+            frame_bgr: The image; all have the same size.
+            t_s: Its time, later than the one before.
+            truth: Rear-axle pose in the map and the six labels (:data:`TRUTH_NAMES`; labels may be NaN), for
+                every frame or for none.
+            **commands: Commanded values by the names of :class:`.recording.Commands`; the same names for
+                every frame.
+
+        Raises:
+            DriveFormatError: If a value is missing, unknown or not finite, time does not increase, or the
+                image has another size; names the frame.
+        """
+        number = len(self._rows)
+        where = f"{self.path}: frame {number}"
+        unknown = [name for name in commands if name not in COMMAND_NAMES]
+        if unknown:
+            raise DriveFormatError(
+                f"{where}: unknown command {unknown[0]!r}, known: {', '.join(COMMAND_NAMES)}"
+            )
+        row = {"t_s": float(t_s), **{name: float(value) for name, value in commands.items()}}
+        size = (frame_bgr.shape[1], frame_bgr.shape[0])
+        if self._rows:
+            _check_like_first(where, row, self._rows[0], "commands")
+            if size != self._size:
+                raise DriveFormatError(f"{where}: image of {size[0]}x{size[1]} px, expected {self._size}")
+            if not row["t_s"] > self._rows[-1]["t_s"]:
+                raise DriveFormatError(
+                    f"{where}: t_s {t_s:g} after {self._rows[-1]['t_s']:g} has to increase"
+                )
+            if (truth is None) != (not self._truth):
+                raise DriveFormatError(f"{where}: truth has to be given for every frame or for none")
+        elif self._camera is not None and size != (self._camera.width, self._camera.height):
+            raise DriveFormatError(
+                f"{where}: image of {size[0]}x{size[1]} px, but the camera has "
+                f"{self._camera.width}x{self._camera.height}"
+            )
+        _check_finite(where, row)
+        if truth is not None:
+            known = {name: float(value) for name, value in truth.items()}
+            _check_like_first(where, known, dict.fromkeys(TRUTH_NAMES, 0.0), "truth")
+            _check_finite(where, {name: v for name, v in known.items() if name not in POINT_NAMES or v == v})
+            self._truth.append(known)
+        ok, data = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])
+        if not ok:
+            raise DriveFormatError(f"{where}: the image cannot be encoded as JPEG")
+        (self.folder / image_name(number)).write_bytes(data.tobytes())
+        self._size = size
+        self._rows.append(row)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            try:
+                self._finish()
+            except BaseException as problem:
+                self._stack.__exit__(type(problem), problem, problem.__traceback__)
+                raise
+        self._stack.__exit__(kind, error, trace)
+        self._folder = None
+
+    def _finish(self) -> None:
+        if not self._rows:
+            raise DriveFormatError(f"{self.path}: no frame was added, nothing is written")
+        frame = np.arange(len(self._rows))
+        names = {"frame": frame, "file": [image_name(int(k)) for k in frame]}
+        numbers = {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
+        write_csv(self.folder / FRAMES_FILE, {**names, **numbers})
+        if self._truth:
+            truth = {name: np.array([row[name] for row in self._truth]) for name in TRUTH_NAMES}
+            write_csv(self.folder / TRUTH_FILE, {"frame": frame, **truth}, allow_empty=POINT_NAMES)
+        if self._camera is not None:
+            write_camera(self.folder / "camera.yaml", self._camera, self._camera_method)
+        write_drive_file(self.folder, self._file)
+
+
+def image_name(number: int) -> str:
+    """Return the name of a frame's image, relative to the drive's folder."""
+    return f"images/{number:06d}.jpg"
+
+
+def _check_like_first(where: str, row: dict[str, float], first: dict[str, float], what: str) -> None:
+    if row.keys() != first.keys():
+        different = sorted(row.keys() ^ first.keys())
+        raise DriveFormatError(
+            f"{where}: {what}: {', '.join(different)} given for some frames only, or unknown"
+        )
+
+
+def _check_finite(where: str, row: dict[str, float]) -> None:
+    for name, value in row.items():
+        if not np.isfinite(value):
+            raise DriveFormatError(f"{where}: {name} is {value}")

@@ -29,9 +29,8 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.folder import FRAMES_FILE
-from lanenet.data.drives.reading import DRIVE_FORMAT, DriveFile, write_drive_file
-from lanenet.data.drives.writer import image_name
+from lanenet.data.drives.folder import FRAMES_FILE, image_name
+from lanenet.data.drives.recording import DRIVE_FORMAT, DriveFile, write_drive_file
 from lanenet.data.files import sync_path, write_text
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.geometry.camera import Camera

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.drives.reading import DRIVE_FILE, DriveFormat, RecordedFrames
-from lanenet.data.drives.recording import Commands, ImageFiles
+from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, ImageFiles, RecordedFrames
 from lanenet.errors import DriveFormatError
 
 MANIFEST_FILE = "manifest.json"

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.drives.reading import DriveFormat, RecordedFrames, read_times
-from lanenet.data.drives.recording import Commands
+from lanenet.data.drives.recording import Commands, DriveFormat, RecordedFrames, read_times
 from lanenet.errors import DriveFormatError
 
 VIDEO_ENDINGS: tuple[str, ...] = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")

@@ -15,11 +15,9 @@ from jaxtyping import Bool, Float, Int
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.files import write_json, write_text
-from lanenet.data.maps.lanes import FrameLanes, assign_lanes
+from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
 from lanenet.data.maps.line import LaneLine
-from lanenet.data.parquet import write_columns
-from lanenet.data.tables import ColumnSpec, read_csv, write_csv
-from lanenet.data.trajectory import write_tum
+from lanenet.data.tables import ColumnSpec, read_csv, write_columns, write_csv, write_tum
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES

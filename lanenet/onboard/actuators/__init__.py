@@ -6,11 +6,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685, PCA9685Settings
 from lanenet.onboard.actuators.recorder import Recorder, RecorderSettings
 from lanenet.onboard.actuators.serial_board import SerialBoard, SerialBoardSettings
+from lanenet.onboard.devices import Actuator
 
 __all__ = ["ActuatorSettings", "make_actuator"]
 

@@ -129,7 +129,7 @@ class PCA9685:
             )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.devices.Actuator`.
 
         Raises:
             HardwareError: If it is not open, a value is not finite, or the chip did not answer or has

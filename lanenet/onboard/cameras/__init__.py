@@ -10,8 +10,8 @@ from lanenet.onboard.cameras.live import LiveSource
 from lanenet.onboard.cameras.picamera import PiCamera, PiCameraSettings
 from lanenet.onboard.cameras.replay import ReplaySettings, ReplaySource
 from lanenet.onboard.cameras.rpicam import Rpicam, RpicamSettings
-from lanenet.onboard.cameras.source import FrameSource
 from lanenet.onboard.cameras.v4l2 import V4L2Camera, V4L2Settings
+from lanenet.onboard.devices import FrameSource
 
 __all__ = ["SourceSettings", "open_source"]
 

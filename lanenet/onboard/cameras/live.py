@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.errors import HardwareError
-from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.devices import Frame
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class LiveSource:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Start the camera and wait for its first frame; see :class:`.source.FrameSource`.
+        """Start the camera and wait for its first frame; see :class:`lanenet.onboard.devices.FrameSource`.
 
         Raises:
             HardwareError: If the camera is not there, sends nothing, or sends images of another size.

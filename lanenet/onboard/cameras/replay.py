@@ -14,7 +14,7 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import DriveFormatError, HardwareError
-from lanenet.onboard.cameras.source import Frame, SourceEnded
+from lanenet.onboard.devices import Frame, SourceEnded
 
 #: Of a drive with a single frame: Donkeycar's 20 frames/s.
 _DEFAULT_STEP_S = 0.05

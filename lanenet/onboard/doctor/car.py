@@ -16,7 +16,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
-from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
+from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
 from lanenet.onboard.drive import DriveSettings, build_drive_detector
 

@@ -18,7 +18,7 @@ from lanenet.cli import app as cli
 from lanenet.config import read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError
 from lanenet.onboard.bench import example_camera, example_frames
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from lanenet.cli.app import app
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.onboard.drive import build_loop, load_drive_settings

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 
 from lanenet.cli import app as cli
 from lanenet.data.camera_file import read_camera, write_camera
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.errors import LanenetError
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_frames

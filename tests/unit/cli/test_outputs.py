@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
-from lanenet.cli.shared.outputs import check_ending, check_not_source
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.cli.shared.options import check_ending, check_not_source
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import ConfigError
 
 

@@ -8,8 +8,7 @@ import pytest
 from drives import CAMERA, edit, frame_image, write_drive
 
 from lanenet.data.drives import Drive, open_drive, read_truth
-from lanenet.data.drives.folder import TRUTH_NAMES
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
 from lanenet.geometry.lane import POINT_NAMES
 

@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lanenet.data.drives.folder import TRUTH_NAMES
-from lanenet.data.drives.writer import DriveWriter
-from lanenet.data.maps.labelled_frames import read_truth_frames
+from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
+from lanenet.data.maps.mapped_drive import read_truth_frames
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting

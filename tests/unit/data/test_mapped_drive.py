@@ -13,10 +13,9 @@ import pytest
 from datagen.labels.label_map import label_map
 from datagen.settings import MapSettings
 from lanenet.config import dump_settings
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, read_map, write_map
-from lanenet.data.maps.labelled_frames import read_map_frames
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.data.maps.mapped_drive import (
     AWAY,
@@ -29,6 +28,7 @@ from lanenet.data.maps.mapped_drive import (
     labelled_points,
     open_mapped_drive,
     points_in_window,
+    read_map_frames,
 )
 from lanenet.errors import CalibrationError, DriveFormatError, MapFormatError
 from lanenet.evaluation.sources import open_tests

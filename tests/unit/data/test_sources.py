@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.drives.sources import open_source
-from lanenet.data.drives.writer import DriveWriter
 from lanenet.onboard.bench import example_camera
 
 

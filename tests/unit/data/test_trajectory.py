@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tum import read_tum
 
-from lanenet.data.trajectory import tum_from_poses, write_tum
+from lanenet.data.tables import tum_from_poses, write_tum
 from lanenet.errors import MapFormatError
 
 poses_lists = st.lists(

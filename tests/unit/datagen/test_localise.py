@@ -24,7 +24,7 @@ from lanenet.cli.research.localise import CameraFrames
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
-from lanenet.onboard.cameras.source import Frame, SourceEnded
+from lanenet.onboard.devices import Frame, SourceEnded
 
 SETTINGS = MapSettings(filter=FilterSettings(particles=60))
 KNOWN = StartSettings(factor=1.0)

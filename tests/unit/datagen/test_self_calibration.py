@@ -31,8 +31,8 @@ from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
 from lanenet.data.camera_file import write_camera
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
-from lanenet.data.drives.writer import DriveWriter
 from lanenet.data.maps.line import LaneLine
 from lanenet.errors import CalibrationError
 from lanenet.perception.edges.road import RoadEdges

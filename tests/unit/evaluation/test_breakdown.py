@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.parquet import png_size
+from lanenet.data.tables import png_size
 from lanenet.evaluation.breakdown import (
     RELIABILITY_SHARES,
     bootstrap_segments,

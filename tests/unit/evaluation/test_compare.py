@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.parquet import png_size
+from lanenet.data.tables import png_size
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.comparison import FORMAT, SourceAnswers, compare_detectors
 from lanenet.evaluation.pictures import error_picture

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lanenet.data.maps.labelled_frames import LabelledFrames
+from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import Compared, answer_frames, choose_names
 from lanenet.evaluation.breakdown import GROUPS

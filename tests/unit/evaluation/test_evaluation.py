@@ -7,7 +7,7 @@ from datagen.world.car.camera import CameraSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.files import json_text
-from lanenet.data.maps.labelled_frames import read_truth_frames
+from lanenet.data.maps.mapped_drive import read_truth_frames
 from lanenet.errors import DriveFormatError
 from lanenet.evaluation import answers
 from lanenet.evaluation import report as evaluation

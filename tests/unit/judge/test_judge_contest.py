@@ -21,7 +21,7 @@ from datagen.world.road.build import random_track
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli.app import app
-from lanenet.cli.research.entrants import NamedDetector
+from lanenet.cli.research.judge import NamedDetector
 from lanenet.errors import ConfigError, LanenetError
 
 # Short open roads: a run is a few dozen frames.

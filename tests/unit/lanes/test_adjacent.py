@@ -11,8 +11,7 @@ from lane_edges import FRAME_CM, joined, paint, ring_path, speckle
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.trace import TraceSettings, trace_adjacent, trace_lane
-from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame
-from lanenet.data.maps.lanes import FrameLanes, assign_lanes
+from lanenet.data.maps.frame_lines import FrameLanes, FrameLines, assign_lanes, lines_of_frame
 from lanenet.data.maps.line import LaneLine
 from lanenet.geometry.frames import car_from_map
 from lanenet.geometry.lane import ROWS_CM

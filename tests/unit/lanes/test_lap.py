@@ -13,7 +13,7 @@ from lane_edges import arc_path
 from datagen.lanes.offset import CubicBasis, adapted_breaks
 from datagen.lanes.path import edges_along_path, lap_path, positions_on_lap
 from datagen.slam.odometry.scans import pack_scans
-from lanenet.data.maps.lanes import assign_lanes
+from lanenet.data.maps.frame_lines import assign_lanes
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.geometry.frames import car_from_map
 from lanenet.perception.edges.road import RoadEdges

@@ -16,8 +16,8 @@ from lanenet.onboard.cameras import open_source
 from lanenet.onboard.cameras.live import CameraSettings, Capture, LiveSource
 from lanenet.onboard.cameras.picamera import PiCameraSettings
 from lanenet.onboard.cameras.rpicam import RpicamSettings
-from lanenet.onboard.cameras.source import FrameSource
 from lanenet.onboard.cameras.v4l2 import V4L2Settings
+from lanenet.onboard.devices import FrameSource
 
 SMALL = {"width": 64, "height": 48, "rate_hz": 100.0}
 

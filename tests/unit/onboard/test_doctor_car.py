@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from lanenet.cli.app import app
 from lanenet.config import check_settings
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import HardwareError
 from lanenet.onboard.bench import example_camera
-from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.devices import Frame
 from lanenet.onboard.doctor import car as doctor_car
 from lanenet.onboard.doctor import installation as doctor
 from lanenet.onboard.doctor.car import check_car, check_source, check_temperature, check_throttling

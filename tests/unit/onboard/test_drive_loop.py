@@ -10,9 +10,8 @@ import pytest
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
-from lanenet.onboard.cameras.source import Frame, FrameSource, SourceEnded
-from lanenet.onboard.drive_report import LatencyHistogram, Step
-from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, LatencyHistogram, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings, State
 from lanenet.perception.estimate import LaneEstimate
 

@@ -15,7 +15,7 @@ import yaml
 from board_process import BoardProcess, build_host_board
 
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.onboard.bench import example_frames
 
 ROOT = Path(__file__).resolve().parents[3]

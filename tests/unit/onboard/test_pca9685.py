@@ -9,8 +9,8 @@ import pytest
 
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.actuators import make_actuator
-from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
+from lanenet.onboard.devices import Actuator
 
 SETTINGS = PCA9685Settings(max_steering_rad=0.4)
 

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import HardwareError
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
-from lanenet.onboard.cameras.source import FrameSource, SourceEnded
+from lanenet.onboard.devices import FrameSource, SourceEnded
 
 STEP_S = 0.04
 

@@ -7,7 +7,7 @@ import pytest
 
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
-from lanenet.onboard.cameras.source import Frame
+from lanenet.onboard.devices import Frame
 from lanenet.onboard.safety import (
     CommandLimiter,
     FrameCheck,

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.actuators import make_actuator
-from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.serial_board import (
     MAX_LINE,
     Line,
@@ -26,6 +25,7 @@ from lanenet.onboard.actuators.serial_board import (
     decode,
     encode,
 )
+from lanenet.onboard.devices import Actuator
 
 CORE = Path("/usr/share/arduino/hardware/arduino/avr")
 PULSES = {

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from lanenet.errors import ConfigError
-from lanenet.onboard.doctor.yaml_edit import set_values
+from lanenet.onboard.doctor.wheel_trial import set_values
 
 CARS = Path(__file__).resolve().parents[3] / "configs" / "car"
 TEXT = """\

@@ -19,7 +19,7 @@ from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.perception.edges.canny import EdgeSettings
 

@@ -14,7 +14,7 @@ from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings
-from lanenet.data.drives.writer import DriveWriter
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.maps.folder import read_map
 
 

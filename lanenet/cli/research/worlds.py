@@ -1,4 +1,4 @@
-"""``lanenet track``: a road, checked and drawn from above."""
+"""``lanenet track`` and ``lanenet sheets``: synthetic roads and frames to look at."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.outputs import check_ending
+from lanenet.cli.shared.options import check_ending
 from lanenet.errors import ConfigError
 
 app = typer.Typer()
@@ -31,7 +31,7 @@ def track(
     from datagen.world.road.track_picture import draw_track, picture_scale
     from datagen.world.road.track_settings import load_track_settings, preset, preset_names
     from lanenet.data.files import write_bytes
-    from lanenet.data.parquet import png_bytes
+    from lanenet.data.tables import png_bytes
 
     check_ending(out, ".png")
     path = Path(road)
@@ -57,3 +57,32 @@ def track(
     console.next_command(
         "simulate", "CONFIG", f"track.{'file' if path.exists() else 'preset'}={road}", "--out", "DRIVE"
     )
+
+
+@app.command(epilog="Example: lanenet sheets bfmc light --out runs/sheets")
+def sheets(
+    out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).", show_default=False)],
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Presets and groups of effects; default all.")
+    ] = None,
+    max_kb: Annotated[
+        int | None, typer.Option(min=5, help="Shrink each picture to so many kB.", show_default=False)
+    ] = None,
+) -> None:
+    """Draw sheets of frames to look at: presets in random looks, and effects one by one."""
+    from datagen.world.sheets import draw_sheet, encode_sheet, sheet_names
+    from lanenet.data.files import write_bytes
+
+    chosen = sheet_names() if not names else list(dict.fromkeys(names))
+    for name in chosen:
+        if name not in sheet_names():
+            raise ConfigError(f"no sheet {name!r}, expected some of {', '.join(sheet_names())}")
+    paths = [out / f"{name}.jpg" for name in chosen]
+    with console.progress_bar("sheets") as progress:
+        for done, (name, path) in enumerate(zip(chosen, paths, strict=True)):
+            progress(done, len(chosen))
+            data = encode_sheet(draw_sheet(name), None if max_kb is None else 1000 * max_kb)
+            write_bytes(path, data)
+        progress(len(chosen), len(chosen))
+    console.wrote(*paths)
+    console.next_command("track", "PRESET", "--out", "PICTURE.png")
