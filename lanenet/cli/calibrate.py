@@ -33,15 +33,13 @@ app = typer.Typer(
     help="Find the camera: its lens, and where it sits on the car.",
 )
 
-_Board = Annotated[
-    str | None, typer.Option(help="Inner corners of the board, for example 9x6.", show_default=False)
-]
+_Board = Annotated[str | None, typer.Option(help="Inner corners of the board, for example 9x6.")]
 _Square = Annotated[float, typer.Option(min=0.01, help="Side of a square, cm.")]
 #: Left, near, right and far edge of the bird's-eye pictures, [cm]; chosen: two lanes wide, three car lengths.
 _AREA_CM = (-60.0, 0.0, 60.0, 120.0)
 #: Scale of bird's-eye pictures that stand side by side.
 _SMALL_PX_PER_CM = 4.0
-_Out = Annotated[Path, typer.Option(help="Camera file to write (.yaml).", show_default=False)]
+_Out = Annotated[Path, typer.Option(help="Camera file to write (.yaml).")]
 
 
 class LensModel(StrEnum):
@@ -54,10 +52,8 @@ class LensModel(StrEnum):
 
 @app.command(epilog="Example: lanenet calibrate chessboard photos/*.jpg --board 9x6 --out runs/camera.yaml")
 def chessboard(
-    images: Annotated[
-        list[str], typer.Argument(metavar="IMAGES", help="Photos, patterns or folders.", show_default=False)
-    ],
-    board: Annotated[str, typer.Option(help="Inner corners of the board, as 9x6.", show_default=False)],
+    images: Annotated[list[str], typer.Argument(metavar="IMAGES", help="Photos, patterns or folders.")],
+    board: Annotated[str, typer.Option(help="Inner corners of the board, as 9x6.")],
     out: _Out,
     square: _Square = 2.5,
     model: Annotated[
@@ -125,15 +121,11 @@ def chessboard(
     epilog="Example: lanenet calibrate ground points.csv --camera runs/camera.yaml --out runs/camera.yaml"
 )
 def ground(
-    camera: Annotated[
-        Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.", show_default=False)
-    ],
+    camera: Annotated[Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.")],
     out: _Out,
     points: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="POINTS.csv", help="Columns x_cm, y_cm (right, ahead), u_px, v_px.", show_default=False
-        ),
+        typer.Argument(metavar="POINTS.csv", help="Columns x_cm, y_cm (right, ahead), u_px, v_px."),
     ] = None,
     image: Annotated[
         Path | None, typer.Option(help="Photo of the ground, with the board if there is one.")
@@ -142,9 +134,7 @@ def ground(
     square: _Square = 2.5,
     near_left: Annotated[
         str | None,
-        typer.Option(
-            help="The board's inner corner nearest to the car and leftmost, as X,Y in cm.", show_default=False
-        ),
+        typer.Option(help="The board's inner corner nearest to the car and leftmost, as X,Y in cm."),
     ] = None,
     wheelbase: WheelbaseOption = None,
 ) -> None:
@@ -205,7 +195,7 @@ def drive_(
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help="Camera YAML to start from (--refine).", show_default=False),
+        typer.Option("--camera", help="Camera YAML to start from (--refine)."),
     ] = None,
     refine: Annotated[
         bool,

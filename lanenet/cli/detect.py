@@ -44,16 +44,14 @@ _WITH_MASK = listed(detector_names(lambda kind: kind.takes_mask))
 def detect(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="SOURCE", help="Photo, folder of photos, video, drive or tub.", show_default=False
-        ),
+        typer.Argument(metavar="SOURCE", help="Photo, folder of photos, video, drive or tub."),
     ],
-    detector: Annotated[DetectorName, typer.Option(help="Which detector.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).", show_default=False)],
+    detector: Annotated[DetectorName, typer.Option(help="Which detector.")],
+    out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).")],
     model: ModelOption = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help=f"Camera YAML; {_WITHOUT_CAMERA} need none.", show_default=False),
+        typer.Option("--camera", help=f"Camera YAML; {_WITHOUT_CAMERA} need none."),
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
@@ -73,7 +71,7 @@ def detect(
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(help=f"YAML with the settings of {_WITH_SETTINGS}.", show_default=False),
+        typer.Option(help=f"YAML with the settings of {_WITH_SETTINGS}."),
     ] = None,
     mask: Annotated[
         str | None,

@@ -16,9 +16,7 @@ app = typer.Typer()
 
 @app.command(epilog="Example: lanenet export checkpoints/small --out runs/small.onnx")
 def export(
-    checkpoint: Annotated[
-        Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.", show_default=False)
-    ],
+    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.")],
     out: Annotated[
         Path | None,
         typer.Option(help="Model to write; default CHECKPOINT/model.onnx, with --int8 model-int8.onnx."),

@@ -15,8 +15,8 @@ app = typer.Typer()
 
 @app.command(epilog="Example: lanenet label runs/tub --out runs/tub.parquet")
 def label(
-    map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Label set to write (.parquet).", show_default=False)],
+    map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.")],
+    out: Annotated[Path, typer.Option(help="Label set to write (.parquet).")],
     force: Annotated[bool, typer.Option("--force", help="Label a rejected map, too.")] = False,
     colour_weight: Annotated[
         float | None,

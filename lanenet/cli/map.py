@@ -20,9 +20,9 @@ def map_drive(
     drive: DriveArgument,
     lane_width: Annotated[
         float,
-        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm.", show_default=False),
+        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the map.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the map.")],
     camera: CameraOption = None,
     config: MappingOption = None,
     refine_camera: Annotated[

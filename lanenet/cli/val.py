@@ -30,7 +30,6 @@ def val(
         typer.Argument(
             metavar="[MODEL] SOURCE...",
             help="Model (.onnx) or checkpoint folder; simulated drives, maps, or label sets (.parquet).",
-            show_default=False,
         ),
     ],
     out: Annotated[
@@ -43,8 +42,7 @@ def val(
         str | None,
         typer.Option(
             help=f"Which to compare, as in network,painter; all: {', '.join(compared_names())}. "
-            "Default: all that the sources allow.",
-            show_default=False,
+            "Default: all that the sources allow."
         ),
     ] = None,
     no_baselines: Annotated[bool, typer.Option("--no-baselines", help="The network only.")] = False,
@@ -58,7 +56,7 @@ def val(
         list[Path] | None,
         typer.Option(
             help="Label set that MODEL has learned from; may be given again. Errors on the same map are also "
-            "shown by the distance from it.",
+            "shown by the distance from it."
         ),
     ] = None,
     robust: Annotated[

@@ -15,7 +15,7 @@ app = typer.Typer()
 
 @app.command(epilog="Example: lanenet analyse runs/camera.yaml --out runs/density.png")
 def analyse(
-    camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.", show_default=False)],
+    camera: Annotated[Path, typer.Argument(metavar="CAMERA", help="Camera YAML.")],
     out: Annotated[Path | None, typer.Option(help="Picture of pixels per ground cell (.png).")] = None,
 ) -> None:
     """Show how accurately a camera sees the road: cm per pixel and the worst steering error."""

@@ -20,9 +20,7 @@ app = typer.Typer()
 @app.command(epilog="Example: lanenet doctor --config configs/car/picamera_pca9685.yaml")
 def doctor(
     camera: CameraOption = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML of a car, to check its devices.", show_default=False)
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML of a car, to check its devices.")] = None,
     wheels_off_ground: Annotated[
         bool,
         typer.Option(

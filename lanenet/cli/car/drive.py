@@ -16,7 +16,7 @@ app = typer.Typer()
 
 @app.command(epilog="Example: lanenet drive configs/car/replay.yaml --dry-run")
 def drive(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML of the car.", show_default=False)],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML of the car.")],
     overrides: OverridesArgument = None,
     arm: Annotated[bool, typer.Option("--arm", help="Let the motor turn, after a countdown.")] = False,
     steering_only: Annotated[
@@ -25,9 +25,7 @@ def drive(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Use no actuator; show what would be sent.")
     ] = False,
-    frames: Annotated[
-        int | None, typer.Option(min=1, help="End after this many frames.", show_default=False)
-    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="End after this many frames.")] = None,
 ) -> None:
     """Drive the car by what its camera sees; without --arm the motor stays in neutral."""
     from lanenet.onboard.drive import build_loop, load_drive_settings

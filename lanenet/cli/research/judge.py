@@ -41,16 +41,12 @@ def judge(
         str | None,
         typer.Option(
             help=f"Entrants, separated by commas; {_WITH_SETTINGS} also as NAME=SETTINGS.yaml; truth is the "
-            f"scripted driver, true-points the steering law on the true lane. Default: {_DETECTORS}.",
-            show_default=False,
+            f"scripted driver, true-points the steering law on the true lane. Default: {_DETECTORS}."
         ),
     ] = None,
     model: Annotated[
         Path | None,
-        typer.Option(
-            help=f"Model (.onnx) or checkpoint folder of the network; default {SHIPPED_MODEL}.",
-            show_default=False,
-        ),
+        typer.Option(help=f"Model (.onnx) or checkpoint folder of the network; default {SHIPPED_MODEL}."),
     ] = None,
     tracks: Annotated[
         str | None,

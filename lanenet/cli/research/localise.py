@@ -35,25 +35,19 @@ _WAIT_S = 0.1
 def localise(
     out: Annotated[
         Path,
-        typer.Option(
-            help="Poses to write, frame by frame (.csv); beside it a .tum and a .png.", show_default=False
-        ),
+        typer.Option(help="Poses to write, frame by frame (.csv); beside it a .tum and a .png."),
     ],
     source: Annotated[
         Path | None,
-        typer.Argument(metavar="SOURCE", help="Drive, tub or video; none with --live.", show_default=False),
+        typer.Argument(metavar="SOURCE", help="Drive, tub or video; none with --live."),
     ] = None,
     live: Annotated[
         Path | None,
-        typer.Option(
-            metavar="CONFIG",
-            help="YAML of the car, as for drive: use its running camera.",
-            show_default=False,
-        ),
+        typer.Option(metavar="CONFIG", help="YAML of the car, as for drive: use its running camera."),
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help="Camera YAML; default: the drive's or the car's.", show_default=False),
+        typer.Option("--camera", help="Camera YAML; default: the drive's or the car's."),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML with the mapping's settings, or a map's settings.yaml.")
@@ -63,7 +57,6 @@ def localise(
         typer.Option(
             min=1e-3,
             help="Typical step length, cm per frame; with a recorded speed, its gain. Default: estimated.",
-            show_default=False,
         ),
     ] = None,
     start_frames: Annotated[
@@ -72,13 +65,11 @@ def localise(
     speed: Annotated[
         float | None,
         typer.Option(
-            min=1e-3,
-            help="With --live: how fast the car is driven, cm/s. Default: the CONFIG's cruise_cm_s.",
-            show_default=False,
+            min=1e-3, help="With --live: how fast the car is driven, cm/s. Default: the CONFIG's cruise_cm_s."
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="With --live: end after this many frames.", show_default=False)
+        int | None, typer.Option(min=1, help="With --live: end after this many frames.")
     ] = None,
 ) -> None:
     """Run the particle filter alone, as on the car: one pose per frame, in bounded memory."""

@@ -28,15 +28,14 @@ _YAML = (".yaml", ".yml")
 def reality(
     drives: Annotated[
         list[Path],
-        typer.Argument(metavar="REAL_DRIVE...", help="Real drives, tubs or videos.", show_default=False),
+        typer.Argument(metavar="REAL_DRIVE...", help="Real drives, tubs or videos."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for tables and pictures.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for tables and pictures.")],
     camera: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[DRIVE=]FILE",
             help="Camera YAML of the drive with this folder name; without a name, of all others.",
-            show_default=False,
         ),
     ] = None,
     synthetic: Annotated[
@@ -44,7 +43,6 @@ def reality(
         typer.Option(
             metavar="CONFIG|DRIVE",
             help="YAML with the settings of the synthetic drives, or a simulated drive; may be given again.",
-            show_default=False,
         ),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Synthetic drives; default 60.")] = None,

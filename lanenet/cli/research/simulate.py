@@ -19,12 +19,12 @@ app = typer.Typer()
 @app.command(epilog="Example: lanenet simulate configs/drives/example.yaml seed=3 --out runs/three")
 def simulate(
     config: ConfigArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the drive.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the drive.")],
     overrides: OverridesArgument = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that draw the frames.")] = 1,
     detector: Annotated[
         str | None,
-        typer.Option(help="Detector that steers instead of the scripted driver.", show_default=False),
+        typer.Option(help="Detector that steers instead of the scripted driver."),
     ] = None,
     model: ModelOption = None,
 ) -> None:

@@ -18,9 +18,9 @@ app = typer.Typer()
 def track(
     road: Annotated[
         str,
-        typer.Argument(metavar="FILE|PRESET", help="YAML file, or name of a preset.", show_default=False),
+        typer.Argument(metavar="FILE|PRESET", help="YAML file, or name of a preset."),
     ],
-    out: Annotated[Path, typer.Option(help="Picture to write (.png).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Picture to write (.png).")],
     seed: Annotated[int, typer.Option(min=0, help="Seed for what the road file leaves open.")] = 0,
     size: Annotated[int, typer.Option(min=100, max=20_000, help="Longer side of the picture, px.")] = 1600,
 ) -> None:
@@ -61,13 +61,11 @@ def track(
 
 @app.command(epilog="Example: lanenet sheets bfmc light --out runs/sheets")
 def sheets(
-    out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures (.jpg).")],
     names: Annotated[
         list[str] | None, typer.Argument(metavar="NAME", help="Presets and groups of effects; default all.")
     ] = None,
-    max_kb: Annotated[
-        int | None, typer.Option(min=5, help="Shrink each picture to so many kB.", show_default=False)
-    ] = None,
+    max_kb: Annotated[int | None, typer.Option(min=5, help="Shrink each picture to so many kB.")] = None,
 ) -> None:
     """Draw sheets of frames to look at: presets in random looks, and effects one by one."""
     from datagen.world.sheets import draw_sheet, encode_sheet, sheet_names

@@ -11,16 +11,12 @@ import typer
 from lanenet.errors import ConfigError
 from lanenet.perception.registry import detector_names, listed
 
-ConfigArgument = Annotated[
-    Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.", show_default=False)
-]
+ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.")]
 OverridesArgument = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
 ]
-DriveArgument = Annotated[
-    Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.", show_default=False)
-]
-CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAML.", show_default=False)]
+DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
+CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAML.")]
 WheelbaseOption = Annotated[
     float | None, typer.Option("--wheelbase", min=0.1, help="Distance between the car's axles, cm.")
 ]
@@ -34,7 +30,7 @@ MarkingOption = Annotated[
 ]
 ModelOption = Annotated[
     Path | None,
-    typer.Option("--model", help="Model (.onnx) or checkpoint folder of the network.", show_default=False),
+    typer.Option("--model", help="Model (.onnx) or checkpoint folder of the network."),
 ]
 AnyCameraOption = Annotated[
     bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
