@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from datagen.judge.settings import JudgeSettings
-from datagen.world.car.pilot import (
+from datagen.world.car.driver import (
     DetectorPilot,
     DriverPilot,
     Pilot,

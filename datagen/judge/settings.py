@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from datagen.world.car.driver import DriverSettings
-from datagen.world.car.pilot import PilotSettings
+from datagen.world.car.driver import DriverSettings, PilotSettings
 from datagen.world.road.track_settings import TrackSettings, load_track_settings, preset, preset_names
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings

@@ -7,7 +7,6 @@ are drawn over it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +32,6 @@ from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 
 Bgr = tuple[int, int, int]
 Image = UInt8[np.ndarray, "_ _ 3"]
-Progress = Callable[[int, int], None]
 
 _SPEED_CM_S = 60.0
 #: From the front axle to the thing that a frame shows; and from the middle of the lane to the car.
@@ -144,20 +142,19 @@ def sheet_names() -> list[str]:
     return [*preset_names(), *EFFECT_SHEETS]
 
 
-def draw_sheet(name: str, progress: Progress | None = None) -> Image:
+def draw_sheet(name: str) -> Image:
     """Draw a sheet; the same name gives the same picture.
 
     Args:
         name: One of :func:`sheet_names`.
-        progress: Called with the number of frames drawn and the number of all.
 
     Raises:
         ConfigError: If there is no such sheet.
     """
     if name in EFFECT_SHEETS:
-        return _effect_sheet(name, progress)
+        return _effect_sheet(name)
     if name in preset_names():
-        return _road_sheet(name, progress)
+        return _road_sheet(name)
     raise ConfigError(f"no sheet {name!r}, expected one of {', '.join(sheet_names())}")
 
 
@@ -171,7 +168,7 @@ def encode_sheet(sheet: Image, max_bytes: int | None = None) -> bytes:
         sheet = np.asarray(cv2.resize(sheet, None, fx=_SHRINK, fy=_SHRINK, interpolation=cv2.INTER_AREA))
 
 
-def _road_sheet(name: str, progress: Progress | None) -> Image:
+def _road_sheet(name: str) -> Image:
     """A preset in several appearances: frame with the true lines, and the edges from above."""
     total = _ROAD_COLUMNS * _ROAD_ROWS
     # Its own seeds, so that no two presets look the same.
@@ -189,12 +186,10 @@ def _road_sheet(name: str, progress: Progress | None) -> Image:
             _draw_line(frame, world.camera.project_ground(line_cm), colour)
         title = f"{name}, seed {seed}, {world.settings.look.floor}, at {s_cm:.0f} cm"
         tiles.append(_titled(np.concatenate([frame, above], axis=1), title))
-        if progress is not None:
-            progress(len(tiles), total)
     return _grid(tiles, _ROAD_COLUMNS)
 
 
-def _effect_sheet(name: str, progress: Progress | None) -> Image:
+def _effect_sheet(name: str) -> Image:
     """A row per road, a column per effect, all of a row at one place."""
     roads, effects = EFFECT_SHEETS[name]
     camera = CameraSettings().build(SimulationSettings().car.wheelbase_cm)
@@ -216,8 +211,6 @@ def _effect_sheet(name: str, progress: Progress | None) -> Image:
             pose, yaw_rate = _pose_at(track, s_cm, camera)
             frame = renderer.render(pose, effect.frame, _SPEED_CM_S * effect.speed, yaw_rate * effect.speed)
             tiles.append(_titled(frame, f"{road}: {effect.name}"))
-            if progress is not None:
-                progress(len(tiles), len(roads) * len(effects))
     return _grid(tiles, len(effects))
 
 

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from datagen.world.car.driver import place_on_track
-from datagen.world.car.pilot import LostLane, Pilot, PilotSettings, Sight
+from datagen.world.car.driver import LostLane, Pilot, PilotSettings, Sight, place_on_track
 from datagen.world.render.renderer import Renderer
 from datagen.world.render.sensor import as_jpeg
 from datagen.world.road.track import write_track

@@ -126,7 +126,9 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
         look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})
     if settings.random_look:
         look = random_appearance(look, look_rng, tuple(marking.colour_bgr for marking in track.markings))
-    donkey = draw_donkey(settings.donkey, donkey_rng, _needed_steering_rad(settings, track))
+    bend_rad = math.atan(settings.car.wheelbase_cm * float(np.max(np.abs(track.curvature_per_cm))))
+    needed_rad = min(_STEERING_RESERVE * bend_rad, settings.car.max_steering_rad)
+    donkey = draw_donkey(settings.donkey, donkey_rng, needed_rad)
     settings = settings.model_copy(update={"look": look, "random_look": False, "donkey": donkey})
     camera = settings.camera.build(settings.car.wheelbase_cm)
     start_cm = 0.0 if track.closed else START_CM
@@ -173,13 +175,6 @@ def resolve_length(settings: SimulationSettings) -> SimulationSettings:
     return settings.model_copy(update={"track": track})
 
 
-def _needed_steering_rad(settings: SimulationSettings, track: Track) -> float:
-    """Steering angle for the tightest bend, with a reserve, limited to what the servo gives."""
-    car = settings.car
-    bend_rad = math.atan(car.wheelbase_cm * float(np.max(np.abs(track.curvature_per_cm))))
-    return min(_STEERING_RESERVE * bend_rad, car.max_steering_rad)
-
-
 def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Track:
     track = random_track(settings.track, rng)
     car = settings.car
@@ -187,10 +182,8 @@ def _drawn_track(settings: SimulationSettings, rng: np.random.Generator) -> Trac
         f"a car of wheelbase {car.wheelbase_cm:g} cm and {math.degrees(car.max_steering_rad):.0f} degrees"
     )
     min_radius_cm = car.wheelbase_cm / math.tan(car.max_steering_rad)
-    if settings.driver.direction == "forward":
-        check_drivable(track, min_radius_cm, settings.track, car_text)
-        return track
-    # On two lanes the other lane is driven, whose bends have other radii.
-    track = track.reversed()
-    check_drivable(track, min_radius_cm, settings.track, car_text, backward=True)
+    backward = settings.driver.direction == "backward"
+    if backward:  # on two lanes the other lane is driven, whose bends have other radii
+        track = track.reversed()
+    check_drivable(track, min_radius_cm, settings.track, car_text, backward)
     return track

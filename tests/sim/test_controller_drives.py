@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.world.car.camera import CameraSettings
-from datagen.world.car.pilot import PilotSettings, Sight
+from datagen.world.car.driver import PilotSettings, Sight
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import ClosedLoop
 from datagen.world.world import SimulationSettings, World, build_world

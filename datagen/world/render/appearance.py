@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from datagen.world.render.textures import FloorKind
+from datagen.world.road.track import Bgr
 from lanenet.config import Settings
 
-Bgr = tuple[float, float, float]
 #: Least difference between floor and fresh paint, in grey levels; chosen: clear at the loudest noise.
 _CONTRAST = 60.0
 #: The same for dull paint, and the least factor on the brightness of paint: these include the thin tape

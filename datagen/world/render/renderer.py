@@ -86,17 +86,14 @@ class Renderer:
         self._surface = _surface(scene, appearance)
         colours = np.minimum(track.boxes[:, HALF_WIDTH + 1 :] * appearance.line_brightness, 255.0)
         boxes = np.column_stack([track.boxes[:, : HALF_WIDTH + 1], colours])
-        self._boxes, self._clutter = _nearby_flat(boxes), _nearby_flat(scene.clutter)
+        self._boxes, self._clutter = _nearby(boxes, NEAR_CM), _nearby(scene.clutter, NEAR_CM)
         self._lamps = Nearby(scene.lamps, scene.lamps[:, 2], 2.0 * NEAR_CM)
-        self._shadows = _nearby_movers(scene.objects.shadows, NEAR_CM)
-        self._solids = _nearby_movers(scene.objects.solids, WALL_CM)
+        self._shadows = _nearby(scene.objects.shadows, NEAR_CM, moving=True)
+        self._solids = _nearby(scene.objects.solids, WALL_CM, moving=True)
         self._falloff = corner_falloff(camera.height, camera.width, appearance.vignetting)
         self._eye_car_cm = camera.mounting.position_car_cm
-        self._room_buffers = (
-            np.zeros(2 * TILE, np.int32),
-            np.zeros(4 * TILE, np.float32),
-            np.zeros(4 * TILE, np.float32),
-        )
+        weights, colours = np.zeros((2, 4 * TILE), np.float32)
+        self._room_buffers = (np.zeros(2 * TILE, np.int32), weights, colours)
         self._image = np.zeros((camera.height, camera.width, 3), np.uint8)
         self._blurred = np.zeros((camera.height, camera.width, 3), np.float32)
 
@@ -245,10 +242,8 @@ def _surface(scene: Scene, appearance: Appearance) -> Surface:
     )
 
 
-def _nearby_flat(rows: Float[np.ndarray, "n 9"]) -> Nearby:
-    return Nearby(rows, np.hypot(rows[:, HALF_LENGTH], rows[:, HALF_WIDTH]), NEAR_CM)
-
-
-def _nearby_movers(rows: Float[np.ndarray, "n k"], sight_cm: float) -> Nearby:
-    reach = np.hypot(rows[:, HALF_LENGTH], rows[:, HALF_WIDTH]) + np.hypot(rows[:, -4], rows[:, -3])
+def _nearby(rows: Float[np.ndarray, "n k"], sight_cm: float, moving: bool = False) -> Nearby:
+    reach = np.hypot(rows[:, HALF_LENGTH], rows[:, HALF_WIDTH])
+    if moving:
+        reach += np.hypot(rows[:, -4], rows[:, -3])
     return Nearby(rows, reach, sight_cm)

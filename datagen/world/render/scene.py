@@ -480,16 +480,13 @@ def _car(rng: np.random.Generator, heading: float) -> list[list[float]]:
 
 def _cast(row: list[float], light: Float[np.ndarray, "2"], cot: float, depth: float) -> list[float]:
     """Shadow of a solid: a strip from its foot away from the light, softer the longer it is."""
-    x, y, c, s, half_a, half_b, _, top = row[: TOP + 1]
-    # How wide and how deep the footprint is across and along the light.
-    across = abs(half_a * (c * light[1] - s * light[0])) + abs(half_b * (c * light[0] + s * light[1]))
-    within = abs(half_a * (c * light[0] + s * light[1])) + abs(half_b * (c * light[1] - s * light[0]))
+    across, within = _half_span(row, -light[1], light[0]), _half_span(row, *light)
     if row[SHAPE] != BOX:
-        across = within = half_a
+        across = within = row[HALF_LENGTH]
     if row[SHAPE] == CONE:
         across *= 0.6
-    length = min(top * cot, _LONGEST_SHADOW_CM)
-    middle = np.array([x, y]) - 0.5 * length * light
+    length = min(row[TOP] * cot, _LONGEST_SHADOW_CM)
+    middle = np.array([row[X], row[Y]]) - 0.5 * length * light
     soft = 1.5 + 0.12 * length
     return [*middle, *light, 0.5 * length + within, across, soft, depth, *row[-4:]]
 

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from datagen.world.road.centre_line import (
     CentreLine,
-    check_slack_cm,
     closed_centre_line,
     comes_near_itself,
     open_centre_line,
@@ -153,8 +152,7 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
             line, road_cm + settings.line_width_cm, settings.closed, middle_cm=middle_cm
         )
         if found is not None:
-            first, second, distance = found
-            least_cm = road_cm + settings.line_width_cm + check_slack_cm(line)
+            first, second, distance, least_cm = found
             raise ConfigError(
                 f"{settings.origin}: pieces: the road meets itself: {_piece_at(settings, first)} and "
                 f"{_piece_at(settings, second)} come within {distance:.1f} cm of each other, expected at "

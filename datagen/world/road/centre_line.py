@@ -18,7 +18,7 @@ from lanenet.errors import ConfigError
 
 #: Distance between samples; a bend of 60 cm leaves its chords by 0.002 cm.
 SAMPLE_CM = 1.0
-#: Spacing of the points that are compared for clearance; what that may miss is added, see ``check_slack_cm``.
+#: Spacing of the points that are compared for clearance; what that may miss is added.
 _CHECK_CM = 5.0
 #: Newton steps that close a loop; two or three suffice.
 _CLOSING_STEPS = 8
@@ -145,21 +145,9 @@ def end_of(sections: Sequence[Section]) -> tuple[float, complex]:
     return float(heading[-1]), complex(z[-1])
 
 
-def check_slack_cm(line: CentreLine) -> float:
-    """Return how much nearer two sections may be than the points at which they are compared.
-
-    These points may straddle the nearest ones by half a stride on both curves.
-    """
-    return 0.25 * _check_stride(line) * line.step_cm
-
-
-def _check_stride(line: CentreLine) -> int:
-    return max(1, round(_CHECK_CM / line.step_cm))
-
-
 def comes_near_itself(
     line: CentreLine, separation_cm: float, closed: bool, after_cm: float = 0.0, middle_cm: float = 0.0
-) -> tuple[float, float, float] | None:
+) -> tuple[float, float, float, float] | None:
     """Find two sections of a road that lie closer together than they should.
 
     Args:
@@ -171,19 +159,21 @@ def comes_near_itself(
         middle_cm: Offset of the road's middle, whose distance counts.
 
     Returns:
-        The two places along the road and their distance, [cm]; None where it keeps clear.
+        The two places along the road, their distance, and what it should be, [cm]: ``separation_cm`` and what
+        the check may miss. None where the road keeps clear.
     """
-    stride = _check_stride(line)
+    stride = max(1, round(_CHECK_CM / line.step_cm))
     heading = line.heading_rad[::stride]
     points = line.xy_cm[::stride] + middle_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     s_cm = np.arange(len(line.xy_cm))[::stride] * line.step_cm
-    separation_cm += check_slack_cm(line)
+    # The points that are compared may straddle the nearest ones by half a stride on both curves.
+    separation_cm += 0.25 * stride * line.step_cm
     lap_cm = len(line.xy_cm) * line.step_cm if closed else np.inf
     i, j = _first_pair(points, s_cm, separation_cm, 0.5 * np.pi * separation_cm, lap_cm, after_cm)
     if i < 0:
         return None
     i, j = max(i, j), min(i, j)
-    return float(s_cm[j]), float(s_cm[i]), float(np.linalg.norm(points[i] - points[j]))
+    return float(s_cm[j]), float(s_cm[i]), float(np.linalg.norm(points[i] - points[j])), separation_cm
 
 
 @njit(cache=True, error_model="numpy")

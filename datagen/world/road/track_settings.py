@@ -125,8 +125,20 @@ class TrackSettings(Settings):
             data = {"left": None, "middle": {"kind": "dashed"}, "far": {}, **data}
         settings = handler(data)
         settings._origin = origin
-        settings._check_lines()
-        settings._check_corners()
+        wanted = ("left", "right") if settings.lanes == 1 else ("middle", "right", "far")
+        for name in ("left", "middle", "far"):
+            found = getattr(settings, name) is not None
+            if found != (name in wanted):
+                raise ValueError(
+                    f"key {name!r}: a road of {settings.lanes} lane(s) has the lines {', '.join(wanted)}; "
+                    f"the others are null, found {'a line' if found else 'none'} for {name}"
+                )
+        if settings.corners > 0.0 and (settings.closed or settings.pieces):
+            kind = "from pieces" if settings.pieces else "that is a loop"
+            raise ValueError(
+                f"key 'corners': found {settings.corners:g} for a road {kind}, expected 0: only open roads "
+                "drawn at random have them (closed: false)"
+            )
         return settings
 
     @property
@@ -138,15 +150,13 @@ class TrackSettings(Settings):
     def lines(self) -> dict[LineName, tuple[float, MarkingSettings]]:
         """The lines with their offsets from the centre line of the driven lane, left positive, [cm]."""
         half_cm = 0.5 * self.lane_width_cm
-        lines: dict[LineName, tuple[float, MarkingSettings]] = {}
-        if self.left is not None:
-            lines["left"] = (half_cm, self.left)
-        if self.middle is not None:
-            lines["middle"] = (half_cm, self.middle)
-        lines["right"] = (-half_cm, self.right)
-        if self.far is not None:
-            lines["far"] = (3.0 * half_cm, self.far)
-        return lines
+        lines: dict[LineName, tuple[float, MarkingSettings | None]] = {
+            "left": (half_cm, self.left),
+            "middle": (half_cm, self.middle),
+            "right": (-half_cm, self.right),
+            "far": (3.0 * half_cm, self.far),
+        }
+        return {name: (at_cm, line) for name, (at_cm, line) in lines.items() if line is not None}
 
     @property
     def tightest_radius_cm(self) -> float:
@@ -156,24 +166,6 @@ class TrackSettings(Settings):
         return min(
             (radius_cm for piece in self.pieces for _, radius_cm, _ in piece.bends()), default=math.inf
         )
-
-    def _check_lines(self) -> None:
-        wanted = ("left", "right") if self.lanes == 1 else ("middle", "right", "far")
-        for name in ("left", "middle", "far"):
-            found = getattr(self, name) is not None
-            if found != (name in wanted):
-                raise ValueError(
-                    f"key {name!r}: a road of {self.lanes} lane(s) has the lines {', '.join(wanted)}; the "
-                    f"others are null, found {'a line' if found else 'none'} for {name}"
-                )
-
-    def _check_corners(self) -> None:
-        if self.corners > 0.0 and (self.closed or self.pieces):
-            kind = "from pieces" if self.pieces else "that is a loop"
-            raise ValueError(
-                f"key 'corners': found {self.corners:g} for a road {kind}, expected 0: only open roads drawn "
-                "at random have them (closed: false)"
-            )
 
 
 def preset_names() -> list[str]:

@@ -214,7 +214,7 @@ def pilot_builder(text: str, model: Path | None, lane_width_cm: float) -> BuildP
         LanenetError: If there is no such detector or file.
     """
     from datagen.judge.run import build_pilot
-    from datagen.world.car.pilot import PilotSettings
+    from datagen.world.car.driver import PilotSettings
 
     entrant = named_entrant(text, model, "--detector", any_camera=False)
     warn_of_widths([entrant], [lane_width_cm])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datagen.world.car.camera import CameraSettings
-from datagen.world.car.pilot import (
+from datagen.world.car.driver import (
     DetectorPilot,
     DriverPilot,
     LostLane,
