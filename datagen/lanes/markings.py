@@ -10,6 +10,7 @@ half is its lane; if it drives on the middle line or changes sides often, its la
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import no_type_check
 
 import numpy as np
@@ -22,6 +23,24 @@ from datagen.lanes.path import Path, Samples
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.config import Settings
 from lanenet.errors import TrackingLostError
+
+#: Ratio of two line distances at which one counts as half of the other. Chosen: widths are known to a cell of
+#: 0.06 camera heights, 3 % of a usual lane.
+_HALF = (0.44, 0.56)
+#: Least support of lines at half or twice the distance of the best ones. Chosen: one of them may be dashed.
+_AS_WELL = 0.8
+#: Least support of each of three lines relative to what lies in the middles of the two lanes. Chosen: on a
+#: mottled floor, any place across the road has some support.
+_CLEAR = 1.25
+#: Largest offset of the car from the centre of its lane, as a share of the lane's width. Chosen: a pair of
+#: lines further off is half of a lane, next to a crack or shadow that the car drives over.
+_OFF_CENTRE = 0.4
+#: Offsets from the middle of a road with two lanes, in widths of the road. Derived: beyond the first, the car
+#: is nearer to the centre of one lane (at 0.25) than to the middle; beyond the second, it is not on the road.
+_IN_HALF, _ON_ROAD = 0.125, 1.0
+#: Least share of frames in the same half of the road if the car keeps to it. Measured on simulated drives in
+#: one of two lanes: 0.88 with wide swerves, else 0.96 and more.
+_MOST = 0.5
 
 
 class TraceSettings(Settings):
@@ -77,19 +96,17 @@ class Markings:
         profile: Density of edges along it.
         tape_cm: Width of the markings.
         settings: Cell sizes, costs and bounds.
-        support: Support of a marking with its middle in each cell of the profile, 0..1.
     """
 
     path: Path
     profile: EdgeProfile
     tape_cm: float
     settings: TraceSettings
-    support: Float[np.ndarray, "m c"]
 
-    @classmethod
-    def of(cls, path: Path, profile: EdgeProfile, tape_cm: float, settings: TraceSettings) -> Markings:
-        """Find the support of markings of this width."""
-        return cls(path, profile, tape_cm, settings, profile.tapes(tape_cm))
+    @cached_property
+    def support(self) -> Float[np.ndarray, "m c"]:
+        """Support of a marking with its middle in each cell of the profile, 0..1."""
+        return self.profile.tapes(self.tape_cm)
 
     def best_lane(self, lane_width_cm: float) -> tuple[float, Samples]:
         """Find the lane's width, within a tenth of the given one, and the offset of its centre."""
@@ -197,25 +214,6 @@ def _viterbi(support, against, smoothness, sideways):
     for i in range(m - 1, 0, -1):
         track[i - 1] = track[i] + back[i, track[i]]
     return track, score
-
-
-#: Ratio of two line distances at which one counts as half of the other. Chosen: widths are known to a cell of
-#: 0.06 camera heights, 3 % of a usual lane.
-_HALF = (0.44, 0.56)
-#: Least support of lines at half or twice the distance of the best ones. Chosen: one of them may be dashed.
-_AS_WELL = 0.8
-#: Least support of each of three lines relative to what lies in the middles of the two lanes. Chosen: on a
-#: mottled floor, any place across the road has some support.
-_CLEAR = 1.25
-#: Largest offset of the car from the centre of its lane, as a share of the lane's width. Chosen: a pair of
-#: lines further off is half of a lane, next to a crack or shadow that the car drives over.
-_OFF_CENTRE = 0.4
-#: Offsets from the middle of a road with two lanes, in widths of the road. Derived: beyond the first, the car
-#: is nearer to the centre of one lane (at 0.25) than to the middle; beyond the second, it is not on the road.
-_IN_HALF, _ON_ROAD = 0.125, 1.0
-#: Least share of frames in the same half of the road if the car keeps to it. Measured on simulated drives in
-#: one of two lanes: 0.88 with wide swerves, else 0.96 and more.
-_MOST = 0.5
 
 
 def find_tape_width(

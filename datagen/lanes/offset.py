@@ -45,6 +45,13 @@ _ALONE = 1.0
 #: Length of a gap at whose ends paint is not used, and how much of it, in camera heights. Chosen: before a
 #: junction, paint bends into the side road over about a marking's width.
 _LONG_GAP, _GAP_MARGIN = 2.0, 0.4
+#: Weight of one border's edge points per path sample above which it counts as seen: absolute, and relative to
+#: the line's median. Chosen: paint shows several points per sample and frame, clutter one now and then.
+_SEEN, _SEEN_SHARE = 0.5, 0.15
+#: Weight of a gap's length where a parallel line is seen. Chosen: that line fixes the offset, not the kinks.
+_GUIDED_GAP = 0.4
+#: Least number of painted cells in a frame for its share without paint to count. Chosen: two dashes.
+_MIN_CELLS = 4
 
 
 @dataclass(frozen=True)
@@ -357,15 +364,6 @@ def adapted_breaks(
     count = np.concatenate([[0.0], np.cumsum(step_cm / spacing)])
     breaks = np.linspace(0.0, count[-1], max(8, round(count[-1])) + 1)
     return np.interp(breaks, count, np.arange(len(count)) * step_cm)
-
-
-#: Weight of one border's edge points per path sample above which it counts as seen: absolute, and relative to
-#: the line's median. Chosen: paint shows several points per sample and frame, clutter one now and then.
-_SEEN, _SEEN_SHARE = 0.5, 0.15
-#: Weight of a gap's length where a parallel line is seen. Chosen: that line fixes the offset, not the kinks.
-_GUIDED_GAP = 0.4
-#: Least number of painted cells in a frame for its share without paint to count. Chosen: two dashes.
-_MIN_CELLS = 4
 
 
 def seen_samples(

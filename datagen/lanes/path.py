@@ -280,16 +280,7 @@ def edges_along_path(
         wheelbase_cm,
         reach_cm + 2.0 * wheelbase_cm,
     )
-    good = np.isfinite(s)
-    return PathEdges(
-        s[good],
-        d[good],
-        side[good],
-        along[good],
-        scans.weights[keep][good],
-        distance[keep][good],
-        frame[good],
-    )
+    return PathEdges(s, d, side, along, scans.weights[keep], distance[keep], frame).select(np.isfinite(s))
 
 
 def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:

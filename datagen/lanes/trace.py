@@ -84,7 +84,7 @@ def trace_lane(
     if not path.closed:
         driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
     tape = find_tape_width(profile, driven, camera_height_cm, settings)
-    markings = Markings.of(path, profile, tape, settings)
+    markings = Markings(path, profile, tape, settings)
     if lane_width_cm is None:
         lane_width_cm = find_lane_width(markings, driven, camera_height_cm)
     lane, centre = markings.best_lane(lane_width_cm)
@@ -183,7 +183,7 @@ def trace_adjacent(
         The driven lane, with the lines of adjacent lanes.
     """
     profile = _profile_along(path, edges, camera_height_cm, settings)
-    markings = Markings.of(path, profile, lane.tape_cm, settings)
+    markings = Markings(path, profile, lane.tape_cm, settings)
     band = 2.0 * settings.width_share * lane.lane_cm
     adjacent: dict[tuple[Side, int], Samples] = {}
     sides: list[tuple[Side, float, Samples]] = [

@@ -199,18 +199,13 @@ class _PoseLog:
     def add(self, pose: LivePose) -> None:
         x, y, heading = pose.estimate.pose
         match = "" if np.isnan(pose.estimate.match) else f"{pose.estimate.match:.3f}"
-        self._write(
-            f"{pose.frame},{pose.t_s:.6f},{x:.4f},{y:.4f},{heading:.6f},{pose.segment},{match},"
-            f"{pose.estimate.spread_cm:.3f}\n"
-        )
-
-    def _write(self, text: str) -> None:
+        row = f"{pose.frame},{pose.t_s:.6f},{x:.4f},{y:.4f},{heading:.6f},{pose.segment},{match}"
         try:
             if self._file is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = self.path.open("w", encoding="utf-8", newline="\n")
                 self._file.write(HEADER)
-            self._file.write(text)
+            self._file.write(f"{row},{pose.estimate.spread_cm:.3f}\n")
             self._file.flush()
         except OSError as error:
             raise LanenetError(f"{self.path}: cannot be written ({error})") from None

@@ -57,6 +57,10 @@ $body
 </body></html>
 """
 )
+#: Colours of the lines, as in the pictures.
+_COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
+#: Distance bins of the residuals. Chosen: three per label row.
+_BIN_CM = 5.0
 
 
 def report_page(
@@ -269,12 +273,6 @@ def scale_rows(meta: MapMeta) -> list[Row]:
         ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
         ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
     ]
-
-
-#: Colours of the lines, as in the pictures.
-_COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
-#: Distance bins of the residuals. Chosen: three per label row.
-_BIN_CM = 5.0
 
 
 def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]]:

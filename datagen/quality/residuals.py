@@ -13,7 +13,7 @@ contradicted, only that line is masked.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -39,10 +39,28 @@ _MIN_AGREEMENT = 0.8
 _STEP_CM = 1.0
 #: Limits of the distance bands ahead of the front axle: the label rows and beyond.
 BANDS_CM = (0.0, 15.0, 30.0, 45.0, 90.0)
+#: Every how many frames one is checked. Chosen: neighbouring frames show nearly the same.
+_EVERY = 3
+#: A frame contradicts the map if the median distance of the edges exceeds the first, in pixels of an image
+#: 160 px wide, or if the coverage is below the second. Chosen: right maps keep below 0.5 px; both lines are
+#: seldom interrupted at once.
+_OFF_PX, _LEAST_MET = 1.0, 0.15
+#: The same for one line, if both together agree. Derived: edges met by chance have a median of 2 px, half the
+#: gate, so every other frame contradicts a wrong line; a lower bound masks lines that are right.
+_ALONE_PX = 2.0
+#: Sigma up to which a line is checked, in lane widths. Chosen: lines with a larger sigma bridge gaps, where
+#: no paint is expected.
+_KNOWN_LANES = 0.02
+#: Least number of samples of a frame: in view, and with an edge. Chosen: one border over 15 cm.
+_MIN_VIEW, _MIN_MET = 15, 8
+#: Samples up to this distance ahead count. Chosen: twice the farthest label row.
+_REACH_CM = 60.0
+#: Distance along the path up to which frames count for a place, and the share that has to contradict the map.
+#: Chosen: a single bad frame is outvoted, and an error over 20 cm of road is not.
+_AROUND_CM, _SHARE = 20.0, 0.3
 
 
-@dataclass(frozen=True)
-class BorderSamples:
+class BorderSamples(NamedTuple):
     """Places on the borders of the lines that are in view of a frame, with the residuals there.
 
     Attributes:
@@ -63,16 +81,13 @@ class BorderSamples:
 
     def select(self, rows: Bool[np.ndarray, "m"]) -> BorderSamples:
         """Return some of the samples."""
-        return BorderSamples(self.right[rows], self.ahead_cm[rows], self.residual_px[rows])
+        return BorderSamples(*(column[rows] for column in self))
 
 
 def join_samples(parts: list[BorderSamples]) -> BorderSamples:
     """Concatenate the samples of several frames."""
-    return BorderSamples(
-        np.concatenate([np.zeros(0, dtype=bool), *(part.right for part in parts)]),
-        np.concatenate([np.zeros(0), *(part.ahead_cm for part in parts)]),
-        np.concatenate([np.zeros(0), *(part.residual_px for part in parts)]),
-    )
+    none = BorderSamples(np.zeros(0, dtype=bool), np.zeros(0), np.zeros(0))
+    return BorderSamples(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
 
 
 def border_samples(
@@ -103,7 +118,8 @@ def border_samples(
             place = at + border * marking_cm * across
             uv, gradient = _in_image(place, -np.sign(border) * across, camera)
             seen = _in_view(uv, gradient, keep)
-            residual = _nearest(edges, uv[seen], gradient[seen], camera.width / REFERENCE_WIDTH)
+            gate_px = GATE_PX * (camera.width / REFERENCE_WIDTH)
+            residual = _nearest(edges.uv_px, edges.normals, uv[seen], gradient[seen], gate_px)
             parts.append(BorderSamples(np.full(int(seen.sum()), SIDES[i] == "right"), at[seen, 1], residual))
     return join_samples(parts)
 
@@ -154,20 +170,13 @@ def _in_view(
     return inside
 
 
-def _nearest(
-    edges: EdgePixels, uv: Float[np.ndarray, "m 2"], gradient: Float[np.ndarray, "m 2"], scale: float
-) -> Float[np.ndarray, "m"]:
-    """Signed distance along the gradient to the closest edge across the border; NaN without one."""
-    found = np.full(len(uv), np.nan)
-    _meet(edges.uv_px, edges.normals, uv, gradient, _MIN_AGREEMENT, GATE_PX * scale, found)
-    return found
-
-
 @njit(cache=True)
 @no_type_check
-def _meet(edge_uv, edge_normal, uv, gradient, least, gate, found):
+def _nearest(edge_uv, edge_normal, uv, gradient, gate_px):
+    """Signed distance along the gradient to the closest edge across the border; NaN without one."""
+    found = np.full(len(uv), np.nan)
     for i in range(uv.shape[0]):
-        best = gate
+        best = gate_px
         gx, gy = gradient[i, 0], gradient[i, 1]
         for j in range(edge_uv.shape[0]):
             dx, dy = edge_uv[j, 0] - uv[i, 0], edge_uv[j, 1] - uv[i, 1]
@@ -175,8 +184,9 @@ def _meet(edge_uv, edge_normal, uv, gradient, least, gate, found):
             # Edge pixels of a line are about one pixel apart, at any image size.
             if abs(across) > best or abs(dx * gy - dy * gx) > 0.75:
                 continue
-            if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= least:
+            if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= _MIN_AGREEMENT:
                 found[i], best = across, abs(across)
+    return found
 
 
 @dataclass(frozen=True)
@@ -202,9 +212,9 @@ class ResidualFigures:
         scale = REFERENCE_WIDTH / width
         return {
             **vars(self),
-            "robust_sd_px_at_160": self.robust_sd_px * scale,
-            "p95_px_at_160": self.p95_px * scale,
-            "median_px_at_160": self.median_px * scale,
+            **{
+                f"{name}_at_160": vars(self)[name] * scale for name in ("robust_sd_px", "p95_px", "median_px")
+            },
         }
 
 
@@ -222,27 +232,6 @@ def summarise(samples: BorderSamples) -> ResidualFigures:
         float(np.percentile(size, 95.0)),
         float(np.median(found)),
     )
-
-
-#: Every how many frames one is checked. Chosen: neighbouring frames show nearly the same.
-_EVERY = 3
-#: A frame contradicts the map if the median distance of the edges exceeds the first, in pixels of an image
-#: 160 px wide, or if the coverage is below the second. Chosen: right maps keep below 0.5 px; both lines are
-#: seldom interrupted at once.
-_OFF_PX, _LEAST_MET = 1.0, 0.15
-#: The same for one line, if both together agree. Derived: edges met by chance have a median of 2 px, half the
-#: gate, so every other frame contradicts a wrong line; a lower bound masks lines that are right.
-_ALONE_PX = 2.0
-#: Sigma up to which a line is checked, in lane widths. Chosen: lines with a larger sigma bridge gaps, where
-#: no paint is expected.
-_KNOWN_LANES = 0.02
-#: Least number of samples of a frame: in view, and with an edge. Chosen: one border over 15 cm.
-_MIN_VIEW, _MIN_MET = 15, 8
-#: Samples up to this distance ahead count. Chosen: twice the farthest label row.
-_REACH_CM = 60.0
-#: Distance along the path up to which frames count for a place, and the share that has to contradict the map.
-#: Chosen: a single bad frame is outvoted, and an error over 20 cm of road is not.
-_AROUND_CM, _SHARE = 20.0, 0.3
 
 
 def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:

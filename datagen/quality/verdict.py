@@ -145,13 +145,13 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
             f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; "
             f"{_percent(evidence.labelled_share)} of the frames have labels"
         ]
-    remarks = []
+    remarks: tuple[str, ...] = ()
     if evidence.found_lane_cm is None:
-        remarks.append(
+        remarks = (
             f"the lane width of {evidence.given_lane_cm:g} cm is the one thing that sets the scale: if it is "
-            "wrong, every length is wrong by the same share, and no check here can show it"
+            "wrong, every length is wrong by the same share, and no check here can show it",
         )
-    return Verdict(found[0][0] if found else "good", tuple(reasons), tuple(remarks))
+    return Verdict(found[0][0] if found else "good", tuple(reasons), remarks)
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:

@@ -23,8 +23,8 @@ from datagen.slam.filter.dp_slam import (
     reweigh,
     systematic_resample,
 )
-from datagen.slam.filter.field import DirectionField
 from datagen.slam.filter.motion import MotionModel
+from datagen.slam.loops.revisits import DirectionField
 from datagen.slam.odometry.scans import Scan, Scans, condense, pack_scans
 from lanenet.geometry.frames import car_from_map, map_from_car, map_from_car_directions
 from lanenet.perception.edges.road import RoadEdges
@@ -87,7 +87,7 @@ class SharedField:
         self.settings, self.rng = settings, rng
         self.states = motion.start(settings.particles, rng)
         self.weights = np.full(settings.particles, 1.0 / settings.particles)
-        self.field = DirectionField.empty(0.04 * HEIGHT_CM, 1024, settings.memory_frames)
+        self.field = DirectionField.empty(0.04 * HEIGHT_CM, 1024)
         self.frame = 0
 
     def step(self, scan: Scan, motion: MotionModel, k: int) -> None:
@@ -95,7 +95,7 @@ class SharedField:
         scored = condense(scan, self.settings.patch_heights * HEIGHT_CM, self.settings.max_points)
         if self.frame > 0:
             motion.predict(self.states, k, self.rng)
-            scores = self.field.score(self.states[:, :3], WHEELBASE_CM, scored, self.frame)
+            scores = self.field.score(self.states[:, :3], WHEELBASE_CM, scored)
             self.weights = reweigh(self.weights, scores, self.settings.effective_share)
         pose = self.weights @ self.states[:, :3]
         if effective_number(self.weights) < self.settings.resample_below * len(self.weights):
@@ -105,14 +105,13 @@ class SharedField:
             map_from_car(scan.points_cm, pose, WHEELBASE_CM),
             map_from_car_directions(scan.normals, pose[2]),
             scan.weights,
-            self.frame,
         )
         self.frame += 1
 
     @property
     def bytes(self) -> int:
         """Memory of the map."""
-        return self.field.vectors.nbytes + self.field.owner.nbytes + self.field.seen.nbytes
+        return self.field.vectors.nbytes + self.field.owner.nbytes + self.field.mapped.nbytes
 
 
 def measure(frames: int) -> list[dict[str, float | str]]:

@@ -50,6 +50,25 @@ _DAMPING = 1e-8
 #: Relative fall of the cost at which a round ends early. Chosen: it only saves
 #: steps that change little.
 _CONVERGED = 1e-5
+#: Shares of its frames in which a point meets an edge by chance, and in which it is taken for a mark on the
+#: road; weight of a point below the first. Chosen between noise, which meets an edge now and then, and marks,
+#: which meet one in nearly every image (tests/unit/slam/test_bundle.py); not zero, so that the system stays
+#: determined.
+_CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
+#: Trust in a point that is in view of fewer than two frames, whose share says little. Chosen between the two.
+_TRUST_ONCE = 0.3
+#: Margin at the rim of the pixels in which edges are looked for, [px] for images 160 px wide: edges are found
+#: with a kernel that reaches one pixel further.
+_RIM_PX = 1.0
+#: Image width for which settings in pixels are given: that of a Donkeycar tub.
+_REFERENCE_WIDTH = 160.0
+#: Commanded steps that are shorter than this share of the typical one count as this long: a car that hardly
+#: moves says little about its gain.
+_LEAST_STEP = 0.1
+#: Sigma of the first pose, which only fixes the map: far below anything that is measured.
+_FIXED_SIGMA = 1e-6
+
+_Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
 
 
 @dataclass(frozen=True)
@@ -136,27 +155,6 @@ def adjust(
     )
 
 
-#: Shares of its frames in which a point meets an edge by chance, and in which it is taken for a mark on the
-#: road; weight of a point below the first. Chosen between noise, which meets an edge now and then, and marks,
-#: which meet one in nearly every image (tests/unit/slam/test_bundle.py); not zero, so that the system stays
-#: determined.
-_CHANCE, _SURE, _LEAST_TRUST = 0.4, 0.9, 0.02
-#: Trust in a point that is in view of fewer than two frames, whose share says little. Chosen between the two.
-_TRUST_ONCE = 0.3
-#: Margin at the rim of the pixels in which edges are looked for, [px] for images 160 px wide: edges are found
-#: with a kernel that reaches one pixel further.
-_RIM_PX = 1.0
-#: Image width for which settings in pixels are given: that of a Donkeycar tub.
-_REFERENCE_WIDTH = 160.0
-#: Commanded steps that are shorter than this share of the typical one count as this long: a car that hardly
-#: moves says little about its gain.
-_LEAST_STEP = 0.1
-#: Sigma of the first pose, which only fixes the map: far below anything that is measured.
-_FIXED_SIGMA = 1e-6
-
-_Lifted = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 8 2"], Float[np.ndarray, "m 2"]]
-
-
 @dataclass(frozen=True)
 class Equations:
     """Normal equations at a state.
@@ -207,7 +205,7 @@ def _factorised(matrix: csc_matrix) -> SuperLU:
 
 
 class BundleProblem:
-    """Points, edges and pairs of frames, which stay; see :func:`datagen.slam.adjustment.adjust.adjust`.
+    """Points, edges and pairs of frames, which stay; see :func:`adjust`.
 
     Attributes:
         pairs: Pairs of frames; points of the first are moved into the second.

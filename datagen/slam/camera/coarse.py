@@ -5,6 +5,8 @@ one at the true motion and nowhere else. Before a loop is closed, this gives the
 the focal length to about a fifth, so a prior on the focal length is needed. The lens is taken as an
 equidistant fisheye with its axis in the image centre. Scale is not observable: the camera's height is nominal
 until the lane width sets it.
+
+Also here: cameras that differ from a given one in scale, in where they look, or in one number.
 """
 
 from __future__ import annotations
@@ -36,6 +38,8 @@ _FIRST_PAIRS, _PAIRS = 20, 40
 _FOCAL_PRIOR = 0.05
 #: Height of the camera before the scale is known, [cm]; any would do, this is near those of 1:10 cars.
 NOMINAL_HEIGHT_CM = 15.0
+#: Angles of the mounting by their names in the adjustment.
+_ANGLES = {"pitch": "pitch_down_rad", "roll": "roll_rad", "yaw": "yaw_rad"}
 #: Width of the images for which focal lengths are given, [px]: that of a Donkeycar.
 _REFERENCE_WIDTH = 160.0
 
@@ -199,12 +203,8 @@ def nudged(camera: Camera, name: str, by: float) -> Camera:
             the focal length, [px] for the principal point.
     """
     m = camera.mounting
-    if name == "pitch":
-        return camera.with_mounting(pitch_down_rad=m.pitch_down_rad + by)
-    if name == "roll":
-        return camera.with_mounting(roll_rad=m.roll_rad + by)
-    if name == "yaw":
-        return camera.with_mounting(yaw_rad=m.yaw_rad + by)
+    if name in _ANGLES:
+        return camera.with_mounting(**{_ANGLES[name]: getattr(m, _ANGLES[name]) + by})
     if name == "lever":
         return camera.with_mounting(ahead_of_front_axle_cm=m.ahead_of_front_axle_cm + by * m.height_cm)
     K, D = np.array(camera.K, dtype=np.float64), np.array(camera.D, dtype=np.float64)

@@ -39,8 +39,6 @@ MIN_REVISITS = 6
 MAX_FOCAL_SIGMA = 0.05
 #: Numbers that stay as they start until a loop is closed.
 _LENS = ("focal", "cx", "cy", "k1")
-#: Numbers whose priors every ordinary camera meets: far from them, the images show more than a flat road.
-_ORDINARY = ("cx", "cy", "roll")
 #: Standard deviations of the principal point from the image centre, for images 160 px wide, and of the roll,
 #: [rad], among real cameras. Wider than the adjustment's priors, which are close because these numbers are
 #: nearly degenerate with the yaw; a real drive had a roll of 3 degrees.
@@ -196,15 +194,14 @@ def _restarted(drive: Drive, searched: Camera, first: SolvedSegment, solver: Seg
 
 
 def prior_strain(camera: Camera, prior: Camera, priors: BundleSettings) -> float:
-    """Distance of a camera's principal point and roll from their priors, in sigmas of ordinary cameras."""
-    centre = max(priors.centre_px, _CENTRE_PX) * camera.width / _REFERENCE_WIDTH
-    spread = {"cx": centre, "cy": centre, "roll": max(priors.roll, _LEVEL_RAD)}
-    off = {
-        "cx": camera.K[0, 2] - prior.K[0, 2],
-        "cy": camera.K[1, 2] - prior.K[1, 2],
-        "roll": camera.mounting.roll_rad - prior.mounting.roll_rad,
-    }
-    return max(abs(float(off[name])) / spread[name] for name in _ORDINARY)
+    """Distance of a camera's principal point and roll from their priors, in sigmas of ordinary cameras.
+
+    Every ordinary camera meets these priors: far from them, the images show more than a flat road.
+    """
+    centre_px = max(priors.centre_px, _CENTRE_PX) * camera.width / _REFERENCE_WIDTH
+    off_px = np.abs(camera.K[:2, 2] - prior.K[:2, 2]).max()
+    roll_rad = abs(camera.mounting.roll_rad - prior.mounting.roll_rad)
+    return max(float(off_px) / centre_px, roll_rad / max(priors.roll, _LEVEL_RAD))
 
 
 def honest_sigma(

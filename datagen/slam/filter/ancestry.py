@@ -35,6 +35,26 @@ Likelihood = Literal["direction", "count"]
 
 #: Frames that may be collapsed while one is entered: two bound the work of a frame and catch up in time.
 _COLLAPSED_PER_FRAME = 2
+#: Entries per page. Chosen: a page of vectors is four cache lines.
+PAGE_SIZE = 16
+#: A node's number in an entry: its row in the bits above these, its place in the row below.
+PLACE_BITS = 16
+PLACE = (1 << PLACE_BITS) - 1
+#: Type of an index: unsigned, so that numba need not check for indices from the end.
+U = np.uint32
+#: Columns of a cell's state.
+OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
+#: Cells along each side of the square in which a node's last entries are remembered. Chosen: neighbouring
+#: points are at most a patch apart, which is a cell.
+_RECENT = 4
+_NOWHERE = -(1 << 31)  # no cell has this number
+#: A cell counts as occupied until what was seen in it has faded to this share: three memories, exp(-3).
+_OCCUPIED = 0.05
+#: Cells that the particles' views of one point may spread over to be looked up together. Chosen: 64 x 64
+#: cells, far more than particles spread over while they track.
+_BOX = 4096
+#: Particles with the same cell up to which each is looked up singly. Chosen: it only changes the time.
+_FEW = 4
 
 
 @dataclass(frozen=True)
@@ -173,17 +193,6 @@ class AncestryMap:
         self._oldest += 1
 
 
-#: Entries per page. Chosen: a page of vectors is four cache lines.
-PAGE_SIZE = 16
-#: A node's number in an entry: its row in the bits above these, its place in the row below.
-PLACE_BITS = 16
-PLACE = (1 << PLACE_BITS) - 1
-#: Type of an index: unsigned, so that numba need not check for indices from the end.
-U = np.uint32
-#: Columns of a cell's state.
-OWNER_X, OWNER_Y, PAGE, STAMP, PRUNED = range(5)
-
-
 class AncestryTree(NamedTuple):
     """Nodes of the last frames; those of frame k stand in row k % window, in the order of the particles.
 
@@ -265,14 +274,6 @@ class MapArrays(NamedTuple):
     wheelbase_cm: float
     memory_frames: float
     counting: bool
-
-
-#: Cells along each side of the square in which a node's last entries are remembered. Chosen: neighbouring
-#: points are at most a patch apart, which is a cell.
-_RECENT = 4
-_NOWHERE = -(1 << 31)  # no cell has this number
-#: A cell counts as occupied until what was seen in it has faded to this share: three memories, exp(-3).
-_OCCUPIED = 0.05
 
 
 @njit(cache=True, error_model="numpy")
@@ -513,13 +514,6 @@ def collapse(shared, row):
         tree.nodes[row] = 0
         tree.size[row] = 0
     return forced
-
-
-#: Cells that the particles' views of one point may spread over to be looked up together. Chosen: 64 x 64
-#: cells, far more than particles spread over while they track.
-_BOX = 4096
-#: Particles with the same cell up to which each is looked up singly. Chosen: it only changes the time.
-_FEW = 4
 
 
 @njit(cache=True, error_model="numpy")

@@ -21,6 +21,10 @@ from datagen.slam.filter.motion import FACTOR, MotionModel, widen_steps
 from datagen.slam.odometry.scans import Progress, Scan, Scans, condense
 from lanenet.config import Settings
 
+#: Factor between the temperatures that are tried, and how many: 1.4^20 = 840 flattens any scores of 80
+#: points.
+_COOLER, _TEMPERATURES = 1.4, 20
+
 
 class FilterSettings(Settings):
     """Size of the filter and sharpness of its likelihood.
@@ -73,13 +77,11 @@ class Estimate:
     Attributes:
         pose: Weighted mean of the particles: rear-axle x, y and heading (unwrapped), [cm], [cm], [rad],
             frame map.
-        factor: Mean distance factor (see :class:`MotionModel`).
         match: Matched share of the frame's edge points, 0..1; NaN where it has none and in the first frame.
         spread_cm: Standard deviation of the particles' position.
     """
 
     pose: Float[np.ndarray, "3"]
-    factor: float
     match: float
     spread_cm: float
 
@@ -177,7 +179,7 @@ class ParticleFilter:
         # Headings are unwrapped and close together: a plain mean serves.
         mean = self.weights @ self.states
         spread = np.sqrt(self.weights @ np.sum((self.states[:, :2] - mean[:2]) ** 2, axis=1))
-        return Estimate(mean[:3], float(mean[FACTOR]), float(match), float(spread))
+        return Estimate(mean[:3], float(match), float(spread))
 
     def _resample(self) -> Int[np.ndarray, "p"]:
         """Resample if too few particles count; return the parent of each new particle."""
@@ -244,11 +246,6 @@ def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> 
         if k > 0:
             weights = np.bincount(history[k].parents, weights, minlength=len(history[k - 1].states))
     return smoothed
-
-
-#: Factor between the temperatures that are tried, and how many: 1.4^20 = 840 flattens any scores of 80
-#: points.
-_COOLER, _TEMPERATURES = 1.4, 20
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -1,15 +1,21 @@
-"""Revisits: frames that show the same place, and the relative pose between them."""
+"""Revisits: frames that show the same place, and the relative pose between them.
+
+The relative pose is found on a likelihood field: blurred unit normals of the mapped edges, scored by dot
+product. A count of matched points prefers standing still; with directions, an edge only matches an edge that
+brightens in the same direction.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32, Int32
+from numba import njit
 from pydantic import Field
 
-from datagen.slam.filter.field import DirectionField
 from datagen.slam.odometry.scans import Scan, Scans, thin_scan
 from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_images
 from lanenet.config import Settings
@@ -35,13 +41,15 @@ _MAP_FRAMES, _QUERY_FRAMES, _QUERY_POINTS, _LEAST_POINTS = 20, 4, 60, 20
 #: number. Chosen: the spacing is about a cell of the coarsest field.
 _CELLS_HEIGHTS, _GRID_HEIGHTS, _GRID_DEG = (0.12, 0.06, 0.04), 0.15, 3.0
 _SAMPLE_DEG, _SHRINK, _SAMPLES = 2.0, 0.35, 600
-#: Cells along each side of the field; frames after which it fades: never.
-_FIELD_SIZE, _NO_FADING = 512, 1e9
+#: Cells along each side of the field: 20 camera heights at the finest, more than the frames around see.
+_FIELD_SIZE = 512
 #: The field is an average over frames that do not quite agree: this brings it to about one where they do.
 _FIELD_GAIN = 8.0
 #: Weight of the prior that similar images were taken at about the same place. Weak: it only settles ties
 #: between dashes.
 _PLACE_PRIOR = 0.1
+#: Cells on each side of a point that it blurs into: two standard deviations of the blur, which is one cell.
+_REACH = 2
 
 
 class RevisitSettings(Settings):
@@ -206,17 +214,16 @@ def match_places(
     spread = np.array([step, step, np.deg2rad(_SAMPLE_DEG)])
     best, share = np.zeros(3), 0.0
     for cell_heights in _CELLS_HEIGHTS:
-        field = DirectionField.empty(cell_heights * camera_height_cm, _FIELD_SIZE, _NO_FADING)
+        field = DirectionField.empty(cell_heights * camera_height_cm, _FIELD_SIZE)
         for k in near:
             scan, pose = scans.scan(k), relative_pose(poses[earlier], poses[k])
             field.insert(
                 map_from_car(scan.points_cm, pose, wheelbase_cm),
                 map_from_car_directions(scan.normals, pose[2]),
                 scan.weights / len(near),
-                0,
             )
         field.vectors[...] *= _FIELD_GAIN
-        scores = field.score(tried, wheelbase_cm, query, 0) / query.weights.sum()
+        scores = field.score(tried, wheelbase_cm, query) / query.weights.sum()
         chosen = int(np.argmax(scores - _PLACE_PRIOR * np.sum((tried[:, :2] / reach) ** 2, axis=1)))
         best, share = tried[chosen], float(scores[chosen])
         tried = best + rng.normal(size=(_SAMPLES, 3)) * spread
@@ -249,3 +256,104 @@ def _submap(
         car = np.stack([-ahead_left[:, 1], ahead_left[:, 0] - wheelbase_cm], axis=1)
         parts.append((car, np.stack([-directions[:, 1], directions[:, 0]], axis=1), weights))
     return Scan(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+class DirectionField(NamedTuple):
+    """A wrapping grid of blurred unit vectors: a cell holds the patch of road that was mapped there last.
+
+    Attributes:
+        cell_cm: Side of a cell.
+        vectors: Sum of unit normals per cell, size x size x 2.
+        owner: Which cell of the unbounded plane (ix, iy) each grid cell holds.
+        mapped: Whether the cell holds anything.
+    """
+
+    cell_cm: float
+    vectors: Float32[np.ndarray, "s s 2"]
+    owner: Int32[np.ndarray, "s s 2"]
+    mapped: Bool[np.ndarray, "s s"]
+
+    @staticmethod
+    def empty(cell_cm: float, size: int) -> DirectionField:
+        """Return an empty field; ``size`` must be a power of two."""
+        return DirectionField(
+            cell_cm,
+            np.zeros((size, size, 2), np.float32),
+            np.zeros((size, size, 2), np.int32),
+            np.zeros((size, size), np.bool_),
+        )
+
+    def insert(
+        self,
+        points_map_cm: Float[np.ndarray, "n 2"],
+        normals_map: Float[np.ndarray, "n 2"],
+        weights: Float[np.ndarray, "n"],
+    ) -> None:
+        """Map edge points, [cm], frame map."""
+        _insert(self, points_map_cm, normals_map, weights)
+
+    def score(
+        self, poses: Float[np.ndarray, "p 3"], wheelbase_cm: float, scan: Scan
+    ) -> Float[np.ndarray, "p"]:
+        """Score how well a frame's edges fit the map from each pose.
+
+        Returns:
+            Weighted sum over the points of normal . field, one number per pose; about the weighted number
+            of matched points.
+        """
+        return np.asarray(_score(self, poses, wheelbase_cm, scan))
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _insert(field, points, normals, weights):
+    vectors, owner, mapped, cell_cm = field.vectors, field.owner, field.mapped, field.cell_cm
+    mask = vectors.shape[0] - 1
+    for i in range(points.shape[0]):
+        gx, gy = points[i, 0] / cell_cm, points[i, 1] / cell_cm
+        cx, cy = int(np.floor(gx)), int(np.floor(gy))
+        for iy in range(cy - _REACH, cy + _REACH + 1):
+            for ix in range(cx - _REACH, cx + _REACH + 1):
+                dx, dy = ix + 0.5 - gx, iy + 0.5 - gy
+                w = weights[i] * np.exp(-0.5 * (dx * dx + dy * dy))
+                a, b = iy & mask, ix & mask
+                if not mapped[a, b] or owner[a, b, 0] != ix or owner[a, b, 1] != iy:
+                    owner[a, b, 0], owner[a, b, 1] = ix, iy
+                    vectors[a, b, 0] = 0.0
+                    vectors[a, b, 1] = 0.0
+                    mapped[a, b] = True
+                vectors[a, b, 0] += w * normals[i, 0]
+                vectors[a, b, 1] += w * normals[i, 1]
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _score(field, poses, wheelbase, scan):
+    vectors, owner, mapped, cell_cm = field.vectors, field.owner, field.mapped, field.cell_cm
+    points, normals, weights = scan.points_cm, scan.normals, scan.weights
+    mask = vectors.shape[0] - 1
+    scores = np.zeros(poses.shape[0])
+    for p in range(poses.shape[0]):
+        c, s = np.cos(poses[p, 2]), np.sin(poses[p, 2])
+        total = 0.0
+        for i in range(points.shape[0]):
+            forward, right = points[i, 1] + wheelbase, points[i, 0]
+            gx = (poses[p, 0] + forward * c + right * s) / cell_cm - 0.5
+            gy = (poses[p, 1] + forward * s - right * c) / cell_cm - 0.5
+            nx = normals[i, 1] * c + normals[i, 0] * s
+            ny = normals[i, 1] * s - normals[i, 0] * c
+            ix, iy = int(np.floor(gx)), int(np.floor(gy))
+            tx, ty = gx - ix, gy - iy
+            vx, vy = 0.0, 0.0
+            for jy in range(2):
+                wy = ty if jy else 1.0 - ty
+                for jx in range(2):
+                    a, b = (iy + jy) & mask, (ix + jx) & mask
+                    if mapped[a, b] and owner[a, b, 0] == ix + jx and owner[a, b, 1] == iy + jy:
+                        w = wy * (tx if jx else 1.0 - tx)
+                        vx += w * vectors[a, b, 0]
+                        vy += w * vectors[a, b, 1]
+            # Saturate: an edge that was seen often counts once.
+            total += weights[i] * (nx * vx + ny * vy) / (1.0 + np.sqrt(vx * vx + vy * vy))
+        scores[p] = total
+    return scores

@@ -39,6 +39,25 @@ _STEERING_TEMPER, _STEERING_FLOOR = 0.3, 0.02
 #: Errors of turns seen in the distance last as well: each frame's sigma is widened, and there is a floor.
 #: Chosen: lower than the steering's, as these turns are measured.
 _SEEN_WIDER, _SEEN_FLOOR = 1.5, 0.005
+#: What is this far away on the ground, in camera heights, and all above it counts as far. With a focal length
+#: of 80 px, a step of half a camera height moves that row by 0.6 px.
+_FAR_HEIGHTS = 8.0
+#: Width at which images are compared, that of a Donkeycar tub, and the fewest rows that tell anything.
+_WIDTH, _LEAST_ROWS = 160, 12
+#: Correlation peak from which a shift is believed, and the largest such shift as a share of the width.
+#: Chosen: well above the peak of noise; a larger shift leaves too little overlap.
+_LEAST_PEAK, _MOST_SHIFT = 0.3, 0.25
+#: Least standard deviation of a view, gray levels: less is the noise of a blank wall.
+_LEAST_CONTRAST = 2.0
+#: Frames, correlation with the turns by the road, and share of inliers that are needed. Chosen: 50 frames are
+#: two to five seconds; lamps that move with the car, and blank distance, must stay below the others.
+_LEAST_FRAMES, _LEAST_CORRELATION, _LEAST_SHARE = 50, 0.8, 0.6
+#: Inliers are within so many sigmas; rounds of the fit without the others. Chosen: usual for a robust fit.
+_INLIER, _ROUNDS = 4.0, 5
+#: Factor on the turns that the lens gives, at most, either way: a guessed lens is not further off.
+_LENS_FACTOR = 2.0
+#: Least sigma of such a turn, [rad]: a third of a pixel of a lens of 80 px.
+_LEAST_SIGMA_RAD = 0.004
 
 
 @dataclass(frozen=True)
@@ -171,27 +190,6 @@ def follow_motion(
     return step, turn
 
 
-#: What is this far away on the ground, in camera heights, and all above it counts as far. With a focal length
-#: of 80 px, a step of half a camera height moves that row by 0.6 px.
-_FAR_HEIGHTS = 8.0
-#: Width at which images are compared, that of a Donkeycar tub, and the fewest rows that tell anything.
-_WIDTH, _LEAST_ROWS = 160, 12
-#: Correlation peak from which a shift is believed, and the largest such shift as a share of the width.
-#: Chosen: well above the peak of noise; a larger shift leaves too little overlap.
-_LEAST_PEAK, _MOST_SHIFT = 0.3, 0.25
-#: Least standard deviation of a view, gray levels: less is the noise of a blank wall.
-_LEAST_CONTRAST = 2.0
-#: Frames, correlation with the turns by the road, and share of inliers that are needed. Chosen: 50 frames are
-#: two to five seconds; lamps that move with the car, and blank distance, must stay below the others.
-_LEAST_FRAMES, _LEAST_CORRELATION, _LEAST_SHARE = 50, 0.8, 0.6
-#: Inliers are within so many sigmas; rounds of the fit without the others. Chosen: usual for a robust fit.
-_INLIER, _ROUNDS = 4.0, 5
-#: Factor on the turns that the lens gives, at most, either way: a guessed lens is not further off.
-_LENS_FACTOR = 2.0
-#: Least sigma of such a turn, [rad]: a third of a pixel of a lens of 80 px.
-_LEAST_SIGMA_RAD = 0.004
-
-
 @dataclass(frozen=True)
 class SeenTurns:
     """Turns as seen in the distance.
@@ -227,7 +225,10 @@ def far_turns(drive: Drive, camera: Camera) -> Float[np.ndarray, "n"]:
     window = cv2.createHanningWindow((width, rows), cv2.CV_32F)
     before: Float32[np.ndarray, "h w"] | None = None
     for k in range(len(drive)):
-        view = _far_view(drive, k, width, rows, scale)
+        view = to_gray(drive.image(k))[: int(np.ceil(rows / scale))]
+        if view.shape != (rows, width):
+            view = cv2.resize(view, (width, rows), interpolation=cv2.INTER_AREA)
+        view = view.astype(np.float32)
         blank = float(view.std()) < _LEAST_CONTRAST
         # Without the mean: the window itself would look alike in all images.
         view = (view - view.mean()) * window
@@ -275,10 +276,3 @@ def _median_ratio(x: Float[np.ndarray, "m"], y: Float[np.ndarray, "m"]) -> float
     order = np.argsort(ratio)
     half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
     return float(ratio[order[half]])
-
-
-def _far_view(drive: Drive, k: int, width: int, rows: int, scale: float) -> Float32[np.ndarray, "h w"]:
-    gray = to_gray(drive.image(k))[: int(np.ceil(rows / scale))]
-    if gray.shape != (rows, width):
-        gray = cv2.resize(gray, (width, rows), interpolation=cv2.INTER_AREA)
-    return gray.astype(np.float32)

@@ -49,6 +49,31 @@ _EPSILON = 1e-9
 _GOES_ON = 3.0
 #: Frames that a live car looks back, and moving frames whose median change is its typical one.
 _BACK, _WATCHED = 4, 300
+#: Cells of distance and bearing about the camera's foot, in camera heights and radians, and how many of them:
+#: 4 camera heights, and 1.6 rad to either side. Chosen: a cell is about what noise moves an edge by.
+_RING_HEIGHTS, _RINGS = 0.05, 80
+_BEARING_RAD, _BEARINGS = 0.04, 80
+#: Largest turn of the car from one frame to the next, in cells of bearing: 0.12 rad.
+_TURN_CELLS = 3
+#: Frames for which an edge keeps its distance before it counts as standing still. Chosen: a car that is not
+#: crawling has driven a camera height by then.
+_LIFE = 8
+#: An edge faces the camera, or away from it, if the components of its normal along the ray and along the
+#: car's path are at least this. With the former alone, dashes beside the car were taken for lamps, since
+#: their sides face the camera from there; the ends of the dashes, which tell the distance best, went with
+#: them. Chosen: 53 degrees.
+_FACING = 0.6
+#: Frames by which a frame without the edge reduces its count. A place beside a row of dashes sees a dash,
+#: then a gap, and must not reach the count. Chosen.
+_MISSED = 2
+#: Cells of the road, in camera heights, in which the continuation of an edge is looked for, and directions
+#: told apart; size of this grid in cells: 9 camera heights ahead, 6 to either side.
+_CELL_HEIGHTS, _SECTORS = 0.05, 8
+_AHEAD_CELLS, _SIDE_CELLS = 180, 120
+#: Places along a straight edge where it must go on, in camera heights: the rim of a mirrored lamp is smaller.
+_ON_STRAIGHT_HEIGHTS = (0.2, 0.4, 0.6, 0.8)
+#: Edges this near to a standing one, and on no straight one, belong to it: 0.2 camera heights.
+_NEAR_CELLS = 4
 
 
 def following_frames(drive: Drive) -> tuple[Drive, list[str]]:
@@ -216,33 +241,6 @@ def put_elsewhere(small: Float32[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:
 def _change(flat: Float[np.ndarray, "n d"], frames: int) -> Float[np.ndarray, "m"]:
     """Mean change of each image to the one so many frames later, [gray levels]."""
     return np.abs(flat[frames:] - flat[:-frames]).mean(axis=1)
-
-
-#: Cells of distance and bearing about the camera's foot, in camera heights and radians, and how many of them:
-#: 4 camera heights, and 1.6 rad to either side. Chosen: a cell is about what noise moves an edge by.
-_RING_HEIGHTS, _RINGS = 0.05, 80
-_BEARING_RAD, _BEARINGS = 0.04, 80
-#: Largest turn of the car from one frame to the next, in cells of bearing: 0.12 rad.
-_TURN_CELLS = 3
-#: Frames for which an edge keeps its distance before it counts as standing still. Chosen: a car that is not
-#: crawling has driven a camera height by then.
-_LIFE = 8
-#: An edge faces the camera, or away from it, if the components of its normal along the ray and along the
-#: car's path are at least this. With the former alone, dashes beside the car were taken for lamps, since
-#: their sides face the camera from there; the ends of the dashes, which tell the distance best, went with
-#: them. Chosen: 53 degrees.
-_FACING = 0.6
-#: Frames by which a frame without the edge reduces its count. A place beside a row of dashes sees a dash,
-#: then a gap, and must not reach the count. Chosen.
-_MISSED = 2
-#: Cells of the road, in camera heights, in which the continuation of an edge is looked for, and directions
-#: told apart; size of this grid in cells: 9 camera heights ahead, 6 to either side.
-_CELL_HEIGHTS, _SECTORS = 0.05, 8
-_AHEAD_CELLS, _SIDE_CELLS = 180, 120
-#: Places along a straight edge where it must go on, in camera heights: the rim of a mirrored lamp is smaller.
-_ON_STRAIGHT_HEIGHTS = (0.2, 0.4, 0.6, 0.8)
-#: Edges this near to a standing one, and on no straight one, belong to it: 0.2 camera heights.
-_NEAR_CELLS = 4
 
 
 @dataclass(frozen=True)
