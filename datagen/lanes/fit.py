@@ -219,9 +219,8 @@ class _Fitter:
         border = np.where(edges.side < 0.0, 1.0, -1.0)
         off = edges.d_cm - np.interp(edges.s_cm, path.s_cm, start_cm, period=path.period_cm)
         reach = 0.3 * tape_cm + settings.reach_heights * self.height_cm
-        slope = _slope(path, smooth_cm)[
-            np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
-        ]
+        row = np.clip((edges.s_cm / path.step_cm).astype(np.intp), 0, len(start_cm) - 1)
+        slope = (_change(path, smooth_cm) / path.step_cm)[row]
         aligned = -border * (edges.side - slope * edges.along) / np.hypot(1.0, slope)
         near = (aligned >= settings.min_aligned) & (np.abs(off - 0.5 * border * tape_cm) < reach)
         distance = edges.distance_cm[near] / (settings.precise_heights * self.height_cm)
@@ -244,7 +243,7 @@ def parallel_offset(path: Path, d_cm: Samples, apart_cm: Samples) -> Samples:
         apart_cm: Distance of the parallel to its left; negative to its right.
     """
     line = path.points(d_cm)
-    parallel = line + apart_cm[:, None] * left_of(_along(path, line))
+    parallel = line + apart_cm[:, None] * left_of(_change(path, line))
     rows = _around(path, float(np.abs(apart_cm).max()))
     nearest = np.argmin(np.sum((path.xy_cm[rows] - parallel[:, None]) ** 2, axis=2), axis=1)
     at = rows[np.arange(len(rows)), nearest]
@@ -273,11 +272,11 @@ def distance_across(path: Path, from_cm: Samples, to_cm: Samples, known: SampleM
     return np.where(known[rows[each, nearest]], distance[each, nearest], np.nan)
 
 
-def _along(path: Path, line: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
-    """Direction of a line at each path sample."""
+def _change(path: Path, values: Float[np.ndarray, "m *d"]) -> Float[np.ndarray, "m *d"]:
+    """Change of values along the path, per sample."""
     if path.closed:
-        return np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0)
-    return np.gradient(line, axis=0)
+        return 0.5 * (np.roll(values, -1, axis=0) - np.roll(values, 1, axis=0))
+    return np.asarray(np.gradient(values, axis=0))
 
 
 def _around(path: Path, apart_cm: float) -> Int[np.ndarray, "m k"]:
@@ -298,10 +297,3 @@ def _curvature(path: Path) -> Samples:
 
 def _smoothed(path: Path, values: Samples, over_cm: float) -> Samples:
     return gaussian_filter1d(values, over_cm / path.step_cm, mode="wrap" if path.closed else "nearest")
-
-
-def _slope(path: Path, d_cm: Samples) -> Samples:
-    """Derivative of an offset along the path."""
-    if path.closed:
-        return 0.5 * (np.roll(d_cm, -1) - np.roll(d_cm, 1)) / path.step_cm
-    return np.gradient(d_cm) / path.step_cm

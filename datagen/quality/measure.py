@@ -20,10 +20,10 @@ from datagen.quality.residuals import (
     GATE_PX,
     BorderSamples,
     border_samples,
+    frame_edges,
     join_samples,
     summarise,
 )
-from datagen.slam.view import mapping_range
 from lanenet.data.maps.mapped_drive import (
     DELETED,
     NOT_TO_LABEL,
@@ -34,8 +34,6 @@ from lanenet.data.maps.mapped_drive import (
 )
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import SIDES
-from lanenet.perception.edges.canny import EdgePixels, find_edges
-from lanenet.perception.edges.road import RoadTable
 
 #: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
 NOT_MAPPED, LABELLED = "stretch not mapped", "labelled"
@@ -104,19 +102,14 @@ class MapQuality:
 def measure_map(mapped: MappedDrive) -> MapQuality:
     """Compare the map's lines with its held-out frames, and find which frames get labels."""
     drive_map, drive = mapped.drive_map, mapped.drive
-    camera = drive_map.camera
-    limits = mapping_range(camera.mounting.height_cm, mapped.perception.range)
-    table = RoadTable(camera, limits)
     rows = np.flatnonzero(drive_map.held_out)
     samples, chance = [], []
     tape_cm, lane_cm = drive_map.meta.tape_cm, drive_map.meta.mapped_lane_cm
-    for k in rows.tolist():
-        image = drive.image(int(mapped.rows[k]))
-        edges: EdgePixels = find_edges(image, mapped.perception.edges, table.keep, table.scale)
+    for k, edges, keep in frame_edges(mapped, rows):
         lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
-        samples.append(border_samples(edges, lines, tape_cm, nodded, table.keep))
+        samples.append(border_samples(edges, lines, tape_cm, nodded, keep))
         left = lines.without(np.array([False, True]))
-        chance.append(border_samples(edges, left, tape_cm, nodded, table.keep, aside_cm=0.5 * lane_cm))
+        chance.append(border_samples(edges, left, tape_cm, nodded, keep, aside_cm=0.5 * lane_cm))
     status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
     labels = label_frames(mapped, BirdseyeWindow())
     for row, reason in zip(mapped.rows.tolist(), labels.reasons, strict=True):

@@ -353,13 +353,8 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
 def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
     """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
     figure, (axes, strip) = _figure(6.5, 3.8, 2)
-    axes.plot(
-        drive_map.frames[quality.held_out],
-        quality.frame_median_px * REFERENCE_WIDTH / width,
-        ".",
-        color="#2060c0",
-        ms=4,
-    )
+    median_px = quality.frame_median_px * REFERENCE_WIDTH / width
+    axes.plot(drive_map.frames[quality.held_out], median_px, ".", color="#2060c0", ms=4)
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("median residual\nof held-out frame, px", fontsize=8)
     status = np.array(quality.status)
@@ -397,13 +392,8 @@ def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes 
         gain, trim = np.polyfit(command, curvature, 1)
         r = float(np.corrcoef(command, curvature)[0, 1])
         ends = np.array([command.min(), command.max()])
-        axes.plot(
-            ends,
-            gain * ends + trim,
-            "k-",
-            lw=1.0,
-            label=f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}",
-        )
+        label = f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}"
+        axes.plot(ends, gain * ends + trim, "k-", lw=1.0, label=label)
     axes.set_xlabel("steering command, positive left")
     axes.set_ylabel("curvature, 1/m")
     if axes.get_legend_handles_labels()[0]:

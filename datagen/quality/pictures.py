@@ -73,13 +73,10 @@ def draw_map(
         p = (points - low) * scale
         return np.stack([p[:, 0], height - 1 - p[:, 1]], axis=1).astype(np.int32)
 
-    hues = cv2.cvtColor(
-        np.stack(
-            [np.linspace(0, 150, len(clouds)), np.full(len(clouds), 200), np.full(len(clouds), 200)], axis=1
-        ).astype(np.uint8)[None],
-        cv2.COLOR_HSV2BGR,
-    )[0]
-    for cloud, colour in zip(clouds, hues, strict=True):
+    hues = np.full((1, len(clouds), 3), 200, np.uint8)
+    hues[0, :, 0] = np.linspace(0, 150, len(clouds))
+    hues = np.asarray(cv2.cvtColor(hues, cv2.COLOR_HSV2BGR))
+    for cloud, colour in zip(clouds, hues[0], strict=True):
         at = pixels(cloud)
         image[at[:, 1], at[:, 0]] = colour
     for points, colour in lanes:

@@ -12,11 +12,12 @@ contradicted, only that line is masked.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
 from datagen.slam.view import mapping_range
@@ -234,27 +235,30 @@ def summarise(samples: BorderSamples) -> ResidualFigures:
     )
 
 
+def frame_edges(
+    mapped: MappedDrive, rows: Int[np.ndarray, "m"]
+) -> Iterator[tuple[int, EdgePixels, UInt8[np.ndarray, "h w"]]]:
+    """Yield frames of a map with their edges, and the mask of the pixels that show road."""
+    camera, perception = mapped.drive_map.camera, mapped.perception
+    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
+    for k in rows.tolist():
+        image = mapped.drive.image(int(mapped.rows[k]))
+        yield k, find_edges(image, perception.edges, table.keep, table.scale), table.keep
+
+
 def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
     """Return which left and right lines of the map's frames are contradicted by the images around."""
     drive_map = mapped.drive_map
-    camera, n = drive_map.camera, len(drive_map.frames)
-    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, mapped.perception.range))
+    n = len(drive_map.frames)
     checked = np.arange(0, n, _EVERY)
     against, counts = np.zeros((len(checked), 2), dtype=bool), np.zeros(len(checked), dtype=bool)
-    for i, k in enumerate(checked.tolist()):
-        image = mapped.drive.image(int(mapped.rows[k]))
-        edges = find_edges(image, mapped.perception.edges, table.keep, table.scale)
-        samples = border_samples(
-            edges,
-            lines_at(drive_map, k, _KNOWN_LANES),
-            drive_map.meta.tape_cm,
-            drive_map.camera_at(k),
-            table.keep,
-        )
+    for i, (k, edges, keep) in enumerate(frame_edges(mapped, checked)):
+        lines = lines_at(drive_map, k, _KNOWN_LANES)
+        samples = border_samples(edges, lines, drive_map.meta.tape_cm, drive_map.camera_at(k), keep)
         samples = samples.select(samples.ahead_cm < _REACH_CM)
         counts[i] = len(samples.residual_px) >= _MIN_VIEW
         if counts[i]:
-            against[i] = _contradicts(samples, camera.width)
+            against[i] = _contradicts(samples, drive_map.camera.width)
     contradicted = np.zeros((n, 2), dtype=bool)
     distance = path_lengths(drive_map.poses)
     for k in range(n):

@@ -159,16 +159,14 @@ class BundleState(NamedTuple):
         """Return the camera with this state's numbers."""
         lens, mount = self.lens, self.mount
         K = np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
-        mounting = replace(
-            camera.mounting,
+        D = np.array(camera.D, dtype=np.float64)
+        D[0] = lens[4]
+        return replace(camera, K=K, D=D).with_mounting(
             pitch_down_rad=float(mount[0]),
             roll_rad=float(mount[1]),
             yaw_rad=float(mount[2]),
             ahead_of_front_axle_cm=float(mount[3] * camera.mounting.height_cm - camera.wheelbase_cm),
         )
-        D = np.array(camera.D, dtype=np.float64)
-        D[0] = lens[4]
-        return replace(camera, K=K, D=D, mounting=mounting)
 
     def camera_minus(self, other: Camera) -> Float[np.ndarray, "8"]:
         """Return the camera's adjustable numbers minus those of another camera; the focal length relative."""
