@@ -273,7 +273,7 @@ def without_reflections(edges: Sequence[EdgePixels], camera: Camera, table: Road
         table: Its table, with which the edges were found.
 
     Source:
-        Own method; tests/unit/slam/test_reflections.py.
+        Own method; tests/unit/slam/test_stillness.py.
     """
     views = [_view(table.lift(frame), camera) for frame in edges]
     before = _lives(views)
