@@ -28,7 +28,8 @@ from lanenet.data.drives import Drive
 from lanenet.data.drives.recording import COMMAND_NAMES, MAX_PAUSE_S, Commands
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels, check_frame, find_edges
+from lanenet.perception.edges.canny import check_frame, find_edges
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadEdges, RoadTable
 
 #: Frames that are needed to find the typical step: as many as the odometry compares.

@@ -26,7 +26,8 @@ from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 from lanenet.geometry.poses import path_lengths
-from lanenet.perception.edges.canny import EdgePixels, find_edges
+from lanenet.perception.edges.canny import find_edges
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadTable
 
 #: Image width to which pixels are converted so that drives can be compared: that of Donkeycar images.

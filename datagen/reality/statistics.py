@@ -17,7 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.perception.edges.canny import EdgePixels, find_edges, to_gray
+from lanenet.perception.edges.canny import find_edges, to_gray
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges, RoadTable
 
 #: Distance of neighbours, at most: a pixel's diagonal, and sub-pixel shifts on either side.

@@ -18,7 +18,7 @@ from datagen.slam.settings import SlamSettings
 from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 #: Road that one pixel may span, in camera heights: about the width of a tape, 5 cm for a camera 17 cm high.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,32 +29,16 @@ _START_ANGLES_DEG: dict[CameraModel, tuple[float, ...]] = {
 }
 #: Starts that are refined; chosen: neighbours of the best one, since the ranking is rough.
 _STARTS_KEPT = 3
-#: Numbers of the lens that the rough search moves: fx, fy, k1, k2.
-_ROUGH = np.array([True, True, False, False, True, True])
 #: Largest correlation between the residuals of neighbouring corners that is believed. Chosen: at 0.8 a corner
 #: still counts for 1/81 of one; without a bound, a bent board would leave no evidence at all.
 _MAX_CORRELATION = 0.8
 
 
-@dataclass(frozen=True)
-class Search:
-    """When residuals count less than quadratically, and when the solver stops.
-
-    Attributes:
-        scale_px: Scale of the soft L1 loss.
-        max_evaluations: Most evaluations.
-        tolerance: Least share by which a step has to lower the cost.
-    """
-
-    scale_px: float
-    max_evaluations: int
-    tolerance: float
-
-
+#: Scale of the soft L1 loss, [px], most evaluations, and the least share by which a step lowers the cost.
 #: From a start that may be far off: corners count up to a few pixels, and a few digits are enough.
-ROUGH_SEARCH = Search(3.0, 25, 1e-4)
+_ROUGH_SEARCH: dict[str, Any] = {"f_scale": 3.0, "max_nfev": 25, "ftol": 1e-4}
 #: Close to the solution: half a pixel is an error of a corner finder, more is an outlier.
-FINE_SEARCH = Search(0.5, 60, 1e-8)
+_FINE_SEARCH: dict[str, Any] = {"f_scale": 0.5, "max_nfev": 60, "ftol": 1e-8}
 
 
 @dataclass(frozen=True)
@@ -147,15 +132,16 @@ def start_fit(model: CameraModel, views: Sequence[BoardView]) -> LensFit | None:
             errors = np.concatenate(view_residuals(model, lens, poses, views))
             starts.append((float(np.median(np.abs(errors))), lens, poses))
     starts.sort(key=lambda start: start[0])
-    rough = np.zeros(N_INTRINSIC + N_DISTORTION[model], bool)
-    rough[: len(_ROUGH)] = _ROUGH
+    # fx, fy, k1, k2.
+    free = free_numbers(model, (0, 1))
+    free[2:4] = False
     best: LensFit | None = None
     for _, lens, poses in starts[:_STARTS_KEPT]:
-        fit = refine(model, lens, poses, views, rough, ROUGH_SEARCH)
+        fit = refine(model, lens, poses, views, free, rough=True)
         # A plane has two poses that look alike; a board in the wrong one gets a second chance.
         again = poses_of_views(model, fit.lens, views)
         if again is not None:
-            fit = refine(model, fit.lens, again, views, rough, ROUGH_SEARCH)
+            fit = refine(model, fit.lens, again, views, free, rough=True)
         if best is None or fit.robust_cost < best.robust_cost:
             best = fit
     return best
@@ -193,7 +179,7 @@ def refine(
     poses: Float[np.ndarray, "v 6"],
     views: Sequence[BoardView],
     free: Bool[np.ndarray, "p"],
-    search: Search = FINE_SEARCH,
+    rough: bool = False,
 ) -> LensFit:
     """Fit lens and poses to all corners.
 
@@ -203,7 +189,7 @@ def refine(
         poses: Where the boards start.
         views: Views of one camera.
         free: Which numbers of the lens may move.
-        search: Loss and stopping rule.
+        rough: The start may be far off, and a few digits are enough.
 
     Returns:
         The fit, with standard deviations from its Jacobian and the spread of its residuals.
@@ -241,9 +227,7 @@ def refine(
         jacobian,
         x_scale="jac",
         loss="soft_l1",
-        f_scale=search.scale_px,
-        max_nfev=search.max_evaluations,
-        ftol=search.tolerance,
+        **(_ROUGH_SEARCH if rough else _FINE_SEARCH),
     )
     full, moved = unpack(result.x)
     errors = view_residuals(model, full, moved, views)

@@ -24,6 +24,7 @@ _MIN_PICTURE_PX = 40
 #: sizes at which OpenCV's finder is fast and still sees boards held far away.
 _SEARCH_WIDTHS_PX = (640, 1280)
 _SB_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+_PLAIN_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
 
 @dataclass(frozen=True)
@@ -197,17 +198,15 @@ def find_views(
 
 def _find_complete(gray: UInt8[np.ndarray, "h w"], board: Board) -> Float[np.ndarray, "n 2"] | None:
     size = (board.columns, board.rows)
-    for scaled, scale in _scales(gray):
-        found, corners = cv2.findChessboardCornersSB(scaled, size, flags=_SB_FLAGS)
-        if found and len(corners) == board.columns * board.rows:
-            first = _checked(_unscaled(corners, scale), gray, size)
-            return None if first is None else _checked(_refined(gray, first, size), gray, size)
-    for scaled, scale in _scales(gray):
-        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-        found, corners = cv2.findChessboardCorners(scaled, size, flags=flags)
-        if found and len(corners) == board.columns * board.rows:
-            first = _checked(_unscaled(corners, scale), gray, size)
-            return None if first is None else _checked(_refined(gray, first, size), gray, size)
+    for find, flags in (
+        (cv2.findChessboardCornersSB, _SB_FLAGS),
+        (cv2.findChessboardCorners, _PLAIN_FLAGS),
+    ):
+        for scaled, scale in _scales(gray):
+            found, corners = find(scaled, size, flags=flags)
+            if found and len(corners) == board.columns * board.rows:
+                first = _checked(_unscaled(corners, scale), gray, size)
+                return None if first is None else _checked(_refined(gray, first, size), gray, size)
     return None
 
 
@@ -216,19 +215,15 @@ def _find_part(
 ) -> tuple[int, int, Float[np.ndarray, "n 2"]] | None:
     """A board that the image cuts off: any rectangle of its corners is a board as well."""
     least = (min(_MIN_SIDE, board.columns), min(_MIN_SIDE, board.rows))
-    for scaled, scale in _scales(gray)[:1]:
-        flags = _SB_FLAGS | cv2.CALIB_CB_LARGER
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, least, flags)
-        if not found or meta is None:
-            continue
-        rows, columns = np.asarray(meta).shape[:2]
-        long, short = max(board.columns, board.rows), min(board.columns, board.rows)
-        if len(corners) != rows * columns or max(rows, columns) > long or min(rows, columns) > short:
-            continue
-        checked = _checked(_unscaled(corners, scale), gray, (columns, rows))
-        if checked is not None:
-            return columns, rows, _refined(gray, checked, (columns, rows))
-    return None
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(gray, least, _SB_FLAGS | cv2.CALIB_CB_LARGER)
+    if not found or meta is None:
+        return None
+    rows, columns = np.asarray(meta).shape[:2]
+    long, short = max(board.columns, board.rows), min(board.columns, board.rows)
+    if len(corners) != rows * columns or max(rows, columns) > long or min(rows, columns) > short:
+        return None
+    checked = _checked(_unscaled(corners, 1.0), gray, (columns, rows))
+    return None if checked is None else (columns, rows, _refined(gray, checked, (columns, rows)))
 
 
 def _scales(gray: UInt8[np.ndarray, "h w"]) -> list[tuple[UInt8[np.ndarray, "sh sw"], float]]:

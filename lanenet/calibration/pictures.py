@@ -8,26 +8,13 @@ from jaxtyping import Float, UInt8
 
 from lanenet.calibration.lens import moved_points
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.views import View, undistorting_view
+from lanenet.perception.edges.views import View
 
 #: BGR of the grid's lines, of its axes, of measured and of projected points.
 GRID_BGR, AXIS_BGR, MEASURED_BGR, PROJECTED_BGR = (200, 160, 60), (60, 60, 230), (60, 220, 60), (40, 60, 240)
 _MAX_SIDE_PX = 1200
 #: Spacing of grid lines, [cm]: the finest that leaves this many pixels between them.
 _SPACINGS_CM, _MIN_SPACING_PX = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0), 28.0
-
-
-def undistorted_picture(frame_bgr: UInt8[np.ndarray, "h w 3"], camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
-    """Show a frame as a lens without distortion would: what is straight becomes straight.
-
-    Args:
-        frame_bgr: Frame of the camera.
-        camera: The camera.
-
-    Returns:
-        An image of the same size and direction, with the field of the frame up to 120 degrees across.
-    """
-    return undistorting_view(camera).of(frame_bgr)
 
 
 def plane_picture(

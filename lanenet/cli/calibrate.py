@@ -284,7 +284,8 @@ def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
     """Write the largest view undistorted, and its board from above; returns the paths."""
     from lanenet.calibration.chessboard import read_picture
     from lanenet.calibration.chessboard_camera import reprojected
-    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+    from lanenet.calibration.pictures import plane_picture, points_picture
+    from lanenet.perception.edges.views import undistorting_view
 
     sizes = [float(np.prod(np.ptp(view.corners_px, axis=0))) for view in result.views]
     index = int(np.argmax(sizes))
@@ -295,7 +296,7 @@ def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
     margin = 0.4 * max(x1 - x0, y1 - y0)
     area = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
     return [
-        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "undistorted", undistorting_view(result.camera).of(marked)),
         _write_picture(out, "board", plane_picture(frame, result.camera, result.fit.poses[index], area)),
     ]
 
@@ -305,12 +306,13 @@ def _ground_pictures(
 ) -> list[Path]:
     """Write the photo of the ground undistorted, and from above; returns the paths."""
     from lanenet.calibration.lens import pose_from_mounting
-    from lanenet.calibration.pictures import plane_picture, points_picture, undistorted_picture
+    from lanenet.calibration.pictures import plane_picture, points_picture
+    from lanenet.perception.edges.views import undistorting_view
 
     marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
     pose = pose_from_mounting(result.camera.mounting)
     return [
-        _write_picture(out, "undistorted", undistorted_picture(marked, result.camera)),
+        _write_picture(out, "undistorted", undistorting_view(result.camera).of(marked)),
         _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
     ]
 
@@ -318,11 +320,12 @@ def _ground_pictures(
 def _drive_pictures(out: Path, result: CalibratedDrive) -> list[Path]:
     """Write frames of a straight section undistorted, and from above; returns the paths."""
     from lanenet.calibration.lens import pose_from_mounting
-    from lanenet.calibration.pictures import plane_picture, undistorted_picture
+    from lanenet.calibration.pictures import plane_picture
+    from lanenet.perception.edges.views import undistorting_view
 
     pose = pose_from_mounting(result.camera.mounting)
     frames = [result.drive.image(k) for k in result.shown]
-    flat = [undistorted_picture(frame, result.camera) for frame in frames]
+    flat = [undistorting_view(result.camera).of(frame) for frame in frames]
     above = [plane_picture(frame, result.camera, pose, _AREA_CM, _SMALL_PX_PER_CM) for frame in frames]
     return [
         _write_picture(out, "undistorted", np.concatenate(flat, axis=1)),

@@ -10,7 +10,7 @@ pinhole lens has the distortion of Brown and Conrady, in OpenCV's order of coeff
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -204,17 +204,7 @@ class Camera:
 
         Numbers are rounded to nine significant digits, so that the trip through a YAML file keeps it.
         """
-        m = self.mounting
-        numbers = [
-            *self.K.ravel(),
-            *self.D.ravel(),
-            m.height_cm,
-            m.pitch_down_rad,
-            m.roll_rad,
-            m.yaw_rad,
-            m.ahead_of_front_axle_cm,
-            m.right_of_centre_cm,
-        ]
+        numbers = [*self.K.ravel(), *self.D.ravel(), *astuple(self.mounting)]
         text = f"{self.model} {self.width} {self.height} " + " ".join(f"{float(v):.9g}" for v in numbers)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

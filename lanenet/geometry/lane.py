@@ -53,11 +53,6 @@ def points_from_parabolas(parabolas: Float[np.ndarray, "*n 2 3"]) -> Float[np.nd
     return points.reshape(*points.shape[:-2], N_POINTS)
 
 
-def parabola_x_cm(parabola: Float[np.ndarray, "*n 3"], y_cm: float) -> Float[np.ndarray, "*n"]:
-    """Evaluate x = a y^2 + b y + c, [cm]."""
-    return (parabola[..., 0] * y_cm + parabola[..., 1]) * y_cm + parabola[..., 2]
-
-
 def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"]:
     """Find x where a lane line crosses the label rows.
 

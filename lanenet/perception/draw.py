@@ -144,9 +144,12 @@ def _draw_polyline(
 ) -> None:
     seen = np.isfinite(points_px).all(axis=1)
     for k in np.flatnonzero(seen[:-1] & seen[1:]):
-        ends = _clipped_line(points_px[k], points_px[k + 1], *_bounds(image))
-        if ends is not None:
-            cv2.line(image, _fixed(ends[0]), _fixed(ends[1]), colour, thickness, cv2.LINE_AA, _SHIFT)
+        # A line is an area of two corners; clipping may repeat its ends.
+        ends = _clipped_area(points_px[k : k + 2], *_bounds(image))
+        if len(ends):
+            along = ends @ (points_px[k + 1] - points_px[k])
+            start, end = _fixed(ends[along.argmin()]), _fixed(ends[along.argmax()])
+            cv2.line(image, start, end, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def _bounds(
@@ -157,37 +160,10 @@ def _bounds(
     return -_MARGIN * size, (1.0 + _MARGIN) * size
 
 
-def _clipped_line(
-    start_px: Float[np.ndarray, "2"],
-    end_px: Float[np.ndarray, "2"],
-    low_px: Float[np.ndarray, "2"],
-    high_px: Float[np.ndarray, "2"],
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """The part of a line within a box, or None: OpenCV's fixed point overflows far outside the image.
-
-    Source:
-        Liang and Barsky 1984, "A new concept and method for line clipping", ACM Transactions on Graphics 3.
-    """
-    first, last = 0.0, 1.0
-    step = end_px - start_px
-    for axis in (0, 1):
-        if step[axis] == 0.0:
-            if not low_px[axis] <= start_px[axis] <= high_px[axis]:
-                return None
-            continue
-        enter, leave = sorted(
-            ((low_px - start_px)[axis] / step[axis], (high_px - start_px)[axis] / step[axis])
-        )
-        first, last = max(first, float(enter)), min(last, float(leave))
-    if first > last:
-        return None
-    return start_px + first * step, start_px + last * step
-
-
 def _clipped_area(
     outline_px: Float[np.ndarray, "n 2"], low_px: Float[np.ndarray, "2"], high_px: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "m 2"]:
-    """The part of an area within a box.
+    """The part of an area within a box: OpenCV's fixed point overflows far outside the image.
 
     Source:
         Sutherland and Hodgman 1974, "Reentrant polygon clipping", Communications of the ACM 17.

@@ -43,24 +43,16 @@ class ErrorAnalysis:
 
     Attributes:
         settings: Grid and look-ahead.
-        x_cm: Middle of each column, frame car.
-        y_cm: Middle of each row, frame car.
         pixels: Pixel centres in each cell.
-        sideways_cm_per_px: Most that one pixel's step along a row or a column moves the road point sideways,
-            at the middle of each cell; NaN where the camera does not see it.
-        ahead_cm_per_px: The same along the direction of travel.
         line_pixels: Pixel centres in the cells of the left and the right line's point at the look-ahead.
-        line_cm_per_px: Sideways, at these two points; NaN outside the image.
+        line_cm_per_px: Most that one pixel's step along a row or a column moves the road point sideways, at
+            these two points; NaN outside the image.
         position_error_cm: Worst sideways error of the lane's centre: a pixel and the filter's grid.
         steering_error_rad: Steering error of that at the look-ahead.
     """
 
     settings: AnalysisSettings
-    x_cm: Float[np.ndarray, "c"]
-    y_cm: Float[np.ndarray, "r"]
     pixels: Int[np.ndarray, "r c"]
-    sideways_cm_per_px: Float[np.ndarray, "r c"]
-    ahead_cm_per_px: Float[np.ndarray, "r c"]
     line_pixels: tuple[int, int]
     line_cm_per_px: tuple[float, float]
     position_error_cm: float
@@ -110,24 +102,15 @@ def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> 
     pixels = np.zeros((rows, columns), np.int64)
     np.add.at(pixels, (cells[inside, 0], cells[inside, 1]), 1)
 
-    y_cm = (np.arange(rows) + 0.5) * chosen.cell_cm
-    x_cm = (np.arange(columns) - half_columns + 0.5) * chosen.cell_cm
-    centres = np.stack(np.meshgrid(x_cm, y_cm), axis=-1).reshape(-1, 2)
-    steps = _cm_per_px(camera, centres).reshape(rows, columns, 2)
-
     half_lane = 0.5 * chosen.lane_width_cm
     lines = np.array([[-half_lane, chosen.lookahead_cm], [half_lane, chosen.lookahead_cm]])
-    line_steps = _cm_per_px(camera, lines)[:, 0]
+    line_steps = sideways_cm_per_px(camera, lines)
     seen = line_steps[np.isfinite(line_steps)]
     error_cm = float(seen.max()) + chosen.filter_grid_cm if seen.size else math.nan
     left, right = (_count(pixels, cell) for cell in _cells_of(lines, chosen.cell_cm, half_columns))
     return ErrorAnalysis(
         chosen,
-        x_cm,
-        y_cm,
         pixels,
-        steps[..., 0],
-        steps[..., 1],
         (left, right),
         (float(line_steps[0]), float(line_steps[1])),
         error_cm,
@@ -170,8 +153,8 @@ def _count(pixels: np.ndarray, cell: np.ndarray) -> int:
     return int(pixels[row, column]) if 0 <= row < rows and 0 <= column < columns else 0
 
 
-def _cm_per_px(camera: Camera, points_cm: np.ndarray) -> np.ndarray:
-    """Sideways and ahead: how far a step of one pixel, along u or v, moves a road point; NaN if unseen."""
+def sideways_cm_per_px(camera: Camera, points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    """Return how far a step of one pixel, along u or v, moves road points sideways; NaN if unseen."""
     at = camera.project_ground(points_cm)
     half = 0.5
     size = [camera.width - half, camera.height - half]
@@ -180,9 +163,8 @@ def _cm_per_px(camera: Camera, points_cm: np.ndarray) -> np.ndarray:
     # Central differences over one pixel; a step that leaves the road is NaN and stays so.
     along_u = camera.intersect_ground(at + [half, 0.0]) - camera.intersect_ground(at - [half, 0.0])
     along_v = camera.intersect_ground(at + [0.0, half]) - camera.intersect_ground(at - [0.0, half])
-    steps = np.maximum(np.abs(along_u), np.abs(along_v))
-    steps[~visible] = np.nan
-    return steps
+    steps = np.maximum(np.abs(along_u[:, 0]), np.abs(along_v[:, 0]))
+    return np.where(visible, steps, np.nan)
 
 
 _CELL_PX = 36
@@ -219,7 +201,9 @@ def draw_analysis(analysis: ErrorAnalysis) -> UInt8[np.ndarray, "h w 3"]:
         dark = shade[row, column] > 150 or pixels[row, column] == 0
         cv2.putText(image, text, at, _FONT, 0.38, _DARK_BGR if dark else (255, 255, 255), 1, cv2.LINE_AA)
     _mark_points(image, analysis, rows, columns)
-    _write_figures(image, analysis, rows * _CELL_PX)
+    for index, line in enumerate(figure_lines(analysis)):
+        place = (8, rows * _CELL_PX + 19 + 20 * index)
+        cv2.putText(image, line, place, _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)
     return image
 
 
@@ -254,8 +238,3 @@ def figure_lines(analysis: ErrorAnalysis) -> list[str]:
     else:
         lines.append(f"neither L nor R is seen at {chosen.lookahead_cm:g} cm: no errors to tell")
     return lines
-
-
-def _write_figures(image: np.ndarray, analysis: ErrorAnalysis, top: int) -> None:
-    for index, line in enumerate(figure_lines(analysis)):
-        cv2.putText(image, line, (8, top + 19 + 20 * index), _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)

@@ -18,14 +18,6 @@ from lanenet.geometry.lane import N_POINTS, SIDES, lane_width_cm, parabolas_from
 from lanenet.perception.edges.road import PerceptionSettings
 
 
-def _no_points() -> Float[np.ndarray, "6"]:
-    return np.full(N_POINTS, np.nan)
-
-
-def _no_presence() -> Float[np.ndarray, "2"]:
-    return np.full(len(SIDES), np.nan)
-
-
 @dataclass(frozen=True)
 class LaneEstimate:
     """The lane as one frame shows it.
@@ -43,13 +35,13 @@ class LaneEstimate:
             know it.
     """
 
-    points_cm: Float[np.ndarray, "6"] = field(default_factory=_no_points)
-    sigma_cm: Float[np.ndarray, "6"] = field(default_factory=_no_points)
+    points_cm: Float[np.ndarray, "6"] = field(default_factory=lambda: np.full(N_POINTS, np.nan))
+    sigma_cm: Float[np.ndarray, "6"] = field(default_factory=lambda: np.full(N_POINTS, np.nan))
     steering_rad: float = float("nan")
     confidence: float = 0.0
     radius_cm: float = float("nan")
     offset_cm: float = float("nan")
-    presence: Float[np.ndarray, "2"] = field(default_factory=_no_presence)
+    presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
 
     @property
     def mask(self) -> np.ndarray:

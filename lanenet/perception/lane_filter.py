@@ -121,13 +121,7 @@ class Markings:
 
     def subset(self, keep: Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> Markings:
         """Return some of them, in the order asked for."""
-        return Markings(
-            self.row[keep],
-            self.middle_cm[keep],
-            self.direction_rad[keep],
-            self.polarity[keep],
-            self.exact[keep],
-        )
+        return Markings(*(values[keep] for values in vars(self).values()))
 
 
 def find_markings(

@@ -17,7 +17,7 @@ from pydantic import Field
 from datagen.slam.adjustment.kernels import N_FRAME
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 #: Names of the camera's adjustable numbers, in the order of the kernels.
 CAMERA_NAMES = ("focal", "cx", "cy", "k1", "pitch", "roll", "yaw", "lever")

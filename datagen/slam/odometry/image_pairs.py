@@ -12,7 +12,7 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 #: Directions that edges are told apart by; each edge counts for the two nearest.
 SECTORS = 8

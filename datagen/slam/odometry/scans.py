@@ -12,7 +12,8 @@ from numba import njit
 
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, find_edges
+from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadEdges, RoadTable
 
 Progress = Callable[[int, int], None]

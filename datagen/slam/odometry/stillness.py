@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from lanenet.data.drives import Commands, Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels, to_gray
+from lanenet.perception.edges.canny import to_gray
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadEdges, RoadTable
 
 #: Size of a small image: patches of 6 to 7 px of an image of 160 x 120.

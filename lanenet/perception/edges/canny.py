@@ -16,16 +16,6 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.markings_only import ColourSettings, PixelScale, colour_edges
 from lanenet.perception.edges.pixels import EdgePixels, edge_pixels, gradients, prefer_stronger
 
-__all__ = [
-    "EdgePixels",
-    "EdgeSettings",
-    "check_frame",
-    "check_size",
-    "find_edges",
-    "sample_pixels",
-    "to_gray",
-]
-
 # Channels of BGR; gray is mostly green.
 _BLUE, _RED = 0, 2
 

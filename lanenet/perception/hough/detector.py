@@ -34,7 +34,6 @@ from lanenet.perception.hough.lines import (
     Segment,
     centre_on_marking,
     choose_lines,
-    x_at,
 )
 from lanenet.perception.image_lane import (
     ImageLane,
@@ -254,16 +253,16 @@ class HoughTracker:
         segment, earlier = (left, state.left) if left is not None else (right, state.right)
         if segment is not None and earlier is not None:
             distance, before = self._distance_px(segment), earlier.distance_px
-            rule = change_by_right_line_deg if left is None else change_by_left_line_deg
             if settings.max_jump_px is None or abs(distance - before) <= settings.max_jump_px:
-                change = rule(distance, before, settings.gain_deg)
-        return angle_of_one_line_deg(state.steering_deg, change)
+                change = change_by_line_deg(distance, before, settings.gain_deg)
+        # Eq. 12.
+        return state.steering_deg + (change if left is not None else -change)
 
     def _distance_px(self, segment: Segment) -> float:
-        """Return dnx or dpx of a line, measured on the row of the settings."""
+        """Return dnx or dpx (below eq. 10): the distance along x between c1 and the line, on one row."""
         width, height = self._size
         row = 0.0 if self.settings.steering.distance_row == "top" else height
-        return horizontal_distance(segment.line, (0.5 * width, height), row)
+        return abs(lines.x_at(segment.line, row) - 0.5 * width)
 
     @property
     def _size(self) -> tuple[float, float]:
@@ -349,34 +348,16 @@ def distance_angle_deg(dnx: float, dpx: float, gain_deg: float) -> float:
     return gain_deg * (dnx - dpx) / total if total > 0.0 else 0.0
 
 
-def angle_of_one_line_deg(previous_deg: float, change_deg: float) -> float:
-    """Return theta = theta_{t-1} + theta_delta.
-
-    Source:
-        Suto 2021, eq. 12.
-    """
-    return previous_deg + change_deg
-
-
-def change_by_left_line_deg(distance: float, previous: float, gain_deg: float) -> float:
+def change_by_line_deg(distance: float, previous: float, gain_deg: float) -> float:
     """Return theta_delta of a left line: towards it (left, positive) as its distance grows.
 
-    No earlier distance to compare with, or one of 0, gives 0.
+    That of a right line has the opposite sign. An earlier distance of 0 gives 0.
 
     Source:
-        Suto 2021, eq. 13.
+        Suto 2021, eq. 13 and 14.
     """
     # The paper's two cases are one formula.
     return gain_deg * (distance - previous) / previous if previous > 0.0 else 0.0
-
-
-def change_by_right_line_deg(distance: float, previous: float, gain_deg: float) -> float:
-    """Return theta_delta of a right line: towards it (right, negative) as its distance grows.
-
-    Source:
-        Suto 2021, eq. 14.
-    """
-    return -change_by_left_line_deg(distance, previous, gain_deg)
 
 
 def smooth_angle_deg(current_deg: float, previous_deg: float | None, w1: float) -> float:
@@ -397,15 +378,6 @@ def smooth_line(current: Line, previous: Line | None, w2: float) -> Line:
     if previous is None:
         return current
     return Line(w2 * current.m + (1.0 - w2) * previous.m, w2 * current.b + (1.0 - w2) * previous.b)
-
-
-def horizontal_distance(line: Line, c1: Point, row: float) -> float:
-    """Return dnx or dpx: the distance along x between c1 and the line's point on a row.
-
-    Source:
-        Suto 2021, below eq. 10.
-    """
-    return abs(x_at(line, row) - c1[0])
 
 
 KIND = DetectorKind(

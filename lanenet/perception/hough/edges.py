@@ -7,7 +7,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int16, Num, UInt8
+from jaxtyping import Int16, Num, UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
@@ -98,17 +98,10 @@ def gray_of(roi_bgr: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) ->
     """Return the channel of HSV that serves as gray image; a hue that would be noise becomes 179."""
     hsv = cv2.cvtColor(roi_bgr, cv2.COLOR_BGR2HSV)
     gray = np.asarray(cv2.extractChannel(hsv, _CHANNELS[settings.channel]))
-    return np.where(is_coloured(hsv, settings), gray, _GRAY_HUE) if settings.channel == "hue" else gray
-
-
-def is_coloured(roi_hsv: UInt8[np.ndarray, "r c 3"], settings: HoughEdgeSettings) -> Bool[np.ndarray, "r c"]:
-    """True where a pixel is saturated and bright enough for its hue to be no noise."""
-    return (roi_hsv[..., 1] >= settings.min_saturation) & (roi_hsv[..., 2] >= settings.min_value)
-
-
-def rough_share(gray: UInt8[np.ndarray, "r c"]) -> float:
-    """Return the share of horizontal neighbours that differ strongly: near 1 in noise, small on a road."""
-    return float((cv2.absdiff(gray[:, 1:], gray[:, :-1]) >= _ROUGH_STEP).mean())
+    if settings.channel != "hue":
+        return gray
+    coloured = (hsv[..., 1] >= settings.min_saturation) & (hsv[..., 2] >= settings.min_value)
+    return np.where(coloured, gray, _GRAY_HUE)
 
 
 def crowded_share(binary: UInt8[np.ndarray, "r c"]) -> float:
@@ -119,14 +112,6 @@ def crowded_share(binary: UInt8[np.ndarray, "r c"]) -> float:
     rows, columns = (max(n // _BLOCK_PX, 1) for n in binary.shape)
     blocks = binary[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
     return float(blocks.reshape(rows, -1, columns, blocks.shape[1] // columns).any(axis=(1, 3)).mean())
-
-
-def horizontal_response(
-    gray: UInt8[np.ndarray, "r c"], settings: HoughEdgeSettings
-) -> Int16[np.ndarray, "r c"]:
-    """Return the horizontal Sobel response of the blurred channel, positive where it rises to the right."""
-    blurred = cv2.GaussianBlur(gray, (settings.blur_px, settings.blur_px), 0)
-    return np.asarray(cv2.Sobel(blurred, cv2.CV_16S, 1, 0))
 
 
 def binarise(response: Num[np.ndarray, "r c"], threshold: float) -> UInt8[np.ndarray, "r c"]:
@@ -144,8 +129,11 @@ def binarise(response: Num[np.ndarray, "r c"], threshold: float) -> UInt8[np.nda
 def find_contours(frame_bgr: UInt8[np.ndarray, "h w 3"], settings: HoughEdgeSettings) -> Contours:
     """Return the contours of the region of interest (section 4.1 of the paper as a whole)."""
     gray = gray_of(cut_roi(frame_bgr, settings), settings)
-    response = horizontal_response(gray, settings)
+    blurred = cv2.GaussianBlur(gray, (settings.blur_px, settings.blur_px), 0)
+    response = np.asarray(cv2.Sobel(blurred, cv2.CV_16S, 1, 0))
     binary = binarise(response, settings.threshold)
-    if rough_share(gray) > settings.max_rough_share:
+    # Near 1 in noise, small on a road.
+    rough_share = float((cv2.absdiff(gray[:, 1:], gray[:, :-1]) >= _ROUGH_STEP).mean())
+    if rough_share > settings.max_rough_share:
         binary = np.zeros_like(gray)
     return Contours(response, binary)

@@ -26,6 +26,20 @@ from lanenet.perception.hough.edges import Contours, crowded_share
 
 Point = tuple[float, float]
 
+# The constants of finding the middle of a marking. Half and double of each, one at a time, change the RMSE of
+# hough-value on a synthetic drive by less than 0.1 cm, except for _WEAK: 1 instead of 0.5 adds 0.24 cm.
+#: How far beside the line an edge is searched, and how near an edge belongs to the line, [px]. Chosen: the
+#: error of a Hough line of one degree over the region, and of an edge pixel.
+_SEARCH_PX, _NEAR_PX = 3, 1.0
+#: Least response of the other edge as a share of the threshold: the floors on both sides can differ.
+_WEAK = 0.5
+#: A gap of more rows than this ends a line. Chosen: a third of the region, more than between dashes.
+_LONGEST_GAP_PX = 25
+#: Fewest rows of a fit, and the share of them that must show the other edge.
+_LEAST_ROWS, _LEAST_SHARE = 6, 0.5
+#: Rounds of a robust fit, and of following an edge.
+_ROUNDS = 3
+
 
 class HoughLineSettings(Settings):
     """Which segments count as lane lines, and how one of each side is chosen (sections 4.2 and 4.3).
@@ -94,9 +108,9 @@ class Segment:
 
     @property
     def line(self) -> Line:
-        """The straight line through both ends; its slope must be finite."""
+        """The straight line through both ends, b = y2 - m x2 (eq. 3); its slope must be finite."""
         m = slope_of(self)
-        return Line(m, intercept_of(self, m))
+        return Line(m, self.y2 - m * self.x2)
 
 
 def slope_of(segment: Segment) -> float:
@@ -108,15 +122,6 @@ def slope_of(segment: Segment) -> float:
     if segment.x2 == segment.x1:
         return math.inf
     return (segment.y2 - segment.y1) / (segment.x2 - segment.x1)
-
-
-def intercept_of(segment: Segment, m: float) -> float:
-    """Return b = y2 - m x2.
-
-    Source:
-        Suto 2021, eq. 3.
-    """
-    return segment.y2 - m * segment.x2
 
 
 def angle_deg(m: float) -> float:
@@ -242,22 +247,18 @@ def line_distance(line: Line, earlier: Line | None, height: float) -> float:
     return sum(abs(x_at(line, y) - x_at(earlier, y)) for y in (0.0, height))
 
 
-def pair_cost(dn: float, dp: float, dc: float, settings: HoughLineSettings) -> float:
-    """Return 0.7 (dn + dp) + 0.3 dc, which the best pair minimises.
+def weighted_cost(line_px: float, centre_px: float, settings: HoughLineSettings) -> float:
+    """Return what the best pair, or the best single line, minimises: 0.7 (dn + dp) + 0.3 dc.
+
+    Args:
+        line_px: Distance to the earlier lines: dn + dp of a pair, dnp of a single line.
+        centre_px: Distance to c1: dc of a pair, dp1 of a single line.
+        settings: Both weights.
 
     Source:
-        Suto 2021, eq. 5.
+        Suto 2021, eq. 5 and 7.
     """
-    return settings.line_weight * (dn + dp) + settings.centre_weight * dc
-
-
-def single_cost(dnp: float, dp1: float, settings: HoughLineSettings) -> float:
-    """Return 0.7 dnp + 0.3 dp1, which the best line minimises where only one side has any.
-
-    Source:
-        Suto 2021, eq. 7.
-    """
-    return settings.line_weight * dnp + settings.centre_weight * dp1
+    return settings.line_weight * line_px + settings.centre_weight * centre_px
 
 
 def choose_lines(
@@ -279,8 +280,17 @@ def choose_lines(
     if pair is not None:
         return pair
     known = bool(left and earlier[0]) or bool(right and earlier[1])
+    c1 = (0.5 * width, height)
     costs = [
-        (cost_of_single(segment, line, width, height, settings), side, segment)
+        (
+            weighted_cost(
+                line_distance(segment.line, line, height),
+                math.dist((segment.x1, segment.y1), c1),
+                settings,
+            ),
+            side,
+            segment,
+        )
         for side, (segments, line) in enumerate(zip((left, right), earlier, strict=True))
         for segment in segments
         if line is not None or not known
@@ -314,7 +324,7 @@ def choose_pair(
         dc = math.dist(pc, (0.5 * width, height))
         dn = line_distance(negative.line, earlier[0], height)
         dp = line_distance(positive.line, earlier[1], height)
-        return pair_cost(dn, dp, dc, settings)
+        return weighted_cost(dn + dp, dc, settings)
 
     limit = settings.max_vanishing_share
     pairs = [
@@ -324,33 +334,6 @@ def choose_pair(
         if limit is None or vanishing_point(a.line, b.line)[1] <= limit * height
     ]
     return min(pairs, key=cost, default=None)
-
-
-def cost_of_single(
-    segment: Segment, earlier: Line | None, width: float, height: float, settings: HoughLineSettings
-) -> float:
-    """Return the cost of a line where no pair is; dp1 is the distance between c1 and its lower end.
-
-    Source:
-        Suto 2021, eq. 7.
-    """
-    dp1 = math.dist((segment.x1, segment.y1), (0.5 * width, height))
-    return single_cost(line_distance(segment.line, earlier, height), dp1, settings)
-
-
-# Half and double of each of these, one at a time, change the RMSE of hough-value on a synthetic drive by less
-# than 0.1 cm, except for _WEAK: 1 instead of 0.5 adds 0.24 cm.
-#: How far beside the line an edge is searched, and how near an edge belongs to the line, [px]. Chosen: the
-#: error of a Hough line of one degree over the region, and of an edge pixel.
-_SEARCH_PX, _NEAR_PX = 3, 1.0
-#: Least response of the other edge as a share of the threshold: the floors on both sides can differ.
-_WEAK = 0.5
-#: A gap of more rows than this ends a line. Chosen: a third of the region, more than between dashes.
-_LONGEST_GAP_PX = 25
-#: Fewest rows of a fit, and the share of them that must show the other edge.
-_LEAST_ROWS, _LEAST_SHARE = 6, 0.5
-#: Rounds of a robust fit, and of following an edge.
-_ROUNDS = 3
 
 
 def centre_on_marking(

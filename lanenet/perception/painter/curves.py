@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -153,23 +152,6 @@ def mean_curve(left: Curve, right: Curve) -> Curve:
     )
 
 
-@runtime_checkable
-class Plane(Protocol):
-    """Between pixels and the plane, x right and y ahead."""
-
-    def from_image(self, pixels_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Move pixels to the plane; those that do not lie on it are not finite."""
-        ...
-
-    def edge_points(self, edges: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-        """Move all edge pixels to the plane."""
-        ...
-
-    def to_image(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Move points of the plane into the image; those that are not seen are not finite."""
-        ...
-
-
 class RoadPlane:
     """The road in cm, frame car."""
 
@@ -185,15 +167,15 @@ class RoadPlane:
         self._points_cm = table.points_cm.reshape(-1, 2)
 
     def from_image(self, pixels_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """Move pixels to the plane; those that do not lie on it are not finite."""
         return self._camera.intersect_ground(np.asarray(pixels_px, np.float64))
 
     def edge_points(self, edges: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """Move all edge pixels to the plane."""
         return self._points_cm[np.flatnonzero((edges & self._keep) > 0)]
 
     def to_image(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """Move points of the plane into the image; those that are not seen are not finite."""
         return self._camera.project_ground(points)
 
 
@@ -208,17 +190,21 @@ class SquarePlane:
         )
 
     def from_image(self, pixels_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """As in :class:`RoadPlane`."""
         return _mapped(self._square_from_image, pixels_px)
 
     def edge_points(self, edges: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """As in :class:`RoadPlane`."""
         v, u = np.nonzero(edges)
         return finite_rows(self.from_image(np.stack([u, v], axis=1).astype(np.float64)))
 
     def to_image(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """See :class:`Plane`."""
+        """As in :class:`RoadPlane`."""
         return _mapped(np.linalg.inv(self._square_from_image), points)
+
+
+#: Between pixels and the plane, x right and y ahead.
+Plane = RoadPlane | SquarePlane
 
 
 def finite_rows(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
@@ -233,7 +219,7 @@ def move_lines(
     """Move many lines in one call, which costs more than the points, above all for a fisheye.
 
     Args:
-        move: :meth:`Plane.from_image` or :meth:`Plane.to_image`.
+        move: ``from_image`` or ``to_image`` of a plane.
         lines: Points of each line.
 
     Returns:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -83,7 +83,7 @@ def follow_lines(
     lines_px = [straight_px(line, trapezoid_px) for line in lines]
     guesses = move_lines(plane.from_image, lines_px)
     straight = [
-        Marking(line, None, line_px, _rising(guess))
+        Marking(line, None, line_px, guess[np.argsort(guess[:, 1], kind="stable")])
         for line, line_px, guess in zip(lines, lines_px, guesses, strict=True)
     ]
     if settings is None:
@@ -124,7 +124,7 @@ def weigh(
     The curve is preferred since it is fitted to both borders of the marking and lies on its middle.
     """
     first, *second = (
-        Marking(m.line, m.curve, m.line_px, m.points, measure_evidence(m.line_px, edges, settings), known)
+        replace(m, evidence=measure_evidence(m.line_px, edges, settings), known=known)
         for m in (straight, curved)
         if m is not None
     )
@@ -249,7 +249,3 @@ def _is_lane(
     if near <= 0.0 or far <= 0.0 or max(near, far) > settings.max_width_ratio * min(near, far):
         return False
     return camera_height_cm is None or near <= settings.max_width_heights * camera_height_cm
-
-
-def _rising(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    return np.asarray(points[np.argsort(points[:, 1], kind="stable")])

@@ -121,5 +121,5 @@ def test_commands_say_what_is_wrong(tmp_path: Path) -> None:
     words = ["calibrate", "chessboard", str(tmp_path), "--board", "9x6", "--out", str(tmp_path / "c.yaml")]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 1
-    assert "error: none of 1 pictures shows a whole board" in result.stderr
+    assert "error: none of 1 images shows a whole board" in result.stderr
     assert not (tmp_path / "c.yaml").exists()

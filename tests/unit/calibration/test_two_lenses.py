@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from boards import BOARD, fisheye_of, views_of
 
-from lanenet.calibration.bundle import FINE_SEARCH, LensFit, free_numbers, poses_of_views, refine
+from lanenet.calibration.bundle import LensFit, free_numbers, poses_of_views, refine
 from lanenet.calibration.chessboard import BoardView, find_views, list_pictures
 from lanenet.calibration.chessboard_camera import calibrate_lens
 from lanenet.calibration.lens import N_DISTORTION
@@ -50,9 +50,7 @@ def fit_of_one_lens(camera: Camera, views: list[BoardView]) -> LensFit:
     poses = poses_of_views(camera.model, lens, views)
     assert poses is not None
     free = free_numbers(camera.model, range(N_DISTORTION[camera.model]))
-    return refine(
-        camera.model, lens, poses, views, free, dataclasses.replace(FINE_SEARCH, max_evaluations=30)
-    )
+    return refine(camera.model, lens, poses, views, free)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,7 +9,6 @@ import pytest
 
 from lanenet.geometry.lane import (
     ROWS_CM,
-    parabola_x_cm,
     parabolas_from_points,
     points_from_parabolas,
     proportional_angle_rad,
@@ -43,7 +42,7 @@ def test_a_parabola_between_and_before_its_points(y_cm: float, left_cm: float, r
     At 22.5 cm: 6 / 450 * 506.25 - 1.125 - 21.5 = 6.75 - 22.625 = -15.875, and 3.375 + 2.25 + 18 = 23.625.
     At -15 cm: 3 + 0.75 - 21.5 = -17.75, and 1.5 - 1.5 + 18 = 18.
     """
-    np.testing.assert_allclose(parabola_x_cm(PARABOLAS, y_cm), [left_cm, right_cm], atol=1e-12)
+    np.testing.assert_allclose(np.polyval(PARABOLAS.T, y_cm), [left_cm, right_cm], atol=1e-12)
 
 
 def test_a_straight_lane_has_no_curvature() -> None:

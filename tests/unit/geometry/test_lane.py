@@ -14,7 +14,6 @@ from lanenet.geometry.lane import (
     SIDES,
     mirror_points,
     parabola_through,
-    parabola_x_cm,
     parabolas_from_points,
     points_from_parabolas,
     rows_of_polyline,
@@ -57,8 +56,8 @@ def test_points_and_parabolas_are_one_to_one(points: np.ndarray) -> None:
     assert parabolas.shape == (len(points), 2, 3)
     np.testing.assert_allclose(points_from_parabolas(parabolas), points, atol=1e-9)
     for row, y_cm in enumerate(ROWS_CM):
-        np.testing.assert_allclose(parabola_x_cm(parabolas[:, 0], y_cm), points[:, row], atol=1e-9)
-        np.testing.assert_allclose(parabola_x_cm(parabolas[:, 1], y_cm), points[:, 3 + row], atol=1e-9)
+        np.testing.assert_allclose(np.polyval(parabolas[:, 0].T, y_cm), points[:, row], atol=1e-9)
+        np.testing.assert_allclose(np.polyval(parabolas[:, 1].T, y_cm), points[:, 3 + row], atol=1e-9)
 
 
 @pytest.mark.parametrize("missing", range(N_POINTS))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.geometry.lane import ROWS_CM, parabola_x_cm
+from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.draw import ARROW_BGR, LEFT_BGR, RIGHT_BGR, draw_estimate
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.image_lane import ImageLane
@@ -28,7 +28,7 @@ def test_lines_and_points_lie_where_the_camera_sees_them(scale: int) -> None:
         # Smoothing spreads a thin line over two pixels.
         drawn = picture.astype(int) @ colour > 0.4 * np.dot(colour, colour)
         for y in (*ROWS_CM[1:], 22.0, 38.0):
-            x = float(parabola_x_cm(estimate.parabolas, y)[side])
+            x = float(np.polyval(estimate.parabolas.T, y)[side])
             u, v = (CAMERA.project_ground(np.array([[x, y]]))[0] + 0.5) * scale - 0.5
             assert drawn[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].any(), (side, y)
 

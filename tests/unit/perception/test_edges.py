@@ -7,7 +7,8 @@ import pytest
 
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.edges.canny import EdgePixels, EdgeSettings, find_edges, sample_pixels, to_gray
+from lanenet.perception.edges.canny import EdgeSettings, find_edges, sample_pixels, to_gray
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadEdgeExtractor, RoadTable
 
 DIRECTIONAL = EdgeSettings()

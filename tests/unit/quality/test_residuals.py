@@ -17,7 +17,7 @@ from datagen.quality.residuals import (
 )
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.geometry.camera import Camera, Mounting
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 CAMERA = Camera(
     "fisheye",

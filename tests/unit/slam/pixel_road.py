@@ -9,7 +9,7 @@ from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tapes_along
 
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 WIDTH, HEIGHT = 160, 120
 #: Edge points per frame at most; more would only cost time.

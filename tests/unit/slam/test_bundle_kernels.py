@@ -13,7 +13,7 @@ from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleProblem, BundleSe
 from datagen.slam.adjustment.kernels import N_VIEW, lift_pixel, project_point, project_with_jacobian, set_view
 from datagen.slam.adjustment.state import BundleEstimate, BundleState, Observations
 from lanenet.geometry.camera import Camera
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 CAMERAS = {"fisheye": fisheye(), "pinhole": pinhole()}
 SMALL = BundleSettings(lags=(1, 4), points=40)

@@ -9,7 +9,7 @@ from tape_road import HEIGHT_CM, STEP_CM, TapeRoad, tape_road
 
 from datagen.slam.odometry.image_pairs import SECTORS, ImagePairs, OdometrySettings, index_edges, turns_up_to
 from datagen.slam.odometry.odometry import STEPS_HEIGHTS, Evidence, Odometry, best_step, typical_step
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 
 SETTINGS = OdometrySettings()
 STEP = STEP_CM / HEIGHT_CM

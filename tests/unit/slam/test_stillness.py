@@ -25,7 +25,7 @@ from datagen.slam.odometry.stillness import (
 )
 from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import TrackingLostError
-from lanenet.perception.edges.canny import EdgePixels
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 
