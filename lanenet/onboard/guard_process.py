@@ -156,9 +156,13 @@ class Guard:
         self._driving = False
 
     def _say(self, text: str) -> None:
-        # A loop that does not read must not block the guard.
-        with contextlib.suppress(OSError):
-            self._line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
+        _say(self._line, text)
+
+
+def _say(line: socket.socket, text: str) -> None:
+    # A loop that does not read must not block the guard.
+    with contextlib.suppress(OSError):
+        line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
 
 
 def actuator_from_json(text: str) -> Actuator:
@@ -186,11 +190,6 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     logging.basicConfig(format="lanenet guard: %(message)s", level=logging.INFO)
-
-    def say(text: str) -> None:
-        with contextlib.suppress(OSError):
-            line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
-
     actuator: Actuator | None = None
     try:
         actuator = build(settings_json)
@@ -208,19 +207,19 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
         # A garbage collection would be a pause.
         gc.collect()
         gc.disable()
-        say("ready")
+        _say(line, "ready")
         reason = guard.run()
     except LanenetError as error:
-        say(f"failed {error}")
+        _say(line, f"failed {error}")
         return 1
     except Exception as error:
-        say(f"failed the guard of the actuator failed: {type(error).__name__}: {error}")
+        _say(line, f"failed the guard of the actuator failed: {type(error).__name__}: {error}")
         raise
     finally:
         if actuator is not None:
             actuator.neutral()
             actuator.close()
-        say("closed")
+        _say(line, "closed")
     # Logged after the motor has stopped: a terminal that is gone may block a writer for ever.
     log.info("neutral: %s", reason)
     return 0

@@ -17,12 +17,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Int
 
 from lanenet.control.controller import LaneController, SpeedSettings, throttle_of
+from lanenet.data.drives.recorder import DriveRecorder
 from lanenet.errors import HardwareError
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.guard import CommandSink
@@ -49,23 +50,6 @@ _BIN_MS = 0.05
 _BINS = 10_000
 
 
-@runtime_checkable
-class FrameRecorder(Protocol):
-    """Takes the frames of a drive; never blocks and never raises."""
-
-    path: Path
-    recorded: int
-    dropped: int
-
-    def add(self, frame_bgr: UInt8[np.ndarray, "h w 3"], t_s: float, **commands: float) -> None:
-        """Queue a frame and its commands."""
-        ...
-
-    def close(self) -> None:
-        """Write the waiting frames."""
-        ...
-
-
 @dataclass(frozen=True)
 class CarParts:
     """What a drive loop connects; nothing is open yet.
@@ -82,7 +66,7 @@ class CarParts:
     detector: Detector
     controller: LaneController
     sink: CommandSink
-    recorder: FrameRecorder | None = None
+    recorder: DriveRecorder | None = None
 
 
 @dataclass(frozen=True)

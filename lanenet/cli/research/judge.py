@@ -20,7 +20,6 @@ from lanenet.perception.registry import KINDS, build_detector, detector_names, k
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
     from datagen.judge.settings import JudgeSettings
-    from datagen.world.simulate import BuildPilot
     from lanenet.geometry.camera import Camera
     from lanenet.perception.estimate import Detector
 
@@ -200,25 +199,6 @@ class NamedDetector:
         """Hash of the files it depends on."""
         files = [path for path in (self.model, self.config) if path is not None]
         return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
-
-
-def pilot_builder(text: str, model: Path | None, lane_width_cm: float) -> BuildPilot:
-    """Return a function that builds the driver of a simulated world in closed loop.
-
-    Args:
-        text: A detector's name, as in judge's ``--detectors``.
-        model: Model or checkpoint folder of the network; None takes the shipped one, and says so.
-        lane_width_cm: Lane width of the road; prints a warning if the network was trained on other widths.
-
-    Raises:
-        LanenetError: If there is no such detector or file.
-    """
-    from datagen.judge.run import build_pilot
-    from datagen.world.car.driver import PilotSettings
-
-    entrant = named_entrant(text, model, "--detector", any_camera=False)
-    warn_of_widths([entrant], [lane_width_cm])
-    return lambda world: build_pilot(world, entrant, PilotSettings())
 
 
 def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) -> Entrant:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lanenet.cli.research.judge import pilot_builder
+from lanenet.cli.research.judge import named_entrant, warn_of_widths
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import ConfigArgument, ModelOption, OverridesArgument
 from lanenet.config import load_settings
@@ -29,6 +30,8 @@ def simulate(
     model: ModelOption = None,
 ) -> None:
     """Make a synthetic drive with ground truth, by a scripted driver or in closed loop by a detector."""
+    from datagen.judge.run import build_pilot
+    from datagen.world.car.driver import PilotSettings
     from datagen.world.simulate import simulate_drive
     from datagen.world.world import SimulationSettings
 
@@ -36,7 +39,11 @@ def simulate(
     if model is not None and detector is None:
         raise ConfigError("--model: is the network's, expected --detector network as well")
     width_cm = settings.track.lane_width_cm
-    pilot = None if detector is None else pilot_builder(detector, model, width_cm)
+    pilot = None
+    if detector is not None:
+        entrant = named_entrant(detector, model, "--detector", any_camera=False)
+        warn_of_widths([entrant], [width_cm])
+        pilot = partial(build_pilot, entrant=entrant, settings=PilotSettings())
     with console.progress_bar("simulate") as progress:
         drive = simulate_drive(settings, out, progress, workers=workers, pilot=pilot)
     console.wrote(drive)

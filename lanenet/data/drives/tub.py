@@ -43,13 +43,6 @@ class _Record:
     throttle: float
 
 
-@dataclass(frozen=True)
-class _Manifest:
-    catalogs: list[str]
-    deleted: set[int]
-    image_key: str
-
-
 def read_tub(path: Path) -> RecordedFrames:
     """Read a tub; nothing is copied or converted.
 
@@ -59,9 +52,9 @@ def read_tub(path: Path) -> RecordedFrames:
     Raises:
         DriveFormatError: If the manifest or all catalogs cannot be read, or no row can be used.
     """
-    manifest = _read_manifest(path / MANIFEST_FILE)
-    present = [name for name in manifest.catalogs if (path / name).is_file()]
-    absent = [name for name in manifest.catalogs if name not in present]
+    catalogs, deleted, image_key = _read_manifest(path / MANIFEST_FILE)
+    present = [name for name in catalogs if (path / name).is_file()]
+    absent = [name for name in catalogs if name not in present]
     if not present:
         found = f"{', '.join(absent)} are not there" if absent else "the manifest lists no catalog"
         raise DriveFormatError(f"{path / MANIFEST_FILE}: the tub is empty: {found}")
@@ -70,11 +63,11 @@ def read_tub(path: Path) -> RecordedFrames:
         problems.append(f"{path / MANIFEST_FILE}: catalogs listed but not there: {', '.join(absent)}")
     records: list[_Record] = []
     for name in present:
-        found_records, bad_rows = _read_catalog(path / name, manifest.image_key)
+        found_records, bad_rows = _read_catalog(path / name, image_key)
         records += found_records
         if bad_rows:
             problems.append(
-                f"{path / name}: {len(bad_rows)} rows are not JSON with '_index' and {manifest.image_key!r} "
+                f"{path / name}: {len(bad_rows)} rows are not JSON with '_index' and {image_key!r} "
                 f"(first: row {bad_rows[0]})"
             )
     ordered = _in_order(records)
@@ -117,7 +110,7 @@ def read_tub(path: Path) -> RecordedFrames:
         ImageFiles([folder / record.image for record in records]),
         tuple(problems),
         times_trusted=distrust is None,
-        deleted=np.array([record.index in manifest.deleted for record in records], dtype=bool),
+        deleted=np.array([record.index in deleted for record in records], dtype=bool),
         sessions=np.array([False, *(before != now for before, now in sessions)]),
     )
 
@@ -135,7 +128,8 @@ def is_old(path: Path) -> bool:
     return any(path.glob("record_*.json"))
 
 
-def _read_manifest(path: Path) -> _Manifest:
+def _read_manifest(path: Path) -> tuple[list[str], set[int], str]:
+    """Return the names of the catalogs, the deleted indexes, and the key of the images."""
     try:
         lines = [line for line in path.read_text(encoding="utf-8").split("\n") if line.strip()]
         values = [json.loads(line) for line in lines]
@@ -155,7 +149,7 @@ def _read_manifest(path: Path) -> _Manifest:
         image_key = str(named.get("image_array", image_key))
     # macOS adds a "._name" beside each file that it copies.
     names = [str(name) for name in catalogs[-1]["paths"] if not Path(str(name)).name.startswith("._")]
-    return _Manifest(names, set(deleted), image_key)
+    return names, set(deleted), image_key
 
 
 def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]:
