@@ -1,16 +1,20 @@
-"""Tables of a contest: a row per kind of road and entrant, mean and worst over its runs."""
+"""What a contest leaves: tables by kind of road and entrant, and top views with the driven paths."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from datagen.judge.run import RunResult
+from datagen.judge.run import RunResult, Trajectory
 from datagen.judge.settings import JudgeSettings
+from datagen.world.road.track import Track
+from datagen.world.road.track_picture import FIXED_BITS, box_corners_cm, paint_track, painted_bounds_cm
 from lanenet.data.files import write_json, write_text
 from lanenet.data.tables import write_csv
 
@@ -27,6 +31,22 @@ _MEASURES: tuple[tuple[str, str, int, float], ...] = (
     ("time, s", "time_s", 0, 1.0),
 )
 _HEADERS: tuple[str, ...] = ("completed", "clean", *(header for header, *_ in _MEASURES))
+
+_SIDE_PX = 1100  # of the longer side of the road
+_MARGIN_CM = 50.0
+_BESIDE_PAINT_CM = 3.0
+_ROW_PX = 26
+_GROUND_BGR, _ROAD_BGR, _TEXT_BGR = (225, 228, 225), (120, 120, 120), (30, 30, 30)
+#: BGR by place among the entrants; more of them start over.
+COLOURS_BGR: tuple[tuple[int, int, int], ...] = (
+    (40, 40, 40),
+    (230, 140, 20),
+    (30, 160, 40),
+    (20, 110, 245),
+    (200, 40, 200),
+    (40, 40, 220),
+    (200, 190, 0),
+)
 
 
 def summarise(results: Sequence[RunResult]) -> list[dict[str, Any]]:
@@ -96,3 +116,108 @@ def write_report(out: Path, settings: JudgeSettings, results: Sequence[RunResult
     names = [field.name for field in fields(RunResult)]
     write_csv(paths[2], {name: [getattr(result, name) for result in results] for name in names})
     return paths
+
+
+@dataclass(frozen=True)
+class _View:
+    """From the map to the image."""
+
+    origin_cm: Float[np.ndarray, "2"]
+    px_per_cm: float
+    top_px: int
+
+    def fixed(self, xy_cm: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """Points in OpenCV's fixed point; y of the map is up."""
+        px = (xy_cm - self.origin_cm) * [self.px_per_cm, -self.px_per_cm] + [0.0, self.top_px]
+        return np.rint(px * (1 << FIXED_BITS)).astype(np.int32)
+
+
+def draw_top_view(
+    track: Track, runs: Sequence[tuple[RunResult, Trajectory]], title: str
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw a road and the runs on it.
+
+    A filled dot marks where a departure begins, a cross where the car was put back.
+
+    Args:
+        track: The road.
+        runs: Results and trajectories, in the order of their colours.
+        title: For the top left corner.
+    """
+    # Markings reach beyond the driven lane where the road has another one.
+    half_cm = 0.5 * track.lane_width_cm
+    sides_cm = [-half_cm, half_cm, *(marking.offset_cm for marking in track.markings)]
+    low_cm, high_cm = painted_bounds_cm(track, _MARGIN_CM)
+    size_cm = high_cm - low_cm
+    scale = _SIDE_PX / float(size_cm.max())
+    header_px = _ROW_PX * (len(runs) + 1) + 12
+    width, height = max(760, round(size_cm[0] * scale)), round(size_cm[1] * scale) + header_px
+    image = np.full((height, width, 3), _GROUND_BGR, np.uint8)
+    view = _View(np.array([low_cm[0], high_cm[1]]), scale, header_px)
+    road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
+    middle_cm = track.beside(np.arange(len(track.s_cm)), 0.5 * (max(sides_cm) + min(sides_cm)))
+    points = view.fixed(middle_cm)
+    cv2.polylines(image, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, FIXED_BITS)
+    _pave_furniture(image, track, view)
+    paint_track(image, track, view.fixed)
+    for index, (_, trajectory) in enumerate(runs):
+        # Later ones are thinner, so that equal paths below stay visible.
+        thickness = min(2 + len(runs) - 1 - index, 7)
+        _draw_run(image, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, view)
+    _draw_start(image, track, max(sides_cm) + 18.0, view)
+    _write(image, title, 0, _TEXT_BGR)
+    for index, (result, _) in enumerate(runs):
+        text = (
+            f"{result.entrant}: {result.laps:.2f} laps, {result.departures} departures, "
+            f"{result.put_backs} put back, offset {result.mean_offset_cm:.2f} cm mean, "
+            f"{result.worst_offset_cm:.1f} cm worst"
+        )
+        _write(image, text, index + 1, COLOURS_BGR[index % len(COLOURS_BGR)])
+    return image
+
+
+def _pave_furniture(image: UInt8[np.ndarray, "h w 3"], track: Track, view: _View) -> None:
+    """Draw the ground of bays and side roads, since white paint needs something darker below it."""
+    paved = np.zeros(image.shape[:2], np.uint8)
+    for box in track.boxes:
+        cv2.fillPoly(paved, [view.fixed(box_corners_cm(box, _BESIDE_PAINT_CM))], 255, cv2.LINE_8, FIXED_BITS)
+    # What lies between the lines of a side road and the road itself is road as well.
+    side_px = 1 + round(2.0 * track.half_width_cm * view.px_per_cm)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px))
+    paved = cv2.morphologyEx(paved, cv2.MORPH_CLOSE, disc)
+    road = (image == _ROAD_BGR).all(axis=2).astype(np.uint8) * 255
+    joined = cv2.morphologyEx(paved | road, cv2.MORPH_CLOSE, disc)
+    image[(joined & cv2.dilate(paved, disc)) > 0] = _ROAD_BGR
+
+
+def _draw_run(
+    image: UInt8[np.ndarray, "h w 3"],
+    trajectory: Trajectory,
+    colour: tuple[int, int, int],
+    thickness: int,
+    view: _View,
+) -> None:
+    points = view.fixed(trajectory.xy_cm)
+    for section in np.split(points, np.flatnonzero(trajectory.put_back) + 1):
+        if len(section):
+            cv2.polylines(image, [section], False, colour, thickness, cv2.LINE_AA, FIXED_BITS)
+    begins = np.flatnonzero(trajectory.over & ~np.concatenate([[False], trajectory.over[:-1]]))
+    for x, y in points[begins].tolist():
+        cv2.circle(image, (x, y), 5 << FIXED_BITS, colour, -1, cv2.LINE_AA, FIXED_BITS)
+        cv2.circle(image, (x, y), 5 << FIXED_BITS, (255, 255, 255), 1, cv2.LINE_AA, FIXED_BITS)
+    for x, y in (points[trajectory.put_back] >> FIXED_BITS).tolist():
+        cv2.drawMarker(image, (x, y), colour, cv2.MARKER_TILTED_CROSS, 14, 3)
+
+
+def _draw_start(image: UInt8[np.ndarray, "h w 3"], track: Track, offset_cm: float, view: _View) -> None:
+    """An arrow beside the start, in the direction of travel."""
+    heading = float(track.heading_rad[0])
+    ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    tail_cm = track.xy_cm[0] + offset_cm * left
+    tail, tip = (view.fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> FIXED_BITS).tolist()
+    cv2.arrowedLine(image, tail, tip, _TEXT_BGR, 2, cv2.LINE_AA, tipLength=0.35)
+
+
+def _write(image: UInt8[np.ndarray, "h w 3"], text: str, row: int, colour: tuple[int, int, int]) -> None:
+    place = (12, _ROW_PX * (row + 1))
+    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 2 if row else 1, cv2.LINE_AA)

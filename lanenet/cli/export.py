@@ -39,7 +39,7 @@ def export(
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch; it cannot be combined with --int8")
     if int8:
-        from lanenet.learn.quantise import export_int8
+        from lanenet.learn.export import export_int8
         from lanenet.perception.network.model_file import MODEL_NAME
 
         path, report = export_int8(checkpoint, out)

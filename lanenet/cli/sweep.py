@@ -25,7 +25,7 @@ def sweep(
 ) -> None:
     """Try windows, sizes, losses and learning rates on CONFIG's validation drives, and keep the table."""
     from datagen.datasets.build import prepare
-    from lanenet.learn.run_state import check_start
+    from lanenet.learn.checkpoint import check_start
     from lanenet.learn.sweep import sweep as sweep_networks
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)

@@ -70,11 +70,11 @@ def train(
     from lanenet.data.label_set import read_labels
     from lanenet.evaluation.answers import Compared
     from lanenet.evaluation.card import CARD_NAME, model_card
-    from lanenet.evaluation.report import default_names, evaluate
+    from lanenet.evaluation.comparison import default_names, evaluate
+    from lanenet.evaluation.report import report_files
     from lanenet.evaluation.robustness import as_dict
     from lanenet.evaluation.sources import open_tests
-    from lanenet.learn.checkpoint import publish
-    from lanenet.learn.run_state import METRICS_NAME, check_start, hash_run
+    from lanenet.learn.checkpoint import METRICS_NAME, check_start, hash_run, publish
     from lanenet.learn.train import train as train_network
     from lanenet.perception.network.model_file import read_model_meta
     from lanenet.samples.dataset import compile_kernels
@@ -98,7 +98,7 @@ def train(
     sources = open_tests([part.labels for part in judged], [part.frames for part in judged])
     training = [read_labels(path) for path in dict.fromkeys(data.train)]
     with console.progress_bar("test") as progress:
-        evaluation = evaluate(
+        comparison, seen = evaluate(
             sources,
             # The config decides which camera made which test drive.
             Compared(default_names(sources, with_model=True), {"network": model}, marking, any_camera=True),
@@ -106,25 +106,25 @@ def train(
             settings.data.processes,
             progress,
         )
-    val_cli.show(evaluation.comparison)
+    val_cli.show(comparison)
     robustness = _robustness(model, sources)
     card = model_card(
         settings.name,
         read_model_meta(model),
         json.loads((run_folder / METRICS_NAME).read_text(encoding="utf-8")),
         training,
-        evaluation.comparison,
+        comparison,
         robustness,
     )
     files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card}
-    files |= {f"results{ending}": content for ending, content in evaluation.files.items()}
+    files |= {f"results{ending}": content for ending, content in report_files(comparison, seen).items()}
     if robustness:
         files["robustness.json"] = json_text(as_dict(robustness))
     if data.camera is not None:
         files["camera.yaml"] = data.camera.read_bytes()
     if data.example is not None:
         files[f"example{data.example.suffix}"] = data.example.read_bytes()
-    publish(run_folder, checkpoint, settings.name, files, evaluation.comparison.as_dict())
+    publish(run_folder, checkpoint, settings.name, files, comparison.as_dict())
     console.wrote(checkpoint)
     options = {
         "--detector": "network",

@@ -1,4 +1,4 @@
-"""``lanenet val``: a thin shell over :mod:`lanenet.evaluation.report`."""
+"""``lanenet val``: a thin shell over :mod:`lanenet.evaluation.comparison`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source
 from lanenet.errors import ConfigError
-from lanenet.evaluation.report import default_names, evaluate
+from lanenet.evaluation.comparison import default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
 from lanenet.perception.network.model_file import find_model, is_model
 from lanenet.perception.registry import compared_names, kind_of, listed
@@ -77,6 +77,7 @@ def val(
     from lanenet.data.files import write_bytes, write_json, write_text
     from lanenet.data.label_set import read_labels
     from lanenet.evaluation.answers import Compared
+    from lanenet.evaluation.report import report_files
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network.model_file import read_model_meta
 
@@ -99,19 +100,20 @@ def val(
         widths_cm = [source.lane_width_cm for source in sources]
         console.show_problems(read_model_meta(path).untrained_widths(widths_cm, str(path)))
     with console.progress_bar("val") as progress:
-        evaluation = evaluate(
+        comparison, seen = evaluate(
             sources,
             Compared(names, ({} if model is None else {"network": model}) | more, marking, any_camera),
             [read_labels(path) for path in trained_on or []],
             os.cpu_count() or 1,
             progress,
         )
-    show(evaluation.comparison)
+    show(comparison)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
-        write_json(Path(f"{out}.json"), evaluation.comparison.as_dict())
+        files = report_files(comparison, seen)
+        write_json(Path(f"{out}.json"), comparison.as_dict())
         console.wrote(Path(f"{out}.json"))
-        for ending, content in evaluation.files.items():
+        for ending, content in files.items():
             path = Path(f"{out}{ending}")
             if isinstance(content, str):
                 write_text(path, content)
@@ -123,9 +125,9 @@ def val(
             write_text(Path(f"{out}-robust.md"), table)
             write_json(Path(f"{out}-robust.json"), figures)
             console.wrote(Path(f"{out}-robust.md"), Path(f"{out}-robust.json"))
-        if ".png" not in evaluation.files:
-            console.show_problems(["no picture of the errors without Matplotlib: pip install 'lanenet[viz]'"])
-    best = min(evaluation.comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
+        if ".png" not in files:
+            console.show_problems(["no plot of the errors without Matplotlib: pip install 'lanenet[viz]'"])
+    best = min(comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
     shown = "network" if "network" in names else best
     console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from lanenet.data.label_set import LabelSet
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import ConfigError, ModelMismatchError
-from lanenet.evaluation.run import run_detectors
+from lanenet.evaluation.detect import run_detectors
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, SIDES
 from lanenet.perception.edges.road import PerceptionSettings

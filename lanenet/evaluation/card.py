@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from lanenet.data.label_set import LabelSet
-from lanenet.evaluation.breakdown import GROUPS
 from lanenet.evaluation.comparison import Comparison
-from lanenet.evaluation.errors import ErrorStats
+from lanenet.evaluation.errors import GROUPS, ErrorStats
 from lanenet.evaluation.robustness import RobustRow, robust_table
 from lanenet.evaluation.tables import show_cm, show_share
 from lanenet.geometry.lane import POINT_NAMES

@@ -1,27 +1,41 @@
-"""Several detectors on the same frames: their errors in cm, overall, on shared points and by source."""
+"""Several detectors on the same sources: their errors in cm, overall, on shared points and by source.
+
+What needs SciPy, PyArrow or numba is imported inside functions: the car, which knows ``lanenet val`` as a
+command, has none of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from lanenet.errors import LabelFormatError
-from lanenet.evaluation.breakdown import (
+from lanenet.evaluation.errors import (
     GROUPS,
     Breakdown,
+    ErrorStats,
+    ErrorTable,
     bootstrap_segments,
+    error_stats,
     errors_by_group,
     lane_curvature,
     lines_shown,
+    point_errors,
     presence_stats,
     rmse_interval_cm,
     sigma_stats,
 )
-from lanenet.evaluation.errors import ErrorStats, ErrorTable, error_stats, point_errors
+from lanenet.evaluation.sources import Opened, at_frames, distance_to_training_cm, lines_seen
 from lanenet.geometry.lane import ROWS_CM
+
+if TYPE_CHECKING:
+    from lanenet.data.label_set import LabelSet
+    from lanenet.data.maps.labelled_frames import LabelledFrames
+    from lanenet.evaluation.answers import Answers, Compared, Progress
 
 FORMAT = "lanenet-evaluation/1"
 
@@ -41,7 +55,7 @@ class SourceAnswers:
         sigma_cm: By detector, its sigmas; a detector that predicts none may be left out.
         presence: By detector, its probability that the left and the right line can be seen; likewise.
         visible: Whether each line can be seen: 1, 0, or NaN for unknown; None if unknown throughout.
-        conditions: By name (see :data:`lanenet.evaluation.breakdown.GROUPS`) its value for each frame.
+        conditions: By name (see :data:`lanenet.evaluation.errors.GROUPS`) its value for each frame.
     """
 
     name: str
@@ -139,6 +153,53 @@ class Comparison:
         }
 
 
+def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[str, ...]:
+    """Return the detectors that all sources allow, in the order of the tables."""
+    from lanenet.perception.registry import compared_names
+
+    with_frames = all(source.frames is not None for source in sources)
+    return tuple(
+        compared_names(
+            lambda kind: (with_frames or kind.on_label_sets) and (with_model or not kind.needs_model)
+        )
+    )
+
+
+def evaluate(
+    sources: Sequence[Opened],
+    compared: Compared,
+    training: Sequence[LabelSet] = (),
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> tuple[Comparison, list[tuple[LabelledFrames, Float[np.ndarray, "_ 6"]]]]:
+    """Run detectors over sources and compare them.
+
+    Args:
+        sources: Labelled frames; or label sets, if all detectors can do without frames.
+        compared: The detectors; the first is what the others are compared with.
+        training: What the network has learned from, if known: errors are also given by the distance from it.
+        workers: Processes at a time, where several sources have many frames.
+        progress: Called with (source, frames done, frames); with several processes with ("sources", sources
+            done, sources).
+
+    Returns:
+        The comparison; and the sources that have frames, each with the first detector's points on them.
+
+    Raises:
+        LanenetError: If a source cannot be read or does not fit a detector.
+    """
+    all_frames = [source.frames for source in sources if source.frames is not None]
+    answers = iter(compared.answer_each(all_frames, workers, progress))
+    answered = [_describe(source, compared, answers, training) for source in sources]
+    comparison = compare_detectors(answered)
+    seen = [
+        (source.frames, answer.answers_cm[comparison.first])
+        for source, answer in zip(sources, answered, strict=True)
+        if source.frames is not None
+    ]
+    return comparison, seen
+
+
 def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
     """Compare detectors that answered the same frames.
 
@@ -184,6 +245,41 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         sources=tuple(_source_errors(source) for source in sources),
         errors_cm=errors,
         breakdown=_break_down(sources, names, truth, errors),
+    )
+
+
+def _describe(
+    source: Opened, compared: Compared, answers: Iterator[Answers], training: Sequence[LabelSet]
+) -> SourceAnswers:
+    """Return the answers to a source with its labels and conditions; ``answers`` are those to frames."""
+    frames, labels = source.frames, source.labels
+    conditions, visible = {}, None
+    if labels is not None:
+        visible = lines_seen(labels)
+        conditions["place"] = distance_to_training_cm(labels, training)
+    if frames is None:
+        assert labels is not None
+        kind, reference, truth_cm = "label set", labels.meta.source, labels.points_cm
+        answer = compared.answer_labels(labels, source.path)
+    else:
+        kind = "simulated drive" if frames.reference == "truth" else "map"
+        reference, truth_cm = frames.reference, frames.points_cm
+        answer = next(answers)
+        if labels is not None and visible is not None:
+            visible = at_frames(visible, labels.frame, frames.frames)
+            conditions["place"] = at_frames(conditions["place"], labels.frame, frames.frames)
+        assert answer.brightness is not None
+        conditions |= {"light": answer.brightness, "confidence": next(iter(answer.confidence.values()))}
+    return SourceAnswers(
+        name=str(source.path),
+        kind=kind,
+        reference=reference,
+        truth_cm=truth_cm,
+        answers_cm=answer.points_cm,
+        sigma_cm=answer.sigma_cm,
+        presence=answer.presence,
+        visible=visible,
+        conditions=conditions,
     )
 
 

@@ -1,12 +1,13 @@
-"""Run a detector over recorded frames: a table of detections and, on request, an annotated video."""
+"""Run detectors over frames; for one detector: a table of detections and, on request, an annotated video."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,17 +16,77 @@ from jaxtyping import UInt8
 from lanenet.data.detections import DetectionTable, check_table_path
 from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
-from lanenet.errors import DriveFormatError
-from lanenet.evaluation.run import run_detectors
+from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.image_lane import ImageLane
 
+if TYPE_CHECKING:
+    from lanenet.data.maps.labelled_frames import LabelledFrames
+
+
 #: Annotated frames are enlarged to at least this width. Chosen: the text can be read.
 VIDEO_WIDTH_PX = 640
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
 Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """One frame and what detectors say about it.
+
+    Attributes:
+        index: Its position.
+        image: None if it cannot be read.
+        problem: Why it cannot be read.
+        estimates: By detector; empty estimates for a frame that cannot be read.
+        seconds: What each detector took; none for a frame that cannot be read.
+    """
+
+    index: int
+    image: UInt8[np.ndarray, "h w *c"] | None
+    problem: str | None
+    estimates: Mapping[str, LaneEstimate]
+    seconds: Mapping[str, float]
+
+
+def run_detectors(
+    frames: Source | LabelledFrames, detectors: Mapping[str, Detector], *, skip_unreadable: bool = False
+) -> Iterator[SeenFrame]:
+    """Run detectors over frames in order; each image is read once.
+
+    The detectors are reset at the first frame and wherever the source is interrupted.
+
+    Args:
+        frames: The source.
+        detectors: By name.
+        skip_unreadable: Yield a frame that cannot be read with empty estimates.
+
+    Raises:
+        DriveFormatError: If a frame cannot be read; names it.
+        CalibrationError: If a frame does not fit the camera; names it.
+    """
+    for i in range(len(frames)):
+        if i == 0 or frames.starts[i]:
+            for detector in detectors.values():
+                detector.reset()
+        try:
+            image = frames.image(i)
+        except DriveFormatError as error:
+            if not skip_unreadable:
+                raise DriveFormatError(f"{frames.name}: {error}") from None
+            yield SeenFrame(i, None, str(error), dict.fromkeys(detectors, LaneEstimate()), {})
+            continue
+        estimates, seconds = {}, {}
+        for name, detector in detectors.items():
+            start_s = time.perf_counter()
+            try:
+                estimates[name] = detector.detect(image)
+            except CalibrationError as error:
+                raise CalibrationError(f"{frames.name}, frame {frames.frames[i]}: {error}") from None
+            seconds[name] = time.perf_counter() - start_s
+        yield SeenFrame(i, image, None, estimates, seconds)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ from jaxtyping import Float
 from lanenet.data.label_set import LabelSet
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.answers import RasterAnswers, RasterModel
-from lanenet.evaluation.breakdown import (
+from lanenet.evaluation.errors import (
+    ErrorStats,
     PresenceStats,
     SigmaStats,
+    error_stats,
     presence_stats,
     rmse_interval_cm,
     sigma_stats,
 )
-from lanenet.evaluation.errors import ErrorStats, error_stats
 from lanenet.evaluation.tables import TextTable, show_cm, show_share
 from lanenet.perception.estimate import LaneMemory
 from lanenet.samples.dataset import LaneSamples

@@ -10,9 +10,8 @@ from pathlib import Path
 from rich import box
 from rich.table import Table
 
-from lanenet.evaluation.breakdown import GROUPS, INTERVALS
 from lanenet.evaluation.comparison import Comparison
-from lanenet.evaluation.errors import ErrorStats
+from lanenet.evaluation.errors import GROUPS, INTERVALS, ErrorStats
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
 
 _STATS = ("RMSE", "median", "p95", "worst")

@@ -1,8 +1,11 @@
-"""The checkpoint folder: what a finished run writes, and how it is published as ``checkpoints/<name>/``."""
+"""The folder of a training run: its state, its results, its starting weights, and its publication."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import json
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,14 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 from jaxtyping import UInt8
+from torch import Tensor
 
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_file, atomic_folder, write_json, write_text
 from lanenet.errors import CheckpointError
-from lanenet.evaluation.breakdown import presence_stats
-from lanenet.evaluation.pictures import new_figure, png_bytes
+from lanenet.evaluation.errors import presence_stats
+from lanenet.evaluation.report import new_figure, png_bytes
+from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.export import (
     CALIBRATION_NAME,
@@ -27,22 +33,151 @@ from lanenet.learn.export import (
     RASTERS_NAME,
     WEIGHTS_NAME,
     export_onnx,
+    read_network,
     write_rasters,
     write_weights,
 )
-from lanenet.learn.network import LaneNet
+from lanenet.learn.network import LaneNet, new_network
 from lanenet.learn.predict import Answers
-from lanenet.learn.run_state import METRICS_FORMAT, METRICS_NAME, STATE_NAME, EpochRecord, best_record
+from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
-from lanenet.samples.dataset import LaneSamples
+from lanenet.samples.dataset import LaneSamples, hash_files
 
+STATE_NAME = "last.pt"
 CURVE_NAME = "curve"
+METRICS_NAME = "metrics.json"
+METRICS_FORMAT = "lanenet-metrics/1"
 
+_VERSION = 2  # of the training; raise it when the same settings and data give other weights
+_ADVICE = "pick another name, or delete the folder to train anew"
 #: Rasters that are kept: to check later exports, and to find the value ranges of an INT8 model. Chosen:
 #: enough of both in files below 100 kB.
 _N_CHECK_RASTERS, _N_CALIBRATION_RASTERS = 48, 96
 #: Whose versions the metrics name.
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """One line of the training curve.
+
+    Attributes:
+        epoch: Counted from 1.
+        train_rmse_cm: Over the augmented samples of the epoch, while the weights were changing.
+        val_rmse_cm: Over the validation frames, with the running mean of the weights.
+        learning_rate: At the end of the epoch.
+        samples_per_s: Speed of the training part.
+        val_trimmed_cm: As ``val_rmse_cm``, without the largest hundredth of the errors: some labels from maps
+            are wrong by a lane, and the network that agrees with them is not the best one.
+    """
+
+    epoch: int
+    train_rmse_cm: float
+    val_rmse_cm: float
+    learning_rate: float
+    samples_per_s: float
+    val_trimmed_cm: float
+
+
+@dataclass
+class RunState:
+    """All that a stopped run needs to resume as if it had not stopped.
+
+    Random numbers follow from the seed and the epoch, so no generator is kept.
+
+    Attributes:
+        network: Weights after the last epoch.
+        ema: Running mean of the weights.
+        optimizer: State of the optimiser.
+        step: Steps taken.
+        history: One record per finished epoch.
+        best: Running mean of the weights at the best epoch; None before the first.
+    """
+
+    network: dict[str, Tensor]
+    ema: dict[str, Tensor]
+    optimizer: dict[str, Any]
+    step: int
+    history: list[EpochRecord]
+    best: dict[str, Tensor] | None
+
+
+def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
+    """Return the epoch of the lowest trimmed validation error; the first of equals."""
+    return min(history, key=lambda r: math.inf if math.isnan(r.val_trimmed_cm) else r.val_trimmed_cm)
+
+
+def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
+    """Return a hash of all that decides a run: version, settings, contents of the files, starting weights.
+
+    Raises:
+        LabelFormatError: If a file cannot be read.
+        CheckpointError: If there are no weights to start from.
+    """
+    weights = [] if settings.network.weights is None else [settings.network.weights]
+    text = (
+        f"{_VERSION} {settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
+    )
+    text += hash_of_start(settings.start_from)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_state(path: Path, state: RunState, run_hash: str) -> None:
+    """Write the state; a kill while writing leaves the previous one."""
+    history = [list(vars(record).values()) for record in state.history]
+    data = {"run_hash": run_hash, **vars(state), "history": history}
+    with atomic_file(path) as temporary:
+        torch.save(data, temporary)
+
+
+def read_state(path: Path, run_hash: str) -> RunState | None:
+    """Read the state that an earlier run with the same settings and data left; None if there is none.
+
+    Raises:
+        CheckpointError: If the file is of another run or cannot be read.
+    """
+    if not path.is_file():
+        return None
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+        found = data.pop("run_hash")
+        state = RunState(**data | {"history": [EpochRecord(*values) for values in data["history"]]})
+    except Exception as error:  # the unpickler raises whatever damaged bytes lead it to
+        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise CheckpointError(
+            f"{path}: cannot be read as the state of a run ({reason}); delete it to start over"
+        ) from None
+    if found != run_hash:
+        raise CheckpointError(
+            f"{path}: left by a run with other settings or data ({found}, now {run_hash}); {_ADVICE}"
+        )
+    return state
+
+
+def read_finished(folder: Path, run_hash: str) -> dict[str, Any] | None:
+    """Return the metrics of a finished run with the same settings and data; None if it is not finished.
+
+    Raises:
+        CheckpointError: If the folder holds a finished run with other settings or data.
+    """
+    path = folder / METRICS_NAME
+    if not path.is_file():
+        return None
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        found, form = metrics["run_hash"], metrics["format"]
+        best = float(metrics["val_rmse_cm"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise CheckpointError(f"{path}: not the metrics of a training run; {_ADVICE}") from None
+    if form != METRICS_FORMAT:
+        raise CheckpointError(f"{path}: format {form!r}, expected {METRICS_FORMAT!r}; {_ADVICE}")
+    if found != run_hash:
+        raise CheckpointError(
+            f"{folder}: holds a model trained with other settings or data ({found}, now {run_hash}); "
+            f"{_ADVICE}"
+        )
+    complete = (folder / MODEL_NAME).is_file() and (folder / WEIGHTS_NAME).is_file() and math.isfinite(best)
+    return metrics if complete else None
 
 
 @dataclass(frozen=True)
@@ -217,3 +352,75 @@ def publish(
             write_json(folder / "results.json", results)
         marker = {"format": CHECKPOINT_FORMAT, "name": name}
         write_text(folder / MARKER_NAME, yaml.safe_dump(marker, sort_keys=False))
+
+
+def check_start(
+    settings: LearnSettings, window: BirdseyeWindow, perceptions: Sequence[PerceptionSettings]
+) -> None:
+    """Refuse starting weights that the training would refuse, before its data is made.
+
+    Args:
+        settings: Of the training.
+        window: Window of the rasters that the network will see.
+        perceptions: How the edges of each drive will be found.
+
+    Raises:
+        CheckpointError: As :func:`load_start_weights`; or pretrained weights cannot be read.
+    """
+    network = new_network(settings.network, window.rows, window.columns, settings.seed)
+    if settings.start_from is not None:
+        for perception in perceptions:
+            load_start_weights(network, settings.start_from, window, perception)
+
+
+def load_start_weights(
+    network: LaneNet, folder: Path, window: BirdseyeWindow, perception: PerceptionSettings
+) -> None:
+    """Load the weights of a checkpoint, with the mean and the scale of the labels that belong to them.
+
+    Args:
+        network: Network to change.
+        folder: Checkpoint folder.
+        window: Window of the rasters that the network will see.
+        perception: How their edges were found.
+
+    Raises:
+        CheckpointError: If the checkpoint cannot be read, is of another network or was made for another
+            window or other edges.
+    """
+    start, meta = read_network(folder)
+    if meta.window != window:
+        raise CheckpointError(
+            f"learn.start_from {folder}: was trained on the window {meta.window}, but the labels have "
+            f"{window}; set data.window to the checkpoint's"
+        )
+    unlike = perception.unlike(meta.perception)
+    if unlike:
+        raise CheckpointError(
+            f"learn.start_from {folder}: was trained on edges with other settings than those of the labels "
+            f"({unlike}); set data.colour_weight to the checkpoint's"
+        )
+    weights = start.state_dict()
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    for name in sorted(shapes.keys() | weights.keys()):
+        found = tuple(weights[name].shape) if name in weights else None
+        if found != shapes.get(name):
+            raise CheckpointError(
+                f"learn.start_from {folder}: found weights {name!r} of shape {found}, expected "
+                f"{shapes.get(name)}; set learn.network as in the checkpoint's config.yaml"
+            )
+    network.load_state_dict(weights)
+
+
+def hash_of_start(folder: Path | None) -> str:
+    """Return a hash of the weights that a run starts from; empty for random weights.
+
+    Raises:
+        CheckpointError: If the folder has none.
+    """
+    if folder is None:
+        return ""
+    path = folder / WEIGHTS_NAME
+    if not path.is_file():
+        raise CheckpointError(f"learn.start_from {folder}: no {WEIGHTS_NAME}, expected a checkpoint")
+    return hash_files([path])

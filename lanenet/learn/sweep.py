@@ -18,8 +18,8 @@ from lanenet.data.files import require, write_text
 from lanenet.data.label_set import LabelSet, read_labels
 from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.checkpoint import best_record, hash_run
 from lanenet.learn.config import LearnSettings, NetworkSettings
-from lanenet.learn.run_state import best_record, hash_run
 from lanenet.learn.train import TrainingRun, torch_threads
 from lanenet.learn.trunks import TRUNKS
 from lanenet.samples.dataset import LaneSamples, check_same

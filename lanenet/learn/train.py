@@ -16,22 +16,24 @@ from torch.optim.swa_utils import AveragedModel
 
 from lanenet.data.label_set import read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
-from lanenet.learn.checkpoint import FinishedRun, tensorboard_curve, write_checkpoint
-from lanenet.learn.config import LearnSettings
-from lanenet.learn.loss import lane_loss
-from lanenet.learn.network import LaneNet, input_of_rasters, new_network
-from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
-from lanenet.learn.run_state import (
+from lanenet.learn.checkpoint import (
     STATE_NAME,
     EpochRecord,
+    FinishedRun,
     RunState,
     best_record,
     hash_run,
     load_start_weights,
     read_finished,
     read_state,
+    tensorboard_curve,
+    write_checkpoint,
     write_state,
 )
+from lanenet.learn.config import LearnSettings
+from lanenet.learn.loss import lane_loss
+from lanenet.learn.network import LaneNet, input_of_rasters, new_network
+from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
 from lanenet.perception.network.model_file import MODEL_NAME
 from lanenet.samples.augment import Batch
 from lanenet.samples.dataset import LaneSamples, check_same

@@ -18,11 +18,12 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.samples.kernels import (
     Amounts,
     Frames,
+    Grid,
     augment_frames,
     misplace_points,
+    near_lines,
     rasterise_frames,
 )
-from lanenet.samples.raster import Grid, near_lines
 from lanenet.samples.settings import AugmentSettings
 
 Lines = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]

@@ -14,7 +14,6 @@ import numpy as np
 from numba import njit
 
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, ROWS_CM
-from lanenet.samples.clutter import CORNERS, add_clutter, draw_outline, is_inside, mark_outline, middle_dashes
 from lanenet.samples.random_stream import (
     next_amount,
     next_bell,
@@ -24,7 +23,6 @@ from lanenet.samples.random_stream import (
     next_uniform,
     start_stream,
 )
-from lanenet.samples.raster import count_cells, mark, presence
 from lanenet.samples.settings import AugmentSettings
 
 #: Radius of a disc without paint, and width of a ring. Chosen: glare and worn paint on model roads.
@@ -33,34 +31,32 @@ _UNPAINTED_CM = (4.0, 20.0)
 _DOUBLE_CM = 1.5
 _LABEL_ROWS_CM = np.array(ROWS_CM)
 
+#: Edge points this close to a line belong to it. Chosen: both borders of a wide tape and their blur.
+LINE_REACH_CM = 4.0
+#: Sine of the largest angle between a marking's border and its line. Chosen: 30 degrees.
+_LEAN = 0.5
+#: A line that marks cells over the first length can be seen; over less than the second it cannot. Chosen;
+#: both borders of a tape count, so the first is 9 cm of it.
+SEEN_CM, UNSEEN_CM = 18.0, 3.0
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
-    """Return where a point of the road appears to be if the camera's mounting is wrong.
+# All ranges below are chosen: objects, shadows and markings as they occur on model roads, at 1:10.
+#: Corners of every outline; enough for a round one.
+CORNERS = 12
 
-    See :func:`lanenet.samples.augment.misplaced`.
-    """
-    # The ray in the car's level frame, turned by the error of the mounting: first pitch, then roll.
-    dx, dy, dz = x - camera_x, y - camera_y, -camera_z
-    c, s = np.cos(pitch), np.sin(pitch)
-    dy, dz = c * dy + s * dz, c * dz - s * dy
-    c, s = np.cos(roll), np.sin(roll)
-    dx, dz = c * dx + s * dz, c * dz - s * dx
-    if not dz < 0.0:
-        return np.nan, np.nan
-    scale = -height * camera_z / dz
-    return camera_x + dx * scale, camera_y + dy * scale
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def misplace_points(points_cm, camera_cm, height, pitch, roll, out):
-    """Apply :func:`misplace` to many points of one camera."""
-    right, ahead, up = camera_cm
-    for k in range(len(points_cm)):
-        x, y = points_cm[k]
-        out[k, 0], out[k, 1] = misplace(x, y, right, ahead, up, height, pitch, roll)
+#: Half the width and half the length of a box.
+_BOX_HALF_CM = ((1.5, 12.0), (1.5, 22.0))
+#: Radius of a cone's foot, and how many times longer it appears: what stands is smeared away from the camera.
+_CONE_CM, _SMEAR = (1.5, 6.0), (1.0, 5.0)
+#: Radius of a shadow.
+_SHADOW_CM = (8.0, 50.0)
+#: Shares of shadows and of cones among the outlines; the rest are boxes.
+_SHADOW_SHARE, _CONE_SHARE = 0.3, 0.35
+#: Length of a straight edge.
+_EDGE_CM = (4.0, 40.0)
+#: Length of a dash and of the gap after it.
+_DASH_CM, _GAP_CM = (5.0, 30.0), (5.0, 30.0)
+#: Offset of the dashes from the middle of the lane, in lane widths.
+_OFF_MIDDLE = 0.04
 
 
 #: :class:`AugmentSettings` as numbers, by the same names; ``limit`` is 1 for draws at the limit.
@@ -72,7 +68,7 @@ Amounts: Any = namedtuple(  # type: ignore[misc]
 class Frames(NamedTuple):
     """Frames, concatenated: frame i owns the edges from ``edge_start[i]`` on, its lines 2 i and 2 i + 1.
 
-    ``edge_lines`` are the bits of :func:`lanenet.samples.raster.near_lines`; the others are explained at
+    ``edge_lines`` are the bits of :func:`near_lines`; the others are explained at
     :func:`lanenet.samples.augment.join_frames`.
     """
 
@@ -85,6 +81,18 @@ class Frames(NamedTuple):
     camera_cm: np.ndarray
     lane_cm: np.ndarray
     divides: np.ndarray
+
+
+class Grid(NamedTuple):
+    """A bird's-eye window, in the single precision of edge points and the double precision of labels."""
+
+    left_cm: np.float32
+    far_cm: np.float32
+    cell_cm: np.float32
+    rows: int
+    columns: int
+    label_left_cm: float
+    label_right_cm: float
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -282,3 +290,282 @@ def _unpainted(rng, chance, edges_cm, first, last):
     if kind < 0.5:
         return 1, x, y, size
     return 2, np.sqrt(x * x + y * y), 0.0, 0.5 * size
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
+    """Return where a point of the road appears to be if the camera's mounting is wrong.
+
+    See :func:`lanenet.samples.augment.misplaced`.
+    """
+    # The ray in the car's level frame, turned by the error of the mounting: first pitch, then roll.
+    dx, dy, dz = x - camera_x, y - camera_y, -camera_z
+    c, s = np.cos(pitch), np.sin(pitch)
+    dy, dz = c * dy + s * dz, c * dz - s * dy
+    c, s = np.cos(roll), np.sin(roll)
+    dx, dz = c * dx + s * dz, c * dz - s * dx
+    if not dz < 0.0:
+        return np.nan, np.nan
+    scale = -height * camera_z / dz
+    return camera_x + dx * scale, camera_y + dy * scale
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def misplace_points(points_cm, camera_cm, height, pitch, roll, out):
+    """Apply :func:`misplace` to many points of one camera."""
+    right, ahead, up = camera_cm
+    for k in range(len(points_cm)):
+        x, y = points_cm[k]
+        out[k, 0], out[k, 1] = misplace(x, y, right, ahead, up, height, pitch, roll)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def mark(raster, x_cm, y_cm, grid):
+    """Mark the cell of a point; return whether it lies in the window and was not marked before.
+
+    In single precision, as :meth:`BirdseyeWindow.rasterise` does it with edge points.
+    """
+    column = (np.float32(x_cm) - grid.left_cm) / grid.cell_cm
+    row = (grid.far_cm - np.float32(y_cm)) / grid.cell_cm
+    if not (column >= 0.0 and column < grid.columns and row >= 0.0 and row < grid.rows):
+        return False
+    i, j = int(row), int(column)
+    fresh = raster[i, j] == 0
+    raster[i, j] = 255
+    return fresh
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def mark_edge(raster, ax, ay, bx, by, grid):
+    """Mark a straight edge without holes; return how many cells it added."""
+    steps = 1 + int(np.hypot(bx - ax, by - ay) / (0.7 * grid.cell_cm))
+    added = 0
+    for k in range(steps + 1):
+        t = k / steps
+        if mark(raster, ax + t * (bx - ax), ay + t * (by - ay), grid):
+            added += 1
+    return added
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def near_lines(edges, left_cm, right_cm, out):
+    """Find which lines edge points belong to, and which points go with a line that is missing.
+
+    Bit 0 is set for points within ``LINE_REACH_CM`` of the left line, and for those that run along it farther
+    to the left: other borders of the road, which would be taken for the line if it were missing. Bit 1 is set
+    likewise for the right line. Bits 2 and 3 are set for points within ``LINE_REACH_CM`` that run along the
+    line, as a marking's borders do, and not across it, as most other edges.
+    """
+    reach = LINE_REACH_CM * LINE_REACH_CM
+    for k in range(len(edges)):
+        x, y = edges[k, 0], edges[k, 1]
+        found = 0
+        for side in range(2):
+            line = left_cm if side == 0 else right_cm
+            nearest, outside, along = np.inf, False, False
+            for j in range(len(line) - 1):
+                ax, ay = line[j, 0], line[j, 1]
+                bx, by = line[j + 1, 0] - ax, line[j + 1, 1] - ay
+                length = bx * bx + by * by
+                t = ((x - ax) * bx + (y - ay) * by) / length if length > 0.0 else 0.0
+                t = min(max(t, 0.0), 1.0)
+                square = (x - ax - t * bx) ** 2 + (y - ay - t * by) ** 2
+                # NaN, where a polyline is broken, is never near.
+                if square < nearest:
+                    lean = edges[k, 2] * bx + edges[k, 3] * by
+                    nearest, along = square, lean * lean <= _LEAN * _LEAN * length
+                    outside = (bx * (y - ay) - by * (x - ax) > 0.0) == (side == 0)
+            if nearest <= reach:
+                found |= 5 << side if along else 1 << side
+            elif outside and along:
+                found |= 1 << side
+        out[k] = found
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def count_cells(cells, lines):
+    """Count a newly marked cell for the lines along which its point runs."""
+    cells[0] += (lines >> 2) & 1
+    cells[1] += lines >> 3
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def presence(cells, frames, line, grid):
+    """Return 1 for a line that can be seen, 0 for one that cannot, NaN between or if its place is unknown."""
+    known = False
+    for k in range(frames.line_start[line], frames.line_start[line + 1]):
+        known = known or not np.isnan(frames.lines_cm[k, 0])
+    seen_cm = cells * grid.cell_cm
+    if not known or UNSEEN_CM <= seen_cm < SEEN_CM:
+        return np.nan
+    return 1.0 if seen_cm >= SEEN_CM else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def draw_outline(rng, corners, grid):
+    """Draw a closed outline within the window; return whether it hides the road within it.
+
+    Args:
+        rng: Stream of random numbers.
+        corners: Its corners, [cm], frame car; written.
+        grid: The window.
+    """
+    x = next_between(rng, grid.left_cm, grid.left_cm + grid.columns * grid.cell_cm)
+    y = next_between(rng, grid.far_cm - grid.rows * grid.cell_cm, grid.far_cm)
+    kind = next_uniform(rng)
+    if kind < _SHADOW_SHARE:
+        # An irregular quadrangle: a shadow, a stain, a rug. The road can be seen below it.
+        size, turn = next_between(rng, *_SHADOW_CM), next_between(rng, 0.0, 2.0 * np.pi)
+        for k in range(CORNERS):
+            if k % 3 == 0:
+                angle = turn + 2.0 * np.pi * (k + next_between(rng, -1.0, 1.0)) / CORNERS
+                radius = size * next_between(rng, 0.4, 1.0)
+            corners[k, 0], corners[k, 1] = x + radius * np.cos(angle), y + radius * np.sin(angle)
+        return False
+    if kind < _SHADOW_SHARE + _CONE_SHARE:
+        radius, smear = next_between(rng, *_CONE_CM), next_between(rng, *_SMEAR)
+        away = np.hypot(x, y)
+        ax, ay = (x / away, y / away) if away > 0.0 else (0.0, 1.0)
+        for k in range(CORNERS):
+            angle = 2.0 * np.pi * k / CORNERS
+            along, across = radius * np.sin(angle), radius * np.cos(angle)
+            if along > 0.0:
+                along *= smear
+            corners[k, 0], corners[k, 1] = x + along * ax - across * ay, y + along * ay + across * ax
+        return True
+    wide, long = next_between(rng, *_BOX_HALF_CM[0]), next_between(rng, *_BOX_HALF_CM[1])
+    turn = next_between(rng, 0.0, np.pi)
+    c, s = np.cos(turn), np.sin(turn)
+    for k in range(CORNERS):
+        quarter = k // 3
+        along = long if quarter == 0 or quarter == 1 else -long
+        across = wide if quarter == 0 or quarter == 3 else -wide
+        corners[k, 0], corners[k, 1] = x + along * c - across * s, y + along * s + across * c
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def is_inside(x, y, corners):
+    """Tell whether a point lies within a closed outline (even-odd rule)."""
+    inside = False
+    j = CORNERS - 1
+    for k in range(CORNERS):
+        if (corners[k, 1] > y) != (corners[j, 1] > y):
+            cut = (corners[j, 0] - corners[k, 0]) * (y - corners[k, 1]) / (corners[j, 1] - corners[k, 1])
+            if x < corners[k, 0] + cut:
+                inside = not inside
+        j = k
+    return inside
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def mark_outline(raster, corners, grid):
+    """Mark a closed outline."""
+    for k in range(CORNERS):
+        a, b = corners[k], corners[(k + 1) % CORNERS]
+        mark_edge(raster, a[0], a[1], b[0], b[1], grid)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def add_clutter(rng, raster, count, grid, amounts):
+    """Mark edges of things that are not lanes; ``count`` is the number of cells that the frame marked."""
+    for _ in range(next_number(rng, amounts.clutter_segments, amounts.limit)):
+        _add_edge(rng, raster, _EDGE_CM[1], grid)
+    for _ in range(next_number(rng, amounts.clutter_points, amounts.limit)):
+        _add_point(rng, raster, grid)
+    wanted = next_amount(rng, amounts.clutter_share, amounts.limit) * count
+    added, tries = 0, 0
+    # A crowded raster has no room for more: stop trying.
+    while added < wanted and tries < 2 * count:
+        tries += 1
+        if next_uniform(rng) < 0.1:
+            added += _add_edge(rng, raster, (wanted - added) * grid.cell_cm, grid)
+        else:
+            added += _add_point(rng, raster, grid)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _add_edge(rng, raster, longest_cm, grid):
+    """Mark a straight edge at a random place; return how many cells it added."""
+    width_cm, depth_cm = grid.columns * grid.cell_cm, grid.rows * grid.cell_cm
+    x = grid.left_cm + width_cm * next_uniform(rng)
+    y = grid.far_cm - depth_cm * next_uniform(rng)
+    angle = next_between(rng, 0.0, np.pi)
+    half = 0.5 * min(next_between(rng, _EDGE_CM[0], _EDGE_CM[1]), longest_cm)
+    dx, dy = half * np.cos(angle), half * np.sin(angle)
+    return mark_edge(raster, x - dx, y - dy, x + dx, y + dy, grid)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _add_point(rng, raster, grid):
+    """Mark a cell at a random place; return how many cells that added."""
+    x = grid.left_cm + grid.columns * grid.cell_cm * next_uniform(rng)
+    y = grid.far_cm - grid.rows * grid.cell_cm * next_uniform(rng)
+    return 1 if mark(raster, x, y, grid) else 0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def middle_dashes(rng, frames, i):
+    """Copy a line of a frame to the middle of its lane, in dashes; return their points, [cm], frame car.
+
+    The line of which the frame shows more is copied, with its blur, gaps and range. There are none if the two
+    lines are not sampled alike.
+
+    Args:
+        rng: Stream of random numbers.
+        frames: :class:`Frames`.
+        i: The frame.
+    """
+    dash, gap = next_between(rng, *_DASH_CM), next_between(rng, *_GAP_CM)
+    phase, off = next_uniform(rng), next_between(rng, -_OFF_MIDDLE, _OFF_MIDDLE)
+    first, last = frames.edge_start[i], frames.edge_start[i + 1]
+    starts = frames.line_start
+    n = starts[2 * i + 1] - starts[2 * i]
+    if n < 2 or starts[2 * i + 2] - starts[2 * i + 1] != n:
+        return np.empty((0, 2))
+    along = np.zeros(2, np.int64)
+    for k in range(first, last):
+        along[0] += (frames.edge_lines[k] >> 2) & 1
+        along[1] += frames.edge_lines[k] >> 3
+    side = 0 if along[0] >= along[1] else 1
+    line, other = starts[2 * i + side], starts[2 * i + 1 - side]
+    distance = np.zeros(n)
+    for j in range(1, n):
+        step = np.hypot(
+            frames.lines_cm[line + j, 0] - frames.lines_cm[line + j - 1, 0],
+            frames.lines_cm[line + j, 1] - frames.lines_cm[line + j - 1, 1],
+        )
+        distance[j] = distance[j - 1] + (0.0 if np.isnan(step) else step)
+    points, count = np.empty((along[side], 2)), 0
+    for k in range(first, last):
+        if not (frames.edge_lines[k] >> (2 + side)) & 1:
+            continue
+        x, y = frames.edges_cm[k, 0], frames.edges_cm[k, 1]
+        nearest, at = np.inf, 0
+        for j in range(n):
+            # NaN, where a line is broken, is never near.
+            square = (x - frames.lines_cm[line + j, 0]) ** 2 + (y - frames.lines_cm[line + j, 1]) ** 2
+            if square < nearest:
+                nearest, at = square, j
+        if (distance[at] + phase * (dash + gap)) % (dash + gap) > dash:
+            continue
+        px = x + (0.5 + off) * (frames.lines_cm[other + at, 0] - frames.lines_cm[line + at, 0])
+        py = y + (0.5 + off) * (frames.lines_cm[other + at, 1] - frames.lines_cm[line + at, 1])
+        if not np.isnan(px + py):
+            points[count, 0], points[count, 1] = px, py
+            count += 1
+    return points[:count]

@@ -213,8 +213,8 @@ def test_a_misspelt_key_is_named() -> None:
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
 def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> None:
+    from lanenet.learn.checkpoint import load_start_weights
     from lanenet.learn.network import new_network
-    from lanenet.learn.run_state import load_start_weights
 
     settings = read_training_run(path)
     folder, data = settings.learn.start_from, settings.data

@@ -146,7 +146,7 @@ def _draw_pictures(
     settings: JudgeSettings, entrants: list[Entrant], results: list[RunResult], out: Path
 ) -> Path:
     from datagen.judge.contest import contest_jobs, read_trajectory
-    from datagen.judge.pictures import draw_top_view
+    from datagen.judge.report import draw_top_view
     from datagen.world.world import draw_track
     from lanenet.data.files import write_bytes
     from lanenet.data.tables import png_bytes

@@ -53,8 +53,7 @@ def reality(
     """Compare the network's input on synthetic and on real drives: statistics, histograms, sheets."""
     from datagen.reality.drives import measure_all_synthetic
     from datagen.reality.measure import measure_drive
-    from datagen.reality.pictures import histograms, sheet
-    from datagen.reality.report import compare, summary, table, write_report
+    from datagen.reality.report import compare, histograms, sheet, summary, table, write_report
     from lanenet.data.drives import open_drive
     from lanenet.data.files import write_bytes
     from lanenet.data.tables import png_bytes

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchvision.models import alexnet
 
 from lanenet.errors import CheckpointError
-from lanenet.learn.trunks.trunk import Trunk
+from lanenet.learn.trunks.compact import Trunk
 
 #: Side of the image that AlexNet takes, [px].
 SIDE_PX = 224

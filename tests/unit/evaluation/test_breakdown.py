@@ -8,7 +8,8 @@ from rich.console import Console
 
 from lanenet.data.files import write_json
 from lanenet.data.tables import png_size
-from lanenet.evaluation.breakdown import (
+from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
+from lanenet.evaluation.errors import (
     RELIABILITY_SHARES,
     bootstrap_segments,
     errors_by_group,
@@ -18,8 +19,7 @@ from lanenet.evaluation.breakdown import (
     rmse_interval_cm,
     sigma_stats,
 )
-from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
-from lanenet.evaluation.pictures import breakdown_picture
+from lanenet.evaluation.report import plot_breakdown
 from lanenet.evaluation.tables import as_markdown, lay_out
 from lanenet.geometry.lane import points_from_parabolas
 
@@ -82,7 +82,7 @@ def test_of_few_drives_stretches_are_drawn():
     assert cuts.tolist() == [100, 107] and over == "drives like these"
     # A rest of less than half a stretch belongs to the one before; no stretch reaches into another drive.
     cuts, over = bootstrap_segments([115, 70])
-    assert cuts.tolist() == [40, 80, 115, 155] and over == "segments of 40 frames"
+    assert cuts.tolist() == [40, 80, 115, 155] and over == "stretches of 40 frames"
     assert bootstrap_segments([99])[0].tolist() == [40]
     assert bootstrap_segments([10])[0].tolist() == []
     alike = np.repeat([1.0, 3.0], 60)[:, None] * np.ones((1, 6))
@@ -168,5 +168,5 @@ def test_a_comparison_tells_where_errors_come_from(tmp_path):
     for table in lay_out(wide):
         console.print(table.as_rich())
     assert "by light" in (text := console.export_text()) and "…" not in text
-    size = png_size(breakdown_picture(found))
+    size = png_size(plot_breakdown(found))
     assert size is not None and min(size) > 200

@@ -9,7 +9,7 @@ from lanenet.data.files import write_json
 from lanenet.data.tables import png_size
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.comparison import FORMAT, SourceAnswers, compare_detectors
-from lanenet.evaluation.pictures import error_picture
+from lanenet.evaluation.report import plot_errors
 from lanenet.evaluation.tables import as_markdown, lay_out
 
 NAN = float("nan")
@@ -103,14 +103,14 @@ def test_the_picture_is_a_picture_even_where_nothing_was_answered():
     mute = np.full_like(TRUTH, NAN)
     exact = TRUTH.copy()
     for answers in ({"mute": mute}, {"shy": shy(), "mute": mute, "exact": exact}):
-        size = png_size(error_picture(compare_detectors([source(**answers)])))
+        size = png_size(plot_errors(compare_detectors([source(**answers)])))
         assert size is not None and min(size) > 200
 
 
 def test_the_picture_shows_the_errors():
-    small = error_picture(compare_detectors([source(one=TRUTH + 1.0)]))
-    assert small == error_picture(compare_detectors([source(one=TRUTH - 1.0)]))
-    assert small != error_picture(compare_detectors([source(one=shy() + 0.5)]))
+    small = plot_errors(compare_detectors([source(one=TRUTH + 1.0)]))
+    assert small == plot_errors(compare_detectors([source(one=TRUTH - 1.0)]))
+    assert small != plot_errors(compare_detectors([source(one=shy() + 0.5)]))
 
 
 def test_what_cannot_be_compared_is_refused():

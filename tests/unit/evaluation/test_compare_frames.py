@@ -8,8 +8,8 @@ import pytest
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import Compared, answer_frames, choose_names
-from lanenet.evaluation.breakdown import GROUPS
-from lanenet.evaluation.pictures import WorstFrame, draw_worst, find_worst, jpeg_bytes
+from lanenet.evaluation.errors import GROUPS
+from lanenet.evaluation.report import WorstFrame, draw_worst, find_worst, jpeg_bytes
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.safety import SafetySettings

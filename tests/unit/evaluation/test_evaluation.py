@@ -10,8 +10,9 @@ from lanenet.data.files import json_text
 from lanenet.data.maps.mapped_drive import read_truth_frames
 from lanenet.errors import DriveFormatError
 from lanenet.evaluation import answers
-from lanenet.evaluation import report as evaluation
 from lanenet.evaluation.answers import Compared
+from lanenet.evaluation.comparison import default_names, evaluate
+from lanenet.evaluation.report import report_files
 from lanenet.evaluation.sources import Opened
 
 
@@ -31,20 +32,20 @@ def sources(tmp_path_factory) -> list[Opened]:
 
 def test_several_processes_give_the_answers_of_one(sources, monkeypatch):
     monkeypatch.setattr(answers, "_WORTH_PROCESSES", 1)
-    names = evaluation.default_names(sources, with_model=False)
-    told: dict[int, list] = {1: [], 2: []}
+    names = default_names(sources, with_model=False)
+    shown: dict[int, list] = {1: [], 2: []}
     one, two = (
-        evaluation.evaluate(
-            sources, Compared(names), workers=n, progress=lambda *done, told=told[n]: told.append(done)
+        evaluate(
+            sources, Compared(names), workers=n, progress=lambda *done, shown=shown[n]: shown.append(done)
         )
         for n in (1, 2)
     )
     # As text, in which what is no number equals itself.
-    assert json_text(one.comparison.as_dict()) == json_text(two.comparison.as_dict())
-    assert one.files == two.files
+    assert json_text(one[0].as_dict()) == json_text(two[0].as_dict())
+    assert report_files(*one) == report_files(*two)
     frames = [len(source.frames) for source in sources if source.frames is not None]
-    assert told[1][-1] == ("drive", frames[-1], frames[-1]) and len(told[1]) == sum(frames)
-    assert told[2] == [("sources", done, 3) for done in (1, 2, 3)]
+    assert shown[1][-1] == ("drive", frames[-1], frames[-1]) and len(shown[1]) == sum(frames)
+    assert shown[2] == [("sources", done, 3) for done in (1, 2, 3)]
 
 
 def test_few_frames_are_not_worth_processes(sources, monkeypatch):
@@ -52,7 +53,7 @@ def test_few_frames_are_not_worth_processes(sources, monkeypatch):
         raise AssertionError("processes were started")
 
     monkeypatch.setattr("lanenet.evaluation.answers.run_jobs", refuse)
-    found = evaluation.evaluate(sources, Compared(["hough"]), workers=2).comparison.as_dict()
+    found = evaluate(sources, Compared(["hough"]), workers=2)[0].as_dict()
     assert np.isfinite(found["detectors"]["hough"]["groups"]["all"]["rmse_cm"])
 
 
@@ -61,8 +62,6 @@ def test_a_broken_frame_is_named_by_another_process_too(sources, tmp_path, monke
     drive = tmp_path / "drive"
     simulate_drive(SimulationSettings(seed=3, frames=4, camera=CameraSettings(width=160, height=120)), drive)
     broken = sorted((drive / "images").iterdir())[2]
-    broken.write_bytes(b"no picture")
+    broken.write_bytes(b"no image")
     with pytest.raises(DriveFormatError, match=broken.name):
-        evaluation.evaluate(
-            [sources[0], Opened(drive, read_truth_frames(drive))], Compared(["hough"]), workers=2
-        )
+        evaluate([sources[0], Opened(drive, read_truth_frames(drive))], Compared(["hough"]), workers=2)

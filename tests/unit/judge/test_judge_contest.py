@@ -12,8 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from datagen.judge.contest import contest_jobs, judge, read_run, read_trajectory, run_job
-from datagen.judge.pictures import COLOURS_BGR, draw_top_view
-from datagen.judge.report import summarise, tables, write_report
+from datagen.judge.report import COLOURS_BGR, draw_top_view, summarise, tables, write_report
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings
 from datagen.world.car.camera import CameraSettings

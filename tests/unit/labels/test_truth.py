@@ -13,7 +13,7 @@ from datagen.world.world import SimulationSettings
 from lanenet.data.drives import read_truth
 from lanenet.data.label_set import write_labels
 from lanenet.evaluation.answers import Compared
-from lanenet.evaluation.report import evaluate
+from lanenet.evaluation.comparison import evaluate
 from lanenet.evaluation.sources import open_source, open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.perception.edges.road import PerceptionSettings
@@ -86,7 +86,7 @@ def test_what_is_scored_is_what_the_labels_name(tmp_path):
     for found in (source.frames, opened.frames):
         assert found is not None
         np.testing.assert_array_equal(found.points_cm, labels.points_cm)
-    table = evaluate([source], Compared(["lane-filter"])).comparison.as_dict()["detectors"]["lane-filter"]
+    table = evaluate([source], Compared(["lane-filter"]))[0].as_dict()["detectors"]["lane-filter"]
     # What the car would make of the answers stands beside the other conditions.
     groups = table["conditions"]["confidence"]
     assert list(groups) == ["under 0.2", "0.2 to 0.5", "over 0.5"]

@@ -8,11 +8,10 @@ from synthetic_labels import WINDOW, make_label_set
 from lanenet.data.label_set import write_labels
 from lanenet.errors import CheckpointError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.learn.checkpoint import publish
+from lanenet.learn.checkpoint import check_start, hash_run, load_start_weights, publish
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.export import read_network
 from lanenet.learn.network import new_network
-from lanenet.learn.run_state import check_start, hash_run, load_start_weights
 from lanenet.learn.train import train
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 

@@ -18,10 +18,10 @@ from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, Lanen
 from lanenet.evaluation.answers import RasterModel
 from lanenet.evaluation.errors import point_errors
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.learn.checkpoint import EpochRecord, read_state, write_state
 from lanenet.learn.config import LearnSettings, NetworkSettings
+from lanenet.learn.export import Int8Report, export_int8
 from lanenet.learn.network import new_network
-from lanenet.learn.quantise import Int8Report, export_int8
-from lanenet.learn.run_state import EpochRecord, read_state, write_state
 from lanenet.learn.train import TrainingRun, learning_rate_at, new_optimizer, set_learning_rate, train
 from lanenet.perception.network.model_file import open_model, read_model_meta
 from lanenet.samples.dataset import LaneSamples

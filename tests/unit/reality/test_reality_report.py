@@ -11,10 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from datagen.reality.drives import RealitySettings, drawn_simulation, measure_all_synthetic
-from datagen.reality.measure import MeasuredDrive, at_nominal_height
-from datagen.reality.pictures import histograms, sheet
-from datagen.reality.report import compare, nearest_synthetic, summary, table, write_report
-from datagen.reality.statistics import STATISTICS
+from datagen.reality.measure import STATISTICS, MeasuredDrive, at_nominal_height
+from datagen.reality.report import compare, histograms, nearest_synthetic, sheet, summary, table, write_report
 from datagen.world.car.camera import CameraSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings, assemble_world

@@ -8,8 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.reality.measure import HEIGHT_CM, Sampling, at_nominal_height, measure_frames
-from datagen.reality.statistics import STATISTICS, chain_points, drive_statistics, edge_statistics
+from datagen.reality.measure import (
+    HEIGHT_CM,
+    STATISTICS,
+    Sampling,
+    at_nominal_height,
+    chain_points,
+    drive_statistics,
+    edge_statistics,
+    measure_frames,
+)
 from datagen.world.car.camera import CameraSettings
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
