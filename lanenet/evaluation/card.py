@@ -9,7 +9,7 @@ import numpy as np
 
 from lanenet.data.label_set import LabelSet
 from lanenet.evaluation.comparison import Comparison
-from lanenet.evaluation.errors import GROUPS, ErrorStats
+from lanenet.evaluation.errors import GROUPS
 from lanenet.evaluation.robustness import RobustRow, robust_table
 from lanenet.evaluation.tables import show_cm, show_share
 from lanenet.geometry.lane import POINT_NAMES
@@ -141,17 +141,13 @@ def _weak_spots(comparison: Comparison) -> list[str]:
     return [
         f"- {where}: RMSE {show_cm(stats.rmse_cm)} cm, median {show_cm(stats.median_cm)}"
         for where, stats in spots
-        if _is_worse(stats, groups["all"])
+        if stats.count and stats.rmse_cm > _WORSE * groups["all"].rmse_cm
     ]
 
 
 def _widths_cm(meta: ModelMeta) -> tuple[str, str]:
     low, high = meta.lane_width_range_cm or (meta.lane_width_cm, meta.lane_width_cm)
     return f"{low:.0f}", f"{high:.0f}"
-
-
-def _is_worse(stats: ErrorStats, whole: ErrorStats) -> bool:
-    return stats.count > 0 and stats.rmse_cm > _WORSE * whole.rmse_cm
 
 
 def _plural(count: int, word: str) -> str:

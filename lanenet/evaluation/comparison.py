@@ -34,7 +34,7 @@ from lanenet.geometry.lane import ROWS_CM
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
-    from lanenet.data.maps.labelled_frames import LabelledFrames
+    from lanenet.data.maps.mapped_drive import LabelledFrames
     from lanenet.evaluation.answers import Answers, Compared, Progress
 
 FORMAT = "lanenet-evaluation/1"

@@ -23,7 +23,7 @@ from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.image_lane import ImageLane
 
 if TYPE_CHECKING:
-    from lanenet.data.maps.labelled_frames import LabelledFrames
+    from lanenet.data.maps.mapped_drive import LabelledFrames
 
 
 #: Annotated frames are enlarged to at least this width. Chosen: the text can be read.

@@ -181,10 +181,6 @@ class PresenceStats:
     there: int
     absent: int
 
-    def as_dict(self) -> dict[str, float]:
-        """Return plain values for JSON."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class SigmaStats:
@@ -362,7 +358,7 @@ class Breakdown:
             "rmse_95_interval_cm": None if interval is None else list(interval),
             "rmse_95_interval_over": self.interval_over,
             "doubt": None if sigma is None else sigma.as_dict(),
-            "presence": None if presence is None else presence.as_dict(),
+            "presence": None if presence is None else vars(presence),
             "conditions": {
                 condition: {name: stats.as_dict() for name, stats in by_detector[detector].items()}
                 for condition, by_detector in self.groups.items()

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lanenet.data.maps.labelled_frames import LabelledFrames
+from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.comparison import Comparison
 from lanenet.evaluation.errors import GROUPS, RELIABILITY_SHARES

@@ -83,7 +83,7 @@ class RobustRow:
             "errors": None if self.errors is None else self.errors.as_dict(),
             "rmse_95_interval_cm": None if self.interval_cm is None else list(self.interval_cm),
             "doubt": None if self.sigma is None else self.sigma.as_dict(),
-            "presence": None if self.presence is None else self.presence.as_dict(),
+            "presence": None if self.presence is None else vars(self.presence),
         }
 
 

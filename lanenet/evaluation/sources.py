@@ -31,27 +31,13 @@ class Opened:
 
     Attributes:
         path: Where it lies.
-        content: Frames with labels, or a label set, which holds edge points only.
-        beside: The label set of the frames, if there is one: it knows which lines can be seen.
+        frames: Frames with labels, if it has any.
+        labels: The label set, if there is one. Beside frames it says which lines can be seen.
     """
 
     path: Path
-    content: LabelSet | LabelledFrames
-    beside: LabelSet | None = None
-
-    @property
-    def frames(self) -> LabelledFrames | None:
-        """The frames, if the source has any."""
-        from lanenet.data.maps.mapped_drive import LabelledFrames
-
-        return self.content if isinstance(self.content, LabelledFrames) else None
-
-    @property
-    def labels(self) -> LabelSet | None:
-        """The label set, if there is one."""
-        from lanenet.data.label_set import LabelSet
-
-        return self.content if isinstance(self.content, LabelSet) else self.beside
+    frames: LabelledFrames | None = None
+    labels: LabelSet | None = None
 
     @property
     def drive(self) -> Path:
@@ -62,10 +48,10 @@ class Opened:
     @property
     def lane_width_cm(self) -> float:
         """Between the middles of the lane's two lines."""
-        from lanenet.data.label_set import LabelSet
-
-        content = self.content
-        return content.meta.lane_width_cm if isinstance(content, LabelSet) else content.lane_width_cm
+        if self.frames is not None:
+            return self.frames.lane_width_cm
+        assert self.labels is not None
+        return self.labels.meta.lane_width_cm
 
 
 def open_source(
@@ -91,7 +77,7 @@ def open_source(
     if not path.exists():
         raise DriveFormatError(f"{path}: no such model or source")
     if path.is_file():
-        return Opened(path, read_labels(path))
+        return Opened(path, labels=read_labels(path))
     _check_folder(path)
     frames = _open_frames(path, window)
     if frames.reference == "map":
@@ -142,7 +128,7 @@ def open_tests(labels: Sequence[Path], frames: Sequence[Path]) -> list[Opened]:
     sources = []
     for labels_path, frames_path in zip(labels, frames, strict=True):
         label_set = read_labels(labels_path)
-        opened = Opened(labels_path, label_set)
+        opened = Opened(labels_path, labels=label_set)
         if frames_path.is_dir():
             whole = _open_frames(frames_path, label_set.meta.window)
             # Only the part of a recorded drive that the network has not learned from.

@@ -242,7 +242,7 @@ def write_checkpoint(folder: Path, run: FinishedRun) -> None:
         "val_frames": len(run.val),
         "parameters": network.n_parameters,
         "sigma_factors": network.sigma_factor.tolist(),
-        "val_presence": None if presence is None else presence.as_dict(),
+        "val_presence": None if presence is None else vars(presence),
         "onnx_difference_cm": difference,
         "median_samples_per_s": float(np.median([record.samples_per_s for record in run.history])),
         "seed": settings.seed,

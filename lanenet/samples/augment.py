@@ -6,9 +6,7 @@ edges as sharp as a straight one. The labels of the moved car follow from the la
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +18,6 @@ from lanenet.samples.kernels import (
     Frames,
     Grid,
     augment_frames,
-    misplace_points,
     near_lines,
     rasterise_frames,
 )
@@ -47,34 +44,6 @@ class Batch(NamedTuple):
     points_cm: Float[np.ndarray, "b 6"]
     present: Float[np.ndarray, "b 2"]
     lane_cm: Float[np.ndarray, "b"]
-
-
-@dataclass(frozen=True)
-class _View:
-    """Pose of the car in a changed sample: new point = point @ matrix + offset."""
-
-    mirror: bool
-    matrix: Float[np.ndarray, "2 2"]
-    offset_cm: Float[np.ndarray, "2"]
-
-    def move(self, points_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Express points of the recorded car frame in the frame of the moved car, [cm]."""
-        return points_cm @ self.matrix + self.offset_cm
-
-
-def make_view(mirror: bool, shift_cm: float, turn_rad: float, scale: float = 1.0) -> _View:
-    """Scale and mirror the road, then move the car to the right and turn it left.
-
-    Args:
-        mirror: Swap left and right.
-        shift_cm: Distance by which the front axle is moved to the right, [cm].
-        turn_rad: Turn about the front axle, [rad], positive left.
-        scale: Every length of road and camera is multiplied by this.
-    """
-    c, s = math.cos(turn_rad), math.sin(turn_rad)
-    sign = -1.0 if mirror else 1.0
-    matrix = scale * np.array([[sign * c, -sign * s], [s, c]])
-    return _View(mirror, matrix, np.array([-shift_cm * c, shift_cm * s]))
 
 
 def join_frames(
@@ -168,45 +137,6 @@ def augment_batch(
         _amounts(settings),
     )
     return Batch(rasters, labels, present, given)
-
-
-def misplaced(
-    points_cm: Float[np.ndarray, "n 2"],
-    camera_cm: Float[np.ndarray, "3"],
-    *,
-    height: float = 0.0,
-    pitch_rad: float = 0.0,
-    roll_rad: float = 0.0,
-) -> Float[np.ndarray, "n 2"]:
-    """Return where points of the road appear to be if the camera's mounting is wrong.
-
-    The camera's rays are turned by the error of the mounting and intersected with the road again, below a
-    camera of the wrong height. The camera is assumed to look straight ahead: a wrong pitch then moves the
-    points alike whatever the pitch is, and a wrong roll is one about the level line ahead.
-
-    Args:
-        points_cm: True points, frame car.
-        camera_cm: Optical centre: right of, ahead of and above the front axle.
-        height: The assumed height is too large by this share.
-        pitch_rad: The assumed pitch is too large by this much.
-        roll_rad: The assumed roll is too far to the right by this much.
-
-    Returns:
-        Apparent points, [cm], frame car; NaN where the turned ray misses the road.
-
-    Source:
-        Own derivation; ``tests/unit/samples/test_augment.py`` compares it with two cameras.
-    """
-    moved = np.empty(points_cm.shape)
-    misplace_points(
-        np.asarray(points_cm, np.float64),
-        np.asarray(camera_cm, np.float64),
-        1.0 + height,
-        pitch_rad,
-        roll_rad,
-        moved,
-    )
-    return moved
 
 
 def _starts(parts: Sequence[np.ndarray]) -> Int[np.ndarray, "_"]:

@@ -137,7 +137,8 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
         shift *= right_cm if shift > 0.0 else left_cm
         sign = -1.0 if mirror else 1.0
         c, s = np.cos(turn), np.sin(turn)
-        # As in `lanenet.samples.augment.make_view`.
+        # A point p of the road is seen at p @ ((xx, xy), (yx, yy)) + (x0, y0): scaled and mirrored, then from
+        # a car that was moved to the right and turned left about its front axle.
         xx, xy, yx, yy = sign * c * scale, -sign * s * scale, s * scale, c * scale
         x0, y0 = -shift * c, shift * s
         _label(labels[slot], frames, i, (mirror, xx, xy, yx, yy, x0, y0), grid)
@@ -297,7 +298,25 @@ def _unpainted(rng, chance, edges_cm, first, last):
 def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
     """Return where a point of the road appears to be if the camera's mounting is wrong.
 
-    See :func:`lanenet.samples.augment.misplaced`.
+    The camera's ray is turned by the error of the mounting and intersected with the road again, below a
+    camera of the wrong height. The camera is assumed to look straight ahead: a wrong pitch then moves the
+    points alike whatever the pitch is, and a wrong roll is one about the level line ahead.
+
+    Args:
+        x: Of the true point, [cm], frame car, like y.
+        y: Likewise.
+        camera_x: Optical centre: right of the front axle, [cm]; the next two are ahead of and above it.
+        camera_y: Likewise.
+        camera_z: Likewise.
+        height: Assumed height over the true one.
+        pitch: The assumed pitch is too large by this much, [rad].
+        roll: The assumed roll is too far to the right by this much, [rad].
+
+    Returns:
+        The apparent point, [cm], frame car; NaN where the turned ray misses the road.
+
+    Source:
+        Own derivation; ``tests/unit/samples/test_augment.py`` compares it with two cameras.
     """
     # The ray in the car's level frame, turned by the error of the mounting: first pitch, then roll.
     dx, dy, dz = x - camera_x, y - camera_y, -camera_z
@@ -309,16 +328,6 @@ def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
         return np.nan, np.nan
     scale = -height * camera_z / dz
     return camera_x + dx * scale, camera_y + dy * scale
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def misplace_points(points_cm, camera_cm, height, pitch, roll, out):
-    """Apply :func:`misplace` to many points of one camera."""
-    right, ahead, up = camera_cm
-    for k in range(len(points_cm)):
-        x, y = points_cm[k]
-        out[k, 0], out[k, 1] = misplace(x, y, right, ahead, up, height, pitch, roll)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

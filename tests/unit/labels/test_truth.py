@@ -81,7 +81,7 @@ def test_what_is_scored_is_what_the_labels_name(tmp_path):
     (source,) = open_tests([tmp_path / "labels.parquet"], [tmp_path / "drive"])
     seen = PerceptionSettings().with_colours()
     opened = open_source(tmp_path / "drive", BirdseyeWindow(), seen, truth_labels)
-    assert opened.beside is not None and opened.beside.meta.perception == seen
+    assert opened.labels is not None and opened.labels.meta.perception == seen
     assert np.isnan(labels.points_cm).all(axis=1).any()
     for found in (source.frames, opened.frames):
         assert found is not None

@@ -73,7 +73,7 @@ def test_the_network_as_it_is_comes_first_and_a_later_call_goes_on(quick, paths,
     assert seen == [(1, 2), (2, 2)]
     rows = read(tmp_path)
     assert (rows[0]["cell_cm"], rows[0]["loss"], rows[0]["learning_rate"]) == ("3.0", "bins", "0.003")
-    assert table == (tmp_path / "sweep.md").read_text() and "2 trials to the end" in table
+    assert table == (tmp_path / "sweep.md").read_text() and "2 complete trials" in table
     sweep(SETTINGS, *paths, tmp_path, 600.0, 3, lambda *done: seen.append(done))
     assert seen[2:] == [(3, 3)]
     assert read(tmp_path)[:2] == rows and len(read(tmp_path)) == 3

@@ -1,4 +1,5 @@
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,13 +12,8 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import mirror_points, rows_of_polyline
-from lanenet.samples.augment import (
-    augment_batch,
-    join_frames,
-    make_view,
-    misplaced,
-    plain_batch,
-)
+from lanenet.samples.augment import augment_batch, join_frames, plain_batch
+from lanenet.samples.kernels import misplace
 from lanenet.samples.settings import AugmentSettings
 
 NOTHING = AugmentSettings.only()
@@ -36,11 +32,19 @@ def lines_present(edges, lines_cm, window):
     return plain_batch(frames, np.zeros(1, np.int64), window).present[0]
 
 
-def labels_of_view(points, lines, view):
-    """Slow and obvious: the moved polylines, asked for their rows."""
-    moved = [view.move(line) for line in (lines[::-1] if view.mirror else lines)]
-    known = np.isfinite(mirror_points(points) if view.mirror else points)
+def labels_of_view(points, lines, mirror, shift, turn):
+    """Slow and obvious: the polylines as a moved car sees them, asked for their rows."""
+    # In the map: a car at the origin that heads along +x, with no wheelbase, so that pose = front axle.
+    sign = np.array([-1.0 if mirror else 1.0, 1.0])
+    in_map = [map_from_car(line * sign, np.zeros(3), 0.0) for line in (lines[::-1] if mirror else lines)]
+    moved = [car_from_map(line, np.array([0.0, -shift, turn]), 0.0) for line in in_map]
+    known = np.isfinite(mirror_points(points) if mirror else points)
     return np.where(known, np.concatenate([rows_of_polyline(line) for line in moved]), np.nan)
+
+
+def misplaced(points, camera_cm, height=0.0, pitch_rad=0.0, roll_rad=0.0):
+    found = [misplace(x, y, *camera_cm, 1.0 + height, pitch_rad, roll_rad) for x, y in points.tolist()]
+    return np.array(found)
 
 
 @given(
@@ -78,19 +82,6 @@ def test_mirror_flips_raster_and_labels():
     assert different.sum() <= 0.01 * np.count_nonzero(rasters)
 
 
-@given(shift=st.floats(-6, 6), turn=st.floats(-0.2, 0.2), mirror=st.booleans())
-@settings(max_examples=50, deadline=None)
-def test_a_view_is_what_a_moved_car_sees(shift, turn, mirror):
-    # In the map: a car at the origin that heads along +x, with no wheelbase, so that pose = front axle.
-    points = np.array([[3.0, 40.0], [-20.0, 15.0], [0.0, 0.0]])
-    seen = points * [-1.0, 1.0] if mirror else points
-    in_map = map_from_car(seen, np.zeros(3), 0.0)
-    moved_pose = np.array([0.0, -shift, turn])
-    np.testing.assert_allclose(
-        make_view(mirror, shift, turn).move(points), car_from_map(in_map, moved_pose, 0.0), atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("draw", ["even", "limit"])
 def test_rasters_and_labels_are_those_of_one_view(draw):
     wide = BirdseyeWindow(left_cm=-120.0, near_cm=-20.0, cell_cm=0.5, rows=280, columns=480)
@@ -117,7 +108,7 @@ def test_rasters_and_labels_are_those_of_one_view(draw):
 def test_labels_of_straight_lines_are_exact(shift, turn, mirror):
     y = np.linspace(-80.0, 200.0, 30)
     lines = (np.stack([-20.0 + 0.0 * y, y], 1), np.stack([20.0 + 0.0 * y, y], 1))
-    points = labels_of_view(np.repeat([-20.0, 20.0], 3), lines, make_view(mirror, shift, turn))
+    points = labels_of_view(np.repeat([-20.0, 20.0], 3), lines, mirror, shift, turn)
     # x = +-20 becomes a line at distance +-20 - shift, seen under the angle `turn`.
     rows = np.array([0.0, 15.0, 30.0])
     expected = [(side - shift) / np.cos(turn) + rows * np.tan(turn) for side in (-20.0, 20.0)]
@@ -131,13 +122,13 @@ def test_labels_are_those_of_the_moved_polylines():
     points = np.array([-20.0, -20.0, np.nan, 20.0, 20.0, np.nan])
     frames = join_frames([np.empty((0, 4), np.float32)], [lines], points[None])
     window = BirdseyeWindow()
-    for mirror in (0.0, 1.0):
-        for shift in (-5.0, 5.0):
-            # With no other change, "limit" leaves two shifts to draw from.
-            fixed = NOTHING.model_copy(update={"mirror": mirror, "shift_cm": abs(shift), "draw": "limit"})
-            expected = labels_of_view(points, lines, make_view(bool(mirror), shift, 0.0))
-            found = [augment_batch(frames, ALL[:1], window, fixed, k, 0)[1][0] for k in range(20)]
-            assert any(np.allclose(f, window.labelled(expected), atol=1e-4, equal_nan=True) for f in found)
+    for mirror, shift, turn in product((0.0, 1.0), (-5.0, 5.0), (-0.1, 0.0, 0.1)):
+        # With no other change, "limit" leaves two shifts and two turns to draw from.
+        changes = {"mirror": mirror, "shift_cm": abs(shift), "rotate_rad": abs(turn), "draw": "limit"}
+        expected = labels_of_view(points, lines, bool(mirror), shift, turn)
+        fixed = NOTHING.model_copy(update=changes)
+        found = [augment_batch(frames, ALL[:1], window, fixed, k, 0)[1][0] for k in range(20)]
+        assert any(np.allclose(f, window.labelled(expected), atol=1e-4, equal_nan=True) for f in found)
     assert np.isnan(found[0][[2, 5]]).all()
 
 
