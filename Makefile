@@ -11,16 +11,17 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c c
 # Tests run on this many cores. Each process takes over a gigabyte, hence the bound for large machines.
 TEST_PROCESSES ?= auto
 # Shapes and types of arguments are checked at run time in tests, and only there. A process computes with one
-# thread, so that the processes leave each other their cores.
+# thread, so that the processes leave each other their cores. Neighbouring tests share a process and its
+# fixtures, until a process that has none left takes over some of another one's.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype \
-  --numprocesses $(TEST_PROCESSES) --maxprocesses 4
+  --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
 .PHONY: help train env test test-slow test-base-install golden golden-renew arm check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
 	@echo "make test         environment for developers, then the fast tests"
-	@echo "make test-slow    the tests that take longer than about ten seconds each"
+	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"

@@ -41,7 +41,7 @@ def check_lens(field_deg: float, seed: int) -> None:
     assert error_cm.max() < 0.2
 
 
-@pytest.mark.parametrize("field_deg", [160.0, 180.0, 200.0])
+@pytest.mark.parametrize("field_deg", [160.0, pytest.param(180.0, marks=pytest.mark.slow), 200.0])
 def test_a_wide_fisheye_is_found(field_deg: float) -> None:
     check_lens(field_deg, seed=int(field_deg))
 
@@ -126,7 +126,7 @@ def test_boards_that_all_face_the_camera_are_refused() -> None:
         calibrate_lens(views, "pinhole")
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_random_corners_give_an_error_and_no_camera(seed: int, views: list[BoardView]) -> None:
     rng = np.random.default_rng(seed)
     noise = [dataclasses.replace(v, corners_px=rng.uniform(0.0, 470.0, (54, 2))) for v in views[:6]]
@@ -134,7 +134,7 @@ def test_random_corners_give_an_error_and_no_camera(seed: int, views: list[Board
         calibrate_lens(noise)
 
 
-@pytest.mark.parametrize(("field_deg", "seed"), [(170.0, 4), (200.0, 1)])
+@pytest.mark.parametrize(("field_deg", "seed"), [(170.0, 4), pytest.param(200.0, 1, marks=pytest.mark.slow)])
 def test_a_pinhole_forced_on_a_fisheye_is_refused(field_deg: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     views = views_of(fisheye_of(field_deg, rng), rng, 10)

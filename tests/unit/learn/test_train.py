@@ -122,7 +122,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     torch.load(finished.folder / "last.pt", weights_only=True)
 
 
-@pytest.mark.parametrize(("last", "every"), [(1, 1), (2, 1), (2, 5)])
+@pytest.mark.parametrize(("last", "every"), [(1, 1), pytest.param(2, 1, marks=pytest.mark.slow), (2, 5)])
 def test_a_killed_run_ends_as_an_undisturbed_one(data, finished, tmp_path, last, every):
     settings = TINY.model_copy(update={"checkpoint_every": every, "tensorboard": True})
     with pytest.raises(KilledError):
