@@ -110,7 +110,7 @@ def test_a_trial_that_time_cut_off_is_tried_again(quick, paths, tmp_path, monkey
     clock = iter([0.0, 0.0])
     with monkeypatch.context() as patch:
         patch.setattr(sweep_module.time, "monotonic", lambda: next(clock, 100.0))
-        assert "0 trials to the end" in sweep(SETTINGS, *paths, tmp_path, 60.0, 3)
+        assert "0 complete trials" in sweep(SETTINGS, *paths, tmp_path, 60.0, 3)
     assert read(tmp_path) == []
     sweep(SETTINGS, *paths, tmp_path, 600.0, 1)
     assert [(row["trial"], row["learning_rate"]) for row in read(tmp_path)] == [("1", "0.003")]
