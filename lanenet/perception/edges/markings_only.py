@@ -68,15 +68,17 @@ class ColourSettings(Settings):
 
 @dataclass(frozen=True)
 class MarkingColour:
-    """A colour of tape: a channel of Lab that rises towards it.
+    """A colour of tape: a channel of Lab that rises or falls towards it.
 
     Attributes:
         channel: 1 for a (green to red), 2 for b (blue to yellow).
         floor: Smallest response that counts, from the settings; None where they leave the colour out.
+        falls: The channel falls towards the colour.
     """
 
     channel: Literal[1, 2]
     floor: Callable[[ColourSettings], int | None]
+    falls: bool = False
 
 
 #: Colours beside white. A new one is an entry here and the setting that its floor reads.
@@ -193,6 +195,8 @@ def _coloured_strips(part: np.ndarray, settings: ColourSettings, row_px: np.ndar
     found = []
     for colour, floor in wanted:
         channel = cv2.extractChannel(lab, colour.channel)
+        if colour.falls:
+            channel = cv2.bitwise_not(channel)
         strips = _strips(channel, floor, settings, "light", 0.5 * row_px[::2])
         if cv2.countNonZero(strips.mask):
             mask = cv2.resize(strips.mask, (width, height), interpolation=cv2.INTER_NEAREST)
