@@ -1,4 +1,7 @@
-"""Scale from the lane: its width in the scale of a camera, with its uncertainty."""
+"""The lane width in the scale of a camera, with its uncertainty.
+
+The scale itself is set in :mod:`datagen.assemble` and :mod:`datagen.calibrate_drive`.
+"""
 
 from __future__ import annotations
 

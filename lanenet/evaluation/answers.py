@@ -265,9 +265,6 @@ class RasterModel:
         """
         self.path = path
         self._session, self.meta = open_model(path, threads)
-        outputs = {output.name for output in self._session.get_outputs()}
-        # Models of the first format have points only.
-        self._names = [name for name in ("points_cm", "sigma_cm", "presence") if name in outputs]
 
     def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
         """Refuse rasters of another window, or of edges that were found with other settings.
@@ -306,11 +303,10 @@ class RasterModel:
                 feed[WIDTH_NAME] = lane_cm[start : start + _CHUNK].astype(np.float32)
             # As on the car: an empty raster gets no points.
             marked = np.asarray(part.any(axis=(1, 2, 3)))[:, None]
-            for name, answer in zip(self._names, self._session.run(self._names, feed), strict=True):
+            for name, answer in zip(values, self._session.run(list(values), feed), strict=True):
                 values[name][start : start + _CHUNK] = np.where(marked, answer, np.nan)
-        if "presence" in self._names:
-            # An empty raster shows no line; that is an answer.
-            values["presence"][~rasters.any(axis=(1, 2, 3))] = 0.0
+        # An empty raster shows no line; that is an answer.
+        values["presence"][~rasters.any(axis=(1, 2, 3))] = 0.0
         return RasterAnswers(**values)
 
     def answer_labels(self, labels: LabelSet) -> RasterAnswers:

@@ -57,8 +57,8 @@ def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
     """Find x where a lane line crosses the label rows.
 
     The line is walked in the order of its points, which is the direction of travel; of several crossings of
-    one row the first that goes upwards (the line recedes from the car) counts. NaN where no section does,
-    so that a line that turns away or back is not answered with another section of itself.
+    one row the first that goes upwards (the line recedes from the car) counts. NaN where no section does, so
+    that a line that turns away or back is not answered with another section of the line.
 
     Args:
         line_car_cm: Polyline in the direction of travel, [cm], frame car; NaN rows break it.

@@ -163,6 +163,7 @@ class LanePilot:
         steering_rad, speed_cm_s = self._target
         throttle = throttle_of(speed_cm_s, self._settings.control.speed)
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
+        # Donkeycar's sign: -1 is left.
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
 
     def _is_new(self, bgr: UInt8[np.ndarray, "h w 3"]) -> bool:

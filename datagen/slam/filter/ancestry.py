@@ -128,7 +128,7 @@ class AncestryMap:
         return sum(array.nbytes for part in self.arrays[:3] for array in part)
 
     def score(self, poses: Float[np.ndarray, "p 3"], scan: Scan, frame: int) -> Float[np.ndarray, "p"]:
-        """Score how well a frame's edges fit what each particle's lineage has seen.
+        """Return the log likelihood of each particle: how well the edges fit what its lineage has seen.
 
         Args:
             poses: One per particle, in their order.
@@ -519,7 +519,7 @@ def collapse(shared, row):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def score(shared, poses, points, frame):
-    """Score each particle's view of a frame against the map of its own lineage.
+    """Return the log likelihood of each particle: its view of a frame against the map of its own lineage.
 
     Args:
         shared: The map.

@@ -160,9 +160,9 @@ class ParticleFilter:
         match = np.nan
         if self.frame > 0:
             self._predict(motion, k)
-            scores = self.map.score(self.states[:, :3], scan, self.frame)
-            self.weights = reweigh(self.weights, scores, self.settings.effective_share)
-            match = scores.max() / scan.weights.sum() if scan.weights.size else np.nan
+            log_likelihoods = self.map.score(self.states[:, :3], scan, self.frame)
+            self.weights = reweigh(self.weights, log_likelihoods, self.settings.effective_share)
+            match = log_likelihoods.max() / scan.weights.sum() if scan.weights.size else np.nan
         estimate = self._estimate(match)
         chosen = self._resample()
         self._update_ancestry(chosen, estimate.pose)

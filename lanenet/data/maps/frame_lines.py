@@ -93,7 +93,9 @@ def lines_of_frame(
 
 
 def label_rows(line_car_cm: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3"]:
-    """Find x where a line crosses the label rows; NaN where it crosses too obliquely or more than once.
+    """Find x where a line of a map crosses the label rows; NaN where too obliquely or more than once.
+
+    Stricter than :func:`lanenet.geometry.lane.rows_of_polyline`, which ground truth uses: a map may be wrong.
 
     Args:
         line_car_cm: Polyline in the direction of travel, frame car; NaN rows break it.

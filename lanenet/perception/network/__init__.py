@@ -1,1 +1,1 @@
-"""The network as a detector: the ONNX file, the check that it fits, and inference."""
+"""The network as a detector: the ONNX file, inference, and the check that it fits the camera."""

@@ -1,4 +1,6 @@
-"""Model files: finding one, its description, and the check that both fit.
+"""Model files: finding one, reading its metadata, and checking that the metadata match the graph.
+
+Whether a model fits a camera is checked in :mod:`lanenet.perception.network.detector`.
 
 Wherever a model is expected, its checkpoint folder will do.
 """
