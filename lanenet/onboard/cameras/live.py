@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.errors import HardwareError
-from lanenet.onboard.devices import Frame
+from lanenet.onboard.devices import Frame, FrameSource
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +54,14 @@ class CameraSettings(Settings):
     start_s: float = Field(default=5.0, gt=0.0)
     silence_s: float = Field(default=1.0, gt=0.0)
     give_up_s: float = Field(default=60.0, ge=0.0)
+
+    def make_device(self) -> Device:
+        """Build the camera's driver; the camera is not touched before ``start``."""
+        raise NotImplementedError
+
+    def make_source(self) -> FrameSource:
+        """Build the source; the camera is not touched before ``open``."""
+        return LiveSource(self.make_device(), self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,10 @@ class PiCameraSettings(CameraSettings):
     camera: int = Field(default=0, ge=0)
     pixel_format: Literal["RGB888", "BGR888", "XRGB8888", "XBGR8888"] = "RGB888"
 
+    def make_device(self) -> PiCamera:
+        """Build the driver."""
+        return PiCamera(self)
+
 
 class PiCamera:
     """A ``Device`` over picamera2."""

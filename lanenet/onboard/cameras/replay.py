@@ -41,6 +41,10 @@ class ReplaySettings(Settings):
     loop: bool = False
     may_drive: bool = False
 
+    def make_source(self) -> ReplaySource:
+        """Build the source; the drive is not read before ``open``."""
+        return ReplaySource(self)
+
 
 class ReplaySource:
     """Frames of a drive, one after the other; a ``FrameSource``.

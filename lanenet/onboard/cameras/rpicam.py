@@ -56,6 +56,10 @@ class RpicamSettings(CameraSettings):
             )
         return self
 
+    def make_device(self) -> Rpicam:
+        """Build the driver."""
+        return Rpicam(self)
+
 
 class Rpicam:
     """A ``Device`` over a pipe from rpicam-vid."""

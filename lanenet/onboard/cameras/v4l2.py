@@ -25,6 +25,10 @@ class V4L2Settings(CameraSettings):
     device: str = "/dev/video0"
     fourcc: Literal["MJPG", "YUYV"] = "MJPG"
 
+    def make_device(self) -> V4L2Camera:
+        """Build the driver."""
+        return V4L2Camera(self)
+
 
 class V4L2Camera:
     """A ``Device`` over ``cv2.VideoCapture``."""
