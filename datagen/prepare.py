@@ -110,7 +110,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
 
 
 class KeptImages:
-    """Images that stay in memory once they were read, for mapping looks at every frame a dozen times.
+    """Images kept in memory after the first read, because mapping reads every frame a dozen times.
 
     The first ones are kept until they take up too much.
     """

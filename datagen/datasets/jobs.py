@@ -44,7 +44,7 @@ class Part:
         role: What it is for.
         labels: Its file.
         frames: The simulated drive whose truth it holds, or the map that it was made from.
-        counts_as: As many drives to learn from.
+        counts_as: Number of training drives that this set counts as.
     """
 
     role: Role

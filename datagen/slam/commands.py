@@ -13,7 +13,7 @@ from lanenet.geometry.frames import left_from_donkey
 
 #: Delays of the steering to try, frames: half a second at 20 frames a second; the real drives show 4.
 _MAX_LAG = 10
-#: Typical frame intervals beyond which the frames between were left out because the car stood.
+#: An interval longer than this many typical ones means that the car stood and its frames were left out.
 _LONGEST_STEP = 3.0
 #: Speed below which a yaw rate says nothing about curvature, [cm/s].
 _MOVING_CM_S = 1.0

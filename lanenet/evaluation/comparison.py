@@ -47,7 +47,7 @@ class SourceAnswers:
     """What the detectors say about one drive, map or label set.
 
     Attributes:
-        name: The path, as people know it.
+        name: The path, for display.
         kind: ``simulated drive``, ``map`` or ``label set``.
         reference: Where the labels come from: ``truth`` or ``map``.
         truth_cm: Six labels per frame; NaN where there is none.
@@ -87,7 +87,7 @@ class SourceErrors:
     """Errors on one source.
 
     Attributes:
-        name: The path, as people know it.
+        name: The path, for display.
         kind: As in :class:`SourceAnswers`.
         reference: As in :class:`SourceAnswers`.
         frames: Frames that the detectors saw.

@@ -76,7 +76,7 @@ class BundleResult(BundleEstimate):
     """What the adjustment found.
 
     Attributes:
-        sigma: Standard deviation of each of the camera's numbers (see ``CAMERA_NAMES``; focal relative); 0
+        sigma: Standard deviation of each camera parameter (see ``CAMERA_NAMES``; focal relative); 0
             for those that were held.
         residual_px: Residuals of the last round.
         misfit: Mean robust loss over all compared points; one without an edge counts as if it had met one at
@@ -112,7 +112,7 @@ def adjust(
             stays.
         settings: Priors and robustness.
         rng: Draws the edge points that are compared.
-        free: Names of the camera's numbers that may change.
+        free: Names of the camera parameters that may change.
         loops: More pairs of frames that show the same place.
         prior_camera: Centre of the camera's priors; None for the camera of the start. Where each round starts
             from the result of the last one, the camera would otherwise drift away from what is known of it.
@@ -212,7 +212,7 @@ class BundleProblem:
         points: Pixels that are compared.
         edges: All edges, those of each frame sorted by row, as the kernels search them.
         compared: Number of comparisons: points times pairs.
-        free: Which of the camera's numbers may change.
+        free: Which of the camera parameters may change.
     """
 
     def __init__(
@@ -259,8 +259,8 @@ class BundleProblem:
         """Lift the compared points to the road.
 
         Returns:
-            The points (ahead of the rear axle, left); their Jacobian by the camera's numbers; and points half
-            a pixel further along the gradient.
+            The points (ahead of the rear axle, left); their Jacobian by the camera parameters; and points
+            half a pixel further along the gradient.
         """
         if self._lifted is not None and self._lifted[0] is state:
             # Association and residuals start from the same state.

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-#: Adjustable numbers of the camera: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
+#: Adjustable camera parameters: focal length (relative), cx, cy, k1, pitch, roll, yaw, lever.
 N_CAMERA = 8
-#: Where pitch and roll stand among the camera's numbers; each frame adds its own.
+#: Indices of pitch and roll in the camera parameters; each frame adds its own.
 _PITCH, _ROLL = 4, 5
 #: Numbers of a frame: x, y, heading, and how far its pitch and roll are from the camera's.
 N_FRAME = 5
@@ -165,7 +165,7 @@ def _distorted(fisheye, lens, x, y, z):
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _in_camera(view, forward, left):
-    """A road point in the camera's frame, and before pitch and roll; it lies one camera height below."""
+    """Return a road point in the camera frame and in the level frame, one camera height above the road."""
     a, b = forward - view[6], left - view[7]
     ahead, right = a * view[4] + b * view[5], a * view[5] - b * view[4]
     down, z = view[0] - view[1] * ahead, view[1] + view[0] * ahead
@@ -227,7 +227,7 @@ def lift_points(state, points, out, out_by, out_half):
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
         points: Pixels of all frames.
         out: Filled: road point of each pixel (ahead, left).
-        out_by: Filled: derivatives by the camera's numbers.
+        out_by: Filled: derivatives by the camera parameters.
         out_half: Filled: road point half a pixel further along the gradient.
     """
     lens, tilt, uv, normals = state.lens, state.tilt, points.uv, points.normals
@@ -352,7 +352,7 @@ def accumulate(
         pairs: Pairs of frames, i and j.
         edges: Edges of all frames.
         lifted: Road point of each compared pixel.
-        lifted_by: Its Jacobian by the camera's numbers.
+        lifted_by: Its Jacobian by the camera parameters.
         links: Which point meets which edge.
         point_weight: Inverse variance of each compared pixel.
         cauchy_px: Scale c of the loss.

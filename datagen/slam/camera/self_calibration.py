@@ -229,7 +229,7 @@ def honest_sigma(
 
 
 def turning_rad(poses: Float[np.ndarray, "n 3"]) -> float:
-    """Range of the heading along a path; swaying about one direction adds nothing to it."""
+    """Range of the heading along a path; oscillation about one heading does not increase it."""
     return float(np.ptp(poses[:, 2]))
 
 

@@ -112,7 +112,7 @@ def revisit_residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) 
 def inlier_revisits(
     poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], camera_height_cm: float
 ) -> list[Revisit]:
-    """Return the revisits that an adjusted map confirms; one that the images outvoted shows another place.
+    """Return the revisits that an adjusted map confirms; one that the adjustment overruled is a false match.
 
     Args:
         poses: Poses after closing loops and adjusting all frames.

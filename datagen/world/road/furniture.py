@@ -33,7 +33,7 @@ COLOURS: dict[str, Bgr] = {
 _LINE_STOP_CM = 5.0
 #: Arc per strip of tape; at 15 cm radius a strip leaves the arc by 0.07 cm.
 _CORNER_STEP_RAD = 0.2
-#: Random things: places that are tried for each; least distance along the road and beside it; chosen.
+#: Random furniture: placement attempts per item; minimum distance along and beside the road. Chosen.
 _TRIES = 15
 _APART_CM = 30.0
 _BESIDE_CM = 10.0

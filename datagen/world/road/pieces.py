@@ -92,7 +92,7 @@ class SBendPiece(Settings):
     """Two arcs in opposite directions; the road goes on parallel to itself.
 
     Attributes:
-        radius_cm: Of both arcs.
+        radius_cm: Radius of both arcs.
         angle_deg: Of each arc.
         direction: Of the first arc.
         straight_cm: Between the arcs.
