@@ -6,61 +6,38 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_drive import made_up_drive
 
 from datagen.prepare import KeptImages, check_size, hide_bumper, split_segments
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.recording import Commands, Drive
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 
 
-class _NoImages:
-    def read(self, row: int) -> np.ndarray:
-        raise AssertionError("no image is needed here")
-
-
-def _drive(n: int, breaks: list[int]) -> Drive:
-    flags = np.zeros(n, dtype=bool)
-    flags[breaks] = True
-    return Drive(
-        name="made-up",
-        path=Path("made-up"),
-        frames=np.arange(n),
-        t_s=0.05 * np.arange(n),
-        times_trusted=True,
-        commands=Commands(),
-        deleted=np.zeros(n, dtype=bool),
-        breaks=flags,
-        camera=None,
-        lane_width_cm=None,
-        problems=(),
-        width=160,
-        height=120,
-        images=_NoImages(),
-        rows=np.arange(n),
-    )
-
-
 def test_an_uninterrupted_drive_is_one_segment():
-    assert split_segments(_drive(200, [])) == [slice(0, 200)]
-    assert split_segments(_drive(60, [])) == [slice(0, 60)]
+    assert split_segments(made_up_drive(200, [])) == [slice(0, 200)]
+    assert split_segments(made_up_drive(60, [])) == [slice(0, 60)]
 
 
 def test_a_drive_is_cut_at_its_breaks_and_short_segments_are_left_out():
-    assert split_segments(_drive(400, [100, 130, 300])) == [slice(0, 100), slice(130, 300), slice(300, 400)]
+    assert split_segments(made_up_drive(400, [100, 130, 300])) == [
+        slice(0, 100),
+        slice(130, 300),
+        slice(300, 400),
+    ]
 
 
 def test_a_drive_of_scraps_cannot_be_mapped():
     with pytest.raises(TrackingLostError, match=r"120 frames.* 50.*60"):
-        split_segments(_drive(120, [50, 90]))
+        split_segments(made_up_drive(120, [50, 90]))
     with pytest.raises(TrackingLostError, match="59 frames"):
-        split_segments(_drive(59, []))
+        split_segments(made_up_drive(59, []))
 
 
 def test_a_camera_of_another_size_is_refused():
-    drive = _drive(100, [])
+    drive = made_up_drive(100, [])
     check_size(guessed_camera(160, 120, 80.0, 0.2, GuessSettings()), drive, None)
     with pytest.raises(CalibrationError, match=r"320x240.*160x120"):
         check_size(guessed_camera(320, 240, 80.0, 0.2, GuessSettings()), drive, Path("camera.yaml"))

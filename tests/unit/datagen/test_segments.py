@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_up_drive import made_up_drive
 
 from datagen import pipeline, prepare
 from datagen import segments as drive_segments
@@ -20,7 +21,7 @@ from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
-from lanenet.data.drives.recording import Commands, Drive, ImageFiles
+from lanenet.data.drives.recording import Drive
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
@@ -34,28 +35,6 @@ class _StopError(Exception):
     """Ends a run once what it hands on has been seen."""
 
 
-def _drive(n: int, breaks: list[int]) -> Drive:
-    flags = np.isin(np.arange(n), breaks)
-    return Drive(
-        name="made-up",
-        path=Path("made-up"),
-        # Recordings do not always count from 0.
-        frames=np.arange(n) + 1000,
-        t_s=0.05 * np.arange(n),
-        times_trusted=True,
-        commands=Commands(),
-        deleted=np.zeros(n, dtype=bool),
-        breaks=flags,
-        camera=None,
-        lane_width_cm=None,
-        problems=(),
-        width=160,
-        height=120,
-        images=ImageFiles([]),
-        rows=np.arange(n),
-    )
-
-
 def _solved(n: int) -> SolvedSegment:
     poses = np.column_stack([3.0 * np.arange(n), np.zeros(n), np.zeros(n)])
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
@@ -66,7 +45,7 @@ def _solved(n: int) -> SolvedSegment:
 
 @pytest.mark.parametrize("at", [70, 130])
 def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monkeypatch, at):
-    drive = _drive(200, [at])
+    drive = made_up_drive(200, [at], first_frame=1000)
     longest = _solved(130)
     seen: list[SolvedSegment] = []
 
@@ -151,7 +130,7 @@ def _map(
     ],
 )
 def test_a_segment_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, why):
-    mapped = _map(monkeypatch, _drive(1000, [300, 370]), **bad)
+    mapped = _map(monkeypatch, made_up_drive(1000, [300, 370], first_frame=1000), **bad)
     assert [(int(s.rows[0]), int(s.rows[-1])) for s in mapped.segments] == [(0, 299), (370, 999)]
     (note,) = mapped.notes
     assert note.startswith(f"frames 1300-1369 left out: {why}")
@@ -159,13 +138,13 @@ def test_a_segment_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, 
 
 def test_the_longest_segment_says_why_nothing_could_be_mapped(monkeypatch):
     with pytest.raises(TrackingLostError, match="no pair of lines in 130 frames"):
-        _map(monkeypatch, _drive(200, [70]), no_edges=(70,), no_lane=(130,))
+        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(70,), no_lane=(130,))
     with pytest.raises(TrackingLostError, match="130 frames, 3 edge points"):
-        _map(monkeypatch, _drive(200, [70]), no_edges=(130,), no_lane=(70,))
+        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(130,), no_lane=(70,))
     with pytest.raises(CalibrationError, match="a lane of 30 cm in 130 frames"):
-        _map(monkeypatch, _drive(200, [70]), no_edges=(70,), other_lane=(130,))
+        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(70,), other_lane=(130,))
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):
-    mapped = _map(monkeypatch, _drive(200, [70]))
+    mapped = _map(monkeypatch, made_up_drive(200, [70], first_frame=1000))
     assert len(mapped.segments) == 2 and not mapped.notes

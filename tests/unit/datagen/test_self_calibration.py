@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_drive import made_up_drive
 
 import datagen.slam.camera.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera, straight_frames
@@ -32,7 +33,6 @@ from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.drives.folder import DriveWriter
-from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.line import LaneLine
 from lanenet.errors import CalibrationError
 from lanenet.perception.edges.road import RoadEdges
@@ -223,28 +223,6 @@ def test_a_start_that_was_far_off_is_replaced(monkeypatch, answers, starts):
     assert result.closed and result.camera.K[0, 0] == pytest.approx(closed[-1])
     assert result.strain == pytest.approx(1.0)
     assert not result.refined and "from the drive" in result.note
-
-
-def made_up_drive(frames: int) -> Drive:
-    none = np.zeros(frames, bool)
-    at = np.arange(frames)
-    return Drive(
-        "d",
-        Path("d"),
-        at,
-        0.05 * at,
-        True,
-        Commands(),
-        none,
-        none,
-        None,
-        None,
-        (),
-        160,
-        120,
-        ImageFiles([]),
-        at,
-    )
 
 
 def test_priors_about_a_known_camera_are_never_wider():
