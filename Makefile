@@ -12,8 +12,11 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c c
 TEST_PROCESSES ?= auto
 # Shapes and types of arguments are checked at run time in tests, and only there. A process computes with one
 # thread, so that the processes leave each other their cores. Neighbouring tests share a process and its
-# fixtures, until a process that has none left takes over some of another one's.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=lanenet,datagen,beartype.beartype \
+# fixtures, until a process that has none left takes over some of another one's. Compiled modules are kept, even
+# where the environment forbids it (as many containers do): else each process, and each program that a test
+# starts, compiles them all again.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
+  --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
 .PHONY: help train env test test-slow test-base-install golden golden-renew arm check format format-check lint types imports bench clean

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torchvision.models import alexnet
 
 from lanenet.errors import CheckpointError
 from lanenet.learn.trunks.compact import Trunk
@@ -36,6 +35,9 @@ class AlexNetTrunk(Trunk):
 
     def __init__(self, rows: int, columns: int, channels: None = None, hidden: None = None) -> None:
         super().__init__()
+        # Here, since its import takes two seconds that no other network should wait for.
+        from torchvision.models import alexnet
+
         whole = alexnet(weights=None)
         self.features = whole.features
         self.avgpool = whole.avgpool

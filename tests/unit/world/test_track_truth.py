@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -27,12 +29,12 @@ def _draw(seed: int, **changes: object) -> Track:
     return random_track(TrackSettings(**changes), np.random.default_rng(seed))
 
 
-_TRACKS = {
-    (closed, lanes): _draw(3, closed=closed, lanes=lanes, length_cm=1800.0, random_furniture=RATES)
-    for closed in (False, True)
-    for lanes in (1, 2)
-}
-KINDS = list(_TRACKS)
+KINDS = [(closed, lanes) for closed in (False, True) for lanes in (1, 2)]
+
+
+@functools.cache
+def _track(closed: bool, lanes: int) -> Track:
+    return _draw(3, closed=closed, lanes=lanes, length_cm=1800.0, random_furniture=RATES)
 
 
 @settings(max_examples=15, deadline=None)
@@ -60,7 +62,7 @@ def test_loops_have_straights_and_bend_both_ways():
 
 @pytest.mark.parametrize("key", KINDS)
 def test_reversing_twice_gives_the_same_road(key):
-    track = _TRACKS[key]
+    track = _track(*key)
     again = track.reversed().reversed()
     assert again.length_cm == pytest.approx(track.length_cm, abs=0.05)
     places = np.linspace(5.0, track.length_cm - 5.0, 80)
@@ -73,7 +75,7 @@ def test_reversing_twice_gives_the_same_road(key):
 
 @pytest.mark.parametrize("key", KINDS)
 def test_the_reversed_road_is_painted_in_the_same_places(key):
-    track, back = _TRACKS[key], _TRACKS[key].reversed()
+    track, back = _track(*key), _track(*key).reversed()
     np.testing.assert_array_equal(back.boxes, track.boxes)
     for m, n in zip(track.markings, back.markings, strict=True):
         assert len(m.painted_cm) == len(n.painted_cm)
@@ -88,7 +90,7 @@ def test_the_reversed_road_is_painted_in_the_same_places(key):
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_two_lanes_share_their_middle_line(closed):
-    track = _TRACKS[closed, 2]
+    track = _track(closed, 2)
     back = track.reversed()
     steps = np.linalg.norm(np.diff(back.xy_cm, axis=0), axis=1)
     np.testing.assert_allclose(steps, back.step_cm, atol=0.06)
@@ -103,7 +105,7 @@ def test_two_lanes_share_their_middle_line(closed):
 
 @pytest.mark.parametrize("key", KINDS)
 def test_mirrored_and_moved_roads_answer_alike(key):
-    track = _TRACKS[key]
+    track = _track(*key)
     rng = np.random.default_rng(1)
     mirrored, moved = mirror_track(track), move_track(track, np.array([30.0, -80.0, 1.3]))
     c, s = np.cos(1.3), np.sin(1.3)
@@ -128,11 +130,11 @@ def test_mirrored_and_moved_roads_answer_alike(key):
 
 @pytest.mark.parametrize("key", KINDS)
 def test_painted_stretches_are_disjoint_and_on_the_road(key):
-    for marking in _TRACKS[key].markings:
+    for marking in _track(*key).markings:
         painted = marking.painted_cm
         assert (painted[:, 1] > painted[:, 0]).all()
         assert (painted[1:, 0] >= painted[:-1, 1]).all()
-        assert painted.min() >= 0.0 and painted.max() <= _TRACKS[key].length_cm + 1e-9
+        assert painted.min() >= 0.0 and painted.max() <= _track(*key).length_cm + 1e-9
 
 
 def test_dashes_have_their_length_along_the_line_itself():
@@ -230,7 +232,7 @@ def test_subtraction_agrees_with_a_count(a, b):
 
 @pytest.mark.parametrize("key", KINDS)
 def test_the_grid_answers_with_the_nearest_sample(key):
-    track = _TRACKS[key]
+    track = _track(*key)
     grid = NearestGrid(track)
     rng = np.random.default_rng(2)
     reach_cm = grid.reach_cm
@@ -263,7 +265,7 @@ def test_a_long_road_costs_its_length_only():
 
 
 def test_track_files_keep_boxes_and_the_oncoming_lane(tmp_path):
-    track = _TRACKS[True, 2]
+    track = _track(True, 2)
     path = tmp_path / "track.json"
     write_track(path, track)
     again = read_track(path)
