@@ -117,25 +117,12 @@ def write_quick_labels(path: Path, window: Any, source: str, camera: str) -> Non
     write_labels(path, labels)
 
 
-#: 57 million weights are trained, compared and exported in about a minute.
-SLOW = ("alexnet.yaml",)
+def prepare_quickly(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Make the data of a config without driving and mapping, which take minutes: straight lanes instead.
 
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
-        for path in sorted(CONFIGS.glob("*.y*ml"))
-    ],
-)
-def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of a run but driving and mapping, which would take minutes: their place take straight lanes.
-
-    So the window, the split, the network, the augmentation and what it starts from are those of the file.
+    So the window and the split are those of the file.
     """
     from datagen.datasets import build, jobs
-    from lanenet.learn.checkpoint import publish
-    from lanenet.learn.train import train
 
     def map_drive(request: Any, settings: Any, out: Path, pictures: bool = True) -> None:
         assert request.lane_width_cm > 20.0
@@ -155,14 +142,43 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(jobs, "truth_labels", truth_labels)
     monkeypatch.setattr(jobs, "write_labels", write_or_move)
     monkeypatch.setattr(jobs, "fingerprint", str)
-    settings = read_training_run(path)
-    few = {"train": 2, "validation": 1, "test": 1} if settings.data.synthetic.train else {}
-    data = settings.data.model_copy(
-        update={"synthetic": settings.data.synthetic.model_copy(update=few), "workers": 1}
-    )
+    data = read_training_run(path).data
+    few = {"train": 2, "validation": 1, "test": 1} if data.synthetic.train else {}
+    data = data.model_copy(update={"synthetic": data.synthetic.model_copy(update=few), "workers": 1})
     prepared = build.prepare(data, tmp_path / "work")
     drives = sum(drive.counts_as for drive in data.drives)
     assert len(prepared.train) == few.get("train", 0) + drives
+    for role in ("validation", "test"):
+        parts = prepared.of(role)
+        assert parts and all(part.labels.is_file() for part in parts)
+    return prepared
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+def test_the_data_of_a_training_run_is_made(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare_quickly(path, tmp_path, monkeypatch)
+
+
+#: One that starts from nothing and one that starts from a checkpoint; the others differ in their data.
+FAST = ("small.yaml", "finetune.yaml")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.name, marks=[] if path.name in FAST else [pytest.mark.slow])
+        for path in sorted(CONFIGS.glob("*.y*ml"))
+    ],
+)
+def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network, the augmentation and what it starts from are those of the file, too."""
+    from lanenet.learn.checkpoint import publish
+    from lanenet.learn.train import train
+
+    prepared = prepare_quickly(path, tmp_path, monkeypatch)
+    settings = read_training_run(path)
     n = sum(len(read_labels_of(p)) for p in prepared.train)
     learn = settings.learn.model_copy(update={"epochs": 1, "batch_size": n // 2, "threads": 1})
     if learn.start_from is not None:
@@ -173,9 +189,6 @@ def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch:
         learn = learn.model_copy(update={"start_from": tmp_path / "start"})
     result = train(learn, prepared.train, prepared.validation, tmp_path / "run")
     assert result.model_path.is_file() and result.val_rmse_cm < 100.0
-    for role in ("validation", "test"):
-        parts = prepared.of(role)
-        assert parts and all(part.labels.is_file() for part in parts)
 
 
 def write_or_move(path: Path, labels: Any) -> None:

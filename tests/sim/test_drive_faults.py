@@ -75,10 +75,10 @@ def wait_for_end(wire: Path, process: subprocess.Popen[str], hangs: bool) -> Non
         time.sleep(0.02)
 
 
-def wait_for_close(wire: Path) -> None:
-    """The guard goes after its loop."""
+def wait_for_guard(wire: Path, log: Path, told: str) -> None:
+    """The guard goes after its loop, and says why after it has closed its actuator."""
     end_s = time.monotonic() + 5.0
-    while time.monotonic() < end_s and read_wire(wire)[-1].kind != "close":
+    while time.monotonic() < end_s and (read_wire(wire)[-1].kind != "close" or told not in log.read_text()):
         time.sleep(0.02)
 
 
@@ -99,6 +99,7 @@ class Drive:
 
 def drive_into(fault: str, folder: Path) -> Drive:
     wire, log = folder / "wire.txt", folder / "log.txt"
+    expected, told = FAULTS[fault]
     folder.mkdir()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])}
     with log.open("w") as stream:
@@ -110,12 +111,12 @@ def drive_into(fault: str, folder: Path) -> Drive:
             env=environment,
         )
         try:
-            wait_for_end(wire, process, FAULTS[fault][0] is HUNG)
+            wait_for_end(wire, process, hangs=expected is HUNG)
             code = process.poll()
         finally:
             process.kill()
             process.wait()
-    wait_for_close(wire)
+    wait_for_guard(wire, log, told)
     return Drive(code, log.read_text(), read_wire(wire))
 
 

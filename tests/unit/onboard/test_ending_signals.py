@@ -10,7 +10,7 @@ from lanenet.onboard.loop import ENDING, ending_signals
 
 
 @pytest.mark.usefixtures("hang_up_ends")
-@pytest.mark.parametrize("number", ENDING)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_first_signal_asks_and_the_second_insists(number: signal.Signals) -> None:
     before = [signal.getsignal(n) for n in ENDING]
     heard: list[str] = []
