@@ -255,11 +255,8 @@ def _scale(
 ) -> tuple[float, float | None, str]:
     """Factor to centimetres, relative sigma of the height (None where it was given), and source of both."""
     if camera_height_cm is not None:
-        return (
-            camera_height_cm / camera.mounting.height_cm,
-            None,
-            f"the camera's height, {camera_height_cm:g} cm",
-        )
+        factor = camera_height_cm / camera.mounting.height_cm
+        return factor, None, f"the camera's height, {camera_height_cm:g} cm"
     if lane_width_cm is not None and lane is not None:
         return lane_width_cm / lane.width_cm, lane.sigma, f"the lane's width, {lane_width_cm:g} cm"
     return 1.0, None, f"the given camera's height, {camera.mounting.height_cm:g} cm"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 from pydantic import Field, field_validator
 
@@ -39,15 +38,9 @@ class MapSettings(SlamSettings):
         return every
 
 
-class WithWheelbase(NamedTuple):
-    """Settings and camera that agree on the wheelbase, and notes on where it came from."""
-
-    settings: MapSettings
-    camera: Camera | None
-    notes: tuple[str, ...]
-
-
-def with_wheelbase(settings: MapSettings, camera: Camera | None, wheelbase_cm: float | None) -> WithWheelbase:
+def with_wheelbase(
+    settings: MapSettings, camera: Camera | None, wheelbase_cm: float | None
+) -> tuple[MapSettings, Camera | None, tuple[str, ...]]:
     """Put the wheelbase where mapping looks for it: poses are of the rear axle, labels of the front.
 
     Args:
@@ -64,8 +57,8 @@ def with_wheelbase(settings: MapSettings, camera: Camera | None, wheelbase_cm: f
         nominal = camera is None and settings.guess.wheelbase_cm == nominal_cm
         given = "give the car's with --wheelbase or guess.wheelbase_cm if it is another"
         note = f"the wheelbase is a nominal {nominal_cm:g} cm; {given}"
-        return WithWheelbase(settings, camera, (note,) if nominal else ())
+        return settings, camera, (note,) if nominal else ()
     guess = settings.guess.model_copy(update={"wheelbase_cm": wheelbase_cm})
     settings = settings.model_copy(update={"guess": guess})
     camera = None if camera is None else replace(camera, wheelbase_cm=wheelbase_cm)
-    return WithWheelbase(settings, camera, ())
+    return settings, camera, ()

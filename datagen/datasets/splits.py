@@ -96,10 +96,8 @@ def _cut(
     for start, end in pairwise([*cuts.tolist(), len(labels)]):
         rows = np.arange(start, end)
         if last >= 0:
-            numbers, distances_cm = (
-                labels.frame[rows] - labels.frame[last],
-                distance_cm[rows] - distance_cm[last],
-            )
+            numbers = labels.frame[rows] - labels.frame[last]
+            distances_cm = distance_cm[rows] - distance_cm[last]
             rows = rows[(numbers > gap_frames) & (distances_cm >= gap_cm)]
         if not rows.size:
             raise ConfigError(

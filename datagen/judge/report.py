@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,10 @@ COLOURS_BGR: tuple[tuple[int, int, int], ...] = (
     (40, 40, 220),
     (200, 190, 0),
 )
+
+
+#: From the map to the image, in OpenCV's fixed point.
+_Fixed = Callable[[Float[np.ndarray, "n 2"]], np.ndarray]
 
 
 def summarise(results: Sequence[RunResult]) -> list[dict[str, Any]]:
@@ -118,20 +122,6 @@ def write_report(out: Path, settings: JudgeSettings, results: Sequence[RunResult
     return paths
 
 
-@dataclass(frozen=True)
-class _View:
-    """From the map to the image."""
-
-    origin_cm: Float[np.ndarray, "2"]
-    px_per_cm: float
-    top_px: int
-
-    def fixed(self, xy_cm: Float[np.ndarray, "n 2"]) -> np.ndarray:
-        """Points in OpenCV's fixed point; y of the map is up."""
-        px = (xy_cm - self.origin_cm) * [self.px_per_cm, -self.px_per_cm] + [0.0, self.top_px]
-        return np.rint(px * (1 << FIXED_BITS)).astype(np.int32)
-
-
 def draw_top_view(
     track: Track, runs: Sequence[tuple[RunResult, Trajectory]], title: str
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -153,18 +143,23 @@ def draw_top_view(
     header_px = _ROW_PX * (len(runs) + 1) + 12
     width, height = max(760, round(size_cm[0] * scale)), round(size_cm[1] * scale) + header_px
     image = np.full((height, width, 3), _GROUND_BGR, np.uint8)
-    view = _View(np.array([low_cm[0], high_cm[1]]), scale, header_px)
+
+    def fixed(xy_cm: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """Points in OpenCV's fixed point; y of the map is up."""
+        px = (xy_cm - [low_cm[0], high_cm[1]]) * [scale, -scale] + [0.0, header_px]
+        return np.rint(px * (1 << FIXED_BITS)).astype(np.int32)
+
     road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
     middle_cm = track.beside(np.arange(len(track.s_cm)), 0.5 * (max(sides_cm) + min(sides_cm)))
-    points = view.fixed(middle_cm)
+    points = fixed(middle_cm)
     cv2.polylines(image, [points], track.closed, _ROAD_BGR, road_px, cv2.LINE_AA, FIXED_BITS)
-    _pave_furniture(image, track, view)
-    paint_track(image, track, view.fixed)
+    _pave_furniture(image, track, fixed, scale)
+    paint_track(image, track, fixed)
     for index, (_, trajectory) in enumerate(runs):
         # Later ones are thinner, so that equal paths below stay visible.
         thickness = min(2 + len(runs) - 1 - index, 7)
-        _draw_run(image, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, view)
-    _draw_start(image, track, max(sides_cm) + 18.0, view)
+        _draw_run(image, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, fixed)
+    _draw_start(image, track, max(sides_cm) + 18.0, fixed)
     _write(image, title, 0, _TEXT_BGR)
     for index, (result, _) in enumerate(runs):
         text = (
@@ -176,13 +171,13 @@ def draw_top_view(
     return image
 
 
-def _pave_furniture(image: UInt8[np.ndarray, "h w 3"], track: Track, view: _View) -> None:
+def _pave_furniture(image: UInt8[np.ndarray, "h w 3"], track: Track, fixed: _Fixed, px_per_cm: float) -> None:
     """Draw the ground of bays and side roads, since white paint needs something darker below it."""
     paved = np.zeros(image.shape[:2], np.uint8)
     for box in track.boxes:
-        cv2.fillPoly(paved, [view.fixed(box_corners_cm(box, _BESIDE_PAINT_CM))], 255, cv2.LINE_8, FIXED_BITS)
+        cv2.fillPoly(paved, [fixed(box_corners_cm(box, _BESIDE_PAINT_CM))], 255, cv2.LINE_8, FIXED_BITS)
     # What lies between the lines of a side road and the road itself is road as well.
-    side_px = 1 + round(2.0 * track.half_width_cm * view.px_per_cm)
+    side_px = 1 + round(2.0 * track.half_width_cm * px_per_cm)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px))
     paved = cv2.morphologyEx(paved, cv2.MORPH_CLOSE, disc)
     road = (image == _ROAD_BGR).all(axis=2).astype(np.uint8) * 255
@@ -195,9 +190,9 @@ def _draw_run(
     trajectory: Trajectory,
     colour: tuple[int, int, int],
     thickness: int,
-    view: _View,
+    fixed: _Fixed,
 ) -> None:
-    points = view.fixed(trajectory.xy_cm)
+    points = fixed(trajectory.xy_cm)
     for section in np.split(points, np.flatnonzero(trajectory.put_back) + 1):
         if len(section):
             cv2.polylines(image, [section], False, colour, thickness, cv2.LINE_AA, FIXED_BITS)
@@ -209,12 +204,12 @@ def _draw_run(
         cv2.drawMarker(image, (x, y), colour, cv2.MARKER_TILTED_CROSS, 14, 3)
 
 
-def _draw_start(image: UInt8[np.ndarray, "h w 3"], track: Track, offset_cm: float, view: _View) -> None:
+def _draw_start(image: UInt8[np.ndarray, "h w 3"], track: Track, offset_cm: float, fixed: _Fixed) -> None:
     """An arrow beside the start, in the direction of travel."""
     heading = float(track.heading_rad[0])
     ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     tail_cm = track.xy_cm[0] + offset_cm * left
-    tail, tip = (view.fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> FIXED_BITS).tolist()
+    tail, tip = (fixed(np.stack([tail_cm, tail_cm + 40.0 * ahead])) >> FIXED_BITS).tolist()
     cv2.arrowedLine(image, tail, tip, _TEXT_BGR, 2, cv2.LINE_AA, tipLength=0.35)
 
 

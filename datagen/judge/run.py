@@ -266,9 +266,8 @@ class _Referee:
         if abs(frame.s_cm - self._moved_to_cm) > _MOVED_CM:
             self._moved_at_s, self._moved_to_cm = state.t_s, frame.s_cm
         away_rad = math.remainder(float(state.pose[2]) - track.point(frame.s_cm)[1], 2.0 * math.pi)
-        if abs(frame.offset_cm) > settings.off_lane_share * track.lane_width_cm:
-            return "left the lane"
-        if abs(away_rad) > _FACING_AWAY_RAD:
+        outside = abs(frame.offset_cm) > settings.off_lane_share * track.lane_width_cm
+        if outside or abs(away_rad) > _FACING_AWAY_RAD:
             return "left the lane"
         return "stuck" if state.t_s - self._moved_at_s > settings.stuck_s else ""
 

@@ -65,7 +65,8 @@ def map_figures(
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
-        residual = np.abs(revisit_residuals(solved.poses, solved.revisits))
+        residual = np.abs(revisit_residuals(solved.poses, solved.revisits)) * [factor, factor, 1.0]
+        closure = np.median(residual, axis=0).tolist() if len(residual) else [None] * 3
         segments.append(
             {
                 "first_frame": int(numbers[part.rows[0]]),
@@ -73,11 +74,9 @@ def map_figures(
                 "path_cm": factor * float(solved.path_cm[-1]),
                 "median_match": float(np.nanmedian(solved.trajectory.match)),
                 "revisits": len(solved.revisits),
-                "closure_residual_median": {
-                    "along_cm": factor * float(np.median(residual[:, 0])) if len(residual) else None,
-                    "across_cm": factor * float(np.median(residual[:, 1])) if len(residual) else None,
-                    "heading_rad": float(np.median(residual[:, 2])) if len(residual) else None,
-                },
+                "closure_residual_median": dict(
+                    zip(("along_cm", "across_cm", "heading_rad"), closure, strict=True)
+                ),
                 "heading_drift_rad_per_m": None
                 if solved.drift_rad_per_cm is None
                 else 100.0 * solved.drift_rad_per_cm / factor,

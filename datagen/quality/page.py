@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -26,6 +25,7 @@ from datagen.slam.commands import SteeringFit, commands_of, delayed
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap, MapMeta
 from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
+from lanenet.evaluation.report import new_figure, png_bytes
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 
@@ -277,22 +277,13 @@ def scale_rows(meta: MapMeta) -> list[Row]:
 
 def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]]:
     """Make a figure with panels one below the other."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # Without pyplot, which selects a window system and keeps global state.
-    figure = Figure(figsize=(width, height), dpi=110)
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, height, dpi=110)
+    if figure is None:
+        raise ImportError("Matplotlib is not installed")
     axes = figure.subplots(panels, 1, sharex=panels > 1, squeeze=False)[:, 0]
     for ax in axes:
         ax.grid(True, alpha=0.3)
     return figure, list(axes)
-
-
-def _png(figure: Any) -> bytes:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", bbox_inches="tight")
-    return data.getvalue()
 
 
 def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
@@ -312,10 +303,9 @@ def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"])
     axes.plot(*(0.01 * drive_map.poses[0, :2]), "ko", ms=4)
     axes.annotate(" start", 0.01 * drive_map.poses[0, :2], fontsize=8)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("y, m")
+    axes.set(xlabel="x, m", ylabel="y, m")
     axes.legend(fontsize=8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes:
@@ -341,13 +331,10 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
         axes.axhline(bound, color="gray", lw=0.8, ls=":")
     for ax in (axes, below):
         ax.axvline(VERDICT_REACH_CM, color="gray", lw=0.8, ls=":")
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("px at 160 px width")
+    axes.set(ylim=(0.0, None), ylabel="px at 160 px width")
     axes.legend(fontsize=7, ncol=2)
-    below.set_ylim(0.0, 105.0)
-    below.set_ylabel("edge found, %")
-    below.set_xlabel("ahead of the front axle, cm")
-    return _png(figure)
+    below.set(ylim=(0.0, 105.0), ylabel="edge found, %", xlabel="ahead of the front axle, cm")
+    return png_bytes(figure)
 
 
 def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
@@ -364,9 +351,8 @@ def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: i
         at = drive.frames[status == name]
         strip.plot(at, np.full(len(at), i), "|", color=colour, ms=9)
     strip.set_yticks(range(len(names)), [f"{n} ({int((status == n).sum())})" for n in names], fontsize=8)
-    strip.set_ylim(len(names) - 0.5, -0.5)
-    strip.set_xlabel("frame")
-    return _png(figure)
+    strip.set(ylim=(len(names) - 0.5, -0.5), xlabel="frame")
+    return png_bytes(figure)
 
 
 def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
@@ -394,11 +380,10 @@ def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes 
         ends = np.array([command.min(), command.max()])
         label = f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}"
         axes.plot(ends, gain * ends + trim, "k-", lw=1.0, label=label)
-    axes.set_xlabel("steering command, positive left")
-    axes.set_ylabel("curvature, 1/m")
+    axes.set(xlabel="steering command, positive left", ylabel="curvature, 1/m")
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def speed_plot(mapped: MappedDrive) -> bytes:
@@ -409,8 +394,7 @@ def speed_plot(mapped: MappedDrive) -> bytes:
     # A step across a break was not driven by the car.
     step[mapped.starts[1:]] = np.nan
     axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("frame")
+    axes.set(ylim=(0.0, None), xlabel="frame")
     axes.set_ylabel("step length, cm", color="#2060c0")
     commands = drive.commands
     for values, name in ((commands.speed_cm_s, "commanded speed, cm/s"), (commands.throttle, "throttle")):
@@ -419,4 +403,4 @@ def speed_plot(mapped: MappedDrive) -> bytes:
             other.plot(drive.frames[rows], values[rows], "-", color="#d08020", lw=0.6, alpha=0.7)
             other.set_ylabel(name, color="#d08020")
             break
-    return _png(figure)
+    return png_bytes(figure)

@@ -57,6 +57,9 @@ STATISTICS: dict[str, tuple[str, str]] = {
     "brightness": ("", "median grey level of the road"),
     "grain": ("", "standard deviation of the finest pattern and noise, grey levels"),
 }
+#: Statistics that are the median, or the mean, over a drive's frames.
+_MEDIANS = ("points", "direction_entropy", "along_share", "edge_slope", "edge_blur_px", "brightness", "grain")
+_MEANS = ("long_runs", "short_runs", "specks")
 #: Of directions: 10 degrees each.
 _BINS = 18
 _ALONG_RAD = np.deg2rad(20.0)
@@ -209,8 +212,8 @@ def edge_statistics(
     frame_bgr: UInt8[np.ndarray, "h w *c"],
     table: RoadTable,
     camera_height_cm: float,
-    settings: PerceptionSettings | None = None,
-    window: BirdseyeWindow | None = None,
+    settings: PerceptionSettings = _PERCEPTION,
+    window: BirdseyeWindow = _WINDOW,
 ) -> FrameFigures:
     """Measure one frame by the edge points that a network gets of it.
 
@@ -221,8 +224,6 @@ def edge_statistics(
         settings: How edges are found; None takes the defaults.
         window: The network's window, with its origin below the camera; None takes the default.
     """
-    settings = PerceptionSettings() if settings is None else settings
-    window = BirdseyeWindow() if window is None else window
     gray = to_gray(frame_bgr)
     pixels = find_edges(frame_bgr, settings.edges, table.keep, table.scale)
     road = table.lift(pixels)
@@ -274,22 +275,15 @@ def drive_statistics(frames: Sequence[FrameFigures]) -> dict[str, float]:
         change = 100.0 * points.std() / points.mean()
     run_px, run_p90_px = np.quantile(lengths, [0.5, 0.9]) if lengths.size else (np.nan, np.nan)
     values = {
-        "points": np.median(points),
         "points_change": change,
         **dict(zip(("points_near", "points_middle", "points_far"), shares, strict=True)),
-        "long_runs": np.mean([frame.long_runs for frame in frames]),
-        "short_runs": np.mean([frame.short_runs for frame in frames]),
-        "specks": np.mean([frame.specks for frame in frames]),
+        **{name: np.mean([getattr(frame, name) for frame in frames]) for name in _MEANS},
         "run_length_px": run_px,
         "run_length_p90_px": run_p90_px,
-        "direction_entropy": _known_median([frame.direction_entropy for frame in frames]),
-        "along_share": 100.0 * _known_median([frame.along_share for frame in frames]),
         **dict(zip(("clutter_near", "clutter_middle", "clutter_far"), clutter_shares, strict=True)),
-        "edge_slope": _known_median([frame.edge_slope for frame in frames]),
-        "edge_blur_px": _known_median([frame.edge_blur_px for frame in frames]),
-        "brightness": np.median([frame.brightness for frame in frames]),
-        "grain": np.median([frame.grain for frame in frames]),
+        **{name: _known_median([getattr(frame, name) for frame in frames]) for name in _MEDIANS},
     }
+    values["along_share"] *= 100.0
     return {name: float(values[name]) for name in STATISTICS}
 
 

@@ -22,6 +22,7 @@ from datagen.slam.loops.consistency import AGREE_HEIGHTS, AGREE_RAD, AGREE_SHARE
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
 from datagen.slam.loops.revisits import (
     Revisit,
+    best_of_each,
     diagonal_mean,
     match_places,
     similarities,
@@ -241,17 +242,15 @@ def _alike_frames(
     inner = similarity[: max(first - _EDGE, 0)]
     if not inner.size:
         return []
-    best: dict[int, tuple[float, int, int]] = {}
-    every = max(1.0, len(other) / max_pairs)
+    pairs = []
     for k in range(_EDGE // 4, len(other)):
         earlier = int(inner[:, k].argmax())
         score = float(inner[earlier, k])
         if score < min_similarity or abs(int(similarity[earlier].argmax()) - k) > _MUTUAL:
             continue
-        pair = (score, earlier, first + k)
-        key = int(k / every)
-        best[key] = max(best.get(key, pair), pair)
-    return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda pair: pair[2])]
+        pairs.append((score, earlier, k))
+    every = max(1.0, len(other) / max_pairs)
+    return [(earlier, first + k) for earlier, k in best_of_each(pairs, every)]
 
 
 def _agreeing(poses: Float[np.ndarray, "n 3"], first: int, found: list[Revisit], height_cm: float) -> _Shared:

@@ -127,7 +127,12 @@ class SegmentSolver:
     progress: Progress | None = None
 
     def solve(
-        self, drive: Drive, camera: Camera, find_camera: bool = False, prior_camera: Camera | None = None
+        self,
+        drive: Drive,
+        camera: Camera,
+        find_camera: bool = False,
+        prior_camera: Camera | None = None,
+        commands: CommandedMotion | None = None,
     ) -> SolvedSegment:
         """Track one segment, close its loops, and adjust all of it together.
 
@@ -136,28 +141,20 @@ class SegmentSolver:
             camera: Its camera, or a coarse guess of it.
             find_camera: Adjust the camera too.
             prior_camera: Centre of the camera's priors; None for ``camera``.
+            commands: What was commanded; None for what the drive recorded.
 
         Raises:
             TrackingLostError: If the road shows too few edges.
         """
-        commands = commands_of(drive, camera.wheelbase_cm)
-        return self._solve(drive, commands, camera, find_camera, prior_camera)
-
-    def _solve(
-        self,
-        drive: Drive,
-        commands: CommandedMotion,
-        camera: Camera,
-        find_camera: bool,
-        prior_camera: Camera | None,
-    ) -> SolvedSegment:
+        if commands is None:
+            commands = commands_of(drive, camera.wheelbase_cm)
         view = view_segment(drive, camera, commands, self.settings, self.rng)
         keys = choose_keyframes(view.steps_heights)
         if len(keys) == len(drive):
             return _DenseSegment(view, self, find_camera, prior_camera or camera).solve()
         # The keyframes show the step length better: if the car is still slow, they are thinned again.
         between = commands_between(commands, keys)
-        solved = self._solve(drive.subset(keys), between, camera, find_camera, prior_camera)
+        solved = self.solve(drive.subset(keys), camera, find_camera, prior_camera, between)
         return self.place_between(solved, keys, view.steps_heights, drive, commands)
 
     def place_between(
@@ -235,8 +232,8 @@ class _DenseSegment:
     def solve(self) -> SolvedSegment:
         """Take the segment through all stages."""
         view, solver = self.view, self.solver
-        tracked = track(view, solver.settings, solver.rng, solver.progress)
-        start = BundleEstimate.level(tracked.trajectory.poses, view.camera)
+        trajectory, steering = track(view, solver.settings, solver.rng, solver.progress)
+        start = BundleEstimate.level(trajectory.poses, view.camera)
         opened = self.adjust_all(self.observed, start, self.free)
         closure = self.choose_closure(opened, self.find_revisits(opened))
         road, bundle = view.road, opened
@@ -249,10 +246,10 @@ class _DenseSegment:
             rows=np.arange(len(view.drive)),
             camera=bundle.camera,
             scans=road.scans(bundle.camera, bundle.tilt),
-            trajectory=tracked.trajectory,
+            trajectory=trajectory,
             open_poses=opened.poses,
             poses=bundle.poses,
-            steering=tracked.steering,
+            steering=steering,
             revisits=[] if closure is None else closure.revisits,
             drift_rad_per_cm=None if closure is None else closure.drift_rad_per_cm,
             bundle=bundle,

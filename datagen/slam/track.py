@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from datagen.slam.commands import SteeringFit, fit_steering
@@ -16,17 +14,9 @@ from datagen.slam.settings import MotionSettings, SlamSettings
 from datagen.slam.view import SegmentView
 
 
-@dataclass(frozen=True)
-class Tracked:
-    """Poses before any loop is closed, and how curvature answers to the steering, where it does."""
-
-    trajectory: Trajectory
-    steering: SteeringFit | None
-
-
 def track(
     view: SegmentView, settings: SlamSettings, rng: np.random.Generator, progress: Progress | None = None
-) -> Tracked:
+) -> tuple[Trajectory, SteeringFit | None]:
     """Estimate all poses of a segment without closing loops.
 
     The images alone give each frame's motion first, and from it gain, trim and delay of the steering. The
@@ -37,6 +27,9 @@ def track(
         settings: Settings of all stages.
         rng: Source of randomness.
         progress: Called with (done, total).
+
+    Returns:
+        The poses, and how the car answered to the steering; None where that does not explain the path.
     """
     camera, commands, n = view.camera, view.commands, len(view.scans)
     height = camera.mounting.height_cm
@@ -50,7 +43,7 @@ def track(
     motion = motion_about(odometry, settings.motion, height)
     filtered = None if progress is None else lambda k, _: progress(n + k, 2 * n)
     trajectory = run_filter(view.scans, motion, settings.filter, height, camera.wheelbase_cm, rng, filtered)
-    return Tracked(trajectory, steering)
+    return trajectory, steering
 
 
 def motion_about(odometry: Odometry, settings: MotionSettings, camera_height_cm: float) -> MotionModel:

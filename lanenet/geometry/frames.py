@@ -75,12 +75,6 @@ def map_from_car_directions(
     return np.stack([forward * c + right * s, forward * s - right * c], axis=1)
 
 
-def ros_from_car(points_car_cm: Float[np.ndarray, "n 2"], wheelbase_cm: float) -> Float[np.ndarray, "n 2"]:
-    """Express points in ROS's ``base_link`` (REP 103): metres, x ahead, y left, origin at the rear axle."""
-    ahead = points_car_cm[:, 1] + wheelbase_cm
-    return np.stack([0.01 * ahead, -0.01 * points_car_cm[:, 0]], axis=1)
-
-
 def left_from_donkey(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Turn Donkeycar's sign (-1 = left) into this project's (positive = left); the gain stays unknown."""
     return -np.asarray(angle)

@@ -47,12 +47,6 @@ def parabola_through(x_0: float, x_15: float, x_30: float) -> tuple[float, float
     return a, near - a * ROWS_CM[1], x_0
 
 
-def points_from_parabolas(parabolas: Float[np.ndarray, "*n 2 3"]) -> Float[np.ndarray, "*n 6"]:
-    """Return the six points of two parabolas; inverse of :func:`parabolas_from_points`."""
-    points = np.asarray(parabolas, dtype=np.float64) @ POINTS_FROM_PARABOLA.T
-    return points.reshape(*points.shape[:-2], N_POINTS)
-
-
 def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"]:
     """Find x where a lane line crosses the label rows.
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.world.render.compiled import TILE
+from datagen.world.render.ground import WALL_CM, PixelGround
 from datagen.world.road.build import random_track
 from datagen.world.road.track import Side, Track, is_painted
 from datagen.world.road.track_settings import load_track_settings
@@ -76,3 +78,12 @@ def line_painted(track: Track, side: Side, s_cm: np.ndarray) -> np.ndarray:
         if abs(m.offset_cm - track.line_offset_cm(side)) < 0.25 * track.lane_width_cm
     ]
     return np.any([is_painted(m.painted_cm, s_cm) for m in beside], axis=0)
+
+
+def floor_pixels(ground: PixelGround) -> np.ndarray:
+    """Whether each pixel sees the floor, of a camera that does not shake."""
+    rays = ground.rays.reshape(-1, 9, TILE)[:, :3].transpose(1, 0, 2)
+    right, ahead, up = rays.reshape(3, ground.height, ground.stride)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        reach_cm = np.hypot(right, ahead) * ground.eye_cm[2] / -up
+        return ((up < -1e-6) & (reach_cm < WALL_CM))[:, : ground.width]

@@ -250,19 +250,6 @@ def lift_points(state, points, out, out_by, out_half):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def _first_row(edge_uv, start, stop, v):
-    """First edge of a frame at or below row v; the edges are sorted by row."""
-    while start < stop:
-        middle = (start + stop) // 2
-        if edge_uv[middle, 1] < v:
-            start = middle + 1
-        else:
-            stop = middle
-    return start
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
 def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, in_view, matched, links):
     """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
 
@@ -321,7 +308,7 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
             stop = edges.starts[j + 1]
-            q = _first_row(edge_uv, edges.starts[j], stop, v - gate_px)
+            q = edges.starts[j] + np.searchsorted(edge_uv[edges.starts[j] : stop, 1], v - gate_px)
             while q < stop and edge_uv[q, 1] <= v + gate_px:
                 du, dv = edge_uv[q, 0] - u, edge_uv[q, 1] - v
                 d = du * du + dv * dv

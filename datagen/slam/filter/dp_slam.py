@@ -9,11 +9,10 @@ Source:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, no_type_check
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 from pydantic import Field
 
 from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
@@ -186,7 +185,7 @@ class ParticleFilter:
         count = len(self.weights)
         if self.frame == 0 or effective_number(self.weights) >= self.settings.resample_below * count:
             return np.arange(count)
-        chosen: Int[np.ndarray, "p"] = systematic_resample(self.weights, self.rng.random())
+        chosen = systematic_resample(self.weights, self.rng.random())
         self.weights = np.full(count, 1.0 / count)
         return chosen
 
@@ -248,9 +247,9 @@ def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> 
     return smoothed
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def reweigh(weights, scores, effective_share):
+def reweigh(
+    weights: Float[np.ndarray, "p"], scores: Float[np.ndarray, "p"], effective_share: float
+) -> Float[np.ndarray, "p"]:
     """Turn match scores into weights, as sharply as the particles can bear.
 
     Edge points of one line are not independent, and the plain likelihood would leave one particle. The scores
@@ -264,36 +263,22 @@ def reweigh(weights, scores, effective_share):
     Returns:
         Weights that add up to 1.
     """
-    new = np.empty(len(weights))
-    highest, temperature = scores[0], 1.0
-    for p in range(len(weights)):
-        highest = max(highest, scores[p])
+    below, temperature = scores - scores.max(), 1.0
     for _ in range(_TEMPERATURES):
-        total = 0.0
-        for p in range(len(weights)):
-            new[p] = weights[p] * np.exp((scores[p] - highest) / temperature)
-            total += new[p]
-        for p in range(len(weights)):
-            new[p] /= total
+        new = weights * np.exp(below / temperature)
+        new /= new.sum()
         if effective_number(new) >= effective_share * len(new):
             break
         temperature *= _COOLER
     return new
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def effective_number(weights):
+def effective_number(weights: Float[np.ndarray, "p"]) -> float:
     """Return how many equally weighted particles would be as good: 1 / sum of squares."""
-    total = 0.0
-    for p in range(len(weights)):
-        total += weights[p] * weights[p]
-    return 1.0 / total
+    return 1.0 / float(weights @ weights)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
-def systematic_resample(weights, uniform):
+def systematic_resample(weights: Float[np.ndarray, "p"], uniform: float) -> Int[np.ndarray, "p"]:
     """Draw as many particles as there are, each N times its weight on average, with one random number.
 
     Args:
@@ -307,12 +292,5 @@ def systematic_resample(weights, uniform):
         Kitagawa 1996; copies of each particle differ from N * weight by less than one.
     """
     n = len(weights)
-    chosen = np.empty(n, np.int64)
-    at, cumulative = 0, weights[0]
-    for k in range(n):
-        position = (k + uniform) / n
-        while at < n - 1 and cumulative <= position:
-            at += 1
-            cumulative += weights[at]
-        chosen[k] = at
-    return chosen
+    at = np.searchsorted(np.cumsum(weights), (np.arange(n) + uniform) / n, side="right")
+    return np.minimum(at, n - 1)

@@ -101,8 +101,6 @@ def close_loops(
 
 def revisit_residuals(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> Float[np.ndarray, "r 3"]:
     """What each revisit misses with these poses: ahead and to the left, [cm], and in heading, [rad]."""
-    if not revisits:
-        return np.empty((0, 3))
     earlier, later, relative = _arrays(revisits)
     residual = relative_pose(poses[earlier], poses[later]) - relative
     residual[:, 2] = wrap_angle(residual[:, 2])
@@ -181,7 +179,7 @@ def _arrays(
     earlier, later = (
         np.array([getattr(r, name) for r in revisits], np.intp) for name in ("earlier", "later")
     )
-    return earlier, later, np.array([r.relative for r in revisits])
+    return earlier, later, np.array([r.relative for r in revisits]).reshape(-1, 3)
 
 
 def _constraints(

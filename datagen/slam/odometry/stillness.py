@@ -363,8 +363,6 @@ def _road_cells(points: Float[np.ndarray, "*k 2"]) -> tuple[Int[np.ndarray, "*k"
 
 def _with_neighbours(view: _View, stands: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Add all points beside those that stand still."""
-    if not stands.any():
-        return stands
     grid = np.zeros((_AHEAD_CELLS + 2, 2 * _SIDE_CELLS + 2), np.uint8)
     row, column = _road_cells(view.points)
     grid[row[stands], column[stands]] = 1

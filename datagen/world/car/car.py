@@ -243,10 +243,7 @@ class Car:
         """Draw both deviations anew, as Ornstein-Uhlenbeck processes of unit variance."""
         keep = math.exp(-_STEP_S / _NOISE_TIME_S)
         fresh = math.sqrt(1.0 - keep * keep)
-        speed, steering = (
-            float(self._speed_rng.standard_normal()),
-            float(self._steering_rng.standard_normal()),
-        )
+        speed, steering = (float(rng.standard_normal()) for rng in (self._speed_rng, self._steering_rng))
         self._speed_noise = keep * self._speed_noise + fresh * speed
         self._steering_noise = keep * self._steering_noise + fresh * steering
 

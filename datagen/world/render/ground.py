@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
+from scipy.spatial import cKDTree
 
 from datagen.world.render.compiled import (
     AHEAD,
@@ -34,7 +35,6 @@ from datagen.world.render.compiled import (
     UP_V,
     V_X,
     V_Y,
-    compiled,
     compiled_bare,
 )
 from datagen.world.road.track import Track
@@ -125,15 +125,6 @@ class PixelGround(NamedTuple):
             elevation_rad=elevation.astype(np.float32),
             toward=np.stack([np.cos(azimuth), np.sin(azimuth)]).astype(np.float32),
         )
-
-    @property
-    def floor(self) -> Bool[np.ndarray, "h w"]:
-        """Which pixels see the floor when the camera does not shake."""
-        rays = self.rays.reshape(-1, 9, TILE)[:, :3].transpose(1, 0, 2)
-        right, ahead, up = rays.reshape(3, self.height, self.stride)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            reach_cm = np.hypot(right, ahead) * self.eye_cm[2] / -up
-            return np.asarray((up < -1e-6) & (reach_cm < WALL_CM))[:, : self.width]
 
 
 class View(NamedTuple):
@@ -355,14 +346,13 @@ class NearestGrid:
     """The nearest sample of the centre line for places near a road."""
 
     def __init__(self, track: Track) -> None:
-        """Find which blocks each sample of a road touches."""
+        """Take the samples of a road."""
         #: How far from the centre line it answers.
         self.reach_cm = _GRID_MARGIN_CM + max(
             (abs(m.offset_cm) + 0.5 * m.width_cm for m in track.markings), default=0.0
         )
         self._low = track.xy_cm.min(axis=0) - self.reach_cm - _GRID_CELL_CM
-        self._xy_cm = track.xy_cm
-        self._samples = self._samples_by_block(track)
+        self._samples = cKDTree(track.xy_cm)
         self._blocks: dict[tuple[int, int], Int[np.ndarray, "b b"]] = {}
         self._window: tuple[tuple[int, ...], Int[np.ndarray, "r c"]] | None = None
 
@@ -388,59 +378,24 @@ class NearestGrid:
         return self._window[1], np.array([*(self._low + first * size_cm), _GRID_CELL_CM])
 
     def _join(self, column0: int, row0: int, column1: int, row1: int) -> Int[np.ndarray, "r c"]:
-        n = _BLOCK_CELLS
-        grid = np.full(((row1 - row0 + 1) * n, (column1 - column0 + 1) * n), -1, np.int32)
-        for row in range(row0, row1 + 1):
-            for column in range(column0, column1 + 1):
-                if (row, column) in self._samples:
-                    i, j = (row - row0) * n, (column - column0) * n
-                    grid[i : i + n, j : j + n] = self._block(row, column)
-        return grid
+        rows, columns = range(row0, row1 + 1), range(column0, column1 + 1)
+        return np.block([[self._block(row, column) for column in columns] for row in rows])
 
     def _block(self, row: int, column: int) -> Int[np.ndarray, "b b"]:
-        """Return a block that the road touches."""
+        size_cm = _BLOCK_CELLS * _GRID_CELL_CM
+        low_cm = self._low + np.array([column, row]) * size_cm
+        if self._samples.query(low_cm + 0.5 * size_cm)[0] > self.reach_cm + size_cm:
+            return np.full((_BLOCK_CELLS, _BLOCK_CELLS), -1, np.int32)
         block = self._blocks.get((row, column))
         if block is None:
             if len(self._blocks) >= _MAX_BLOCKS:  # the oldest goes: memory stays flat on a long road
                 del self._blocks[next(iter(self._blocks))]
-            block = np.full((_BLOCK_CELLS, _BLOCK_CELLS), -1, np.int32)
-            x, y = self._low + np.array([column, row]) * (_BLOCK_CELLS * _GRID_CELL_CM)
-            best = np.full(block.shape, 1e18)
-            samples = self._samples[row, column]
-            _fill_grid(self._xy_cm, samples, x, y, _GRID_CELL_CM, self.reach_cm, best, block)
+            x, y = low_cm[:, None] + (np.arange(_BLOCK_CELLS) + 0.5) * _GRID_CELL_CM
+            cells_cm = np.stack(np.meshgrid(x, y), axis=-1)
+            _, nearest = self._samples.query(cells_cm, distance_upper_bound=self.reach_cm)
+            block = np.where(nearest < self._samples.n, nearest, -1).astype(np.int32)
             self._blocks[row, column] = block
         return block
-
-    def _samples_by_block(self, track: Track) -> dict[tuple[int, int], Int[np.ndarray, "samples"]]:
-        """Return for each block that the road touches the samples of the centre line near it."""
-        size_cm = _BLOCK_CELLS * _GRID_CELL_CM
-        low = np.floor((track.xy_cm - self.reach_cm - self._low) / size_cm).astype(int)
-        high = np.floor((track.xy_cm + self.reach_cm - self._low) / size_cm).astype(int)
-        samples: dict[tuple[int, int], list[int]] = {}
-        for i in range(len(low)):
-            for row in range(low[i, 1], high[i, 1] + 1):
-                for column in range(low[i, 0], high[i, 0] + 1):
-                    samples.setdefault((row, column), []).append(i)
-        return {key: np.array(index) for key, index in samples.items()}
-
-
-@compiled
-@no_type_check
-def _fill_grid(nodes_xy, index, origin_x, origin_y, cell, reach, best, grid):
-    """Write into each cell within ``reach`` of the centre line the index of the nearest of some samples."""
-    rows, columns = grid.shape
-    span = int(np.ceil(reach / cell)) + 1
-    for i in index:
-        column0 = int(np.floor((nodes_xy[i, 0] - origin_x) / cell))
-        row0 = int(np.floor((nodes_xy[i, 1] - origin_y) / cell))
-        for row in range(max(0, row0 - span), min(rows, row0 + span + 1)):
-            dy = origin_y + (row + 0.5) * cell - nodes_xy[i, 1]
-            for column in range(max(0, column0 - span), min(columns, column0 + span + 1)):
-                dx = origin_x + (column + 0.5) * cell - nodes_xy[i, 0]
-                d = dx * dx + dy * dy
-                if d < best[row, column] and d <= reach * reach:
-                    best[row, column] = d
-                    grid[row, column] = i
 
 
 class Nearby:

@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
+from scipy.spatial import cKDTree
 
 from lanenet.errors import ConfigError
 
@@ -169,35 +168,16 @@ def comes_near_itself(
     # The points that are compared may straddle the nearest ones by half a stride on both curves.
     separation_cm += 0.25 * stride * line.step_cm
     lap_cm = len(line.xy_cm) * line.step_cm if closed else np.inf
-    i, j = _first_pair(points, s_cm, separation_cm, 0.5 * np.pi * separation_cm, lap_cm, after_cm)
-    if i < 0:
+    pairs = cKDTree(points).query_pairs(separation_cm, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    along_cm = np.abs(s_cm[i] - s_cm[j])
+    near = (np.minimum(along_cm, lap_cm - along_cm) > 0.5 * np.pi * separation_cm) & (s_cm[i] >= after_cm)
+    if not near.any():
         return None
-    i, j = max(i, j), min(i, j)
-    return float(s_cm[j]), float(s_cm[i]), float(np.linalg.norm(points[i] - points[j])), separation_cm
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _first_pair(xy, s, separation, gap, lap, after):
-    """Indices of the first two points that are too close, -1 if there are none."""
-    n = xy.shape[0]
-    step = s[1] - s[0]
-    for i in range(n):
-        if s[i] < after:
-            continue
-        j = 0
-        while j < n:
-            d = np.hypot(xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1])
-            if d >= separation:
-                # A curve leads no nearer than its length: what comes before this is no closer either. Twice
-                # the step covers a line beside the centre line, which is longer than it in bends.
-                j += max(1, int((d - separation) / (2.0 * step)))
-                continue
-            along = abs(s[i] - s[j])
-            if min(along, lap - along) > gap:
-                return i, j
-            j += 1
-    return -1, -1
+    first, other = min(zip(i[near].tolist(), j[near].tolist(), strict=True))
+    apart_cm = float(np.linalg.norm(points[first] - points[other]))
+    low_cm, high_cm = sorted(float(s_cm[k]) for k in (first, other))
+    return low_cm, high_cm, apart_cm, separation_cm
 
 
 def open_centre_line(

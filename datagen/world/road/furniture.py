@@ -207,11 +207,14 @@ def outer_offset_cm(track: Track, side: Side) -> float:
     return track.middle_cm + (track.half_width_cm if side == "left" else -track.half_width_cm)
 
 
-class _Strips:
-    """Collects rectangles given in the frame of one place on the road: x ahead, y left."""
+_Point = tuple[float, float] | Float[np.ndarray, "2"]
 
-    def __init__(self, track: Track, at_cm: float, colour: str) -> None:
-        self._origin, self._heading = track.point(at_cm)
+
+class _Strips:
+    """Collects rectangles given in the frame of one place: x ahead, y left."""
+
+    def __init__(self, origin_cm: Float[np.ndarray, "2"], heading_rad: float, colour: str) -> None:
+        self._origin, self._heading = origin_cm, heading_rad
         self._colour: Bgr = COLOURS[colour]
         self._rows: list[list[float]] = []
 
@@ -230,9 +233,7 @@ class _Strips:
         bgr = self._colour if colour is None else COLOURS[colour]
         self._rows.append([x, y, np.cos(direction), np.sin(direction), 0.5 * length_cm, 0.5 * width_cm, *bgr])
 
-    def strip(
-        self, start: tuple[float, float], end: tuple[float, float], width_cm: float, overlap_cm: float = 0.0
-    ) -> None:
+    def strip(self, start: _Point, end: _Point, width_cm: float, overlap_cm: float = 0.0) -> None:
         """Add a strip of tape from point to point, longer by ``overlap_cm`` in total."""
         dx, dy = end[0] - start[0], end[1] - start[1]
         middle = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
@@ -244,7 +245,7 @@ class _Strips:
 
 
 def _stop_line(track: Track, stop: StopLine, _: float) -> Painted:
-    strips = _Strips(track, stop.at_cm, stop.colour)
+    strips = _Strips(*track.point(stop.at_cm), stop.colour)
     if not stop.dashed:
         strips.box(0.0, 0.0, 0.0, stop.thickness_cm, track.lane_width_cm)
         return Painted(strips.boxes)
@@ -255,7 +256,7 @@ def _stop_line(track: Track, stop: StopLine, _: float) -> Painted:
 
 
 def _zebra(track: Track, zebra: Zebra, _: float) -> Painted:
-    strips = _Strips(track, zebra.at_cm, zebra.colour)
+    strips = _Strips(*track.point(zebra.at_cm), zebra.colour)
     width_cm, period_cm = 2.0 * track.half_width_cm, zebra.bar_cm + zebra.gap_cm
     n = max(1, int((width_cm - zebra.gap_cm) / period_cm))
     for y_cm in (np.arange(n) - 0.5 * (n - 1)) * period_cm + track.middle_cm:
@@ -267,7 +268,7 @@ def _zebra(track: Track, zebra: Zebra, _: float) -> Painted:
 
 
 def _arrow(track: Track, arrow: Arrow, _: float) -> Painted:
-    strips = _Strips(track, arrow.at_cm, arrow.colour)
+    strips = _Strips(*track.point(arrow.at_cm), arrow.colour)
     half_cm, head_cm, width_cm = 0.5 * arrow.length_cm, 0.35 * arrow.length_cm, arrow.strip_cm
     tip, back = (half_cm, 0.0), (-1.0, 0.0)
     if arrow.direction != "straight":
@@ -288,7 +289,7 @@ def _arrow(track: Track, arrow: Arrow, _: float) -> Painted:
 
 
 def _junction(track: Track, junction: Junction, line_width_cm: float) -> Painted:
-    strips = _Strips(track, junction.at_cm, junction.colour)
+    strips = _Strips(*track.point(junction.at_cm), junction.colour)
     sides: tuple[Side, ...] = ("left", "right") if junction.sides == "both" else (junction.sides,)
     half_cm, radius_cm = 0.5 * junction.width_cm, junction.corner_radius_cm
     reach_cm = 0.5 * extent_cm(Furniture(junction=junction))
@@ -302,7 +303,7 @@ def _junction(track: Track, junction: Junction, line_width_cm: float) -> Painted
             angles = np.linspace(0.0, 0.5 * np.pi, int(np.ceil(0.5 * np.pi / _CORNER_STEP_RAD)) + 1)
             x = ahead * (reach_cm - radius_cm * np.sin(angles))
             y = line_cm + sign * radius_cm * (1.0 - np.cos(angles))
-            points = [(float(a), float(b)) for a, b in zip(x, y, strict=True)]
+            points = np.stack([x, y], axis=1)
             # A little longer than the chords, so that no gap opens on the outside of the curve.
             overlap_cm = line_width_cm * np.tan(0.25 * np.pi / (len(points) - 1))
             for start, end in pairwise(points):
@@ -335,14 +336,11 @@ def _parking(track: Track, parking: Parking, line_width_cm: float) -> Painted:
     back_cm = line_cm + sign * parking.depth_cm
     places = parking.at_cm + (np.arange(parking.bays + 1) - 0.5 * parking.bays) * parking.bay_cm
     # In the frame map, since the row follows the road: separators are straight, back edges are chords.
-    starts, ends = ([track.point(float(s), side_cm)[0] for s in places] for side_cm in (line_cm, back_cm))
-    rows = []
+    strips = _Strips(np.zeros(2), 0.0, parking.colour)
+    starts, ends = (track.points(places, side_cm)[0] for side_cm in (line_cm, back_cm))
     for start, end in [*zip(starts, ends, strict=True), *pairwise(ends)]:
-        along = end - start
-        length_cm = np.hypot(*along)
-        shape = (*(0.5 * (start + end)), *(along / length_cm), 0.5 * length_cm, 0.5 * line_width_cm)
-        rows.append([*shape, *COLOURS[parking.colour]])
-    return Painted(np.array(rows))
+        strips.strip(start, end, line_width_cm)
+    return Painted(strips.boxes)
 
 
 _PAINTERS: dict[str, Callable[[Track, Any, float], Painted]] = {
@@ -465,7 +463,7 @@ def _leaves_the_bend(track: Track, item: Furniture) -> bool:
     """Whether straight bars would reach over the lines of a bent road."""
     at_cm, length_cm = item.value.at_cm, extent_cm(item)
     places = np.arange(at_cm - 0.5 * length_cm, at_cm + 0.5 * length_cm, track.step_cm)
-    tightest = max(abs(track.curvature(float(s))) for s in places)
+    tightest = float(np.abs(track.curvature(places)).max())
     return tightest * length_cm**2 / 8.0 > _BAR_BESIDE_CM
 
 
@@ -488,7 +486,7 @@ def _misplaced(track: Track, item: Furniture) -> str | None:
             f"long and this takes up {2.0 * half_cm:.1f} cm"
         )
     places = np.arange(at_cm - half_cm, at_cm + half_cm + track.step_cm, track.step_cm)
-    curvature = np.array([track.curvature(float(s)) for s in places])
+    curvature = track.curvature(places)
     if item.junction is not None:
         turn = float(np.abs(np.cumsum(curvature)).max()) * track.step_cm
         if turn > _BEND_RAD:

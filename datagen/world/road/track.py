@@ -109,9 +109,9 @@ class Track:
         heading, offset_cm = self.heading_rad[index], np.asarray(offset_cm)[..., None]
         return self.xy_cm[index] + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
 
-    def curvature(self, s_cm: float) -> float:
-        """Return the curvature of the centre line at a place, [1/cm], positive left."""
-        return float(self.curvature_per_cm[self._nearest_sample(s_cm)[1]])
+    def curvature(self, s_cm: float | Float[np.ndarray, "m"]) -> Float[np.ndarray, "*m"]:
+        """Return the curvature of the centre line at a place or at many, [1/cm], positive left."""
+        return np.asarray(self.curvature_per_cm[self._nearest_samples(np.asarray(s_cm))[1]])
 
     def point(self, s_cm: float, offset_cm: float = 0.0) -> tuple[Float[np.ndarray, "2"], float]:
         """Return the point at a distance along the road and the road's heading there, [cm], [rad], frame map.
@@ -119,20 +119,15 @@ class Track:
         A loop takes any distance, over any number of laps; an open road continues beyond its ends along the
         circle of its last sample.
         """
-        lap, i = self._nearest_sample(s_cm)
-        along_cm = s_cm - lap * self.length_cm - float(self.s_cm[i])
-        turn = float(self.curvature_per_cm[i]) * along_cm
-        heading = float(self.heading_rad[i]) + turn
-        xy_cm = self.xy_cm[i] + arc_chord(float(self.heading_rad[i]), along_cm, turn)
-        return xy_cm + offset_cm * np.array([-np.sin(heading), np.cos(heading)]), heading
+        xy_cm, heading = self.points(np.array([s_cm]), offset_cm)
+        return xy_cm[0], float(heading[0])
 
     def points(
         self, s_cm: Float[np.ndarray, "m"], offset_cm: float = 0.0
     ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
         """Return many points at once; see :meth:`point`."""
-        i = np.rint(s_cm / self.step_cm).astype(int)
-        index = i % len(self.s_cm) if self.closed else np.clip(i, 0, len(self.s_cm) - 1)
-        along_cm = s_cm - (i if self.closed else index) * self.step_cm
+        lap, index = self._nearest_samples(s_cm)
+        along_cm = s_cm - lap * self.length_cm - self.s_cm[index]
         turn = self.curvature_per_cm[index] * along_cm
         heading = self.heading_rad[index] + turn
         xy_cm = self.xy_cm[index] + arc_chord(self.heading_rad[index], along_cm, turn)
@@ -234,10 +229,13 @@ class Track:
             ),
         )
 
-    def _nearest_sample(self, s_cm: float) -> tuple[int, int]:
-        """Lap and sample nearest to a distance along the road."""
-        n, i = len(self.s_cm), round(s_cm / self.step_cm)
-        return divmod(i, n) if self.closed else (0, min(max(i, 0), n - 1))
+    def _nearest_samples(
+        self, s_cm: Float[np.ndarray, "*m"]
+    ) -> tuple[Int[np.ndarray, "*m"], Int[np.ndarray, "*m"]]:
+        """Lap and sample nearest to each distance along the road."""
+        n, i = len(self.s_cm), np.asarray(np.rint(s_cm / self.step_cm)).astype(int)
+        lap = i // n if self.closed else np.zeros_like(i)
+        return np.asarray(lap), np.clip(i - lap * n, 0, n - 1)
 
     def _samples(self, from_cm: float, to_cm: float) -> Int[np.ndarray, "m"]:
         """Indices of a section in the direction of travel; cut at the ends of an open road."""
@@ -328,10 +326,7 @@ def wear_off(
 
 def cut(painted_cm: Float[np.ndarray, "k 2"], from_cm: float, to_cm: float) -> Float[np.ndarray, "m 2"]:
     """Remove one section of the paint."""
-    before = np.stack([painted_cm[:, 0], np.minimum(painted_cm[:, 1], from_cm)], axis=1)
-    after = np.stack([np.maximum(painted_cm[:, 0], to_cm), painted_cm[:, 1]], axis=1)
-    left = _without_slivers(np.concatenate([before, after]))
-    return left[np.argsort(left[:, 0])]
+    return subtract(painted_cm, np.array([[from_cm, to_cm]]))
 
 
 def subtract(

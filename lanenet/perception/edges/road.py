@@ -90,7 +90,6 @@ class RoadTable:
         sample: Pixels from which :func:`lanenet.perception.edges.canny.find_edges` measures the contrast.
         scale: Road that a pixel spans sideways.
         points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
-        jacobian: d(point)/d(pixel), [cm/px], height x width x 2 x 2 (row x, y; column u, v).
     """
 
     def __init__(
@@ -109,11 +108,7 @@ class RoadTable:
         self._last_px = np.array([self.width - 1.0, self.height - 1.0])
         # A pixel's six numbers lie side by side: one memory access per lookup.
         self._rows = np.concatenate([grid[1:-1, 1:-1], du, dv], axis=-1).reshape(-1, 6)
-        table = self._rows.reshape(self.height, self.width, 6)
-        self.points_cm: Float[np.ndarray, "h w 2"] = table[..., :2]
-        self.jacobian: Float[np.ndarray, "h w 2 2"] = (
-            table[..., 2:].reshape(self.height, self.width, 2, 2).swapaxes(-1, -2)
-        )
+        self.points_cm: Float[np.ndarray, "h w 2"] = self._rows.reshape(self.height, self.width, 6)[..., :2]
         x, y = self.points_cm[..., 0], self.points_cm[..., 1]
         with np.errstate(invalid="ignore"):
             coarse = np.maximum(np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1))

@@ -9,11 +9,11 @@ import pytest
 from detections import read_detections
 
 from lanenet.data.detections import DetectionTable
-from lanenet.geometry.lane import POINT_NAMES, points_from_parabolas
+from lanenet.geometry.lane import POINT_NAMES, POINTS_FROM_PARABOLA
 from lanenet.perception.estimate import LaneEstimate
 
 PARABOLAS = np.array([[0.01, -0.2, -20.0], [-0.02, 0.3, 20.5]])
-FULL = LaneEstimate(points_from_parabolas(PARABOLAS), np.arange(1.0, 7.0), 0.25, 0.875)
+FULL = LaneEstimate((PARABOLAS @ POINTS_FROM_PARABOLA.T).ravel(), np.arange(1.0, 7.0), 0.25, 0.875)
 HALF = LaneEstimate(np.array([-20.0, -19.0, np.nan, 20.0, 21.0, 22.0]), steering_rad=-0.1, confidence=0.5)
 
 

@@ -21,7 +21,7 @@ from lanenet.evaluation.errors import (
 )
 from lanenet.evaluation.report import plot_breakdown
 from lanenet.evaluation.tables import as_markdown, lay_out
-from lanenet.geometry.lane import points_from_parabolas
+from lanenet.geometry.lane import POINTS_FROM_PARABOLA
 
 NAN = float("nan")
 TRUTH = np.zeros((200, 6))
@@ -35,7 +35,7 @@ def test_curvature_is_that_of_circles():
     # The mean of both lines; a parabola through three points of a circle is a little flatter or sharper.
     assert found[0] == pytest.approx(0.5 * (1 / 170.0 + 1 / 130.0), rel=0.02)
     np.testing.assert_allclose(lane_curvature(-np.concatenate(lines)[None]), found)
-    straight = points_from_parabolas(np.array([[[0.0, 0.3, -20.0], [0.0, 0.3, 20.0]]]))
+    straight = (np.array([[0.0, 0.3, -20.0], [0.0, 0.3, 20.0]]) @ POINTS_FROM_PARABOLA.T).reshape(1, 6)
     assert lane_curvature(straight)[0] == pytest.approx(0.0, abs=1e-12)
     half = np.concatenate([lines[0], [NAN, 20.0, 20.0]])[None]
     assert lane_curvature(half)[0] == pytest.approx(1 / 170.0, rel=0.02)
@@ -121,7 +121,8 @@ def sources():
     """Three drives: a straight one and two bends; the network is less sure where it is wrong."""
     rng, found = np.random.default_rng(1), []
     for number, a in enumerate((0.0, 0.002, 0.01)):
-        truth = np.tile(points_from_parabolas(np.array([[a, 0.0, -20.0], [a, 0.0, 20.0]])), (200, 1))
+        parabolas = np.array([[a, 0.0, -20.0], [a, 0.0, 20.0]])
+        truth = np.tile((parabolas @ POINTS_FROM_PARABOLA.T).ravel(), (200, 1))
         sigma = np.full((200, 6), 0.3 + number)
         answers = {"network": truth + rng.normal(0.0, sigma), "painter": truth + 1.0}
         found.append(

@@ -11,7 +11,6 @@ from lanenet.geometry.frames import (
     left_from_donkey,
     map_from_car,
     map_from_car_directions,
-    ros_from_car,
     wrap_angle,
 )
 
@@ -85,11 +84,6 @@ def test_wrap_angle_stays_in_range_and_keeps_the_direction(angles: np.ndarray) -
     assert np.all((wrapped >= -np.pi) & (wrapped <= np.pi))
     np.testing.assert_allclose(np.cos(wrapped), np.cos(angles), atol=1e-9)
     np.testing.assert_allclose(np.sin(wrapped), np.sin(angles), atol=1e-9)
-
-
-def test_ros_axes():
-    # One metre ahead of the front axle and 20 cm to the right of it.
-    np.testing.assert_allclose(ros_from_car(np.array([[20.0, 100.0]]), 26.0), [[1.26, -0.2]])
 
 
 def test_donkeycars_left_is_positive():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lanenet.geometry.lane import (
+    POINTS_FROM_PARABOLA,
     ROWS_CM,
     parabolas_from_points,
-    points_from_parabolas,
     proportional_angle_rad,
 )
 
@@ -32,7 +32,7 @@ def test_points_of_known_parabolas() -> None:
     Left at 15 cm: 6 / 450 * 225 - 0.05 * 15 - 21.5 = 3 - 0.75 - 21.5 = -19.25; at 30 cm: 12 - 1.5 - 21.5.
     """
     assert ROWS_CM == (0.0, 15.0, 30.0)
-    np.testing.assert_allclose(points_from_parabolas(PARABOLAS), POINTS_CM, atol=1e-12)
+    np.testing.assert_allclose((PARABOLAS @ POINTS_FROM_PARABOLA.T).ravel(), POINTS_CM, atol=1e-12)
 
 
 @pytest.mark.parametrize(("y_cm", "left_cm", "right_cm"), [(22.5, -15.875, 23.625), (-15.0, -17.75, 18.0)])

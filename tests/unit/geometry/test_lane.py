@@ -15,7 +15,6 @@ from lanenet.geometry.lane import (
     mirror_points,
     parabola_through,
     parabolas_from_points,
-    points_from_parabolas,
     rows_of_polyline,
 )
 
@@ -54,7 +53,6 @@ def test_parabola_through_known_points() -> None:
 def test_points_and_parabolas_are_one_to_one(points: np.ndarray) -> None:
     parabolas = parabolas_from_points(points)
     assert parabolas.shape == (len(points), 2, 3)
-    np.testing.assert_allclose(points_from_parabolas(parabolas), points, atol=1e-9)
     for row, y_cm in enumerate(ROWS_CM):
         np.testing.assert_allclose(np.polyval(parabolas[:, 0].T, y_cm), points[:, row], atol=1e-9)
         np.testing.assert_allclose(np.polyval(parabolas[:, 1].T, y_cm), points[:, 3 + row], atol=1e-9)

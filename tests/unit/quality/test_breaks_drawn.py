@@ -87,7 +87,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         figures.append(figure)
         return b""
 
-    monkeypatch.setattr(page, "_png", keep)
+    monkeypatch.setattr(page, "png_bytes", keep)
     return figures
 
 

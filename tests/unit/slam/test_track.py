@@ -181,8 +181,7 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     usual = typical_step(pictures, commands.distance_cm, speed_known)
     seen = SegmentView(blank, camera, commands, road_view, road_view.scans(camera), pictures, usual)
     settings = SlamSettings(filter=FilterSettings(particles=200))
-    tracked = track(seen, settings, rng, lambda done, total: calls.append((done, total)))
-    trajectory, fit = tracked.trajectory, tracked.steering
+    trajectory, fit = track(seen, settings, rng, lambda done, total: calls.append((done, total)))
     assert calls == [(k, 2 * n) for k in range(1, 2 * n + 1)]
     assert fit is not None
     assert abs(fit.lag_frames - 2) <= 1

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from synthetic_roads import drive_frames
+from synthetic_roads import drive_frames, floor_pixels
 
 from datagen.world.car.camera import CameraSettings
 from datagen.world.render.appearance import Appearance, random_appearance
@@ -144,7 +144,7 @@ def test_each_row_shows_the_road_as_it_was_when_the_row_was_read():
     for row in (130, 180, 235):
         x, y, c, s = row_poses(240, pose[2], speed, yaw_rate, readout_s)[row]
         then = plain.render(np.array([pose[0] + x, pose[1] + y, np.arctan2(s, c)]), 0)
-        difference = np.abs(skewed[row].astype(int) - then[row])[GROUND.floor[row]]
+        difference = np.abs(skewed[row].astype(int) - then[row])[floor_pixels(GROUND)[row]]
         assert difference.max() <= 2 and difference.mean() < 0.1
         assert np.abs(skewed[row].astype(int) - plain.render(pose, 0)[row]).max() > 20 or row == 119
 
@@ -166,7 +166,7 @@ def test_shake_is_a_turned_camera(pitch, roll, monkeypatch):
     shaken = _renderer(camera=camera, joint_u_cm=20.0, joint_v_cm=20.0).render(_pose(), 0)
     monkeypatch.setattr(Renderer, "_shake_at", lambda *_: np.zeros(2))
     expected = _renderer(camera=turned, joint_u_cm=20.0, joint_v_cm=20.0).render(_pose(), 0)
-    floor = PixelGround.of(turned).floor
+    floor = floor_pixels(PixelGround.of(turned))
     assert floor.sum() > 20000
     assert np.abs(shaken.astype(int) - expected)[floor].max() <= 2
     np.testing.assert_allclose(
@@ -191,7 +191,7 @@ def test_boxes_of_the_track_are_painted_where_they_lie():
 
 def test_verge_begins_at_the_outermost_lines():
     image = _renderer(verge_bgr=(200.0, 20.0, 20.0)).render(_pose(), 3)
-    pixels = np.argwhere(GROUND.floor)[::7]
+    pixels = np.argwhere(floor_pixels(GROUND))[::7]
     points = CAMERA.intersect_ground(pixels[:, ::-1].astype(float)) + [0.0, 26.0]
     pose = _pose()
     c, s = np.cos(pose[2]), np.sin(pose[2])
