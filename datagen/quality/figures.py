@@ -16,6 +16,9 @@ from lanenet.data.maps.mapped_drive import known_lines
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
+#: Of a line's residuals, in the order of :class:`datagen.quality.verdict.LineEvidence`.
+_LINE_FIGURES = ("samples", "coverage", "robust_sd_px_at_160", "p95_px_at_160")
+
 
 @dataclass(frozen=True)
 class Report:
@@ -122,9 +125,7 @@ def contradicted_share(
         deleted: Frames that the driver deleted; they do not count, since the car may have left the road.
     """
     counted = known & ~deleted[:, None]
-    if not counted.any():
-        return 0.0
-    return float(contradicted[counted].mean())
+    return float(contradicted[counted].mean()) if counted.any() else 0.0
 
 
 def map_evidence(
@@ -151,12 +152,7 @@ def map_evidence(
     known = not figures.get("calibration", {}).get("candidates")
     return MapEvidence(
         lines={
-            side: LineEvidence(
-                samples=line[reach]["samples"],
-                coverage=line[reach]["coverage"],
-                robust_sd_px=line[reach]["robust_sd_px_at_160"],
-                p95_px=line[reach]["p95_px_at_160"],
-            )
+            side: LineEvidence(*(line[reach][name] for name in _LINE_FIGURES))
             for side, line in held["lines"].items()
         },
         p95_px=both["p95_px_at_160"],

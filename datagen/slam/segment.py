@@ -5,13 +5,13 @@ A slow car is tracked by keyframes; the frames between them are placed and adjus
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleEstimate, BundleResult, Observations, adjust
+from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, adjust
 from datagen.slam.commands import CommandedMotion, SteeringFit, commands_of, fit_steering
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import (
@@ -223,7 +223,10 @@ class _DenseSegment:
         self, view: SegmentView, solver: SegmentSolver, find_camera: bool, prior_camera: Camera
     ) -> None:
         self.view, self.solver = view, solver
-        self.find_camera, self.prior_camera = find_camera, prior_camera
+        self.find_camera = find_camera
+        self.adjust = partial(
+            adjust, settings=solver.settings.bundle, rng=solver.rng, prior_camera=prior_camera
+        )
         self.revisit_settings = solver.settings.revisits
         self.height = view.camera.mounting.height_cm
         self.free = _OPEN_LOOP if find_camera else ()
@@ -234,7 +237,7 @@ class _DenseSegment:
         view, solver = self.view, self.solver
         trajectory, steering = track(view, solver.settings, solver.rng, solver.progress)
         start = BundleEstimate.level(trajectory.poses, view.camera)
-        opened = self.adjust_all(self.observed, start, self.free)
+        opened = self.adjust(self.observed, start, free=self.free)
         closure = self.choose_closure(opened, self.find_revisits(opened))
         road, bundle = view.road, opened
         if closure is not None and self.find_camera:
@@ -288,7 +291,7 @@ class _DenseSegment:
         if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
             return None
         loops = loop_pairs(revisits, len(poses))
-        closed = self.adjust_all(self.observed, replace(opened, poses=poses), self.free, loops)
+        closed = self.adjust(self.observed, replace(opened, poses=poses), free=self.free, loops=loops)
         return _Closure(revisits, drift, closed) if closed.misfit < MAX_MISFIT * opened.misfit else None
 
     def without_outliers(self, opened: BundleResult, closure: _Closure) -> _Closure:
@@ -307,18 +310,7 @@ class _DenseSegment:
             inliers = inlier_revisits(bundle.poses, closure.revisits, self.height)
             loops = loop_pairs(inliers, len(drive))
             loops += neighbouring_laps(bundle.poses, self.height, self.revisit_settings)
-            bundle = self.adjust_all(road.observed(self.view.commands), bundle, CAMERA_NAMES, loops)
+            bundle = self.adjust(road.observed(self.view.commands), bundle, loops=loops)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
         return road, bundle
-
-    def adjust_all(
-        self,
-        observed: Observations,
-        start: BundleEstimate,
-        free: Sequence[str],
-        loops: Sequence[tuple[int, int]] = (),
-    ) -> BundleResult:
-        """Adjust all frames together, with the priors of this segment."""
-        settings, rng = self.solver.settings.bundle, self.solver.rng
-        return adjust(observed, start, settings, rng, free, loops, self.prior_camera)

@@ -233,7 +233,7 @@ def _place(track: Track, rng: np.random.Generator, facing: bool) -> float:
 def _pose_at(track: Track, s_cm: float, camera: Camera) -> tuple[Float[np.ndarray, "3"], float]:
     """Pose of the car whose front axle is there, a little beside the middle, and its yaw rate."""
     rear_cm, heading = track.point(s_cm - camera.wheelbase_cm, _BESIDE_CM)
-    return np.array([*rear_cm, heading]), _SPEED_CM_S * float(track.curvature(s_cm))
+    return np.array([*rear_cm, heading]), _SPEED_CM_S * float(track.curvature(np.array([s_cm]))[0])
 
 
 def _from_above(

@@ -93,10 +93,8 @@ def transmitted(world: World, speed_cm_s: float, steering_rad: float) -> tuple[f
     donkey = world.donkey
     if donkey is None:
         return speed_cm_s, steering_rad
-    return (
-        donkey.speed_cm_s(donkey.throttle(speed_cm_s)),
-        donkey.steering_rad(donkey.angle(steering_rad)),
-    )
+    throttle, angle = donkey.throttle(speed_cm_s), donkey.angle(steering_rad)
+    return donkey.speed_cm_s(throttle), donkey.steering_rad(angle)
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,19 +85,11 @@ def _outline(solid, ex, ey, height, planes):
                 most_left, most_right = most_left and turn <= 1e-9, most_right and turn >= -1e-9
             length = np.sqrt(xi * xi + yi * yi)
             if most_left:
-                planes[LEFT_X], planes[LEFT_Y], planes[LEFT_Z], planes[LEFT_DISTANCE] = (
-                    yi / length,
-                    -xi / length,
-                    0.0,
-                    length,
-                )
+                planes[LEFT_X], planes[LEFT_Y] = yi / length, -xi / length
+                planes[LEFT_Z], planes[LEFT_DISTANCE] = 0.0, length
             if most_right:
-                planes[RIGHT_X], planes[RIGHT_Y], planes[RIGHT_Z], planes[RIGHT_DISTANCE] = (
-                    -yi / length,
-                    xi / length,
-                    0.0,
-                    length,
-                )
+                planes[RIGHT_X], planes[RIGHT_Y] = -yi / length, xi / length
+                planes[RIGHT_Z], planes[RIGHT_DISTANCE] = 0.0, length
         return nearest, farthest
     radius = solid[HALF_LENGTH]
     if distance <= radius:
@@ -108,12 +100,9 @@ def _outline(solid, ex, ey, height, planes):
         cosine = np.sqrt(1.0 - sine * sine)
         # The tangents' directions: the axis' direction turned by the half angle to either side.
         cx, cy = x / distance, y / distance
-        planes[LEFT_X], planes[LEFT_Y], planes[LEFT_Z] = cy * cosine + cx * sine, cy * sine - cx * cosine, 0.0
-        planes[RIGHT_X], planes[RIGHT_Y], planes[RIGHT_Z] = (
-            cx * sine - cy * cosine,
-            cx * cosine + cy * sine,
-            0.0,
-        )
+        planes[LEFT_X], planes[LEFT_Y] = cy * cosine + cx * sine, cy * sine - cx * cosine
+        planes[RIGHT_X], planes[RIGHT_Y] = cx * sine - cy * cosine, cx * cosine + cy * sine
+        planes[LEFT_Z] = planes[RIGHT_Z] = 0.0
         return distance - radius, distance + radius
     slope = radius / (solid[TOP] - solid[BOTTOM])
     cosine = -slope * (height - solid[TOP]) / distance
@@ -122,11 +111,9 @@ def _outline(solid, ex, ey, height, planes):
     # Normals of the cone's side that are square to the line from its tip to the eye.
     sine, shrink = np.sqrt(1.0 - cosine * cosine), 1.0 / np.sqrt(1.0 + slope * slope)
     bx, by = -x / distance, -y / distance
-    planes[LEFT_X], planes[LEFT_Y] = -shrink * (bx * cosine + by * sine), -shrink * (by * cosine - bx * sine)
-    planes[RIGHT_X], planes[RIGHT_Y] = (
-        -shrink * (bx * cosine - by * sine),
-        -shrink * (by * cosine + bx * sine),
-    )
+    along_x, along_y, across_x, across_y = bx * cosine, by * cosine, bx * sine, by * sine
+    planes[LEFT_X], planes[LEFT_Y] = -shrink * (along_x + across_y), -shrink * (along_y - across_x)
+    planes[RIGHT_X], planes[RIGHT_Y] = -shrink * (along_x - across_y), -shrink * (along_y + across_x)
     planes[LEFT_Z] = planes[RIGHT_Z] = -shrink * slope
     return distance - radius, distance + radius
 
@@ -197,14 +184,8 @@ def _mark_outside(lattice, planes, low, high, margin, marks):
             the lens does not see has none.
     """
     lower, higher = margin * (1.0 + abs(low)), margin * (1.0 + abs(high))
-    p0, p1, p2, p3, p4, p5 = (
-        planes[LEFT_X],
-        planes[LEFT_Y],
-        planes[LEFT_Z],
-        planes[RIGHT_X],
-        planes[RIGHT_Y],
-        planes[RIGHT_Z],
-    )
+    p0, p1, p2 = planes[LEFT_X], planes[LEFT_Y], planes[LEFT_Z]
+    p3, p4, p5 = planes[RIGHT_X], planes[RIGHT_Y], planes[RIGHT_Z]
     xs, ys, zs, flats = lattice[0], lattice[1], lattice[2], lattice[3]
     for k in range(marks.shape[0]):
         x, y, z, flat = xs[k], ys[k], zs[k], flats[k]

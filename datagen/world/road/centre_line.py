@@ -128,13 +128,9 @@ def _knots(
     middle = 0.5 * (knots[1:] + knots[:-1])
     section = np.minimum(np.searchsorted(ends, middle), len(ends) - 1)
     slope = (end - start) / length
-    along0, along1 = (side - (ends - length)[section] for side in (knots[:-1], knots[1:]))
-    return (
-        knots,
-        start[section] + slope[section] * along0,
-        start[section] + slope[section] * along1,
-        is_sample,
-    )
+    along = (side - (ends - length)[section] for side in (knots[:-1], knots[1:]))
+    k0, k1 = (start[section] + slope[section] * s_cm for s_cm in along)
+    return knots, k0, k1, is_sample
 
 
 def end_of(sections: Sequence[Section]) -> tuple[float, complex]:

@@ -109,9 +109,9 @@ class Track:
         heading, offset_cm = self.heading_rad[index], np.asarray(offset_cm)[..., None]
         return self.xy_cm[index] + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
 
-    def curvature(self, s_cm: float | Float[np.ndarray, "m"]) -> Float[np.ndarray, "*m"]:
-        """Return the curvature of the centre line at a place or at many, [1/cm], positive left."""
-        return np.asarray(self.curvature_per_cm[self._nearest_samples(np.asarray(s_cm))[1]])
+    def curvature(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Return the curvature of the centre line at places along it, [1/cm], positive left."""
+        return self.curvature_per_cm[self._nearest_samples(s_cm)[1]]
 
     def point(self, s_cm: float, offset_cm: float = 0.0) -> tuple[Float[np.ndarray, "2"], float]:
         """Return the point at a distance along the road and the road's heading there, [cm], [rad], frame map.
@@ -230,12 +230,12 @@ class Track:
         )
 
     def _nearest_samples(
-        self, s_cm: Float[np.ndarray, "*m"]
-    ) -> tuple[Int[np.ndarray, "*m"], Int[np.ndarray, "*m"]]:
+        self, s_cm: Float[np.ndarray, "m"]
+    ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
         """Lap and sample nearest to each distance along the road."""
-        n, i = len(self.s_cm), np.asarray(np.rint(s_cm / self.step_cm)).astype(int)
+        n, i = len(self.s_cm), np.rint(s_cm / self.step_cm).astype(int)
         lap = i // n if self.closed else np.zeros_like(i)
-        return np.asarray(lap), np.clip(i - lap * n, 0, n - 1)
+        return lap, np.clip(i - lap * n, 0, n - 1)
 
     def _samples(self, from_cm: float, to_cm: float) -> Int[np.ndarray, "m"]:
         """Indices of a section in the direction of travel; cut at the ends of an open road."""

@@ -165,7 +165,7 @@ def test_visibility_curvature_and_lap_are_answered():
         line_painted(track, "left", s + track.length_cm), [True, False, False, True]
     )
     assert not line_painted(track, "right", s).any()
-    assert track.curvature(300.0) == pytest.approx(1.0 / 80.0) and track.curvature(100.0) == 0.0
+    np.testing.assert_allclose(track.curvature(np.array([300.0, 100.0])), [1.0 / 80.0, 0.0])
     # The lines are where the road has them, painted or not.
     assert np.isfinite(track.truth(np.array([60.0, 0.0, 0.0]), WHEELBASE_CM)).all()
 
