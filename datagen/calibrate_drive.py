@@ -12,7 +12,7 @@ from jaxtyping import Float
 from datagen.lanes.scale import LaneScale, measure_lane
 from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
 from datagen.settings import MapSettings
-from datagen.slam.camera.coarse import Candidate, with_known_scale
+from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.camera.self_calibration import (
     DRIVE_INSTEAD,
     MIN_FRAMES,
@@ -46,8 +46,6 @@ class CalibratedDrive:
     Attributes:
         camera: The camera, [cm].
         sigma: Standard deviations; each name ends in its unit. A height that was given has none.
-        candidates: Cameras of the coarse search; none where one was given.
-        closed: Whether a loop was closed.
         notes: What was assumed or left out, a sentence each.
         method: How the camera was found.
         frames: Number of frames that were used.
@@ -60,8 +58,6 @@ class CalibratedDrive:
 
     camera: Camera
     sigma: dict[str, float]
-    candidates: list[Candidate]
-    closed: bool
     notes: tuple[str, ...]
     method: str
     frames: int
@@ -180,8 +176,6 @@ def calibrate_drive(
     return CalibratedDrive(
         camera=camera,
         sigma=_sigma_with_units(found.sigma, camera, height_sigma),
-        candidates=found.candidates,
-        closed=found.closed,
         notes=tuple(notes),
         method=f"{found.how}; {len(drive)} frames of {drive.name}; scale from {scale_from}",
         frames=len(drive),

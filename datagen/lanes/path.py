@@ -267,20 +267,32 @@ def edges_along_path(
     distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
     keep = distance <= reach_cm
     frame = scans.frame_of_point[keep]
-    s, d, side, along = _project(
-        path.xy_cm,
-        path.left,
-        path.step_cm,
-        path.closed,
-        path.s_frames_cm[frame],
-        path.drives_forward[frame],
-        poses[frame],
-        scans.points_cm[keep],
-        scans.normals[keep],
-        wheelbase_cm,
-        reach_cm + 2.0 * wheelbase_cm,
+    ahead = np.stack([np.cos(poses[frame, 2]), np.sin(poses[frame, 2])], axis=1)
+    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    points, normals = (
+        car[keep, 1:] * ahead + car[keep, :1] * right
+        for car in (scans.points_cm + [0.0, wheelbase_cm], scans.normals)
     )
-    return PathEdges(s, d, side, along, scans.weights[keep], distance[keep], frame).select(np.isfinite(s))
+    points += poses[frame, :2]
+    forward, span_cm = path.drives_forward[frame], reach_cm + 2.0 * wheelbase_cm
+    row = _nearest_rows(
+        path.xy_cm, path.step_cm, path.closed, path.s_frames_cm[frame], forward, points, span_cm
+    )
+    seen = row >= 0
+    row, normals, off = row[seen], normals[seen], points[seen] - path.xy_cm[row[seen]]
+    left = path.left[row]
+    # The tangent is the left normal rotated clockwise by 90 degrees.
+    tangent = np.stack([left[:, 1], -left[:, 0]], axis=1)
+    s = row * path.step_cm + np.sum(off * tangent, axis=1)
+    return PathEdges(
+        s_cm=s if path.period_cm is None else np.mod(s, path.period_cm),
+        d_cm=np.sum(off * left, axis=1),
+        side=np.sum(normals * left, axis=1),
+        along=np.sum(normals * tangent, axis=1),
+        weight=scans.weights[keep][seen],
+        distance_cm=distance[keep][seen],
+        frame=frame[seen],
+    )
 
 
 def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
@@ -293,17 +305,22 @@ def without_frames(scans: Scans, left_out: Bool[np.ndarray, "n"]) -> Scans:
 
 @njit(cache=True)
 @no_type_check
-def _project(xy, left, step, closed, s_frame, forward, pose, points, normals, wheelbase, span):
-    n, m = points.shape[0], xy.shape[0]
-    s_out, d_out = np.full(n, np.nan), np.zeros(n)
-    side_out, along_out = np.zeros(n), np.zeros(n)
-    for i in range(n):
-        c, sn = np.cos(pose[i, 2]), np.sin(pose[i, 2])
-        ahead, right = points[i, 1] + wheelbase, points[i, 0]
-        x = pose[i, 0] + ahead * c + right * sn
-        y = pose[i, 1] + ahead * sn - right * c
+def _nearest_rows(xy, step, closed, s_frame, forward, points, span):
+    """Nearest path sample of each point, within what its frame could see; -1 where that is none.
+
+    Args:
+        xy: Path samples.
+        step: Distance between samples.
+        closed: Whether the path is a loop.
+        s_frame: Position along the path of each point's frame.
+        forward: Whether that frame drives along the path's direction.
+        points: Points, frame map.
+        span: How far along the path a frame sees.
+    """
+    m, reach = len(xy), int(span / step)
+    rows = np.full(len(points), -1)
+    for i in range(len(points)):
         here = int(s_frame[i] / step)
-        reach = int(span / step)
         first, last = (here - 5, here + reach) if forward[i] else (here - reach, here + 5)
         if closed:
             last = min(last, first + m - 1)
@@ -311,21 +328,9 @@ def _project(xy, left, step, closed, s_frame, forward, pose, points, normals, wh
             first, last = max(0, first), min(m - 1, last)
         best, nearest = 1e18, first
         for j in range(first, last + 1):
-            distance = (xy[j % m, 0] - x) ** 2 + (xy[j % m, 1] - y) ** 2
+            distance = (xy[j % m, 0] - points[i, 0]) ** 2 + (xy[j % m, 1] - points[i, 1]) ** 2
             if distance < best:
                 best, nearest = distance, j
-        if nearest <= first or nearest >= last:
-            continue
-        nearest = nearest % m
-        dx, dy = x - xy[nearest, 0], y - xy[nearest, 1]
-        # The tangent is the left normal rotated clockwise by 90 degrees.
-        along = dx * left[nearest, 1] - dy * left[nearest, 0]
-        s_out[i] = nearest * step + along
-        if closed:
-            s_out[i] = s_out[i] % (m * step)
-        d_out[i] = dx * left[nearest, 0] + dy * left[nearest, 1]
-        nx = normals[i, 1] * c + normals[i, 0] * sn
-        ny = normals[i, 1] * sn - normals[i, 0] * c
-        side_out[i] = nx * left[nearest, 0] + ny * left[nearest, 1]
-        along_out[i] = nx * left[nearest, 1] - ny * left[nearest, 0]
-    return s_out, d_out, side_out, along_out
+        if first < nearest < last:
+            rows[i] = nearest % m
+    return rows

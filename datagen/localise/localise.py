@@ -6,10 +6,8 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import cv2
 import numpy as np
@@ -18,7 +16,6 @@ from jaxtyping import Float, UInt8
 from datagen.localise.live_filter import LiveFrame, LiveLocaliser, LivePose, StartSettings
 from datagen.quality.pictures import draw_metre, write_png
 from datagen.settings import MapSettings
-from datagen.slam.commands import SteeringFit
 from lanenet.data.files import atomic_file, check_destination
 from lanenet.data.tables import TUM_HEADER, tum_lines
 from lanenet.errors import LanenetError
@@ -49,16 +46,12 @@ class LiveReport:
         frames: Frames taken in.
         poses: Poses written.
         segments: Segments that gave poses.
-        unreadable: Frames without an image.
-        standing: Frames in which the car stood.
-        dropped: Frames of segments too short to find a typical step in.
+        localiser: With the steering that it found, and how many frames were unreadable, standing or left out.
         factor: Typical distance factor (see :class:`datagen.slam.filter.motion.MotionModel`).
         speed_known: Whether the factor is the gain of a recorded speed, not a step length in cm.
-        steering: How the car answered to the steering; None where that was not found.
         match: Median matched share of a frame's edges.
         median_ms: Median time per frame of edges and filter together, over the last frames.
         p99_ms: Its 99th percentile.
-        map_mb: Memory of the filter's map.
         process_mb: Peak memory of the process; None where the system does not tell.
     """
 
@@ -68,16 +61,12 @@ class LiveReport:
     frames: int
     poses: int
     segments: int
-    unreadable: int
-    standing: int
-    dropped: int
+    localiser: LiveLocaliser
     factor: float
     speed_known: bool
-    steering: SteeringFit | None
     match: float
     median_ms: float
     p99_ms: float
-    map_mb: float
     process_mb: float | None
 
 
@@ -119,16 +108,15 @@ def localise(
     matches: deque[float] = deque(maxlen=_TIMED)
     segments, speed_known = set[int](), False
     reach_cm = _DRAWN_HEIGHTS * camera.mounting.height_cm
-    with ExitStack() as stack:
-        log = stack.enter_context(_PoseLog(out))
-        tum = stack.enter_context(stack.enter_context(atomic_file(trajectory)).open("w", encoding="utf-8"))
+    with atomic_file(trajectory) as temporary, temporary.open("w", encoding="utf-8") as tum:
         tum.write(TUM_HEADER)
 
         def keep(poses: list[LivePose]) -> None:
             nonlocal longest, drawn, segment, count
             for pose in poses:
                 known = pose.estimate
-                log.add(pose)
+                _log(out, pose, first=count == 0)
+                count += 1
                 tum.writelines(tum_lines(np.array([pose.t_s]), known.pose[None]))
                 if pose.segment != segment:
                     segment, drawn = pose.segment, LiveCanvas()
@@ -138,7 +126,6 @@ def localise(
                 segments.add(segment)
                 if np.isfinite(known.match):
                     matches.append(known.match)
-            count += len(poses)
 
         try:
             for frame in frames:
@@ -168,47 +155,27 @@ def localise(
         frames=taken,
         poses=count,
         segments=len(segments),
-        unreadable=localiser.unreadable,
-        standing=localiser.standing,
-        dropped=localiser.dropped,
+        localiser=localiser,
         factor=localiser.factor,
         speed_known=speed_known,
-        steering=localiser.steering,
         match=float(np.median(matches)) if matches else float("nan"),
         median_ms=median_ms,
         p99_ms=p99_ms,
-        map_mb=localiser.map_bytes / 1e6,
         process_mb=process_mb(),
     )
 
 
-class _PoseLog:
-    """A CSV that is complete up to the last pose at any moment; it begins with the first pose."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file: TextIO | None = None
-
-    def __enter__(self) -> _PoseLog:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def add(self, pose: LivePose) -> None:
-        x, y, heading = pose.estimate.pose
-        match = "" if np.isnan(pose.estimate.match) else f"{pose.estimate.match:.3f}"
-        row = f"{pose.frame},{pose.t_s:.6f},{x:.4f},{y:.4f},{heading:.6f},{pose.segment},{match}"
-        try:
-            if self._file is None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self.path.open("w", encoding="utf-8", newline="\n")
-                self._file.write(HEADER)
-            self._file.write(f"{row},{pose.estimate.spread_cm:.3f}\n")
-            self._file.flush()
-        except OSError as error:
-            raise LanenetError(f"{self.path}: cannot be written ({error})") from None
+def _log(out: Path, pose: LivePose, first: bool) -> None:
+    """Add a pose to a CSV that is complete at any moment; it begins with the first pose."""
+    x, y, heading = pose.estimate.pose
+    match = "" if np.isnan(pose.estimate.match) else f"{pose.estimate.match:.3f}"
+    row = f"{pose.frame},{pose.t_s:.6f},{x:.4f},{y:.4f},{heading:.6f},{pose.segment},{match}"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("w" if first else "a", encoding="utf-8", newline="\n") as file:
+            file.write((HEADER if first else "") + f"{row},{pose.estimate.spread_cm:.3f}\n")
+    except OSError as error:
+        raise LanenetError(f"{out}: cannot be written ({error})") from None
 
 
 def process_mb() -> float | None:

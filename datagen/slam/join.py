@@ -78,14 +78,14 @@ def join_segments(
     apart, notes = [], []
     for other in sorted((x for x in segments if x is not base), key=lambda x: -len(x.rows)):
         pair = _Pair(base, other, drive, settings)
-        shared = pair.shared_places(rng)
-        joined = pair.join(shared, rng)
+        places, moved = pair.shared_places(rng)
+        joined = pair.join(places, moved, rng)
         if joined is None:
             apart.append(other)
             continue
         notes.append(
             f"{frames_text(drive, other.rows)} lie on the same map as {frames_text(drive, base.rows)}: "
-            f"{len(shared.revisits)} places seen in both"
+            f"{len(places)} places seen in both"
         )
         base = joined
     left = sorted([base, *apart], key=lambda segment: int(segment.rows[0]))
@@ -98,17 +98,8 @@ def frames_text(drive: Drive, rows: Int[np.ndarray, "n"]) -> str:
     return "frames " + ", ".join(f"{drive.frames[run[0]]}-{drive.frames[run[-1]]}" for run in runs)
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """Places that both segments of a pair show.
-
-    Attributes:
-        revisits: Alignments that agree, from a frame of the base to one of the other segment.
-        moved: Poses of the other segment as these alignments place it on the base's map.
-    """
-
-    revisits: list[Revisit]
-    moved: Float[np.ndarray, "m 3"]
+#: Places that both segments show, and the poses of the second one moved accordingly.
+_Shared = tuple[list[Revisit], Float[np.ndarray, "m 3"]]
 
 
 class _Pair:
@@ -138,19 +129,21 @@ class _Pair:
                 found.append(match)
         return _agreeing(apart, self.first, found, self.height)
 
-    def join(self, shared: _Shared, rng: np.random.Generator) -> SolvedSegment | None:
+    def join(
+        self, places: list[Revisit], moved: Float[np.ndarray, "m 3"], rng: np.random.Generator
+    ) -> SolvedSegment | None:
         """Carry the other segment over; None where it shows too few places of the base, or does not fit."""
         base, other = self.both
-        later = [r.later - self.first for r in shared.revisits]
+        later = [r.later - self.first for r in places]
         path = path_lengths(other.poses)
         if count_places(path[later], self.height) < self.settings.revisits.min_revisits:
             return None
         # The loop closures of either map, beside what they share.
         own = [replace(r, earlier=r.earlier + self.first, later=r.later + self.first) for r in other.revisits]
-        revisits = [*base.revisits, *own, *shared.revisits]
-        start = np.concatenate([base.poses, shared.moved])
+        revisits = [*base.revisits, *own, *places]
+        start = np.concatenate([base.poses, moved])
         poses, missed = close_loops(start, revisits, self.height, self.breaks)
-        along, across = np.median(np.abs(missed[-len(shared.revisits) :, :2]), axis=0) / self.height
+        along, across = np.median(np.abs(missed[-len(places) :, :2]), axis=0) / self.height
         if along > MAX_MISSED[0] or across > MAX_MISSED[1]:
             return None
         roads = [
@@ -279,7 +272,7 @@ def _agreeing(poses: Float[np.ndarray, "n 3"], first: int, found: list[Revisit],
                 kept.append(replace(r, turns=round(turns / (2.0 * np.pi))))
         if len(kept) > len(best):
             best, moved = kept, carried
-    return _Shared(best, moved)
+    return best, moved
 
 
 def _concatenated(a: Scans, b: Scans) -> Scans:

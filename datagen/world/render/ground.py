@@ -374,12 +374,9 @@ class NearestGrid:
         key = (int(first[0]), int(first[1]), int(last[0]), int(last[1]))
         # The blocks around the car stay the same for many frames.
         if self._window is None or self._window[0] != key:
-            self._window = key, self._join(*key)
+            rows, columns = range(key[1], key[3] + 1), range(key[0], key[2] + 1)
+            self._window = key, np.block([[self._block(row, column) for column in columns] for row in rows])
         return self._window[1], np.array([*(self._low + first * size_cm), _GRID_CELL_CM])
-
-    def _join(self, column0: int, row0: int, column1: int, row1: int) -> Int[np.ndarray, "r c"]:
-        rows, columns = range(row0, row1 + 1), range(column0, column1 + 1)
-        return np.block([[self._block(row, column) for column in columns] for row in rows])
 
     def _block(self, row: int, column: int) -> Int[np.ndarray, "b b"]:
         size_cm = _BLOCK_CELLS * _GRID_CELL_CM

@@ -197,22 +197,23 @@ class CameraFrames:
 
 
 def _show(report: LiveReport) -> None:
+    localiser = report.localiser
     lines = [
         f"{report.poses} poses of {report.frames} frames, {report.segments} segment(s); "
-        f"{report.unreadable} unreadable, {report.standing} standing, {report.dropped} left out",
+        f"{localiser.unreadable} unreadable, {localiser.standing} standing, {localiser.dropped} left out",
         f"{1e3 / report.median_ms:.0f} frames/s: {report.median_ms:.2f} ms per frame (median), "
         f"{report.p99_ms:.2f} ms (p99)",
-        f"map {report.map_mb:.0f} MB"
+        f"map {localiser.map_bytes / 1e6:.0f} MB"
         + ("" if report.process_mb is None else f", process {report.process_mb:.0f} MB at most"),
         f"gain of the speed {report.factor:.3f}"
         if report.speed_known
         else f"typical step length {report.factor:.2f} cm per frame",
         f"median match {report.match:.2f}",
     ]
-    if report.steering is not None:
+    if localiser.steering is not None:
         lines.append(
-            f"steering found: correlation {report.steering.correlation:.2f}, "
-            f"delay {report.steering.lag_frames} frames"
+            f"steering found: correlation {localiser.steering.correlation:.2f}, "
+            f"delay {localiser.steering.lag_frames} frames"
         )
     console.show_lines(lines)
     console.wrote(report.out, report.trajectory, report.picture)

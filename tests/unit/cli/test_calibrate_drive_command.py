@@ -47,8 +47,6 @@ def asked(drive: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     result = CalibratedDrive(
         example_camera(),
         SIGMA,
-        [],
-        True,
         ("made up",),
         "a method",
         500,

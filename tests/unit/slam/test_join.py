@@ -193,10 +193,10 @@ def test_alignments_that_contradict_each_other_do_not_join():
     true = moved_rigidly(poses[30:], poses[30], np.array([80.0, 10.0, 0.5]))
     right = [Revisit(k, 30 + k, relative_pose(poses[k], true[k]), 0.8) for k in range(0, 30, 4)]
     wrong = [replace(r, relative=r.relative + rng.normal(size=3) * [60.0, 60.0, 1.0]) for r in right[::2]]
-    shared = _agreeing(poses, 30, wrong + right, 15.0)
-    assert {(r.earlier, *r.relative) for r in shared.revisits} == {(r.earlier, *r.relative) for r in right}
-    np.testing.assert_allclose(shared.moved, true, atol=1e-9)
-    assert len(_agreeing(poses, 30, wrong, 15.0).revisits) < 3
+    places, moved = _agreeing(poses, 30, wrong + right, 15.0)
+    assert {(r.earlier, *r.relative) for r in places} == {(r.earlier, *r.relative) for r in right}
+    np.testing.assert_allclose(moved, true, atol=1e-9)
+    assert len(_agreeing(poses, 30, wrong, 15.0)[0]) < 3
 
 
 def test_alignments_of_one_place_alone_do_not_join(same_road, monkeypatch):
