@@ -76,10 +76,6 @@ class DepartureCounter:
             self.over = False
         return self.over
 
-    def put_back(self) -> None:
-        """The car stands in the lane again."""
-        self.over = False
-
 
 #: Makes a detector for a camera, a lane width and a width of the markings, both in cm.
 BuildDetector = Callable[[Camera, float, float | None], Detector]
@@ -275,7 +271,7 @@ class _Referee:
         """The car stands in the lane again, at a place along the road."""
         self._rows[-1][-1] = 1.0
         self._moved_at_s, self._moved_to_cm = self._rows[-1][0], s_cm
-        self.wheels.put_back()
+        self.wheels.over = False
 
     def trajectory(self) -> Trajectory:
         """Return the run so far."""

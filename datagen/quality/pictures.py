@@ -97,7 +97,8 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
 def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]
     for run in true_runs(np.isfinite(points[:, 0])):
         if len(run) > 1:
-            cv2.polylines(image, [pixels(points[run])], False, colour, 1, cv2.LINE_AA)
+            at = pixels(points[run]).astype(np.int32)
+            cv2.polylines(image, [at], False, colour, 1, cv2.LINE_AA)
 
 
 def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"]) -> None:
@@ -132,9 +133,7 @@ def draw_lines(
         inside = (
             np.isfinite(at).all(axis=1) & (np.abs(at) < 4 * big.shape[1]).all(axis=1) & (line[:, 1] > -5.0)
         )
-        for k in np.flatnonzero(inside[:-1] & inside[1:]):
-            a, b = (tuple(int(v) for v in np.rint(at[i])) for i in (k, k + 1))
-            cv2.line(big, a, b, colour, 1, cv2.LINE_AA)
+        _polyline(big, np.rint, np.where(inside[:, None], at, np.nan), colour)
     rows = np.tile(ROWS_CM, 2)
     for u, v in pixels(np.stack([lines.points_cm, rows], axis=1)):
         if np.isfinite(u) and np.isfinite(v) and abs(u) < 9999 and abs(v) < 9999:

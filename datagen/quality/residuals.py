@@ -131,16 +131,14 @@ def _along(line_cm: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, "m 2"],
     step = np.diff(line_cm, axis=0)
     length = np.linalg.norm(step, axis=1)
     good = np.isfinite(length) & (length > 1e-9)
-    places, across = [np.empty((0, 2))], [np.empty((0, 2))]
+    start, length = line_cm[:-1][good], length[good]
+    ahead = step[good] / length[:, None]
     # The spacing continues from one segment to the next, so that short segments get their share of samples.
-    offset = 0.0
-    for k in np.flatnonzero(good):
-        s = np.arange(offset, length[k], _STEP_CM)
-        offset = (s[-1] + _STEP_CM if s.size else offset) - length[k]
-        direction = step[k] / length[k]
-        places.append(line_cm[k] + s[:, None] * direction)
-        across.append(np.tile([direction[1], -direction[0]], (len(s), 1)))
-    at, right = np.concatenate(places), np.concatenate(across)
+    ends = np.cumsum(length)
+    s = np.arange(0.0, length.sum(), _STEP_CM)
+    k = np.minimum(np.searchsorted(ends, s, side="right"), len(ends) - 1)
+    at = start[k] + (s - (ends - length)[k])[:, None] * ahead[k]
+    right = np.stack([ahead[k, 1], -ahead[k, 0]], axis=1)
     inside = (at[:, 1] >= BANDS_CM[0]) & (at[:, 1] < BANDS_CM[-1])
     return at[inside], right[inside]
 

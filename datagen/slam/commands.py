@@ -71,10 +71,7 @@ def commanded_motion(
     typical = max(typical_s, 1e-6)
     # The frames of a stop were left out: in the long step over it the car has driven for about one frame.
     step_s = np.where(step_s > _LONGEST_STEP * typical, typical, step_s)
-    if speed_cm_s is not None:
-        distance, known = speed_cm_s * step_s, True
-    else:
-        distance, known = step_s / typical, False
+    distance = step_s / typical if speed_cm_s is None else speed_cm_s * step_s
     turn = None
     if steering_rad is not None:
         turn = np.tan(steering_rad) / wheelbase_cm
@@ -84,7 +81,7 @@ def commanded_motion(
     elif yaw_rate_rad_s is not None and speed_cm_s is not None:
         moving = np.abs(speed_cm_s) >= _MOVING_CM_S
         turn = np.where(moving, yaw_rate_rad_s / np.where(moving, speed_cm_s, 1.0), 0.0)
-    return CommandedMotion(distance, known, turn)
+    return CommandedMotion(distance, speed_cm_s is not None, turn)
 
 
 def joined_commands(parts: Sequence[CommandedMotion]) -> CommandedMotion:

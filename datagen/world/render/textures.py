@@ -52,7 +52,7 @@ def floor_pattern(kind: FloorKind, scale_cm: float, stretch: float, rng: np.rand
     """
     base = noise(scale_cm, stretch, rng)
     if kind == "asphalt":
-        base = 0.6 * base + 1.6 * _specks(rng) + _cracks(int(rng.integers(0, 5)), 0.5, -4.0, rng)
+        base = 0.6 * base + 1.6 * _specks(rng) + _cracks(int(rng.integers(0, 5)), -4.0, rng)
     elif kind == "wood":
         base = 0.7 * base + _planks(rng)
     elif kind == "tile":
@@ -77,7 +77,7 @@ def stains(rng: np.random.Generator) -> Cells:
 
 def cracks(rng: np.random.Generator) -> Cells:
     """Draw a few cracks that wander over the floor: 1 inside, 0 outside."""
-    return np.minimum(_cracks(int(rng.integers(1, 6)), 0.5, 1.0, rng), 1.0)
+    return np.minimum(_cracks(int(rng.integers(1, 6)), 1.0, rng), 1.0)
 
 
 def level_starts() -> Int[np.ndarray, "starts"]:
@@ -105,17 +105,22 @@ def _specks(rng: np.random.Generator) -> Cells:
     return np.asarray(np.where(np.abs(cells) > 1.8, np.sign(cells) * 2.0, 0.2 * cells))
 
 
-def _cracks(count: int, width: float, level: float, rng: np.random.Generator) -> Cells:
+def _cracks(count: int, level: float, rng: np.random.Generator) -> Cells:
     """Thin lines that wander over the floor and fork."""
     cells = np.zeros((_CELLS, _CELLS), np.float32)
     for _ in range(count):
         steps = int(rng.integers(60, 200))
         turns = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(rng.normal(0.0, 0.22, steps))
-        path = rng.uniform(0.0, _CELLS, 2) + np.cumsum(
-            3.0 * np.stack([np.cos(turns), np.sin(turns)], axis=1), axis=0
-        )
-        _wrapped_line(cells, path, level, 1 + int(width))
+        _wrapped_line(cells, _wander(turns, 3.0, rng), level, 1)
     return cells.astype(np.float64)
+
+
+def _wander(
+    turns_rad: Float[np.ndarray, "k"], step: float, rng: np.random.Generator
+) -> Float[np.ndarray, "k 2"]:
+    """A path from a random cell, by steps in the given directions."""
+    steps = step * np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=1)
+    return rng.uniform(0.0, _CELLS, 2) + np.cumsum(steps, axis=0)
 
 
 def _wrapped_line(
@@ -159,10 +164,7 @@ def _wrinkles(rng: np.random.Generator) -> Cells:
     cells = np.zeros((_CELLS, _CELLS), np.float32)
     for _ in range(int(rng.integers(2, 7))):
         angle = rng.uniform(0.0, np.pi)
-        turns = angle + np.cumsum(rng.normal(0.0, 0.04, 60))
-        path = rng.uniform(0.0, _CELLS, 2) + np.cumsum(
-            6.0 * np.stack([np.cos(turns), np.sin(turns)], axis=1), axis=0
-        )
+        path = _wander(angle + np.cumsum(rng.normal(0.0, 0.04, 60)), 6.0, rng)
         _wrapped_line(cells, path, 3.0, 4)
         _wrapped_line(cells, path + 5.0 * np.array([-np.sin(angle), np.cos(angle)]), -3.0, 4)
     # Wrapped, so that the blur of a fold continues at the opposite side.

@@ -45,63 +45,62 @@ _BAR_BESIDE_CM = 2.0
 _BEND_RAD = 0.1
 
 
-class StopLine(Settings):
+class Paint(Settings):
+    """What is painted at a place on the road.
+
+    Attributes:
+        at_cm: Of its middle, along the centre line.
+        colour: Of the paint.
+    """
+
+    at_cm: float = Field(ge=0.0)
+    colour: Colour = "white"
+
+
+class StopLine(Paint):
     """A bar across the driven lane.
 
     Attributes:
-        at_cm: Of its middle, along the centre line.
         thickness_cm: Along the road.
-        colour: Of the paint.
         dashed: A row of squares (give way) instead of a bar.
     """
 
-    at_cm: float = Field(ge=0.0)
     thickness_cm: float = Field(default=4.0, gt=0.0)
-    colour: Colour = "white"
     dashed: bool = False
 
 
-class Zebra(Settings):
+class Zebra(Paint):
     """Bars along the road, over its whole width.
 
     Attributes:
-        at_cm: Of its middle, along the centre line.
         length_cm: Of the bars.
         bar_cm: Width of a bar.
         gap_cm: Between bars.
-        colour: Of the paint.
     """
 
-    at_cm: float = Field(ge=0.0)
     length_cm: float = Field(default=40.0, gt=0.0)
     bar_cm: float = Field(default=4.0, gt=0.0)
     gap_cm: float = Field(default=4.0, gt=0.0)
-    colour: Colour = "white"
 
 
-class Arrow(Settings):
+class Arrow(Paint):
     """An arrow in the middle of the driven lane, made of strips of tape.
 
     Attributes:
-        at_cm: Of its middle, along the centre line.
         direction: Where it points.
         length_cm: Along the road.
         strip_cm: Width of the tape.
-        colour: Of the paint.
     """
 
-    at_cm: float = Field(ge=0.0)
     direction: Literal["straight", "left", "right"] = "straight"
     length_cm: float = Field(default=30.0, gt=0.0)
     strip_cm: float = Field(default=3.0, gt=0.0)
-    colour: Colour = "white"
 
 
-class Junction(Settings):
+class Junction(Paint):
     """A road that meets this one at a right angle; the lines at its mouth are interrupted.
 
     Attributes:
-        at_cm: Of its middle, along the centre line.
         sides: Where it leads to: one side (a T) or both (a cross).
         width_cm: Of the side road, between its lines.
         corner_radius_cm: Of the curve from line to line.
@@ -109,10 +108,8 @@ class Junction(Settings):
         stop: Bars at the ends of the side road.
         stop_colour: Of the bars; None: that of the paint.
         middle_colour: Of the dashes between the lanes of the side road; None: that of the paint.
-        colour: Of the paint.
     """
 
-    at_cm: float = Field(ge=0.0)
     sides: Literal["left", "right", "both"] = "right"
     width_cm: float = Field(default=40.0, gt=0.0)
     corner_radius_cm: float = Field(default=15.0, gt=0.0)
@@ -120,27 +117,22 @@ class Junction(Settings):
     stop: bool = True
     stop_colour: Colour | None = None
     middle_colour: Colour | None = None
-    colour: Colour = "white"
 
 
-class Parking(Settings):
+class Parking(Paint):
     """Parking bays beside the road.
 
     Attributes:
-        at_cm: Of the middle of the row, along the centre line.
         side: Of the road.
         bays: How many.
         bay_cm: Length of a bay along the road.
         depth_cm: Across.
-        colour: Of the paint.
     """
 
-    at_cm: float = Field(ge=0.0)
     side: Side = "right"
     bays: int = Field(default=3, ge=1, le=50)
     bay_cm: float = Field(default=60.0, gt=0.0)
     depth_cm: float = Field(default=30.0, gt=0.0)
-    colour: Colour = "white"
 
 
 class Furniture(OneOf):

@@ -113,7 +113,7 @@ def test_a_departure_is_an_event_and_ends_inside():
     assert out == [False, True, True, True, True, True, False, True, False]
     assert counter.count == 2
     counter.update(np.array([30.0]))
-    counter.put_back()
+    counter.over = False  # put back
     assert not counter.update(np.array([0.0])) and counter.count == 3
 
 
