@@ -58,7 +58,7 @@ STATISTICS: dict[str, tuple[str, str]] = {
     "grain": ("", "standard deviation of the finest pattern and noise, grey levels"),
 }
 #: Statistics that are the median, or the mean, over a drive's frames.
-_MEDIANS = ("points", "direction_entropy", "along_share", "edge_slope", "edge_blur_px", "brightness", "grain")
+_MEDIANS = ("direction_entropy", "along_share", "edge_slope", "edge_blur_px", "brightness", "grain")
 _MEANS = ("long_runs", "short_runs", "specks")
 #: Of directions: 10 degrees each.
 _BINS = 18
@@ -275,6 +275,7 @@ def drive_statistics(frames: Sequence[FrameFigures]) -> dict[str, float]:
         change = 100.0 * points.std() / points.mean()
     run_px, run_p90_px = np.quantile(lengths, [0.5, 0.9]) if lengths.size else (np.nan, np.nan)
     values = {
+        "points": np.median(points),
         "points_change": change,
         **dict(zip(("points_near", "points_middle", "points_far"), shares, strict=True)),
         **{name: np.mean([getattr(frame, name) for frame in frames]) for name in _MEANS},
