@@ -15,9 +15,9 @@ from lanenet.calibration.lens import (
     N_INTRINSIC,
     camera_of_lens,
     moved_points,
-    plane_points,
     pose_of_plane,
     project_points,
+    standard_deviations,
 )
 from lanenet.geometry.camera import CameraModel
 
@@ -164,9 +164,7 @@ def view_residuals(
     views: Sequence[BoardView],
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Return measured minus projected corners of each view, [px]."""
-    moved = [
-        moved_points(pose, plane_points(view.points_cm))[0] for pose, view in zip(poses, views, strict=True)
-    ]
+    moved = [moved_points(pose, view.points_cm)[0] for pose, view in zip(poses, views, strict=True)]
     # One call for all views: the call costs more than the arithmetic.
     pixels = project_points(model, lens, np.concatenate(moved))[0]
     ends = np.cumsum([len(points) for points in moved])[:-1]
@@ -197,8 +195,7 @@ def refine(
     from scipy.optimize import least_squares
 
     n_free = int(np.count_nonzero(free))
-    solids = [plane_points(view.points_cm) for view in views]
-    ends = 2 * np.cumsum([len(solid) for solid in solids])
+    ends = 2 * np.cumsum([len(view.points_cm) for view in views])
 
     def unpack(x: Float[np.ndarray, "x"]) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "v 6"]]:
         full = lens.copy()
@@ -212,7 +209,7 @@ def refine(
     def jacobian(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r x"]:
         full, moved = unpack(x)
         matrix = np.zeros((int(ends[-1]), len(x)))
-        boards = [moved_points(pose, solid) for pose, solid in zip(moved, solids, strict=True)]
+        boards = [moved_points(pose, view.points_cm) for pose, view in zip(moved, views, strict=True)]
         _, by_point, by_lens = project_points(model, full, np.concatenate([points for points, _ in boards]))
         by_pose = by_point @ np.concatenate([derivatives for _, derivatives in boards])
         matrix[:, :n_free] = by_lens[:, :, free].reshape(-1, n_free)
@@ -231,32 +228,14 @@ def refine(
     )
     full, moved = unpack(result.x)
     errors = view_residuals(model, full, moved, views)
+    sigma = np.zeros(len(free))
+    sigma[free] = standard_deviations(jacobian(result.x), np.concatenate(errors).ravel())[:n_free]
     return LensFit(
         model=model,
         lens=full,
         free=free,
         poses=moved,
         residuals_px=errors,
-        lens_sigma=_lens_sigma(jacobian(result.x), np.concatenate(errors).ravel(), free, n_free),
+        lens_sigma=sigma,
         robust_cost=2.0 * float(result.cost),
     )
-
-
-def _lens_sigma(
-    jacobian: Float[np.ndarray, "r x"],
-    errors_px: Float[np.ndarray, "r"],
-    free: Bool[np.ndarray, "p"],
-    n_free: int,
-) -> Float[np.ndarray, "p"]:
-    """Standard deviations of the lens while the poses are unknown too; infinite where undetermined."""
-    # Residuals below a twentieth of a pixel come from luck or a rendered board.
-    spread = max(float(np.sqrt(np.sum(errors_px**2) / max(len(errors_px) - jacobian.shape[1], 1))), 0.05)
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-    _, singular, rows = np.linalg.svd(jacobian / scale, full_matrices=False)
-    sigma = np.zeros(len(free))
-    with np.errstate(divide="ignore"):
-        inverse = np.where(singular > 1e-12 * singular[0], 1.0 / singular, np.inf)
-    with np.errstate(invalid="ignore"):
-        variance = np.nansum((rows[:, :n_free] * inverse[:, None]) ** 2, axis=0)
-    sigma[free] = spread * np.sqrt(variance) / scale[:n_free]
-    return sigma

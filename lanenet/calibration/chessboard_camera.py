@@ -22,7 +22,6 @@ from lanenet.calibration.lens import (
     N_INTRINSIC,
     camera_of_lens,
     moved_points,
-    plane_points,
     project_points,
     rotation_from_vector,
 )
@@ -112,8 +111,7 @@ def calibrate_lens(
             of them contradict each other, they are of two lenses, the model asked for is far worse than the
             other, or the lens that fits best is not one that can exist.
     """
-    dropped: dict[str, str] = {}
-    kept = usable_views(views, dropped)
+    kept, dropped = usable_views(views)
     check_count(kept, dropped)
     # Both models are fitted even if one is asked for: only a comparison shows that it was the wrong one.
     fits, reasons = first_fits(kept, progress)
@@ -223,7 +221,7 @@ def view_errors_px(result: ChessboardCalibration) -> dict[str, float]:
 def reprojected(result: ChessboardCalibration, index: int) -> Float[np.ndarray, "n 2"]:
     """Project the corners of a used view with the lens found, [px]."""
     view, pose = result.views[index], result.fit.poses[index]
-    points_cm = moved_points(pose, plane_points(view.points_cm))[0]
+    points_cm = moved_points(pose, view.points_cm)[0]
     return project_points(result.fit.model, result.fit.lens, points_cm)[0]
 
 
@@ -365,10 +363,7 @@ def check_wanted_model(
 def angles_rad(fit: LensFit, views: Sequence[BoardView]) -> Float[np.ndarray, "n"]:
     """Angle of each corner from the optical axis."""
     points = np.concatenate(
-        [
-            moved_points(pose, plane_points(view.points_cm))[0]
-            for pose, view in zip(fit.poses, views, strict=True)
-        ]
+        [moved_points(pose, view.points_cm)[0] for pose, view in zip(fit.poses, views, strict=True)]
     )
     return np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
 

@@ -18,10 +18,10 @@ from lanenet.calibration.lens import (
     N_DISTORTION,
     mounting_from_pose,
     moved_points,
-    plane_points,
     pose_of_plane,
     project_points,
     rotation_from_vector,
+    standard_deviations,
 )
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera, Mounting
@@ -185,17 +185,12 @@ def _sigma(
     for name in names:
         value, step = getattr(camera.mounting, name), 1e-4
         ends = [camera.with_mounting(**{name: value + s}).project_ground(points_cm) for s in (step, -step)]
-        columns.append(np.einsum("nij,nj->ni", weights, ends[0] - ends[1]).ravel() / (2.0 * step))
+        columns.append(_weighted(ends[0] - ends[1], weights).ravel() / (2.0 * step))
     jacobian = np.stack(columns, axis=1)
     if not np.isfinite(jacobian).all():
         return dict.fromkeys(names, float("inf"))
-    freedom = max(jacobian.shape[0] - jacobian.shape[1], 1)
-    weighted = np.einsum("nij,nj->ni", weights, residuals_px)
-    spread = max(float(np.sqrt(np.sum(weighted**2) / freedom)), 0.05)
-    sizes = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-    _, singular, rows = np.linalg.svd(jacobian / sizes, full_matrices=False)
-    variance = np.sum((rows / np.maximum(singular, 1e-12)[:, None]) ** 2, axis=0)
-    return dict(zip(names, (spread * np.sqrt(variance) / sizes).tolist(), strict=True))
+    sigma = standard_deviations(jacobian, _weighted(residuals_px, weights).ravel())
+    return dict(zip(names, sigma.tolist(), strict=True))
 
 
 def _check_answer(answer: GroundCalibration) -> None:
@@ -358,17 +353,14 @@ def pixel_residuals(
     pixels_px: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n 2"]:
     """Return measured minus projected pixels."""
-    return (
-        pixels_px
-        - project_points(camera.model, _lens(camera), moved_points(pose, plane_points(points_cm))[0])[0]
-    )
+    return pixels_px - project_points(camera.model, _lens(camera), moved_points(pose, points_cm)[0])[0]
 
 
 def residual_weights(
     camera: Camera, pose: Float[np.ndarray, "6"], points_cm: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2 2"]:
     """Return the matrices that turn residuals into ones of equal spread, that of a clicked pixel."""
-    moved = moved_points(pose, plane_points(points_cm))[0]
+    moved = moved_points(pose, points_cm)[0]
     by_ground = project_points(camera.model, _lens(camera), moved)[1] @ rotation_from_vector(pose[:3])[:, :2]
     ground_sigma_cm = _GROUND_SIGMA_SHARE * float(np.linalg.norm(np.ptp(points_cm, axis=0)))
     # Close to the lens the derivative has no bound; a finite weight is enough.
@@ -393,7 +385,7 @@ def _starts(
         pose = pose_of_plane(points_cm[list(chosen)], rays[list(chosen)])
         if pose is None:
             continue
-        moved = moved_points(pose, plane_points(points_cm))[0]
+        moved = moved_points(pose, points_cm)[0]
         directions = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
         angles = np.linalg.norm(np.cross(directions, rays), axis=1) + (
             np.sum(directions * rays, axis=1) < 0.0
@@ -413,10 +405,10 @@ def _refined(
 ) -> tuple[Float[np.ndarray, "6"], float]:
     from scipy.optimize import least_squares
 
-    lens, solid = _lens(camera), plane_points(points_cm[used])
+    lens = _lens(camera)
 
     def jacobian(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
-        points, by_pose = moved_points(pose, solid)
+        points, by_pose = moved_points(pose, points_cm[used])
         return (weights[used] @ project_points(camera.model, lens, points)[1] @ by_pose).reshape(-1, 6)
 
     def residuals(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m"]:

@@ -12,14 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.camera import (
-    Camera,
-    CameraModel,
-    Mounting,
-    distort_pinhole,
-    fisheye_radius,
-    fisheye_slope,
-)
+from lanenet.geometry.camera import Camera, CameraModel, Mounting, fisheye_radius, fisheye_slope
 
 #: Numbers in D.
 N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}
@@ -28,6 +21,7 @@ N_INTRINSIC = 4
 NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM = 20.0, 26.0
 #: Closer to the axis than this, the azimuth of a ray is rounding error.
 _NEAR_AXIS = 1e-9
+_NO_MOVE = np.zeros(3)
 #: A homography has eight numbers, a point gives two.
 _MIN_POINTS = 4
 
@@ -74,22 +68,25 @@ def project_points(
         Pixels, [px]; their derivatives by the points; their derivatives by the lens.
 
     Source:
-        Kannala and Brandt 2006, eq. 6 with four terms (fisheye); Brown-Conrady (pinhole), both as in OpenCV.
-        Derivatives: own derivation, checked against differences.
+        Kannala and Brandt 2006, eq. 6 with four terms (fisheye), as in OpenCV, whose own function ends at 90
+        degrees; derivatives: own derivation, checked against differences. Brown-Conrady (pinhole): OpenCV.
     """
-    if model == "fisheye":
-        flat, d_points, d_distortion = _fisheye(points, lens[N_INTRINSIC:])
-    else:
-        flat, d_points, d_distortion = _pinhole(points, lens[N_INTRINSIC:])
+    if model == "pinhole":
+        # A point at or behind the lens has no image; a least depth keeps the solver's function finite.
+        ahead = points.clip([-np.inf, -np.inf, 1e-3], np.inf)
+        fx, fy, cx, cy = lens[:N_INTRINSIC]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        found, by_all = cv2.projectPoints(ahead, _NO_MOVE, _NO_MOVE, matrix, lens[N_INTRINSIC:])
+        # OpenCV's columns: rotation, translation (as the points), fx, fy, cx, cy, D.
+        columns = np.asarray(by_all).reshape(len(points), 2, -1)
+        return np.asarray(found).reshape(-1, 2), columns[:, :, 3:6], columns[:, :, 6 : 6 + len(lens)]
+    flat, d_points, d_distortion = _fisheye(points, lens[N_INTRINSIC:])
     focal = lens[:2]
-    pixels = flat * focal + lens[2:4]
     by_lens = np.zeros((len(points), 2, len(lens)))
-    by_lens[:, 0, 0] = flat[:, 0]
-    by_lens[:, 1, 1] = flat[:, 1]
-    by_lens[:, 0, 2] = 1.0
-    by_lens[:, 1, 3] = 1.0
+    by_lens[:, [0, 1], [0, 1]] = flat
+    by_lens[:, [0, 1], [2, 3]] = 1.0
     by_lens[:, :, N_INTRINSIC:] = d_distortion * focal[:, None]
-    return pixels, d_points * focal[:, None], by_lens
+    return flat * focal + lens[2:4], d_points * focal[:, None], by_lens
 
 
 def _fisheye(
@@ -113,39 +110,6 @@ def _fisheye(
     return azimuth * radius[:, None], d_points, azimuth[:, :, None] * powers[:, None, :]
 
 
-def _pinhole(
-    points: Float[np.ndarray, "n 3"], D: Float[np.ndarray, "5"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 5"]]:
-    k1, k2, p1, p2, k3 = D
-    # A point at or behind the lens has no image; a least depth keeps the solver's function finite.
-    depth = np.maximum(points[:, 2], 1e-3)
-    x, y = points[:, 0] / depth, points[:, 1] / depth
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    d_radial = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
-    flat = distort_pinhole(np.stack([x, y], axis=1), D)
-    cross = 2.0 * x * y * d_radial + 2.0 * p1 * x + 2.0 * p2 * y
-    xx = radial + 2.0 * x * x * d_radial + 2.0 * p1 * y + 6.0 * p2 * x
-    yy = radial + 2.0 * y * y * d_radial + 6.0 * p1 * y + 2.0 * p2 * x
-    by_flat = np.stack([np.stack([xx, cross], axis=1), np.stack([cross, yy], axis=1)], axis=1)
-    zero, inverse = np.zeros_like(x), 1.0 / depth
-    flat_by_point = np.stack(
-        [
-            np.stack([inverse, zero, -x * inverse], axis=1),
-            np.stack([zero, inverse, -y * inverse], axis=1),
-        ],
-        axis=1,
-    )
-    by_distortion = np.stack(
-        [
-            np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1),
-            np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1),
-        ],
-        axis=1,
-    )
-    return flat, by_flat @ flat_by_point, by_distortion
-
-
 def rotation_from_vector(vector_rad: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation about ``vector_rad`` by its length, [rad]."""
     return np.asarray(cv2.Rodrigues(vector_rad)[0])
@@ -157,20 +121,38 @@ def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray
 
 
 def moved_points(
-    pose: Float[np.ndarray, "6"], points: Float[np.ndarray, "n 3"]
+    pose: Float[np.ndarray, "6"], points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 6"]]:
-    """Move points by a pose (rotation vector, translation), with the derivatives by the pose."""
+    """Move points of a plane, a board or the ground, by its pose (rotation vector, translation).
+
+    Args:
+        pose: Of the plane, [rad], [cm], frame camera.
+        points: Points of the plane, whose z is 0.
+
+    Returns:
+        The points in the camera frame, and their derivatives by the pose.
+    """
     rotation, by_vector = cv2.Rodrigues(pose[:3])
     derivatives = np.empty((len(points), 3, 6))
     # OpenCV's derivative has a row per component of the vector and a column per entry of the matrix.
-    derivatives[:, :, :3] = np.einsum("kij,nj->nik", np.asarray(by_vector).reshape(3, 3, 3), points)
+    derivatives[:, :, :3] = np.einsum("kij,nj->nik", np.asarray(by_vector).reshape(3, 3, 3)[..., :2], points)
     derivatives[:, :, 3:] = np.eye(3)
-    return points @ rotation.T + pose[3:], derivatives
+    return points @ rotation[:, :2].T + pose[3:], derivatives
 
 
-def plane_points(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Return points of a board or of the ground with their z, which is 0."""
-    return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+def standard_deviations(
+    jacobian: Float[np.ndarray, "r p"], residuals: Float[np.ndarray, "r"]
+) -> Float[np.ndarray, "p"]:
+    """Return those of the parameters of a fit, from its residuals' spread; infinite where undetermined."""
+    # Residuals below a twentieth of a pixel come from luck or a rendered board.
+    freedom = max(jacobian.shape[0] - jacobian.shape[1], 1)
+    spread = max(float(np.sqrt(np.sum(residuals**2) / freedom)), 0.05)
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+    _, singular, rows = np.linalg.svd(jacobian / scale, full_matrices=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(singular > 1e-12 * singular[0], 1.0 / singular, np.inf)
+        variance = np.nansum((rows * inverse[:, None]) ** 2, axis=0)
+    return np.asarray(spread * np.sqrt(variance) / scale)
 
 
 def pose_of_plane(
@@ -201,11 +183,8 @@ def pose_of_plane(
     if size <= 0.0:
         return None
     flat = np.concatenate([(points - centre) / size, np.ones((len(points), 1))], axis=1)
-    crosses = np.zeros((len(rays), 3, 3))
-    x, y, z = rays.T
-    crosses[:, 0, 1], crosses[:, 0, 2] = -z, y
-    crosses[:, 1, 0], crosses[:, 1, 2] = z, -x
-    crosses[:, 2, 0], crosses[:, 2, 1] = -y, x
+    # A ray's cross product with each axis, as columns: times a vector, the cross product with that.
+    crosses = np.cross(rays[:, None], np.eye(3)).transpose(0, 2, 1)
     system = np.einsum("nij,nk->nijk", crosses, flat).reshape(-1, 9)
     _, singular, rows = np.linalg.svd(system, full_matrices=False)
     if len(singular) < 9 or singular[7] < 1e-9 * singular[0]:

@@ -42,7 +42,7 @@ def plane_picture(
     rows = int(np.clip(round((far - near) * scale), 8, _MAX_SIDE_PX))
     v, u = np.mgrid[:rows, :columns].astype(np.float64)
     x, y = left + (u + 0.5) / scale, far - (v + 0.5) / scale
-    plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    plane = np.stack([x.ravel(), y.ravel()], axis=1)
     image = View.of_rays(camera, moved_points(pose, plane)[0], rows, columns).of(frame_bgr)
     _draw_grid(image, area_cm, scale)
     return image

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from lanenet.calibration.bundle import LensFit, neighbour_correlation
 from lanenet.calibration.chessboard import BoardView
-from lanenet.calibration.lens import moved_points, plane_points, project_points
+from lanenet.calibration.lens import moved_points, project_points
 from lanenet.errors import CalibrationError
 
 #: Fewest views. Zhang 2000 needs 3 for the focal lengths and centre alone; chosen: two more for the
@@ -49,31 +50,37 @@ _BEST_CUT = float(-np.log(1.0 - 2.0 / np.pi))
 BAD_VIEW_RATIO = 3.5
 
 
-def usable_views(views: Sequence[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    """Return the complete views of the size that most have, each place of the board once.
+def usable_views(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
+    """Choose the complete views of the size that most have, each place of the board once.
 
     Args:
         views: Views of one camera.
-        dropped: Receives the name of each other view, with the reason.
+
+    Returns:
+        The chosen views, and the name of each other one with the reason.
 
     Raises:
         CalibrationError: If most views number their corners for a board that lies across.
     """
-    return _distinct(_of_one_size(_in_rows(_finite(views, dropped), dropped), dropped), dropped)
+    dropped: dict[str, str] = {}
+    kept = list(views)
+    for find in (_incomplete, _turned, _of_other_size, _repeated):
+        found = find(kept)
+        kept = [view for view in kept if view.name not in found]
+        dropped |= found
+    return kept, dropped
 
 
-def _finite(views: Sequence[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    kept = []
-    for view in views:
-        if np.isfinite(view.corners_px).all() and len(view.corners_px) == len(view.points_cm) >= 9:
-            kept.append(view)
-        else:
-            dropped[view.name] = "its corners are incomplete"
-    return kept
+def _incomplete(views: list[BoardView]) -> dict[str, str]:
+    return {
+        view.name: "its corners are incomplete"
+        for view in views
+        if not np.isfinite(view.corners_px).all() or not len(view.corners_px) == len(view.points_cm) >= 9
+    }
 
 
-def _in_rows(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    """Views whose corners come row by row, as the board's points do."""
+def _turned(views: list[BoardView]) -> dict[str, str]:
+    """Views whose corners do not come row by row, as the board's points do."""
     turned: dict[str, str] = {}
     for view in views:
         columns, rows = (len(np.unique(view.points_cm[:, axis].round(6))) for axis in (0, 1))
@@ -88,8 +95,7 @@ def _in_rows(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]
             f"the views do not fit one board: the corners of {len(turned)} of {len(views)} views, {name} "
             f"among them, {what} (columns x rows)"
         )
-    dropped.update({name: f"its corners {what}" for name, what in turned.items()})
-    return [view for view in views if view.name not in turned]
+    return {name: f"its corners {what}" for name, what in turned.items()}
 
 
 def _grid_length(corners_px: Float[np.ndarray, "n 2"], rows: int, columns: int) -> float:
@@ -99,30 +105,24 @@ def _grid_length(corners_px: Float[np.ndarray, "n 2"], rows: int, columns: int) 
     return float(sum(step.sum() for step in steps))
 
 
-def _of_one_size(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    sizes = Counter((view.width, view.height) for view in views)
-    if not sizes:
-        return []
-    width, height = sizes.most_common(1)[0][0]
-    for view in views:
-        if (view.width, view.height) != (width, height):
-            dropped[view.name] = f"{view.width}x{view.height} px, most images have {width}x{height}"
-    return [view for view in views if (view.width, view.height) == (width, height)]
+def _of_other_size(views: list[BoardView]) -> dict[str, str]:
+    sizes = Counter(f"{view.width}x{view.height}" for view in views)
+    usual = sizes.most_common(1)[0][0] if sizes else ""
+    return {
+        view.name: f"{size} px, most images have {usual}"
+        for view in views
+        if (size := f"{view.width}x{view.height}") != usual
+    }
 
 
-def _distinct(views: list[BoardView], dropped: dict[str, str]) -> list[BoardView]:
-    kept: list[BoardView] = []
-    for view in views:
-        limit = _SAME_VIEW * np.hypot(view.width, view.height)
-        for other in kept:
-            if view.corners_px.shape == other.corners_px.shape:
-                shift = np.abs(view.corners_px - other.corners_px).max()
-                if shift < limit:
-                    dropped[view.name] = f"shows the board where {other.name} does"
-                    break
-        else:
-            kept.append(view)
-    return kept
+def _repeated(views: list[BoardView]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for first, second in combinations(views, 2):
+        if first.name not in found and first.corners_px.shape == second.corners_px.shape:
+            shift = np.abs(first.corners_px - second.corners_px).max()
+            if shift < _SAME_VIEW * np.hypot(second.width, second.height):
+                found.setdefault(second.name, f"shows the board where {first.name} does")
+    return found
 
 
 def check_count(views: Sequence[BoardView], dropped: dict[str, str]) -> None:
@@ -196,15 +196,14 @@ def focal_scales(fit: LensFit, views: Sequence[BoardView]) -> FocalScales | None
         Gauss-Newton with soft-L1 weights; a view's focal length scales its pixels about the principal point.
     """
     n_lens, n_views = int(fit.free.sum()), len(views)
-    solids = [plane_points(view.points_cm) for view in views]
     measured = np.concatenate([view.corners_px for view in views])
-    owner = np.repeat(np.arange(n_views), [len(solid) for solid in solids])
+    owner = np.repeat(np.arange(n_views), [len(view.points_cm) for view in views])
     lens, poses, log_scale = fit.lens.copy(), fit.poses.copy(), np.zeros(n_views)
     spread = max(fit.rms_px / np.sqrt(2.0), _LEAST_SIGMA_PX)
     first_scale = n_lens + 6 * n_views
     errors, inverse = np.zeros_like(measured), np.zeros((0, 0))
     for step in range(_STEPS + 1):
-        boards = [moved_points(pose, solid) for pose, solid in zip(poses, solids, strict=True)]
+        boards = [moved_points(pose, view.points_cm) for pose, view in zip(poses, views, strict=True)]
         pixels, by_point, by_lens = project_points(fit.model, lens, np.concatenate([b for b, _ in boards]))
         ratio = np.exp(log_scale)[owner]
         offset = (pixels - lens[2:4]) * ratio[:, None]

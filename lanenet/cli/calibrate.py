@@ -143,6 +143,7 @@ def ground(
 
     from lanenet.calibration.chessboard import read_picture
     from lanenet.calibration.ground import calibrate_ground
+    from lanenet.calibration.pictures import points_picture
     from lanenet.data.camera_file import write_camera
 
     check_ending(out, ".yaml", ".yml")
@@ -171,7 +172,10 @@ def ground(
         {**_figures(camera), **result.residuals},
         datetime.date.today().isoformat(),
     )
-    pictures = [] if frame is None else _ground_pictures(out, frame, result, pixels_px)
+    pictures = []
+    if frame is not None:
+        marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
+        pictures = _road_pictures(out, result.camera, [marked], [frame])
     _show_mounting(result, points_cm, pixels_px)
     console.show_problems([] if image else ["without a photo there are no pictures; give --image"])
     console.wrote(out, *pictures)
@@ -227,7 +231,8 @@ def drive_(
         )
     today = datetime.date.today().isoformat()
     write_camera(out, result.camera, result.method, result.residuals, today)
-    pictures = _drive_pictures(out, result)
+    frames = [result.drive.image(k) for k in result.shown]
+    pictures = _road_pictures(out, result.camera, frames, frames, _SMALL_PX_PER_CM)
     _show_drive(result)
     console.show_problems([*notes, *result.notes, *note])
     console.wrote(out, *pictures)
@@ -301,32 +306,17 @@ def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
     ]
 
 
-def _ground_pictures(
-    out: Path, frame: np.ndarray, result: GroundCalibration, pixels_px: np.ndarray
+def _road_pictures(
+    out: Path, camera: Camera, marked: list[np.ndarray], frames: list[np.ndarray], scale: float | None = None
 ) -> list[Path]:
-    """Write the photo of the ground undistorted, and from above; returns the paths."""
-    from lanenet.calibration.lens import pose_from_mounting
-    from lanenet.calibration.pictures import plane_picture, points_picture
-    from lanenet.perception.edges.views import undistorting_view
-
-    marked = points_picture(frame, pixels_px, pixels_px - result.residuals_px)
-    pose = pose_from_mounting(result.camera.mounting)
-    return [
-        _write_picture(out, "undistorted", undistorting_view(result.camera).of(marked)),
-        _write_picture(out, "birdseye", plane_picture(frame, result.camera, pose, _AREA_CM)),
-    ]
-
-
-def _drive_pictures(out: Path, result: CalibratedDrive) -> list[Path]:
-    """Write frames of a straight section undistorted, and from above; returns the paths."""
+    """Write frames undistorted, with what is marked in them, and from above; returns the paths."""
     from lanenet.calibration.lens import pose_from_mounting
     from lanenet.calibration.pictures import plane_picture
     from lanenet.perception.edges.views import undistorting_view
 
-    pose = pose_from_mounting(result.camera.mounting)
-    frames = [result.drive.image(k) for k in result.shown]
-    flat = [undistorting_view(result.camera).of(frame) for frame in frames]
-    above = [plane_picture(frame, result.camera, pose, _AREA_CM, _SMALL_PX_PER_CM) for frame in frames]
+    pose = pose_from_mounting(camera.mounting)
+    flat = [undistorting_view(camera).of(frame) for frame in marked]
+    above = [plane_picture(frame, camera, pose, _AREA_CM, scale) for frame in frames]
     return [
         _write_picture(out, "undistorted", np.concatenate(flat, axis=1)),
         _write_picture(out, "birdseye", np.concatenate(above, axis=1)),

@@ -195,8 +195,7 @@ def test_points_past_the_fold_of_a_lens_are_left_out() -> None:
     points = np.concatenate([GRID_CM, [[60.0, -10.0], [90.0, -15.0]]])
     seen_before = np.isfinite(camera.project_ground(points)).all(axis=1)
     assert seen_before.tolist() == [True] * len(GRID_CM) + [False] * 2
-    solid = np.column_stack([points, np.zeros(len(points))])
-    rays = moved_points(pose_from_mounting(camera.mounting), solid)[0]
+    rays = moved_points(pose_from_mounting(camera.mounting), points)[0]
     pixels = project_points("fisheye", np.array([180.0, 180.0, 319.5, 239.5, *camera.D]), rays)[0]
     found = calibrate_ground(lens_only(camera), points, pixels)
     assert (found.used == seen_before).all() and (found.behind == ~seen_before).all()

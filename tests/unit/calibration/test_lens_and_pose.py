@@ -54,12 +54,14 @@ def test_derivatives_are_those_of_differences(model: CameraModel) -> None:
 @pytest.mark.parametrize("vector", [[0.3, -0.2, 1.1], [0.0, 0.0, 0.0], [3.0, 0.1, 0.0]])
 def test_a_pose_and_its_derivatives(vector: list[float]) -> None:
     pose, step = np.array([*vector, 1.0, 2.0, 3.0]), 1e-6
-    moved, by_pose = moved_points(pose, POINTS)
-    np.testing.assert_allclose(moved, POINTS @ rotation_from_vector(pose[:3]).T + pose[3:], atol=1e-12)
+    plane = POINTS[:, :2]
+    moved, by_pose = moved_points(pose, plane)
+    axes = rotation_from_vector(pose[:3])[:, :2]
+    np.testing.assert_allclose(moved, plane @ axes.T + pose[3:], atol=1e-12)
     np.testing.assert_allclose(vector_from_rotation(rotation_from_vector(pose[:3])), vector, atol=1e-9)
     for k in range(6):
         move = step * np.eye(6)[k]
-        difference = moved_points(pose + move, POINTS)[0] - moved_points(pose - move, POINTS)[0]
+        difference = moved_points(pose + move, plane)[0] - moved_points(pose - move, plane)[0]
         np.testing.assert_allclose(by_pose[:, :, k], difference / (2 * step), atol=1e-5)
 
 
@@ -84,7 +86,7 @@ def test_a_plane_is_found_from_its_rays(height: float, pitch: float, roll: float
     rays = (solid - mounting.position_car_cm) @ mounting.camera_from_car.T
     pose = pose_of_plane(points, rays / np.linalg.norm(rays, axis=1, keepdims=True))
     assert pose is not None
-    np.testing.assert_allclose(moved_points(pose, solid)[0], rays, atol=1e-6)
+    np.testing.assert_allclose(moved_points(pose, points)[0], rays, atol=1e-6)
 
 
 def test_points_on_a_line_are_no_plane() -> None:
