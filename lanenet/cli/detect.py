@@ -13,7 +13,6 @@ from lanenet.cli.shared.options import (
     AnyCameraOption,
     MarkingOption,
     ModelOption,
-    check_ending,
     check_not_source,
 )
 from lanenet.errors import CalibrationError, ConfigError
@@ -88,7 +87,6 @@ def detect(
     from lanenet.data.drives.sources import open_source
     from lanenet.evaluation.detect import run_detector
 
-    check_ending(out, ".parquet", ".csv")
     check_not_source(source, out, video)
     check_table_path(out)
     whole = open_source(source)

@@ -49,10 +49,7 @@ def export(
     else:
         from lanenet.learn.export import export_checkpoint
 
-        done = export_checkpoint(checkpoint, out, check or ())
-        path = done.path
-        typer.echo(
-            f"onnxruntime and PyTorch differ by {done.difference:.1g} cm at most, on {done.rasters} rasters"
-        )
+        path, rasters, difference = export_checkpoint(checkpoint, out, check or ())
+        typer.echo(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
         console.wrote(path)
     console.next_command("bench", "--model", path)

@@ -74,7 +74,7 @@ def val(
     network no MODEL is needed.
     """
     from datagen.labels.truth import truth_labels
-    from lanenet.data.files import write_bytes, write_json, write_text
+    from lanenet.data.files import json_text, write_bytes
     from lanenet.data.label_set import read_labels
     from lanenet.evaluation.answers import Compared
     from lanenet.evaluation.report import report_files
@@ -110,21 +110,13 @@ def val(
     show(comparison)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
-        files = report_files(comparison, seen)
-        write_json(Path(f"{out}.json"), comparison.as_dict())
-        console.wrote(Path(f"{out}.json"))
+        files = {".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
+        if robustness is not None:
+            files |= {"-robust.md": robustness[0], "-robust.json": json_text(robustness[1])}
         for ending, content in files.items():
             path = Path(f"{out}{ending}")
-            if isinstance(content, str):
-                write_text(path, content)
-            else:
-                write_bytes(path, content)
+            write_bytes(path, content.encode() if isinstance(content, str) else content)
             console.wrote(path)
-        if robustness is not None:
-            table, figures = robustness
-            write_text(Path(f"{out}-robust.md"), table)
-            write_json(Path(f"{out}-robust.json"), figures)
-            console.wrote(Path(f"{out}-robust.md"), Path(f"{out}-robust.json"))
         if ".png" not in files:
             console.show_problems(["no plot of the errors without Matplotlib: pip install 'lanenet[viz]'"])
     best = min(comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]

@@ -293,9 +293,7 @@ def _break_down(
     values = {"bend": lane_curvature(truth_cm)}
     for condition in GROUPS:
         if any(condition in source.conditions for source in sources):
-            unknown = [np.full(len(source.truth_cm), np.nan) for source in sources]
-            parts = [s.conditions.get(condition, u) for s, u in zip(sources, unknown, strict=True)]
-            values[condition] = np.concatenate(parts)
+            values[condition] = _joined(sources, [s.conditions.get(condition) for s in sources])
     visible = _joined(sources, [s.visible for s in sources], 2)
     if np.isfinite(visible).any():
         values["lines"] = lines_shown(visible)
@@ -318,10 +316,10 @@ def _break_down(
 
 
 def _joined(
-    sources: Sequence[SourceAnswers], parts: Sequence[np.ndarray | None], width: int
-) -> Float[np.ndarray, "n w"]:
+    sources: Sequence[SourceAnswers], parts: Sequence[np.ndarray | None], *width: int
+) -> Float[np.ndarray, "n *w"]:
     """Concatenate what sources know; NaN for a source that knows nothing."""
-    unknown = [np.full((len(source.truth_cm), width), np.nan) for source in sources]
+    unknown = [np.full((len(source.truth_cm), *width), np.nan) for source in sources]
     return np.concatenate([u if part is None else part for u, part in zip(unknown, parts, strict=True)])
 
 

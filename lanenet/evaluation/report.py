@@ -113,10 +113,8 @@ def plot_errors(comparison: Comparison) -> bytes | None:
             axes.annotate(
                 share, (x, 0.01), xycoords=("data", "axes fraction"), ha="center", fontsize=8, color=f"C{i}"
             )
-    axes.set_yscale("log")
-    axes.set_xlim(-0.5, len(ROWS_CM) - 0.5)
+    axes.set(yscale="log", xlim=(-0.5, len(ROWS_CM) - 0.5), ylabel="error, cm")
     axes.set_xticks(range(len(ROWS_CM)), [f"y = {row:.0f} cm" for row in ROWS_CM])
-    axes.set_ylabel("error, cm")
     axes.set_title(
         f"Against the {comparison.reference}. Quartiles, whiskers at 5 and 95 %; below: points answered",
         fontsize=10,
@@ -166,11 +164,12 @@ def plot_breakdown(comparison: Comparison) -> bytes | None:
         own = comparison.breakdown.sigma.get(name)
         if own is not None:
             coverage.plot(RELIABILITY_SHARES, own.reliability, marker="o", color=f"C{i}", label=name)
-    coverage.set_xlabel("share of the errors that the interval should hold")
-    coverage.set_ylabel("share that lies in it")
+    labels = {
+        "xlabel": "share of the errors that the interval should hold",
+        "ylabel": "share that lies in it",
+    }
+    coverage.set(**labels, xlim=(0.0, 1.0), ylim=(0.0, 1.0))
     coverage.set_title("Above the line: sigma too large; below: too small", fontsize=10)
-    coverage.set_xlim(0.0, 1.0)
-    coverage.set_ylim(0.0, 1.0)
     coverage.grid(True, alpha=0.3)
     coverage.legend(fontsize=8)
     return png_bytes(figure)

@@ -99,13 +99,9 @@ def _check_folder(path: Path) -> None:
 
 def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
     """Open a map folder or a simulated drive."""
-    if (path / "map.yaml").is_file():
-        from lanenet.data.maps.mapped_drive import read_map_frames
+    from lanenet.data.maps.mapped_drive import read_map_frames, read_truth_frames
 
-        return read_map_frames(path, window)
-    from lanenet.data.maps.mapped_drive import read_truth_frames
-
-    return read_truth_frames(path, window)
+    return (read_map_frames if (path / "map.yaml").is_file() else read_truth_frames)(path, window)
 
 
 def _as_labelled(frames: LabelledFrames, labels: LabelSet) -> LabelledFrames:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from lanenet.config import dump_settings
-from lanenet.data.files import atomic_file, atomic_folder, write_json, write_text
+from lanenet.data.files import atomic_file, atomic_folder, write_bytes, write_json, write_text
 from lanenet.errors import CheckpointError
 from lanenet.evaluation.errors import presence_stats
 from lanenet.evaluation.report import new_figure, png_bytes
@@ -42,6 +42,9 @@ from lanenet.learn.predict import Answers
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
 from lanenet.samples.dataset import LaneSamples, hash_files
+
+if TYPE_CHECKING:
+    from lanenet.learn.train import TrainingRun
 
 STATE_NAME = "last.pt"
 CURVE_NAME = "curve"
@@ -180,50 +183,36 @@ def read_finished(folder: Path, run_hash: str) -> dict[str, Any] | None:
     return metrics if complete else None
 
 
-@dataclass(frozen=True)
-class FinishedRun:
-    """What a checkpoint is written from.
-
-    Attributes:
-        settings: Of the training.
-        network: Weights of the best epoch.
-        samples: Training frames.
-        val: Validation frames.
-        answers: Of the network on ``val``.
-        history: Training curve.
-        run_hash: Of settings and data.
-    """
-
-    settings: LearnSettings
-    network: LaneNet
-    samples: LaneSamples
-    val: LaneSamples
-    answers: Answers
-    history: Sequence[EpochRecord]
-    run_hash: str
-
-
-def write_checkpoint(folder: Path, run: FinishedRun) -> None:
+def write_checkpoint(
+    folder: Path, run: TrainingRun, network: LaneNet, val: LaneSamples, answers: Answers, run_hash: str
+) -> None:
     """Write the results of a run; the metrics come last and mark it as finished.
+
+    Args:
+        folder: Where to write.
+        run: The training.
+        network: Weights of its best epoch.
+        val: Validation frames.
+        answers: Of the network on them.
+        run_hash: Of settings and data.
 
     Raises:
         CheckpointError: If the exported model does not answer as PyTorch does.
     """
-    settings, network, samples, answers = run.settings, run.network, run.samples, run.answers
-    errors = answers.errors
+    settings, samples, errors = run.settings, run.samples, answers.errors
     meta = ModelMeta(
         window=samples.window,
         camera_hashes=tuple(samples.camera_hashes),
         wheelbase_cm=samples.wheelbase_cm,
         lane_width_cm=samples.lane_width_cm,
-        training_hash=run.run_hash,
+        training_hash=run_hash,
         rmse_cm=errors.point_rmse_cm,
         reference=errors.reference,
         perception=samples.perception,
         lane_width_range_cm=samples.lane_widths_cm,
         takes_width=settings.network.takes_width,
     )
-    rasters = _spread_rasters(run.val, _N_CHECK_RASTERS)
+    rasters = _spread_rasters(val, _N_CHECK_RASTERS)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)
@@ -233,13 +222,13 @@ def write_checkpoint(folder: Path, run: FinishedRun) -> None:
     presence = presence_stats(answers.presence, answers.present)
     metrics: dict[str, Any] = {
         "format": METRICS_FORMAT,
-        "run_hash": run.run_hash,
+        "run_hash": run_hash,
         "units": {"*_cm": "centimetres", "samples_per_s": "training samples per second"},
         "val_rmse_cm": errors.all.rmse_cm,
         "best_epoch": best_record(run.history).epoch,
         "epochs": len(run.history),
         "train_frames": len(samples),
-        "val_frames": len(run.val),
+        "val_frames": len(val),
         "parameters": network.n_parameters,
         "sigma_factors": network.sigma_factor.tolist(),
         "val_presence": None if presence is None else vars(presence),
@@ -274,18 +263,15 @@ def tensorboard_curve(
         return
     from torch.utils.tensorboard import SummaryWriter
 
-    writer = SummaryWriter(str(folder / "tensorboard"), purge_step=first_epoch)
+    with SummaryWriter(str(folder / "tensorboard"), purge_step=first_epoch) as writer:
 
-    def show(record: EpochRecord) -> None:
-        for name, value in vars(record).items():
-            if name != "epoch":
-                writer.add_scalar(name, value, record.epoch)
-        writer.flush()
+        def show(record: EpochRecord) -> None:
+            for name, value in vars(record).items():
+                if name != "epoch":
+                    writer.add_scalar(name, value, record.epoch)
+            writer.flush()
 
-    try:
         yield show
-    finally:
-        writer.close()
 
 
 def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:
@@ -300,13 +286,10 @@ def write_curve(folder: Path, history: Sequence[EpochRecord]) -> None:
     epochs = [record.epoch for record in history]
     axes.plot(epochs, [record.train_rmse_cm for record in history], label="training (augmented)")
     axes.plot(epochs, [record.val_rmse_cm for record in history], label="validation")
-    axes.set_xlabel("epoch")
-    axes.set_ylabel("RMSE of the six points, cm")
-    axes.set_yscale("log")
+    axes.set(xlabel="epoch", ylabel="RMSE of the six points, cm", yscale="log")
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
-    with atomic_file(folder / f"{CURVE_NAME}.png") as temporary:
-        temporary.write_bytes(png_bytes(figure))
+    write_bytes(folder / f"{CURVE_NAME}.png", png_bytes(figure))
 
 
 def _version(package: str) -> str | None:
@@ -344,10 +327,8 @@ def publish(
             if path.is_file() and path.name != STATE_NAME:
                 shutil.copyfile(path, folder / path.name)
         for file_name, content in files.items():
-            if isinstance(content, str):
-                write_text(folder / file_name, content)
-            else:
-                (folder / file_name).write_bytes(content)
+            data = content.encode() if isinstance(content, str) else content
+            (folder / file_name).write_bytes(data)
         if results is not None:
             write_json(folder / "results.json", results)
         marker = {"format": CHECKPOINT_FORMAT, "name": name}

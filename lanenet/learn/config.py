@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -33,7 +33,9 @@ class NetworkSettings(Settings):
     """
 
     kind: str = "small"
-    channels: tuple[int, ...] | None = None
+    channels: tuple[Annotated[int, Field(ge=1, le=512)], ...] | None = Field(
+        default=None, min_length=1, max_length=6
+    )
     hidden: int | None = Field(default=None, ge=4, le=1024)
     bins: int = Field(default=64, ge=0, le=512)
     takes_width: bool = False
@@ -44,13 +46,6 @@ class NetworkSettings(Settings):
     def _no_bins_where_they_cannot_be(cls, data: Any) -> Any:
         trunk = TRUNKS.get(data.get("kind", "small")) if isinstance(data, dict) else None
         return data if trunk is None or "bins" in trunk.uses else {"bins": 0, **data}
-
-    @field_validator("channels")
-    @classmethod
-    def _check_channels(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        if value is not None and (not 1 <= len(value) <= 6 or any(not 1 <= c <= 512 for c in value)):
-            raise ValueError("expected one to six layers of 1 to 512 channels")
-        return value
 
     @field_validator("bins")
     @classmethod

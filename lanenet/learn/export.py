@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from lanenet.config import load_settings, read_yaml
-from lanenet.data.files import atomic_file, write_json
+from lanenet.data.files import atomic_file, write_bytes, write_json
 from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
@@ -102,28 +102,19 @@ def export_onnx(
     return difference
 
 
-@dataclass(frozen=True)
-class Exported:
-    """A file that was checked and written.
-
-    Attributes:
-        path: The file.
-        rasters: Number of rasters of the check.
-        difference: Largest difference of any output on them, [cm] or smaller units.
-    """
-
-    path: Path
-    rasters: int
-    difference: float
-
-
-def export_checkpoint(checkpoint: Path, out: Path | None = None, labels: Sequence[Path] = ()) -> Exported:
+def export_checkpoint(
+    checkpoint: Path, out: Path | None = None, labels: Sequence[Path] = ()
+) -> tuple[Path, int, float]:
     """Export the weights of a checkpoint folder.
 
     Args:
         checkpoint: Folder that :func:`lanenet.learn.train.train` wrote.
         out: File to write; None replaces the folder's ``model.onnx``.
         labels: Label sets whose rasters are checked beside those in the folder.
+
+    Returns:
+        The file, the number of rasters of the check, and the largest difference of any output on them, [cm]
+        or smaller units.
 
     Raises:
         CheckpointError: If a file of the folder is missing or does not fit, a label set has another window,
@@ -139,14 +130,13 @@ def export_checkpoint(checkpoint: Path, out: Path | None = None, labels: Sequenc
             raise CheckpointError(f"{file}: made for {label_set.meta.window}, expected {meta.window}")
         rasters.append(np.stack([label_set.raster(i) for i in range(len(label_set))])[:, None])
     every = np.concatenate(rasters)
-    return Exported(path, len(every), export_onnx(network, meta, every, path))
+    return path, len(every), export_onnx(network, meta, every, path)
 
 
 def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
     """Write weights and their description as safetensors."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(save(tensors, metadata=meta.to_properties()))
+    write_bytes(path, save(tensors, metadata=meta.to_properties()))
 
 
 def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
@@ -211,8 +201,7 @@ def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
     done, png = cv2.imencode(".png", tall)
     if not done:
         raise CheckpointError(f"{path}: the rasters {rasters.shape} cannot be written as an image")
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(png.tobytes())
+    write_bytes(path, png.tobytes())
 
 
 def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
@@ -308,7 +297,20 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
         onnx.helper.set_model_props(model, meta.to_properties())
         onnx.save(model, temporary)
         small, _ = open_model(temporary)
-        report = _compare(session, small, checks, source.stat().st_size, temporary.stat().st_size)
+        size_bytes = temporary.stat().st_size
+        names = ["points_cm"]
+        off = small.run(names, {INPUT_NAME: checks})[0] - session.run(names, {INPUT_NAME: checks})[0]
+        times_ms = np.empty((_WARM_UP + _ROUNDS, 2))
+        # Alternately, so that other load on the machine slows both.
+        for i, which in np.ndindex(times_ms.shape):
+            begin = time.perf_counter()
+            (small, session)[which].run(names, {INPUT_NAME: checks[i % len(checks)][None]})
+            times_ms[i, which] = 1e3 * (time.perf_counter() - begin)
+        small_ms, float_ms = np.median(times_ms[_WARM_UP:], axis=0).tolist()
+        largest_cm, float_bytes = float(np.abs(off).max()), source.stat().st_size
+        report = Int8Report(
+            float(np.sqrt(np.mean(off**2))), largest_cm, small_ms, float_ms, size_bytes, float_bytes
+        )
     write_json(path.with_suffix(".json"), asdict(report) | {"recommended": report.recommended})
     return path, report
 
@@ -407,31 +409,3 @@ class _Rasters(CalibrationDataReader):  # type: ignore[misc]
         """Return the next raster by its input's name, or None."""
         raster = next(self._rest, None)
         return None if raster is None else {INPUT_NAME: raster[None]}
-
-
-def _compare(
-    source: onnxruntime.InferenceSession,
-    small: onnxruntime.InferenceSession,
-    rasters: UInt8[np.ndarray, "n 1 r c"],
-    source_bytes: int,
-    small_bytes: int,
-) -> Int8Report:
-    names = ["points_cm"]
-    off = small.run(names, {INPUT_NAME: rasters})[0] - source.run(names, {INPUT_NAME: rasters})[0]
-    times_ms: dict[int, list[float]] = {0: [], 1: []}
-    # Alternately, so that other load on the machine slows both.
-    for i in range(_WARM_UP + _ROUNDS):
-        raster = rasters[i % len(rasters)][None]
-        for which, session in enumerate((source, small)):
-            begin = time.perf_counter()
-            session.run(names, {INPUT_NAME: raster})
-            if i >= _WARM_UP:
-                times_ms[which].append(1e3 * (time.perf_counter() - begin))
-    return Int8Report(
-        rms_difference_cm=float(np.sqrt(np.mean(off**2))),
-        largest_difference_cm=float(np.abs(off).max()),
-        median_ms=float(np.median(times_ms[1])),
-        float_median_ms=float(np.median(times_ms[0])),
-        size_bytes=small_bytes,
-        float_size_bytes=source_bytes,
-    )

@@ -19,7 +19,6 @@ from lanenet.errors import ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.checkpoint import (
     STATE_NAME,
     EpochRecord,
-    FinishedRun,
     RunState,
     best_record,
     hash_run,
@@ -109,19 +108,13 @@ def train(
                     write_state(out / STATE_NAME, run.state(), run_hash)
                 show(record)
                 if progress is not None:
-                    progress(
-                        record.epoch,
-                        settings.epochs,
-                        record.train_rmse_cm,
-                        record.val_rmse_cm,
-                        record.samples_per_s,
-                    )
+                    errors_cm = record.train_rmse_cm, record.val_rmse_cm
+                    progress(record.epoch, settings.epochs, *errors_cm, record.samples_per_s)
         network = run.best_network()
         calibrate_sigma(network, val)
         calibrate_presence(network, val)
         answers = predict(network, val)
-        finished = FinishedRun(settings, network, samples, val, answers, run.history, run_hash)
-        write_checkpoint(out, finished)
+        write_checkpoint(out, run, network, val, answers, run_hash)
     best = best_record(run.history)
     return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
 
@@ -182,7 +175,9 @@ class TrainingRun:
         batches = self.samples.epoch(
             settings.augment, settings.seed, epoch, settings.batch_size, balance=settings.balance
         )
-        with _random_numbers(settings.seed, epoch, self.device):
+        # Torch's own draws (dropout) follow from seed and epoch; its global generators stay untouched.
+        with torch.random.fork_rng([torch.cuda.current_device()] if self.device.type == "cuda" else []):
+            torch.manual_seed(int(np.random.SeedSequence([settings.seed, epoch]).generate_state(1)[0]))
             for batch in batches:
                 rate = learning_rate_at(self.step, self.total, settings)
                 targets = torch.from_numpy(batch.points_cm).to(self.device)
@@ -321,14 +316,6 @@ def _device(settings: LearnSettings) -> torch.device:
     if settings.device == "cuda" and not found:
         raise ConfigError("device: cuda, but PyTorch finds no GPU; expected cpu or auto")
     return torch.device("cuda" if found and settings.device != "cpu" else "cpu")
-
-
-@contextmanager
-def _random_numbers(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
-    """Make torch's own draws (dropout) follow from seed and epoch; its global generators stay untouched."""
-    with torch.random.fork_rng(devices=[torch.cuda.current_device()] if device.type == "cuda" else []):
-        torch.manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
-        yield
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending, check_not_source
+from lanenet.cli.shared.options import MappingOption, check_ending, check_not_source
 from lanenet.errors import CalibrationError, ConfigError, HardwareError
 
 if TYPE_CHECKING:
@@ -49,9 +49,7 @@ def localise(
         Path | None,
         typer.Option("--camera", help="Camera YAML; default: the drive's or the car's."),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML with the mapping's settings, or a map's settings.yaml.")
-    ] = None,
+    config: MappingOption = None,
     factor: Annotated[
         float | None,
         typer.Option(

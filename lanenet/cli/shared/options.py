@@ -20,7 +20,9 @@ CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAML
 WheelbaseOption = Annotated[
     float | None, typer.Option("--wheelbase", min=0.1, help="Distance between the car's axles, cm.")
 ]
-MappingOption = Annotated[Path | None, typer.Option("--config", help="YAML with the mapping's settings.")]
+MappingOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML with the mapping's settings, or a map's settings.yaml.")
+]
 MarkingOption = Annotated[
     float | None,
     typer.Option(

@@ -145,9 +145,10 @@ def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
 
 def test_an_export_is_checked_on_labels_as_well(checkpoint, tmp_path):
     write_labels(tmp_path / "labels.parquet", LABELS)
-    done = export_checkpoint(checkpoint, tmp_path / "m.onnx", [tmp_path / "labels.parquet"] * 60)
-    assert done.path.is_file() and done.rasters == 5 + 60 * 5
-    assert 0.0 <= done.difference <= 1e-3
+    labels = [tmp_path / "labels.parquet"] * 60
+    path, rasters, difference = export_checkpoint(checkpoint, tmp_path / "m.onnx", labels)
+    assert path.is_file() and rasters == 5 + 60 * 5
+    assert 0.0 <= difference <= 1e-3
     other = replace(LABELS, meta=replace(LABELS.meta, window=BirdseyeWindow(rows=48)))
     write_labels(tmp_path / "other.parquet", other)
     with pytest.raises(CheckpointError, match=r"other\.parquet: made for .*rows=48.*expected"):
