@@ -48,7 +48,6 @@ class ErrorAnalysis:
         line_cm_per_px: Most that one pixel's step along a row or a column moves the road point sideways, at
             these two points; NaN outside the image.
         position_error_cm: Worst sideways error of the lane's centre: a pixel and the filter's grid.
-        steering_error_rad: Steering error of that at the look-ahead.
     """
 
     settings: AnalysisSettings
@@ -56,16 +55,11 @@ class ErrorAnalysis:
     line_pixels: tuple[int, int]
     line_cm_per_px: tuple[float, float]
     position_error_cm: float
-    steering_error_rad: float
 
-
-def steering_error_rad(position_error_cm: float, lookahead_cm: float) -> float:
-    """Return the steering error of a sideways error of the aim point, [rad].
-
-    Source:
-        Kozlowski et al. 2024, eq. 3 and section 2.3: 10 mm at 150 mm are 3.8 degrees.
-    """
-    return math.atan2(position_error_cm, lookahead_cm)
+    @property
+    def steering_error_rad(self) -> float:
+        """Steering error of that at the look-ahead; Kozlowski et al. 2024, eq. 3 and section 2.3."""
+        return math.atan2(self.position_error_cm, self.settings.lookahead_cm)
 
 
 def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> ErrorAnalysis:
@@ -108,14 +102,8 @@ def analyse_errors(camera: Camera, settings: AnalysisSettings | None = None) -> 
     seen = line_steps[np.isfinite(line_steps)]
     error_cm = float(seen.max()) + chosen.filter_grid_cm if seen.size else math.nan
     left, right = (_count(pixels, cell) for cell in _cells_of(lines, chosen.cell_cm, half_columns))
-    return ErrorAnalysis(
-        chosen,
-        pixels,
-        (left, right),
-        (float(line_steps[0]), float(line_steps[1])),
-        error_cm,
-        steering_error_rad(error_cm, chosen.lookahead_cm),
-    )
+    steps = float(line_steps[0]), float(line_steps[1])
+    return ErrorAnalysis(chosen, pixels, (left, right), steps, error_cm)
 
 
 def figures(analysis: ErrorAnalysis) -> list[tuple[str, str, str]]:
@@ -168,7 +156,7 @@ def sideways_cm_per_px(camera: Camera, points_cm: Float[np.ndarray, "n 2"]) -> F
 
 
 _CELL_PX = 36
-_FOOT_PX = 66
+_FOOT_PX = 86
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _DARK_BGR, _LINE_BGR, _MISSING_BGR = (30, 30, 30), (40, 40, 220), (225, 225, 225)
 
@@ -201,9 +189,9 @@ def draw_analysis(analysis: ErrorAnalysis) -> UInt8[np.ndarray, "h w 3"]:
         dark = shade[row, column] > 150 or pixels[row, column] == 0
         cv2.putText(image, text, at, _FONT, 0.38, _DARK_BGR if dark else (255, 255, 255), 1, cv2.LINE_AA)
     _mark_points(image, analysis, rows, columns)
-    for index, line in enumerate(figure_lines(analysis)):
+    for index, (name, found, _) in enumerate(figures(analysis)):
         place = (8, rows * _CELL_PX + 19 + 20 * index)
-        cv2.putText(image, line, place, _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)
+        cv2.putText(image, f"{name}: {found}", place, _FONT, 0.48, _DARK_BGR, 1, cv2.LINE_AA)
     return image
 
 
@@ -216,25 +204,3 @@ def _mark_points(image: np.ndarray, analysis: ErrorAnalysis, rows: int, columns:
         u = round(columns * _CELL_PX / 2 + x_cm * scale)
         cv2.circle(image, (u, v), 6, _LINE_BGR, 2, cv2.LINE_AA)
         cv2.putText(image, name, (u + 8, v - 6), _FONT, 0.6, _LINE_BGR, 2, cv2.LINE_AA)
-
-
-def figure_lines(analysis: ErrorAnalysis) -> list[str]:
-    """Return the lines of text below the grid; they say so where L, R or both are not seen."""
-    chosen = analysis.settings
-    lines = [
-        f"pixels per cell of {10.0 * chosen.cell_cm:.1f} mm; at L and R: "
-        f"{analysis.line_pixels[0]} and {analysis.line_pixels[1]} px",
-    ]
-    # max() over NaN depends on the order.
-    seen = [step for step in analysis.line_cm_per_px if math.isfinite(step)]
-    if seen:
-        lines += [
-            f"sideways {10.0 * max(seen):.1f} mm/px, "
-            f"with the filter's grid {10.0 * analysis.position_error_cm:.1f} mm"
-            + ("" if len(seen) == 2 else ", at the one of them that is seen"),
-            f"steering error at {chosen.lookahead_cm:g} cm: "
-            f"{math.degrees(analysis.steering_error_rad):.1f} degrees at most",
-        ]
-    else:
-        lines.append(f"neither L nor R is seen at {chosen.lookahead_cm:g} cm: no errors to tell")
-    return lines

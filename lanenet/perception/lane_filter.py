@@ -7,7 +7,8 @@ view. It is the paper's onboard detector, and a baseline for every other one.
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -18,11 +19,6 @@ from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.lane import N_POINTS, ROWS_CM, proportional_angle_rad
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate
-
-__all__ = ["PAPER", "LaneFilter", "LaneFilterSettings", "find_row"]
-
-from dataclasses import dataclass
-from typing import Literal
 
 #: Settings that switch off every check which is not in the paper.
 PAPER: dict[str, Any] = {

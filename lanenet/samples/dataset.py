@@ -63,7 +63,7 @@ class LaneSamples:
         self.window: BirdseyeWindow = first.window
         same = all(labels.meta.perception == first.perception for labels in label_sets)
         self.perception = first.perception if same else first.perception.of_all_rows()
-        self.reference = reference_of(label_sets)
+        self.reference = " and ".join(sorted({labels.meta.source for labels in label_sets}))
         kept = [
             np.flatnonzero((labels.quality >= min_quality) & np.isfinite(labels.points_cm).any(axis=1))
             for labels in label_sets
@@ -158,16 +158,12 @@ class LaneSamples:
             seed: Of the run.
             epoch: Counted from 0.
             batch_size: Samples per batch.
-            workers: Threads that prepare batches ahead; 0 prepares each batch when it is needed.
+            workers: Threads that prepare batches ahead.
             balance: How often each label set is shown, see :meth:`order`.
         """
         order, streams = self.order(seed, epoch, balance)
         slices = [slice(k, k + batch_size) for k in range(0, len(order), batch_size)]
         jobs = [(order[k], settings, seed, epoch, streams[k]) for k in slices if len(order[k]) > 1]
-        if workers == 0:
-            for job in jobs:
-                yield self.augmented_batch(*job)
-            return
         with ThreadPoolExecutor(workers) as pool:
             ahead: list[Future[Batch]] = []
             try:
@@ -226,11 +222,6 @@ def check_same(a: LabelMeta, b: LabelMeta, name_a: str, name_b: str) -> None:
             f"{name_b}: its edges were found with other settings than those of {name_a} ({unlike}); label "
             "both with the same settings"
         )
-
-
-def reference_of(label_sets: Sequence[LabelSet]) -> str:
-    """Return where labels come from: ``truth``, ``map`` or ``map and truth``."""
-    return " and ".join(sorted({labels.meta.source for labels in label_sets}))
 
 
 def hash_files(paths: Sequence[Path]) -> str:

@@ -8,13 +8,13 @@ that this one imports, delete ``lanenet/samples/__pycache__``.
 from __future__ import annotations
 
 from collections import namedtuple
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, ROWS_CM
 from lanenet.samples.random_stream import (
+    kernel,
     next_amount,
     next_bell,
     next_between,
@@ -95,8 +95,7 @@ class Grid(NamedTuple):
     label_right_cm: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def rasterise_frames(out, indices, frames, grid, present):
     """Write frames as they are into rasters, and which lines they show into ``present``."""
     cells = np.zeros(2, np.int64)
@@ -111,8 +110,7 @@ def rasterise_frames(out, indices, frames, grid, present):
             present[slot, side] = presence(cells[side], frames, 2 * i + side, grid)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch, frames, grid, amounts):
     """Change frames, each by its own draw; write rasters, labels, visible lines and the given lane width.
 
@@ -207,8 +205,7 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
         add_clutter(rng, raster, count, grid, amounts)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _room(frames, i, mirror, scale, most_cm):
     """Return how far the car can move to the left and to the right without leaving its lane.
 
@@ -228,8 +225,7 @@ def _room(frames, i, mirror, scale, most_cm):
     return room_left, room_right
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _label(labels, frames, i, view, grid):
     """Write the labels of the moved car: where its lines cross the rows, for points that the label set has.
 
@@ -259,8 +255,7 @@ def _label(labels, frames, i, view, grid):
                     break
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _missing_lines(rng, amounts):
     """Draw which lines are missing, as bits."""
     chance, side = next_uniform(rng), next_uniform(rng)
@@ -271,8 +266,7 @@ def _missing_lines(rng, amounts):
     return 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _unpainted(rng, chance, edges_cm, first, last):
     """Draw an area without paint: kind (0 none, 1 disc, 2 ring about the car), place and size.
 
@@ -293,8 +287,7 @@ def _unpainted(rng, chance, edges_cm, first, last):
     return 2, np.sqrt(x * x + y * y), 0.0, 0.5 * size
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
     """Return where a point of the road appears to be if the camera's mounting is wrong.
 
@@ -330,8 +323,7 @@ def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
     return camera_x + dx * scale, camera_y + dy * scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def mark(raster, x_cm, y_cm, grid):
     """Mark the cell of a point; return whether it lies in the window and was not marked before.
 
@@ -347,8 +339,7 @@ def mark(raster, x_cm, y_cm, grid):
     return fresh
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def mark_edge(raster, ax, ay, bx, by, grid):
     """Mark a straight edge without holes; return how many cells it added."""
     steps = 1 + int(np.hypot(bx - ax, by - ay) / (0.7 * grid.cell_cm))
@@ -360,8 +351,7 @@ def mark_edge(raster, ax, ay, bx, by, grid):
     return added
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def near_lines(edges, left_cm, right_cm, out):
     """Find which lines edge points belong to, and which points go with a line that is missing.
 
@@ -396,16 +386,14 @@ def near_lines(edges, left_cm, right_cm, out):
         out[k] = found
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def count_cells(cells, lines):
     """Count a newly marked cell for the lines along which its point runs."""
     cells[0] += (lines >> 2) & 1
     cells[1] += lines >> 3
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def presence(cells, frames, line, grid):
     """Return 1 for a line that can be seen, 0 for one that cannot, NaN between or if its place is unknown."""
     known = False
@@ -417,8 +405,7 @@ def presence(cells, frames, line, grid):
     return 1.0 if seen_cm >= SEEN_CM else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def draw_outline(rng, corners, grid):
     """Draw a closed outline within the window; return whether it hides the road within it.
 
@@ -461,8 +448,7 @@ def draw_outline(rng, corners, grid):
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def is_inside(x, y, corners):
     """Tell whether a point lies within a closed outline (even-odd rule)."""
     inside = False
@@ -476,8 +462,7 @@ def is_inside(x, y, corners):
     return inside
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def mark_outline(raster, corners, grid):
     """Mark a closed outline."""
     for k in range(CORNERS):
@@ -485,8 +470,7 @@ def mark_outline(raster, corners, grid):
         mark_edge(raster, a[0], a[1], b[0], b[1], grid)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def add_clutter(rng, raster, count, grid, amounts):
     """Mark edges of things that are not lanes; ``count`` is the number of cells that the frame marked."""
     for _ in range(next_number(rng, amounts.clutter_segments, amounts.limit)):
@@ -504,8 +488,7 @@ def add_clutter(rng, raster, count, grid, amounts):
             added += _add_point(rng, raster, grid)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _add_edge(rng, raster, longest_cm, grid):
     """Mark a straight edge at a random place; return how many cells it added."""
     width_cm, depth_cm = grid.columns * grid.cell_cm, grid.rows * grid.cell_cm
@@ -517,8 +500,7 @@ def _add_edge(rng, raster, longest_cm, grid):
     return mark_edge(raster, x - dx, y - dy, x + dx, y + dy, grid)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _add_point(rng, raster, grid):
     """Mark a cell at a random place; return how many cells that added."""
     x = grid.left_cm + grid.columns * grid.cell_cm * next_uniform(rng)
@@ -526,8 +508,7 @@ def _add_point(rng, raster, grid):
     return 1 if mark(raster, x, y, grid) else 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def middle_dashes(rng, frames, i):
     """Copy a line of a frame to the middle of its lane, in dashes; return their points, [cm], frame car.
 

@@ -9,7 +9,9 @@ Source:
 
 from __future__ import annotations
 
-from typing import no_type_check
+import inspect
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -24,8 +26,12 @@ _BELL_MEAN = 2.0 * 65535.0
 _BELL_SCALE = (4.0 * (65536.0**2 - 1.0) / 12.0) ** -0.5
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function of plain numbers and arrays, without the checks of shapes that tests wrap it in."""
+    return njit(cache=True, error_model="numpy", nogil=True)(inspect.unwrap(function))
+
+
+@kernel
 def start_stream(stream, seed, epoch, number):
     """Start a stream from three integers."""
     stream[0] = np.uint64(seed)
@@ -34,22 +40,19 @@ def start_stream(stream, seed, epoch, number):
     stream[0] = _next(stream)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_uniform(stream):
     """Draw uniformly from [0, 1)."""
     return np.float64(_next(stream) >> _11) * _UNIT
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_between(stream, low, high):
     """Draw uniformly from ``low`` to ``high``."""
     return low + (high - low) * next_uniform(stream)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_spread(stream, most, limit):
     """Draw uniformly from ``-most`` to ``most``; with ``limit`` one of the two ends."""
     draw = 2.0 * next_uniform(stream) - 1.0
@@ -58,24 +61,21 @@ def next_spread(stream, most, limit):
     return most * draw
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_amount(stream, most, limit):
     """Draw uniformly from 0 to ``most``; with ``limit`` always ``most``."""
     draw = next_uniform(stream)
     return most if limit else draw * most
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_number(stream, most, limit):
     """Draw an integer from 0 to ``most``; with ``limit`` always ``most``."""
     draw = next_uniform(stream)
     return most if limit else int(draw * (most + 1))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def next_bell(stream):
     """Draw from a bell curve of mean 0 and standard deviation 1: a sum of four uniform numbers.
 
@@ -90,8 +90,7 @@ def next_bell(stream):
     return (total - _BELL_MEAN) * _BELL_SCALE
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-@no_type_check
+@kernel
 def _next(stream):
     stream[0] += _GAMMA
     z = stream[0]

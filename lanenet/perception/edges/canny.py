@@ -84,7 +84,13 @@ def find_edges(
     raised = 1.0
     if settings.method == "directional":
         if frame_bgr.ndim == 3 and settings.colour_weight > 0.0:
-            for hue_dx, hue_dy in _hue_gradients(frame_bgr, dx, dy, settings.blur_px):
+            # Gray minus blue shows yellow, red minus gray red; white, gray and black have neither. Both
+            # rise towards the inside of yellow tape, as brightness does for white tape, so that normals mean
+            # the same. White tape on a yellow floor may get normals that point to the floor; networks use
+            # positions alone.
+            channels = (cv2.extractChannel(frame_bgr, channel) for channel in (_BLUE, _RED))
+            blue, red = (gradients(channel, settings.blur_px) for channel in channels)
+            for hue_dx, hue_dy in ((dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)):
                 prefer_stronger(dx, dy, hue_dx, hue_dy, settings.colour_weight, settings.low)
         if sample is None:
             sample = sample_pixels(np.ones_like(gray) if keep is None else keep)
@@ -93,22 +99,6 @@ def find_edges(
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
     return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional")
-
-
-def _hue_gradients(
-    frame_bgr: UInt8[np.ndarray, "h w 3"],
-    dx: Int16[np.ndarray, "h w"],
-    dy: Int16[np.ndarray, "h w"],
-    blur_px: int,
-) -> list[tuple[Int16[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]]:
-    """Sobel responses of yellow and of red, of which white, gray and black have none.
-
-    Gray minus blue, and red minus gray: both rise towards the inside of yellow tape, as brightness does for
-    white tape, so that normals mean the same. White tape on a yellow floor may get normals that point to the
-    floor; networks use positions alone.
-    """
-    blue, red = (gradients(cv2.extractChannel(frame_bgr, channel), blur_px) for channel in (_BLUE, _RED))
-    return [(dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)]
 
 
 def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:

@@ -173,13 +173,12 @@ class HoughTracker:
         steered = self.track(left, right)
         self._frames += 1
         self._frames_steered += steered is not None
-        self.last = self._image_lane(left, right, frame.shape[1], frame.shape[0])
+        self.last = self._image_lane(left, right, frame.shape)
         points = np.full((2, N_POINTS // 2), np.nan)
         if self.camera is not None:
             for side, seen in enumerate((left, right)):
                 if seen is not None:
-                    seen_px = self._to_frame(seen, frame.shape[1], frame.shape[0])
-                    points[side] = rows_on_road(seen_px, self.camera)
+                    points[side] = rows_on_road(self._to_frame(seen, frame.shape), self.camera)
         return LaneEstimate(
             points_cm=points.reshape(N_POINTS),
             steering_rad=float("nan") if steered is None else math.radians(steered),
@@ -269,10 +268,8 @@ class HoughTracker:
         """Width and height of the region of interest, [px]."""
         return float(self.settings.edges.width_px), float(self.settings.edges.roi_height_px)
 
-    def _image_lane(
-        self, left: Segment | None, right: Segment | None, frame_width: int, frame_height: int
-    ) -> ImageLane:
-        """Carry lines of the region of interest back to the frame that they were found in."""
+    def _image_lane(self, left: Segment | None, right: Segment | None, shape: tuple[int, ...]) -> ImageLane:
+        """Carry lines of the region of interest back to the frame of this shape."""
         edges = self.settings.edges
 
         def polyline(line: Line) -> Polyline | None:
@@ -283,7 +280,7 @@ class HoughTracker:
                 ends.append((x, line.m * x + line.b))
             whole = Segment(*ends[0], *ends[1])
             inside = all(-1.0 <= y <= edges.roi_height_px for _, y in ends)
-            return self._to_frame(whole, frame_width, frame_height) if inside and ends[0] != ends[1] else None
+            return self._to_frame(whole, shape) if inside and ends[0] != ends[1] else None
 
         memory = (polyline(line) for line in self.state.lines if line is not None)
         return ImageLane(
@@ -292,10 +289,10 @@ class HoughTracker:
             tuple(line for line in memory if line is not None),
         )
 
-    def _to_frame(self, segment: Segment, frame_width: int, frame_height: int) -> Polyline:
-        """Carry a segment of the region of interest back to the frame that it was found in, near to far."""
+    def _to_frame(self, segment: Segment, shape: tuple[int, ...]) -> Polyline:
+        """Carry a segment of the region of interest back to the frame of this shape, near to far."""
         edges = self.settings.edges
-        sx, sy = frame_width / edges.width_px, frame_height / edges.height_px
+        sx, sy = shape[1] / edges.width_px, shape[0] / edges.height_px
         ends = [
             ((x + 0.5) * sx - 0.5, (y + edges.roi_top_px + 0.5) * sy - 0.5)
             for x, y in ((segment.x1, segment.y1), (segment.x2, segment.y2))

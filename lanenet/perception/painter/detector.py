@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -104,10 +103,8 @@ class PaintedLane:
     def text(self) -> str:
         """Both figures for people; empty where neither is known."""
         parts = []
-        if math.isfinite(self.radius_cm):
+        if not math.isnan(self.radius_cm):
             parts.append(f"R {self.radius_cm:.0f} cm" if self.radius_cm < 1e4 else "straight")
-        elif math.isinf(self.radius_cm):
-            parts.append("straight")
         if math.isfinite(self.offset_cm):
             side = "right" if self.offset_cm > 0.0 else "left"
             parts.append(f"{abs(self.offset_cm):.1f} cm {side} of the middle")
@@ -193,14 +190,10 @@ class LanePainter:
         if height_cm is not None:
             half_width = chosen.curve.half_width_heights * height_cm
         curve = chosen.curve if chosen.curves else None
-
-        def follow(lines: Sequence[SolidLine]) -> dict[SolidLine, tuple[Marking, Marking | None]]:
-            followed = follow_lines(lines, plane, trapezoid_px, points, half_width, curve)
-            return dict(zip(lines, followed, strict=True))
-
+        region = (plane, trapezoid_px, points, half_width, curve)
         if not chosen.evidence.required:
             pair = find_two_lines(segments, trapezoid_px, earlier, chosen.lines)
-            followed = follow([line for line in pair if line is not None])
+            followed = follow_lines([line for line in pair if line is not None], *region)
             left, right = (None if line is None else followed[line][1] or followed[line][0] for line in pair)
             return left, right
         field = find_edge_field(frame_bgr, edges, trapezoid_px, chosen.edges)
@@ -208,16 +201,11 @@ class LanePainter:
         both_sides = find_side_lines(
             segments, trapezoid_px, earlier, chosen.lines, chosen.evidence.candidates
         )
-        followed = follow([*both_sides[0], *both_sides[1]])
-        sides = []
-        for lines, before in zip(both_sides, earlier, strict=True):
-            known = [before is not None and are_close(line, before, tolerance) for line in lines]
-            sides.append(
-                [
-                    weigh(*followed[line], field, again, chosen.evidence)
-                    for line, again in zip(lines, known, strict=True)
-                ]
-            )
+        followed = follow_lines([*both_sides[0], *both_sides[1]], *region)
+        sides = [
+            [weigh(*followed[x], field, are_close(x, before, tolerance), chosen.evidence) for x in lines]
+            for lines, before in zip(both_sides, earlier, strict=True)
+        ]
         if height_cm is not None:
             width = frame_bgr.shape[1]
             sides = [can_bound_the_lane(side, plane, width, height_cm, chosen.evidence) for side in sides]
@@ -235,9 +223,7 @@ class LanePainter:
                 continue
             before = self._earlier[k]
             # A different line than before; their mean would lie on neither.
-            if before is not None and not are_close(
-                marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)
-            ):
+            if not are_close(marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)):
                 before = None
             line = blend(marking.line, before, self.settings.video_weight)
             self._earlier[k], self._missed[k] = line, 0

@@ -318,7 +318,7 @@ def find_two_lines(
         return left, right
     tolerance = agree_px(trapezoid_px, settings)
     stays = [
-        line if known is not None and are_close(line, known, tolerance) else None
+        line if are_close(line, known, tolerance) else None
         for line, known in zip((left, right), earlier, strict=True)
     ]
     return (stays[0], stays[1]) if stays.count(None) == 1 else (None, None)
@@ -338,10 +338,11 @@ def agree_px(trapezoid_px: Float[np.ndarray, "4 2"], settings: PainterLineSettin
     return settings.agree_share * float(trapezoid_px[2, 0] - trapezoid_px[3, 0])
 
 
-def are_close(one: SolidLine, other: SolidLine, tolerance_px: float) -> bool:
-    """Return whether two lines lie near to each other at the region's top and bottom."""
+def are_close(one: SolidLine, other: SolidLine | None, tolerance_px: float) -> bool:
+    """Return whether there is another line near to one, at the region's top and bottom."""
     return (
-        abs(one.bottom_px - other.bottom_px) <= tolerance_px
+        other is not None
+        and abs(one.bottom_px - other.bottom_px) <= tolerance_px
         and abs(one.top_px - other.top_px) <= tolerance_px
     )
 

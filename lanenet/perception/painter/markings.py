@@ -69,7 +69,7 @@ def follow_lines(
     edge_points: Float[np.ndarray, "n 2"],
     half_width: float,
     settings: CurveSettings | None,
-) -> list[tuple[Marking, Marking | None]]:
+) -> dict[SolidLine, tuple[Marking, Marking | None]]:
     """Return each straight line as a marking, with the curve that windows along it find, if any.
 
     Args:
@@ -87,16 +87,16 @@ def follow_lines(
         for line, line_px, guess in zip(lines, lines_px, guesses, strict=True)
     ]
     if settings is None:
-        return [(marking, None) for marking in straight]
+        return {marking.line: (marking, None) for marking in straight}
     found = [_find_curve(guess, edge_points, half_width, settings) for guess in guesses]
     paths = [curve.sample(float(guess[0, 1])) for curve, guess in zip(found, guesses, strict=True) if curve]
     paths_px = iter(move_lines(plane.to_image, paths))
-    both: list[tuple[Marking, Marking | None]] = []
+    both: dict[SolidLine, tuple[Marking, Marking | None]] = {}
     for marking, curve in zip(straight, found, strict=True):
         curved = None
         if curve is not None and len(curve_px := next(paths_px)) >= 2:
             curved = Marking(marking.line, curve, curve_px, curve.sample())
-        both.append((marking, curved))
+        both[marking.line] = marking, curved
     return both
 
 

@@ -72,7 +72,7 @@ def test_a_sample_depends_on_seed_epoch_and_index_alone():
 
 def test_workers_do_not_change_an_epoch():
     data, settings = samples(), AugmentSettings()
-    runs = [list(data.epoch(settings, 0, 0, 8, workers)) for workers in (0, 1, 3)]
+    runs = [list(data.epoch(settings, 0, 0, 8, workers)) for workers in (1, 3)]
     for run in runs[1:]:
         assert len(run) == len(runs[0]) == data.steps_per_epoch(8) == 7
         for batch, batch0 in zip(run, runs[0], strict=True):
