@@ -80,23 +80,12 @@ def project_points(
         # OpenCV's columns: rotation, translation (as the points), fx, fy, cx, cy, D.
         columns = np.asarray(by_all).reshape(len(points), 2, -1)
         return np.asarray(found).reshape(-1, 2), columns[:, :, 3:6], columns[:, :, 6 : 6 + len(lens)]
-    flat, d_points, d_distortion = _fisheye(points, lens[N_INTRINSIC:])
-    focal = lens[:2]
-    by_lens = np.zeros((len(points), 2, len(lens)))
-    by_lens[:, [0, 1], [0, 1]] = flat
-    by_lens[:, [0, 1], [2, 3]] = 1.0
-    by_lens[:, :, N_INTRINSIC:] = d_distortion * focal[:, None]
-    return flat * focal + lens[2:4], d_points * focal[:, None], by_lens
-
-
-def _fisheye(
-    points: Float[np.ndarray, "n 3"], D: Float[np.ndarray, "4"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 4"]]:
     x, y, z = points.T
     r = np.maximum(np.hypot(x, y), _NEAR_AXIS)
     theta = np.arctan2(r, z)
     t2 = theta * theta
     powers = theta[:, None] * np.stack([t2, t2**2, t2**3, t2**4], axis=1)
+    D, focal = lens[N_INTRINSIC:], lens[:2]
     radius, slope = fisheye_radius(theta, D), fisheye_slope(theta, D)
     length2 = r * r + z * z
     azimuth = np.stack([x, y], axis=1) / r[:, None]
@@ -107,7 +96,12 @@ def _fisheye(
     d_points = np.stack([x, y], axis=1)[:, :, None] * d_scale[:, None, :]
     d_points[:, 0, 0] += scale
     d_points[:, 1, 1] += scale
-    return azimuth * radius[:, None], d_points, azimuth[:, :, None] * powers[:, None, :]
+    flat = azimuth * radius[:, None]
+    by_lens = np.zeros((len(points), 2, len(lens)))
+    by_lens[:, [0, 1], [0, 1]] = flat
+    by_lens[:, [0, 1], [2, 3]] = 1.0
+    by_lens[:, :, N_INTRINSIC:] = azimuth[:, :, None] * powers[:, None, :] * focal[:, None]
+    return flat * focal + lens[2:4], d_points * focal[:, None], by_lens
 
 
 def rotation_from_vector(vector_rad: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

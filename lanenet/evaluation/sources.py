@@ -180,10 +180,8 @@ def nearest_pose_cm(
     """Return the distance of each pose to the nearest training pose, [cm]; headings do not count."""
     if not len(training_poses):
         return np.full(len(poses), np.nan)
-    result = np.empty(len(poses))
-    for k, pose in enumerate(poses):
-        result[k] = np.sqrt(((training_poses[:, :2] - pose[:2]) ** 2).sum(axis=1).min())
-    return result
+    squares = [((training_poses[:, :2] - pose[:2]) ** 2).sum(axis=1).min() for pose in poses]
+    return np.sqrt(np.array(squares, np.float64))
 
 
 def at_frames(

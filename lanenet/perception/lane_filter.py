@@ -271,10 +271,9 @@ class LaneFilter:
             far = None
             self._centre_cm.pop(far_cm)
         points = np.full((2, len(ROWS_CM)), np.nan)
-        if near is not None:
-            points[:, 1] = near
-        if far is not None:
-            points[:, 2] = far
+        for row, pair in enumerate((near, far), start=1):
+            if pair is not None:
+                points[:, row] = pair
         # NaN unless both rows are known.
         points[:, 0] = points[:, 1] - (points[:, 2] - points[:, 1]) * near_cm / (far_cm - near_cm)
         return LaneEstimate(
@@ -302,11 +301,9 @@ class LaneFilter:
         near: _Pair | None,
         far: _Pair | None,
     ) -> float:
-        look_ahead_cm = self.settings.look_ahead_cm
-        if look_ahead_cm == ROWS_CM[1]:
-            pair = near
-        elif look_ahead_cm == ROWS_CM[2]:
-            pair = far
+        look_ahead_cm, known = self.settings.look_ahead_cm, {ROWS_CM[1]: near, ROWS_CM[2]: far}
+        if look_ahead_cm in known:
+            pair = known[look_ahead_cm]
         else:
             pair = self._track(points_cm, normals, look_ahead_cm, 0.0)
         if pair is None:

@@ -280,24 +280,19 @@ def choose_lines(
     if pair is not None:
         return pair
     known = bool(left and earlier[0]) or bool(right and earlier[1])
-    c1 = (0.5 * width, height)
-    costs = [
-        (
-            weighted_cost(
-                line_distance(segment.line, line, height),
-                math.dist((segment.x1, segment.y1), c1),
-                settings,
-            ),
-            side,
-            segment,
-        )
-        for side, (segments, line) in enumerate(zip((left, right), earlier, strict=True))
+
+    def cost(single: tuple[Segment, int]) -> float:
+        segment, side = single
+        centre_px = math.dist((segment.x1, segment.y1), (0.5 * width, height))
+        return weighted_cost(line_distance(segment.line, earlier[side], height), centre_px, settings)
+
+    singles = [
+        (segment, side)
+        for side, segments in enumerate((left, right))
         for segment in segments
-        if line is not None or not known
+        if earlier[side] is not None or not known
     ]
-    if not costs:
-        return None, None
-    _, side, chosen = min(costs, key=lambda entry: entry[:2])
+    chosen, side = min(singles, key=cost, default=(None, 0))
     return (chosen, None) if side == 0 else (None, chosen)
 
 
