@@ -143,7 +143,8 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     """Build the network of a checkpoint folder.
 
     Raises:
-        CheckpointError: If a file is missing, cannot be read, or the weights do not fit the config.
+        CheckpointError: If a file is missing, cannot be read or is of another format version, or the weights
+            do not fit the config.
     """
     if not checkpoint.is_dir():
         found = "is a file" if checkpoint.exists() else "no such folder"
@@ -151,8 +152,11 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     # A checkpoint without its config or without its weights is named below.
     if not is_model(checkpoint) and not any((checkpoint / n).is_file() for n in (CONFIG_NAME, WEIGHTS_NAME)):
         raise CheckpointError(f"{checkpoint}: expected a checkpoint: {without_model(checkpoint)}")
-    check_marker(checkpoint)
+    marker = checkpoint / MARKER_NAME
     try:
+        # A run's own folder has no marker.
+        if marker.is_file() and (form := read_yaml(marker).get("format")) != CHECKPOINT_FORMAT:
+            raise CheckpointError(f"{marker}: format is {form!r}, expected {CHECKPOINT_FORMAT!r}")
         settings = load_settings(LearnSettings, checkpoint / CONFIG_NAME)
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
@@ -163,10 +167,9 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         with safe_open(path, framework="pt") as file:
             properties = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        meta = ModelMeta.from_properties(properties, str(path))
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: cannot be read as safetensors ({error})") from None
-    try:
-        meta = ModelMeta.from_properties(properties, str(path))
     except ModelMismatchError as error:
         raise CheckpointError(str(error)) from None
     network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
@@ -176,23 +179,6 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         detail = " ".join(str(error).split())[:300]
         raise CheckpointError(f"{path}: weights do not fit {checkpoint / CONFIG_NAME} ({detail})") from None
     return network.eval(), meta
-
-
-def check_marker(checkpoint: Path) -> None:
-    """Refuse a published checkpoint of another format version; a run's own folder has no marker.
-
-    Raises:
-        CheckpointError: Naming the version found and the one expected.
-    """
-    marker = checkpoint / MARKER_NAME
-    if not marker.is_file():
-        return
-    try:
-        found = read_yaml(marker).get("format")
-    except ConfigError as error:
-        raise CheckpointError(str(error)) from None
-    if found != CHECKPOINT_FORMAT:
-        raise CheckpointError(f"{marker}: format is {found!r}, expected {CHECKPOINT_FORMAT!r}")
 
 
 def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:

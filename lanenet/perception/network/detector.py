@@ -140,9 +140,7 @@ def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
     row, column = np.mgrid[0 : window.rows / 2 : 16j, 0 : window.columns - 1 : 32j]
     pixels = camera.project_ground(window.points(np.stack([row.ravel(), column.ravel()], axis=1)))
     with np.errstate(invalid="ignore"):
-        inside = (pixels >= -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(
-            axis=1
-        )
+        inside = ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
     return float(inside.mean())
 
 
