@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,13 +38,10 @@ from lanenet.learn.export import (
     write_weights,
 )
 from lanenet.learn.network import LaneNet, new_network
-from lanenet.learn.predict import Answers
+from lanenet.learn.predict import predict
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
 from lanenet.samples.dataset import LaneSamples, hash_files
-
-if TYPE_CHECKING:
-    from lanenet.learn.train import TrainingRun
 
 STATE_NAME = "last.pt"
 CURVE_NAME = "curve"
@@ -184,22 +181,33 @@ def read_finished(folder: Path, run_hash: str) -> dict[str, Any] | None:
 
 
 def write_checkpoint(
-    folder: Path, run: TrainingRun, network: LaneNet, val: LaneSamples, answers: Answers, run_hash: str
-) -> None:
+    folder: Path,
+    settings: LearnSettings,
+    network: LaneNet,
+    samples: LaneSamples,
+    val: LaneSamples,
+    history: Sequence[EpochRecord],
+    run_hash: str,
+) -> float:
     """Write the results of a run; the metrics come last and mark it as finished.
 
     Args:
         folder: Where to write.
-        run: The training.
+        settings: Of the training.
         network: Weights of its best epoch.
+        samples: Training frames.
         val: Validation frames.
-        answers: Of the network on them.
+        history: Training curve.
         run_hash: Of settings and data.
+
+    Returns:
+        The RMSE of the network on the validation frames, [cm].
 
     Raises:
         CheckpointError: If the exported model does not answer as PyTorch does.
     """
-    settings, samples, errors = run.settings, run.samples, answers.errors
+    answers = predict(network, val)
+    errors = answers.errors
     meta = ModelMeta(
         window=samples.window,
         camera_hashes=tuple(samples.camera_hashes),
@@ -218,27 +226,28 @@ def write_checkpoint(
     write_rasters(folder / RASTERS_NAME, rasters)
     write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
-    write_curve(folder, run.history)
+    write_curve(folder, history)
     presence = presence_stats(answers.presence, answers.present)
     metrics: dict[str, Any] = {
         "format": METRICS_FORMAT,
         "run_hash": run_hash,
         "units": {"*_cm": "centimetres", "samples_per_s": "training samples per second"},
         "val_rmse_cm": errors.all.rmse_cm,
-        "best_epoch": best_record(run.history).epoch,
-        "epochs": len(run.history),
+        "best_epoch": best_record(history).epoch,
+        "epochs": len(history),
         "train_frames": len(samples),
         "val_frames": len(val),
         "parameters": network.n_parameters,
         "sigma_factors": network.sigma_factor.tolist(),
         "val_presence": None if presence is None else vars(presence),
         "onnx_difference_cm": difference,
-        "median_samples_per_s": float(np.median([record.samples_per_s for record in run.history])),
+        "median_samples_per_s": float(np.median([record.samples_per_s for record in history])),
         "seed": settings.seed,
         "versions": {name: _version(name) for name in _PACKAGES},
         "val": errors.as_dict(),
     }
     write_json(folder / METRICS_NAME, metrics)
+    return errors.all.rmse_cm
 
 
 def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:

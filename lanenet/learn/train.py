@@ -113,10 +113,8 @@ def train(
         network = run.best_network()
         calibrate_sigma(network, val)
         calibrate_presence(network, val)
-        answers = predict(network, val)
-        write_checkpoint(out, run, network, val, answers, run_hash)
-    best = best_record(run.history)
-    return TrainResult(out, out / MODEL_NAME, best.epoch, answers.errors.all.rmse_cm, True)
+        rmse_cm = write_checkpoint(out, settings, network, samples, val, run.history, run_hash)
+    return TrainResult(out, out / MODEL_NAME, best_record(run.history).epoch, rmse_cm, True)
 
 
 class TrainingRun:
