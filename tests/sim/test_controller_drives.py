@@ -77,7 +77,7 @@ def drive(seed: int, smoothing: bool) -> Driven:
     )
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_smoothing_calms_the_steering_and_keeps_the_lane(seed: int) -> None:
     plain, smooth = drive(seed, False), drive(seed, True)
     # One line is enough, thanks to the width of the frames before.

@@ -67,7 +67,7 @@ def finished(data, tmp_path_factory):
     return run(data, out)
 
 
-@pytest.mark.parametrize("bins", [0, 24])
+@pytest.mark.parametrize("bins", [pytest.param(0, marks=pytest.mark.slow), 24])
 def test_learns_far_better_than_a_constant(data, tmp_path, bins):
     settings = LearnSettings(
         epochs=8,

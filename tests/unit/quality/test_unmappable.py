@@ -196,7 +196,7 @@ def test_no_line_at_all(tmp_path):
     assert re.search("no lane|no line|no pair of lines", refusal(drive, tmp_path / "map"))
 
 
-@pytest.mark.parametrize("given_cm", [20.0, 80.0])
+@pytest.mark.parametrize("given_cm", [20.0, pytest.param(80.0, marks=pytest.mark.slow)])
 def test_a_lane_width_wrong_by_two_is_found_where_the_camera_is_known(tmp_path, both_lines, given_cm):
     with pytest.raises(
         CalibrationError, match=rf"{given_cm:g} cm apart .* (39|40|41) cm apart .*camera's height"

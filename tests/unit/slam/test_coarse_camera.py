@@ -87,7 +87,7 @@ def test_the_mapping_range_grows_with_the_camera():
     assert (large.top_row, large.bottom_rows) == (40, 7)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     """The truth lies on the grid; a second round looks half as far around the best."""
     true = fisheye(pitch_down_rad=np.deg2rad(24.0), roll_rad=0.0, yaw_rad=0.0)

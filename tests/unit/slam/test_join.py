@@ -152,6 +152,7 @@ def test_keyframes_of_a_slow_car_are_those_of_the_joined_segment(same_road, monk
     assert set(keyframe_pairs(keys, SMALL.bundle.lags)) <= set(pairs)
 
 
+@pytest.mark.slow
 def test_the_segment_that_carries_may_be_the_later_one(same_road):
     drive, true, segments = same_road
     # The short segment was driven first.

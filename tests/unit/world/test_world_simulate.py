@@ -92,7 +92,7 @@ def test_recorded_commands_are_not_the_motion():
 
 def test_the_driver_stays_in_the_lane_and_wanders():
     offsets = []
-    for seed, closed in ((0, False), (1, False), (2, True), (3, True)):
+    for seed, closed in ((0, False), (2, True)):
         world = build_world(
             _settings(seed=seed, frames=420, camera=CameraSettings(width=16, height=16), random_look=False,
                       track=TrackSettings(closed=closed))
