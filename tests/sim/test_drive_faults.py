@@ -48,7 +48,7 @@ SLOW = {
     ),
     *("control raises", "network hangs", "control hangs"),
     *("camera late", "camera of another clock", "camera of another size"),
-    *("network answers infinity", "control answers NaN", "SIGINT"),
+    *("camera frozen", "network answers NaN", "network answers infinity", "control answers NaN", "SIGINT"),
 }
 #: Neutral this long after the fault, read from the wire; nothing is allowed for the machine.
 ALLOWED_S = 0.1
