@@ -32,9 +32,9 @@ from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT
 
 log = logging.getLogger("lanenet.onboard.guard")
 
-#: Neutral is sent again this often, in case it was lost on the wire; chosen: within the 100 ms watchdog of
-#: the Arduino board.
-_REFRESH_S = 0.05
+#: What holds is sent again this often, in case it was lost on the wire; chosen: half of the time for which a
+#: command holds on the Arduino board, which must not run out between two frames of a slow camera.
+_REFRESH_S = 0.04
 #: A driver needs a few milliseconds; after the first time it counts as hanging, checked at the second.
 _SLOW_S, _LOOK_S = 0.05, 0.02
 
@@ -49,6 +49,7 @@ class Guard:
         self._heard_s = time.monotonic()
         self._logged_s = -math.inf
         self._driving = False
+        self._command = (0.0, 0.0)
         #: Why no command is accepted any more; empty while they are.
         self._over = ""
         #: When the present call of the driver began; infinite if there is none.
@@ -117,15 +118,10 @@ class Guard:
         until_s = min(until_s, now_s + self._watchdog_s)
         sane = math.isfinite(steering_rad) and math.isfinite(throttle) and abs(throttle) <= 1.0
         if kind == DRIVE and sane and until_s > now_s and not self._over:
-            try:
-                with self._busy():
-                    self._actuator.send(steering_rad, throttle)
-            except Exception as error:
-                self._neutral()
-                self._over = f"the actuator failed: {error}"
-                self._say(f"failed {self._over}")
-                return
             self._driving, self._until_s = True, until_s
+            self._command = (steering_rad, throttle)
+            if not self._drive():
+                return
         else:
             self._neutral()
             if kind == DRIVE and not sane:
@@ -134,6 +130,18 @@ class Guard:
                 self._say(f"failed {self._over}")
                 return
         self._say(f"ok {number}")
+
+    def _drive(self) -> bool:
+        """Send the present command; False if the actuator failed."""
+        try:
+            with self._busy():
+                self._actuator.send(*self._command)
+        except Exception as error:
+            self._neutral()
+            self._over = f"the actuator failed: {error}"
+            self._say(f"failed {self._over}")
+            return False
+        return True
 
     def _expire(self, readable: bool) -> None:
         now_s = time.monotonic()
@@ -145,8 +153,11 @@ class Guard:
             if now_s - self._logged_s > 1.0:
                 self._logged_s = now_s
                 log.warning("neutral: %s", reason)
-        elif not self._driving and not readable:
-            self._neutral()
+        elif not readable:
+            if self._driving:
+                self._drive()
+            else:
+                self._neutral()
         if not self._over and now_s - self._heard_s > self._give_up_s and math.isfinite(self._until_s):
             self._over = f"the drive loop was silent for {self._give_up_s:g} s"
 

@@ -84,10 +84,13 @@ def test_no_command_is_good_for_longer_than_the_watchdog(wire: Path) -> None:
     sink.open()
     sent_s = time.monotonic()
     sink.send(0.0, 0.2, sent_s + 60.0)
-    assert wait_for(wire, "neutral", wait_for(wire, "send", sent_s).t_s).t_s - sent_s <= WATCHDOG_S + LATE_S
+    neutral_s = wait_for(wire, "neutral", wait_for(wire, "send", sent_s).t_s).t_s
+    assert neutral_s - sent_s <= WATCHDOG_S + LATE_S
+    # While it holds it is repeated, for what is lost on the wire, and for a board with a watchdog of its own.
+    assert len([line for line in read_wire(wire) if line.kind == "send"]) > 1
     sink.send(0.0, 0.2, time.monotonic() - 0.01)
     time.sleep(0.1)
-    assert len([line for line in read_wire(wire) if line.kind == "send"]) == 1
+    assert not [line for line in read_wire(wire) if line.kind == "send" and line.t_s > neutral_s]
     sink.close()
 
 
