@@ -4,10 +4,12 @@
 //   pin 10   signal of the electronic speed controller
 //   GND      ground of both; the servo's supply comes from the speed controller, not from the board
 //
-// The computer sends lines over USB (protocol.h). After 100 ms without a valid command the motor goes to
-// neutral.
+// The computer sends lines over USB (protocol.h). 80 ms after the last report that a command answers the motor
+// goes to neutral; the chip's own watchdog restarts a sketch that hangs, in neutral.
 //
 // Timer 1 makes both pulses, so they do not jitter while bytes arrive; no library is needed.
+
+#include <avr/wdt.h>
 
 #include "protocol.h"
 
@@ -33,6 +35,14 @@ void SetPulses() {
 
 }  // namespace
 
+// After its reset the watchdog still runs, at its shortest time. It is switched off before the first variable is
+// set up: else it would cut every start short.
+void StopWatchdog() __attribute__((naked, used, section(".init3")));
+void StopWatchdog() {
+  MCUSR = 0;
+  wdt_disable();
+}
+
 void setup() {
   // Fast PWM up to ICR1 (mode 14), both outputs high from the start of the period to the match.
   TCCR1A = _BV(COM1A1) | _BV(COM1B1) | _BV(WGM11);
@@ -44,11 +54,16 @@ void setup() {
   pinMode(10, OUTPUT);
   TCCR1B |= _BV(CS11);
   Serial.begin(115200);
-  board.Greet(reply);
+  board.Greet('B', reply);
+  // The restart may have cut a line short.
+  Serial.print('\n');
   Serial.print(reply);
+  // A turn of the loop takes less than 5 ms, also when it waits for room in the output buffer.
+  wdt_enable(WDTO_60MS);
 }
 
 void loop() {
+  wdt_reset();
   while (Serial.available() > 0) {
     if (board.TakeByte(static_cast<char>(Serial.read()), millis(), reply)) Serial.print(reply);
   }

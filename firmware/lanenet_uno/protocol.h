@@ -1,4 +1,4 @@
-// The board's side of the protocol in lanenet/onboard/actuators/serial_board.py, version 1, with the watchdog.
+// The board's side of the protocol in lanenet/onboard/actuators/serial_board.py, version 2, with the watchdog.
 // Uses no Arduino header, so that it can be tested on a computer.
 
 #ifndef LANENET_PROTOCOL_H
@@ -9,9 +9,10 @@
 
 namespace lanenet {
 
-const uint8_t kVersion = 1;
-const uint16_t kWatchdogMs = 100;
-const uint16_t kReportMs = 50;
+const uint8_t kVersion = 2;
+// A command is good until this long after the report that it answers.
+const uint8_t kCommandMs = 80;
+const uint8_t kReportMs = 10;
 // The longest line, without its end.
 const uint8_t kMaxLine = 39;
 // No pulse leaves this range, whatever a line says.
@@ -47,31 +48,32 @@ class Board {
     const uint8_t length = length_;
     length_ = 0;
     if (length == 0) return false;
-    char letter = 0;
-    uint16_t first = 0, second = 0;
-    if (length > kMaxLine || !Parse(length, &letter, &first, &second)) {
-      ++rejected_;
+    Line line;
+    if (length > kMaxLine || !Parse(length, &line)) {
+      ++refused_;
       return false;
     }
-    ++accepted_;
-    if (letter == 'V') return Greet(reply);
-    if (letter == 'N') {
-      neutral_steering_us_ = first;
-      neutral_throttle_us_ = second;
+    if (line.letter == 'V') return Greet('V', reply);
+    if (line.letter == 'N') {
+      neutral_steering_us_ = line.steering_us;
+      neutral_throttle_us_ = line.throttle_us;
       has_neutral_ = true;
       driving_ = false;
-    } else if (has_neutral_) {
-      steering_us_ = first;
-      throttle_us_ = second;
+    } else if (has_neutral_ && now_ms - line.time_ms < kCommandMs) {
+      steering_us_ = line.steering_us;
+      throttle_us_ = line.throttle_us;
+      sequence_ = line.sequence;
+      command_ms_ = line.time_ms;
       driving_ = true;
-      last_command_ms_ = now_ms;
+    } else {
+      ++refused_;
     }
     return false;
   }
 
-  // Fills `reply` with the version; also sent once at the start.
-  bool Greet(char* reply) const {
-    snprintf(reply, kMaxLine, "V%u", static_cast<unsigned>(kVersion));
+  // Fills `reply` with the version: V answers a question, B tells that the board has started.
+  bool Greet(char letter, char* reply) const {
+    snprintf(reply, kMaxLine, "%c%u", letter, static_cast<unsigned>(kVersion));
     Seal(reply);
     return true;
   }
@@ -79,12 +81,12 @@ class Board {
   // Called in every turn of the loop. Returns true when `reply` holds a report to send.
   bool Tick(uint32_t now_ms, char* reply) {
     // Unsigned subtraction stays correct when the clock wraps to 0 after 49 days.
-    if (driving_ && now_ms - last_command_ms_ >= kWatchdogMs) driving_ = false;
+    if (driving_ && now_ms - command_ms_ >= kCommandMs) driving_ = false;
     if (now_ms - last_report_ms_ < kReportMs) return false;
     last_report_ms_ = now_ms;
-    snprintf(reply, kMaxLine, "A%u,%u,%u,%u,%u", static_cast<unsigned>(accepted_),
-             static_cast<unsigned>(rejected_), driving_ ? 1u : 0u, static_cast<unsigned>(steering_us()),
-             static_cast<unsigned>(throttle_us()));
+    snprintf(reply, kMaxLine, "A%lu,%u,%u,%u,%u,%u", static_cast<unsigned long>(now_ms),
+             static_cast<unsigned>(sequence_), static_cast<unsigned>(refused_), driving_ ? 1u : 0u,
+             static_cast<unsigned>(steering_us()), static_cast<unsigned>(throttle_us()));
     Seal(reply);
     return true;
   }
@@ -94,43 +96,65 @@ class Board {
   uint16_t throttle_us() const { return driving_ ? throttle_us_ : neutral_throttle_us_; }
 
  private:
+  struct Line {
+    char letter;
+    uint16_t steering_us, throttle_us, sequence;
+    uint32_t time_ms;
+  };
+
   static int8_t HexDigit(char c) {
     if (c >= '0' && c <= '9') return c - '0';
     if (c >= 'A' && c <= 'F') return c - 'A' + 10;
     return -1;
   }
 
-  // Reads digits up to `end` or a comma; false if there are none or too many, or the pulse is out of range.
-  bool Number(uint8_t* at, uint8_t end, uint16_t* value) const {
-    uint32_t sum = 0;
+  // Reads digits up to `end` or a comma; false if there are none, or the number is out of range.
+  bool Number(uint8_t* at, uint8_t end, uint32_t least, uint32_t most, uint32_t* value) const {
     const uint8_t start = *at;
-    while (*at < end && line_[*at] >= '0' && line_[*at] <= '9' && *at - start < 5)
-      sum = sum * 10 + (line_[(*at)++] - '0');
-    *value = static_cast<uint16_t>(sum);
-    return *at > start && sum >= kShortestUs && sum <= kLongestUs;
+    for (*value = 0; *at < end && line_[*at] >= '0' && line_[*at] <= '9'; ++*at) {
+      const uint8_t digit = line_[*at] - '0';
+      if (*value > (most - digit) / 10) return false;
+      *value = *value * 10 + digit;
+    }
+    return *at > start && *value >= least;
   }
 
-  bool Parse(uint8_t length, char* letter, uint16_t* first, uint16_t* second) const {
+  bool Pulse(uint8_t* at, uint8_t end, uint16_t* pulse_us) const {
+    uint32_t value = 0;
+    if (!Number(at, end, kShortestUs, kLongestUs, &value)) return false;
+    *pulse_us = static_cast<uint16_t>(value);
+    return true;
+  }
+
+  bool Comma(uint8_t* at, uint8_t end) const { return *at < end && line_[(*at)++] == ','; }
+
+  bool Parse(uint8_t length, Line* line) const {
     if (length < 4 || line_[length - 3] != '*') return false;
     const int8_t high = HexDigit(line_[length - 2]), low = HexDigit(line_[length - 1]);
     const uint8_t end = length - 3;
     if (high < 0 || low < 0 || Crc8(line_, end) != high * 16 + low) return false;
-    *letter = line_[0];
-    if (*letter == 'V') return end == 1;
-    if (*letter != 'S' && *letter != 'N') return false;
+    line->letter = line_[0];
+    if (line->letter == 'V') return end == 1;
+    if (line->letter != 'S' && line->letter != 'N') return false;
     uint8_t at = 1;
-    if (!Number(&at, end, first)) return false;
-    if (at >= end || line_[at++] != ',') return false;
-    return Number(&at, end, second) && at == end;
+    if (!Pulse(&at, end, &line->steering_us) || !Comma(&at, end)) return false;
+    if (!Pulse(&at, end, &line->throttle_us)) return false;
+    if (line->letter == 'S') {
+      uint32_t sequence = 0;
+      if (!Comma(&at, end) || !Number(&at, end, 0, UINT16_MAX, &sequence)) return false;
+      line->sequence = static_cast<uint16_t>(sequence);
+      if (!Comma(&at, end) || !Number(&at, end, 0, UINT32_MAX, &line->time_ms)) return false;
+    }
+    return at == end;
   }
 
   char line_[kMaxLine + 1] = {0};
   uint8_t length_ = 0;
-  uint16_t accepted_ = 0, rejected_ = 0;
+  uint16_t sequence_ = 0, refused_ = 0;
   bool has_neutral_ = false, driving_ = false;
   uint16_t neutral_steering_us_ = 1500, neutral_throttle_us_ = 1500;
   uint16_t steering_us_ = 1500, throttle_us_ = 1500;
-  uint32_t last_command_ms_ = 0, last_report_ms_ = 0;
+  uint32_t command_ms_ = 0, last_report_ms_ = 0;
 };
 
 }  // namespace lanenet

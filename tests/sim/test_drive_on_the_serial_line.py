@@ -30,6 +30,8 @@ class Board:
     """The other end of the line: notes what it is told, and has no watchdog of its own that could help."""
 
     def __init__(self) -> None:
+        #: It reports, but hears nothing: a line that fails in one direction.
+        self.deaf = False
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)
@@ -40,7 +42,7 @@ class Board:
         self._thread.start()
 
     def _serve(self) -> None:
-        reader, pulses, due_s = LineReader(), (STOPPED_US, STOPPED_US), 0.0
+        reader, pulses, due_s, driving, sequence = LineReader(), (STOPPED_US, STOPPED_US), 0.0, 0, 0
         os.set_blocking(self._master, False)
         while not self._over.is_set():
             try:
@@ -48,15 +50,18 @@ class Board:
             except BlockingIOError:
                 data = b""
                 time.sleep(0.001)
-            for line in reader.feed(data):
+            for line in [] if self.deaf else reader.feed(data):
                 if line.letter == "V":
                     self._say(encode("V", VERSION))
                 elif line.letter in "NS":
                     pulses = (line.numbers[0], line.numbers[1])
+                    driving = int(line.letter == "S")
+                    sequence = line.numbers[2] if driving else sequence
                     self.told.append((time.monotonic(), line.numbers[1]))
-            if time.monotonic() >= due_s:
-                due_s = time.monotonic() + REPORT_S
-                self._say(encode("A", 0, 0, 1, *pulses))
+            now_s = time.monotonic()
+            if now_s >= due_s:
+                due_s = now_s + REPORT_S
+                self._say(encode("A", int(1e3 * now_s) % 2**32, sequence, 0, driving, *pulses))
 
     def _say(self, line: bytes) -> None:
         """Send a line; as on a wire, it is lost while the other end has not read what came before."""
@@ -137,3 +142,34 @@ def test_the_motor_stops_whatever_ends_the_loop(tmp_path: Path, board: Board, nu
     log = (tmp_path / "log.txt").read_text()
     assert {signal.SIGTERM: "neutral: SIGTERM"}.get(number, "lanenet guard: neutral") in log
     assert code == (0 if number == signal.SIGTERM else -signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_drive_whose_commands_arrive_nowhere_ends_and_says_so(tmp_path: Path, board: Board) -> None:
+    process = start(tmp_path, board)
+    try:
+        board.wait_for(driving=True)
+        board.deaf = True
+        assert process.wait(10.0) == 1
+    finally:
+        process.kill()
+        process.wait()
+    log = (tmp_path / "log.txt").read_text()
+    assert "accepted no command" in log and board.port in log
+
+
+@pytest.mark.slow
+def test_when_the_guard_is_killed_the_loop_sends_neutral_at_once(tmp_path: Path, board: Board) -> None:
+    process = start(tmp_path, board)
+    try:
+        board.wait_for(driving=True)
+        guard = int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
+        struck_s = time.monotonic()
+        os.kill(guard, signal.SIGKILL)
+        neutral_s = board.wait_for(driving=False, after_s=struck_s)
+        assert neutral_s - struck_s <= ALLOWED_S + LATE_S
+        assert process.wait(10.0) == 1
+        assert {us for t_s, us in board.told if t_s >= neutral_s} == {STOPPED_US}
+    finally:
+        process.kill()
+        process.wait()

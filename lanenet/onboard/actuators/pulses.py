@@ -108,15 +108,18 @@ _LONGEST_WAIT_S = 0.02
 
 
 @contextmanager
-def brief_lock(lock: threading.Lock) -> Iterator[None]:
+def brief_lock(lock: threading.Lock) -> Iterator[bool]:
     """Take a lock, but go on without it if it is not free soon: a hanging command must not block neutral.
 
     Args:
         lock: Held by commands while they are sent.
+
+    Yields:
+        Whether the lock was free.
     """
     locked = lock.acquire(timeout=_LONGEST_WAIT_S)
     try:
-        yield
+        yield locked
     finally:
         if locked:
             lock.release()

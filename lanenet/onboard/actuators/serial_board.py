@@ -3,54 +3,63 @@
 The board has its own watchdog, so the motor stops even when this computer hangs or is unplugged. Its sketch
 is ``firmware/lanenet_uno``, whose ``protocol.h`` has the same protocol in C++; tests connect the two.
 
-Protocol, version 1: ASCII at 115200 baud, 8N1. A line is a letter, whole numbers separated by commas, ``*``,
-a checksum and a line feed: ``S1500,1500*49``. The checksum is the CRC-8 of everything before the ``*``
-(CRC-8/SMBUS) as two upper-case hexadecimal digits. A line with a wrong checksum, form or number is dropped
-and counted.
+Protocol, version 2: ASCII at 115200 baud, 8N1. A line is a letter, whole numbers separated by commas, ``*``,
+a checksum and a line feed: ``N1500,1500*39``. The checksum is the CRC-8 of everything before the ``*``
+(CRC-8/SMBUS) as two upper-case hexadecimal digits. A line with a wrong checksum, form or number is refused.
 
 From the computer:
 
     V                               asks for the version
     N<steering_us>,<throttle_us>    sets the pulses of straight wheels and neutral, and goes there
-    S<steering_us>,<throttle_us>    sets the pulses now
+    S<steering_us>,<throttle_us>,<sequence>,<time_ms>
+                                    sets the pulses; <sequence> counts commands modulo 65536, <time_ms> is the
+                                    board's, from its newest report
 
 From the board:
 
-    V<version>                      answers V; also sent once after the board has started
-    A<accepted>,<rejected>,<driving>,<steering_us>,<throttle_us>
-                                    every 50 ms: counts of lines modulo 65536, 1 while commands arrive and 0
-                                    in neutral, and the present pulses
+    V<version>                      answers V
+    B<version>                      sent once after the board has started
+    A<time_ms>,<sequence>,<refused>,<driving>,<steering_us>,<throttle_us>
+                                    every 10 ms: its clock (32 bits), the last command that it accepted, lines
+                                    refused modulo 65536, 1 while a command is good and 0 in neutral, and the
+                                    present pulses
 
-The board goes to its neutral pulses after 100 ms without a valid ``S``. After a start it drives only once it
-got an ``N``, so that a board that restarted stays in neutral until the computer has noticed.
+A command is good until 80 ms after the report that it answers, by the board's own clock; then the board is in
+neutral. A line that waited somewhere is refused: it cannot name a later time of the board than was known when
+it was written. So the motor stops when either direction of the line fails, and no two clocks are compared.
+Neutral always counts. After a start the board drives only once it got an ``N``, so that a board that
+restarted stays in neutral until the computer has noticed.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
-from lanenet.onboard.actuators.pulses import Pulses, PulseSettings, brief_lock, command_pulses, neutral_pulses
+from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
 
-VERSION = 1
+VERSION = 2
 BAUD = 115200
-#: After this time without a valid command the board goes to neutral.
-WATCHDOG_S = 0.1
+#: A command is good until this long after the report that it answers. Chosen: with the 20 ms of a pulse's
+#: period the motor's pulse is neutral within 100 ms; commands come every 40 ms or faster.
+COMMAND_S = 0.08
 #: Time between two reports of the board.
-REPORT_S = 0.05
+REPORT_S = 0.01
 #: The longest line, with its end.
 MAX_LINE = 40
-_POLYNOMIAL = 0x07
-#: A line takes 2 ms; a port that takes none of it for this long is dead.
+#: A line takes 3 ms; a port that takes none of it for this long is dead.
 _WRITE_TIMEOUT_S = 0.05
+#: The greeting is repeated this often; lines are lost while an Uno's boot loader runs.
+_AGAIN_S = 0.1
+#: At most so many reads for the reports that wait; the kernel keeps less than this many times 4096 bytes.
+_READS = 32
 
 _log = logging.getLogger(__name__)
 
@@ -68,13 +77,40 @@ class Line:
     numbers: tuple[int, ...]
 
 
+class Report(NamedTuple):
+    """A report of the board.
+
+    Attributes:
+        time_ms: The board's clock, modulo 2^32.
+        sequence: Number of the last command that it accepted.
+        refused: Lines that it has refused since it started, modulo 65536: damaged or late.
+        driving: 1 while a command is good, 0 in neutral.
+        steering_us: Present pulse of the steering.
+        throttle_us: Present pulse of the motor.
+    """
+
+    time_ms: int
+    sequence: int
+    refused: int
+    driving: int
+    steering_us: int
+    throttle_us: int
+
+
+def _remainder(byte: int) -> int:
+    for _ in range(8):
+        byte = (byte << 1 ^ 0x07 if byte & 0x80 else byte << 1) & 0xFF
+    return byte
+
+
+_REMAINDERS = bytes(map(_remainder, range(256)))
+
+
 def crc8(data: bytes) -> int:
     """Return the CRC-8 of bytes: x^8 + x^2 + x + 1, start 0, not reflected (CRC-8/SMBUS)."""
     crc = 0
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = ((crc << 1) ^ _POLYNOMIAL if crc & 0x80 else crc << 1) & 0xFF
+        crc = _REMAINDERS[crc ^ byte]
     return crc
 
 
@@ -90,7 +126,7 @@ def decode(line: bytes) -> Line | None:
     if not star or len(checksum) != 2 or checksum != f"{crc8(text):02X}".encode("ascii"):
         return None
     letter, fields = text[:1], text[1:].split(b",") if len(text) > 1 else []
-    if not (letter.isalpha() and all(field.isdigit() and len(field) <= 5 for field in fields)):
+    if not (letter.isalpha() and all(field.isdigit() and len(field) <= 10 for field in fields)):
         return None
     return Line(letter.decode("ascii"), tuple(int(field) for field in fields))
 
@@ -117,7 +153,8 @@ class SerialBoardSettings(PulseSettings):
         port: Device of the serial line; names under ``/dev/serial/by-id`` do not change between boots.
         start_s: Longest wait for the board's answer; an Uno restarts when its port is opened, which takes two
             seconds.
-        silence_s: A board that sends no report for this long counts as gone; it reports every 0.05 s.
+        silence_s: A board that sends no report for this long, or accepts no command, counts as gone; it
+            reports every 0.01 s.
     """
 
     kind: Literal["serial"] = "serial"
@@ -135,33 +172,44 @@ class SerialBoard:
         self._lock = threading.Lock()
         self._reader = LineReader()
         self._heard_s = 0.0
-        #: The board's newest report: lines accepted, lines rejected, driving, the two pulses.
-        self._report: tuple[int, ...] | None = None
+        self._report: Report | None = None
+        self._version: int | None = None
+        self._restarted = False
+        #: Number of the last command, and since when the board has accepted none of those that were sent;
+        #: None while none is due.
+        self._sequence = 0
+        self._unaccepted_s: float | None = None
 
     @property
-    def rejected_lines(self) -> int:
-        """Lines that the board has rejected since it started, by its last report."""
-        return 0 if self._report is None else self._report[1]
+    def refused_lines(self) -> int:
+        """Lines that the board has refused since it started, by its last report: damaged or late."""
+        return 0 if self._report is None else self._report.refused
 
     def open(self) -> None:
-        """Wait for the board, send it the neutral pulses, and wait until it reports them.
+        """Send the neutral pulses, and wait until the board reports them.
 
         Raises:
             HardwareError: If the port or the board do not answer, or the sketch is of another version.
             MissingExtraError: If pyserial is not installed.
         """
-        serial = require("serial", "car")
+        serial, termios = require("serial", "car"), require("termios", "car")
         settings = self._settings
         try:
             self._port = serial.Serial(
                 settings.port, BAUD, timeout=0.0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except (OSError, ValueError) as error:
+            # Else the kernel lets go of DTR when the last program closes the port, and an Uno restarts,
+            # without pulses, when the loop opens it again because the guard was killed.
+            attributes = termios.tcgetattr(self._port.fd)
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._port.fd, termios.TCSANOW, attributes)
+        except (OSError, ValueError, termios.error) as error:
+            self._release()
             raise HardwareError(
                 f"{settings.port}: cannot be opened ({error}); is the board plugged in (ls "
                 "/dev/serial/by-id), and are you in its group (sudo usermod -aG dialout $USER)?"
             ) from None
-        self._reader, self._report = LineReader(), None
+        self._reader, self._report, self._version = LineReader(), None, None
         try:
             self._greet()
         except OSError as error:
@@ -172,27 +220,27 @@ class SerialBoard:
             raise
 
     def _greet(self) -> None:
-        neutral = neutral_pulses(self._settings)
-        pulses = (round(neutral.steering_us), round(neutral.throttle_us))
-        end_s = time.monotonic() + self._settings.start_s
-        version: int | None = None
-        while time.monotonic() < end_s:
-            # Repeated, since lines are lost while the board's boot loader runs.
-            self._port.write(encode("V") if version is None else encode("N", *pulses))
-            wait_s = time.monotonic() + 0.1
-            while time.monotonic() < wait_s:
-                for line in self._receive():
-                    if line.letter == "V" and len(line.numbers) == 1:
-                        version = line.numbers[0]
-                if version not in (None, VERSION):
-                    raise HardwareError(
-                        f"{self._settings.port}: the board uses version {version} of the protocol, "
-                        f"expected {VERSION}; load the sketch firmware/lanenet_uno"
-                    )
-                if version is not None and self._report is not None and self._report[3:] == pulses:
-                    return
-                time.sleep(0.005)
-        what = "no answer" if version is None else f"neutral pulses {pulses} not accepted"
+        neutral = self._neutral_pulses()
+        # The first line feed ends what somebody who was killed has left unfinished.
+        greeting = b"\n" + encode("N", *neutral) + encode("V")
+        end_s, again_s = time.monotonic() + self._settings.start_s, 0.0
+        while (now_s := time.monotonic()) < end_s:
+            if now_s >= again_s:
+                self._port.write(greeting)
+                again_s = now_s + _AGAIN_S
+            self._receive()
+            if self._version not in (None, VERSION):
+                raise HardwareError(
+                    f"{self._settings.port}: the sketch on the board uses version {self._version} of the "
+                    f"protocol, expected {VERSION}; upload firmware/lanenet_uno of this lanenet "
+                    "(firmware/README.md)"
+                )
+            report = self._report
+            if self._version is not None and report is not None and report[-3:] == (0, *neutral):
+                self._sequence, self._unaccepted_s, self._restarted = report.sequence, None, False
+                return
+            time.sleep(0.002)
+        what = "no answer" if self._version is None else f"neutral pulses {neutral} not accepted"
         raise HardwareError(
             f"{self._settings.port}: {what} within {self._settings.start_s:g} s; is the sketch "
             "firmware/lanenet_uno on the board?"
@@ -202,36 +250,57 @@ class SerialBoard:
         """Set both outputs; see :class:`lanenet.onboard.devices.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not finite, or the board is gone, silent or has
-                restarted.
+            HardwareError: If it is not open, a value is not finite, or the board is gone, silent, accepts no
+                commands or has restarted.
         """
         pulses = command_pulses(self._settings, steering_rad, throttle)
         if self._port is None:
             raise HardwareError(f"{self._settings.port}: not open")
         with self._lock:
             try:
-                self._write(pulses)
-                lines = self._receive()
+                # First, as a command carries the newest time of the board.
+                self._receive()
+                self._check()
+                self._command(round(pulses.steering_us), round(pulses.throttle_us))
             except OSError as error:
                 raise HardwareError(f"{self._settings.port}: the board is gone ({error})") from None
-        if any(line.letter == "V" for line in lines):
+
+    def _check(self) -> None:
+        """Compare the newest report with what was sent."""
+        port, now_s, allowed_s = self._settings.port, time.monotonic(), self._settings.silence_s
+        if self._restarted:
+            raise HardwareError(f"{port}: the board has restarted and is in neutral; check its supply")
+        if now_s - self._heard_s > allowed_s:
             raise HardwareError(
-                f"{self._settings.port}: the board has restarted and is in neutral; check its supply"
+                f"{port}: the board has been silent for {now_s - self._heard_s:.2f} s, expected a report "
+                f"every {REPORT_S:g} s; check its cable and supply"
             )
-        silent_s = time.monotonic() - self._heard_s
-        if silent_s > self._settings.silence_s:
+        if self._unaccepted_s is not None and now_s - self._unaccepted_s > allowed_s:
             raise HardwareError(
-                f"{self._settings.port}: the board has been silent for {silent_s:.2f} s, expected a report "
-                "every 0.05 s; check its cable and supply"
+                f"{port}: the board reports, but has accepted no command for "
+                f"{now_s - self._unaccepted_s:.2f} s: the last was {self._sequence}, it accepted "
+                f"{self._accepted}, and has refused {self.refused_lines} lines as damaged or late; it is in "
+                "neutral; check the cable from the computer to the board"
             )
+
+    def _command(self, steering_us: int, throttle_us: int) -> None:
+        if self._unaccepted_s is None:
+            self._unaccepted_s = time.monotonic()
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        time_ms = 0 if self._report is None else self._report.time_ms
+        self._port.write(encode("S", steering_us, throttle_us, self._sequence, time_ms))
 
     def neutral(self) -> None:
         """Stop the motor and straighten the wheels; never raises."""
         if self._port is None:
             return
-        with brief_lock(self._lock):
+        with brief_lock(self._lock) as locked:
             try:
-                self._write(neutral_pulses(self._settings))
+                self._port.write(encode("N", *self._neutral_pulses()))
+                if locked:
+                    self._unaccepted_s = None
+                    # Unread reports would fill the line, and the next command would answer an old one.
+                    self._receive()
             except Exception as error:
                 _log.error(
                     "%s: neutral could not be sent, the board's watchdog stops the motor: %s",
@@ -246,18 +315,41 @@ class SerialBoard:
 
     def _release(self) -> None:
         port, self._port = self._port, None
-        if port is not None:
-            with contextlib.suppress(OSError):
-                port.flush()
-            with contextlib.suppress(OSError):
-                port.close()
+        if port is None:
+            return
+        # pyserial waits without end for a line that takes nothing, and reports a lost one by several errors.
+        end_s = time.monotonic() + _WRITE_TIMEOUT_S
+        try:
+            while port.out_waiting and time.monotonic() < end_s:
+                time.sleep(0.001)
+            port.close()
+        except Exception as error:
+            _log.debug("%s: while it was closed: %s", self._settings.port, error)
 
-    def _write(self, pulses: Pulses) -> None:
-        self._port.write(encode("S", round(pulses.steering_us), round(pulses.throttle_us)))
+    def _neutral_pulses(self) -> tuple[int, int]:
+        pulses = neutral_pulses(self._settings)
+        return round(pulses.steering_us), round(pulses.throttle_us)
 
-    def _receive(self) -> list[Line]:
-        lines = self._reader.feed(self._port.read(4096))
-        for line in lines:
-            if line.letter == "A" and len(line.numbers) == 5:
-                self._report, self._heard_s = line.numbers, time.monotonic()
-        return lines
+    @property
+    def _accepted(self) -> int:
+        return 0 if self._report is None else self._report.sequence
+
+    def _receive(self) -> None:
+        """Read everything that the board has sent."""
+        for _ in range(_READS):
+            data = self._port.read(4096)
+            for line in self._reader.feed(data):
+                self._take(line)
+            if len(data) < 4096:
+                return
+
+    def _take(self, line: Line) -> None:
+        if line.letter == "A" and len(line.numbers) == len(Report._fields):
+            before, self._report, self._heard_s = self._accepted, Report(*line.numbers), time.monotonic()
+            if self._accepted == self._sequence:
+                self._unaccepted_s = None
+            elif self._accepted != before and self._unaccepted_s is not None:
+                self._unaccepted_s = self._heard_s
+        elif line.letter in "VB" and len(line.numbers) == 1:
+            self._version = line.numbers[0]
+            self._restarted |= line.letter == "B"

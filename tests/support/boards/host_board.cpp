@@ -1,10 +1,13 @@
 // The board's protocol on this computer: bytes in on stdin, bytes out on stdout (a pseudo-terminal), and on
 // stderr a line "t_s steering_us throttle_us" whenever the pulses change. Ends when stdin is closed.
+//
+//   host_board [start_ms]    where the board's clock starts
 
 #include <poll.h>
 #include <time.h>
 #include <unistd.h>
 
+#include <cstdlib>
 #include <cstring>
 
 #include "protocol.h"
@@ -17,17 +20,21 @@ double Now() {
   return now.tv_sec + 1e-9 * now.tv_nsec;
 }
 
-uint32_t Millis() { return static_cast<uint32_t>(1e3 * Now()); }
+const double kBegun = Now();
+uint32_t start_ms = 0;
+
+uint32_t Millis() { return start_ms + static_cast<uint32_t>(1e3 * (Now() - kBegun)); }
 
 void Send(const char* line) { (void)!write(STDOUT_FILENO, line, std::strlen(line)); }
 
 }  // namespace
 
-int main() {
+int main(int argc, char** argv) {
+  if (argc > 1) start_ms = static_cast<uint32_t>(std::strtoul(argv[1], nullptr, 10));
   lanenet::Board board;
   char reply[lanenet::kMaxLine + 6];
   uint16_t steering_us = 0, throttle_us = 0;
-  board.Greet(reply);
+  board.Greet('B', reply);
   Send(reply);
   for (;;) {
     pollfd input = {STDIN_FILENO, POLLIN, 0};

@@ -1,6 +1,7 @@
 // An Uno in simavr that runs the sketch: the ATmega328P's serial line is stdin and stdout (a pseudo-terminal),
 // and every pulse that starts on pin 9 or 10 becomes a line "t_s pin width_us period_us" on stderr. Simulated
-// time keeps step with real time. Ends when stdin is closed.
+// time keeps step with real time. Ends when stdin is closed. At SIGUSR1 the sketch hangs, with its interrupts off,
+// until something resets the chip.
 //
 // simavr 1.6 does not take new compare values over while the timer runs up to ICR1, as the chip does at the end
 // of each period. Hence the start of a pulse is seen on the pin, and its width is taken from the register.
@@ -8,6 +9,7 @@
 //   avr_board sketch.elf
 
 #include <poll.h>
+#include <signal.h>
 #include <simavr/avr_ioport.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
@@ -23,6 +25,11 @@ enum { OCR1A = 0x88, OCR1B = 0x8A };
 
 static avr_t *avr;
 static int ready = 1;
+static volatile sig_atomic_t asked_to_hang;
+// The program's address and its two bytes there that a jump to itself replaces while the sketch hangs.
+static avr_flashaddr_t hung_at;
+static uint8_t hung_bytes[2];
+static int hung;
 static avr_cycle_count_t rise[2];
 
 static double now_s(void) {
@@ -53,6 +60,19 @@ static void on_pin(struct avr_irq_t *irq, uint32_t value, void *param) {
   rise[which] = avr->cycle;
 }
 
+static void on_signal(int number) {
+  (void)number;
+  asked_to_hang = 1;
+}
+
+static void hang(void) {
+  hung_at = avr->pc;
+  memcpy(hung_bytes, avr->flash + hung_at, 2);
+  memcpy(avr->flash + hung_at, "\xFF\xCF", 2);
+  avr->sreg[S_I] = 0;
+  hung = 1;
+}
+
 int main(int argc, char **argv) {
   elf_firmware_t firmware;
   memset(&firmware, 0, sizeof firmware);
@@ -74,6 +94,7 @@ int main(int argc, char **argv) {
   for (long which = 0; which < 2; ++which)
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('B'), 1 + which), on_pin, (void *)which);
 
+  signal(SIGUSR1, on_signal);
   const double start_s = now_s();
   for (;;) {
     struct pollfd serial = {STDIN_FILENO, POLLIN, 0};
@@ -89,7 +110,13 @@ int main(int argc, char **argv) {
     }
     // A millisecond at most, so that input is looked at again when the computer was busy.
     const avr_cycle_count_t stop = avr->cycle + 16000 < until ? avr->cycle + 16000 : until;
-    while (avr->cycle < stop)
+    if (asked_to_hang && !hung) hang();
+    while (avr->cycle < stop) {
       if (avr_run(avr) == cpu_Crashed) return 3;
+      if (hung && avr->pc != hung_at) {
+        memcpy(avr->flash + hung_at, hung_bytes, 2);
+        hung = asked_to_hang = 0;
+      }
+    }
   }
 }
