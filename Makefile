@@ -19,7 +19,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install golden golden-renew arm check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install golden golden-renew arm neutral check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -29,6 +29,7 @@ help:
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
+	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
 	@echo "make bench        time the stages that run on the car, on this machine"
@@ -59,6 +60,10 @@ golden-renew: $(VENV)/.stamp-dev
 # Needs debootstrap and qemu-user-static, and root.
 arm: $(VENV)/.stamp-train
 	PYTHON=$(abspath $(BIN)/python) contrib/arm/prove
+
+# Twenty times each; for true times leave the machine alone meanwhile. Needs g++.
+neutral: $(VENV)/.stamp-dev
+	$(PYTEST) -s --numprocesses 0 tests/sim/test_neutral_times.py
 
 check: format-check lint types imports test
 
