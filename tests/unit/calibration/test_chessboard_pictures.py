@@ -81,8 +81,10 @@ def test_the_picture_from_above_has_the_road_where_the_grid_says() -> None:
     np.testing.assert_allclose(spot, [(12.0 + 25.0) * 4.0, (55.0 - 33.0) * 4.0], atol=4.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("folder", "views", "rms_px"), [("picam_9x6", 20, 0.15), ("udacity_9x6", 17, 1.0)])
+@pytest.mark.parametrize(
+    ("folder", "views", "rms_px"),
+    [("picam_9x6", 20, 0.15), pytest.param("udacity_9x6", 17, 1.0, marks=pytest.mark.slow)],
+)
 def test_real_chessboards(shared_data: Path, folder: str, views: int, rms_px: float) -> None:
     found, left_out = find_views(list_pictures([str(shared_data / "chessboards" / folder)]), BOARD)
     result = calibrate_lens(found, "pinhole")
