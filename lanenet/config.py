@@ -2,24 +2,50 @@
 
 Every schema derives from :class:`Settings`: frozen, and unknown keys are refused. A YAML file lists only what
 differs from the defaults; ``key=value`` overrides come last.
+
+Values are as strict as keys: a number is a number, not ``yes``, a text or ``1:30``.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 
-from lanenet.errors import ConfigError, did_you_mean
+from lanenet.errors import ConfigError, LanenetError, did_you_mean
+from lanenet.reading import MEBIBYTE, parsing, read_text
+
+#: Of a file of settings. Chosen: the largest one here has 11 kB.
+_MAX_YAML = MEBIBYTE
+#: Values of a file, with every alias written out: nine aliases of nine aliases, nine times over, are 400
+#: million. Chosen: far above what a person writes; PyYAML reads that many in about a second.
+_MAX_NODES = 20_000
+
+
+def _with_strict_numbers(schema: Any) -> Any:
+    # pydantic's own strict mode would refuse lists for tuples and texts for paths, too.
+    if isinstance(schema, list | tuple):
+        return type(schema)(_with_strict_numbers(item) for item in schema)
+    if not isinstance(schema, dict):
+        return schema
+    strict = {"strict": True} if schema.get("type") in ("bool", "float", "int") else {}
+    kept = ("default", "expected", "metadata")
+    return {k: v if k in kept else _with_strict_numbers(v) for k, v in schema.items()} | strict
 
 
 class Settings(BaseModel):
     """Base of every settings schema."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        """Take numbers only for numbers, and truth values only for truth values."""
+        return _with_strict_numbers(handler(source))
 
 
 SettingsT = TypeVar("SettingsT", bound=Settings)
@@ -36,28 +62,98 @@ def flat_settings(settings: Settings) -> dict[str, Any]:
     return flat
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+class _Loader(yaml.SafeLoader):
+    """YAML with the numbers of version 1.2, and without keys that occur twice.
+
+    In YAML 1.1 ``1:30`` is 90, ``010`` is 8, ``1_0`` is 10 and ``1e-3`` is a text.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._nodes = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Count the values before they are built."""
+        self._nodes += 1
+        if self._nodes > _MAX_NODES:
+            raise yaml.composer.ComposerError(problem=f"more than {_MAX_NODES} values")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse what PyYAML takes: the last of several values."""
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if key.value == "<<" or not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in lines:
+                problem = f"key {key.value!r} occurs twice, first at line {lines[key.value]}"
+                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
+            lines[key.value] = line
+        return super().construct_mapping(node, deep)
+
+
+_INT, _FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in known if tag not in (_INT, _FLOAT)]
+    for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    _INT, re.compile(r"[-+]?(0|[1-9][0-9]*)$|0x[0-9a-fA-F]+$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    _FLOAT,
+    re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    list("-+.0123456789"),
+)
+_Loader.add_constructor(_INT, lambda loader, node: int(str(loader.construct_scalar(node)), 0))
+
+
+def parse_yaml(text: str, where: object, error: type[LanenetError] = ConfigError) -> Any:
+    """Return the plain data of a YAML text.
+
+    Raises:
+        LanenetError: Of the type ``error``, naming ``where`` and the line, if it is not YAML, a key occurs
+            twice, or its aliases would fill the memory.
+    """
+    with parsing(f"{where}: not valid YAML", error):
+        try:
+            loader = _Loader(text)
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            if _count_nodes(node, {}) > _MAX_NODES:
+                raise error(f"{where}: its aliases stand for more than {_MAX_NODES} values")
+            return loader.construct_document(node)
+        except yaml.YAMLError as problem:
+            mark = getattr(problem, "problem_mark", None)
+            line = f" at line {mark.line + 1}" if mark is not None else ""
+            why = getattr(problem, "problem", None) or getattr(problem, "reason", None)
+            raise error(f"{where}: not valid YAML{line}{f' ({why})' if why else ''}") from None
+
+
+def _count_nodes(node: yaml.Node, known: dict[int, int]) -> int:
+    """Count the values below a node; one that stands within itself counts as too many."""
+    if isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = _MAX_NODES + 1
+        parts = node.value if isinstance(node, yaml.SequenceNode) else [p for pair in node.value for p in pair]
+        known[id(node)] = 1 + sum(_count_nodes(part, known) for part in parts)
+    return known[id(node)]
+
+
+def read_yaml(path: Path, error: type[LanenetError] = ConfigError) -> dict[str, Any]:
     """Read a YAML file whose top level is a mapping.
 
     Raises:
-        ConfigError: If the file is missing, is not YAML, or is not a mapping.
+        LanenetError: Of the type ``error``, if the file is missing, is not YAML, or is not a mapping.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark is not None else ""
-        raise ConfigError(f"{path}: not valid YAML{where}") from None
+    data = parse_yaml(read_text(path, error, _MAX_YAML), path, error)
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected a mapping of keys to values, found {type(data).__name__}")
+        raise error(f"{path}: expected a mapping of keys to values, found {type(data).__name__}")
     return data
 
 
@@ -72,10 +168,7 @@ def apply_overrides(data: dict[str, Any], overrides: list[str]) -> dict[str, Any
         key, equals, text = override.partition("=")
         if not equals or not key:
             raise ConfigError(f"override {override!r}: expected key=value")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ConfigError(f"override {override!r}: the value is not valid YAML") from None
+        value = parse_yaml(text, f"override {override!r}")
         *parents, last = key.split(".")
         node = result
         for parent in parents:
@@ -104,12 +197,13 @@ def check_settings(schema: type[SettingsT], data: dict[str, Any], where: str) ->
     Raises:
         ConfigError: Naming the origin, the key, what was found and what was expected.
     """
-    try:
-        return schema.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError(
-            f"{where}: " + "; ".join(_describe(schema, e) for e in error.errors()[:3])
-        ) from None
+    with parsing(where, ConfigError):
+        try:
+            return schema.model_validate(data)
+        except ValidationError as error:
+            raise ConfigError(
+                f"{where}: " + "; ".join(_describe(schema, e) for e in error.errors()[:3])
+            ) from None
 
 
 def dump_settings(settings: Settings) -> str:

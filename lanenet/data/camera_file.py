@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,8 +16,20 @@ from lanenet.data.files import write_text
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
 
-Row = tuple[float, float, float]
-Length = Annotated[float, Field(gt=0.0)]
+#: Bounds of what a file may hold. Chosen: ten metres, since no car is larger; a right angle, beyond which a
+#: camera sees no road ahead and a number is one of degrees; and numbers of lenses whose powers stay finite.
+_MAX_CM, _MAX_RAD, _MAX_PX, _MAX_COEFFICIENT = 1000.0, 0.5 * math.pi, 1e6, 1e4
+#: Pixels along a side; the largest sensors have fewer.
+_MAX_SIDE_PX = 2**14
+
+Number = Annotated[float, Field(ge=-_MAX_PX, le=_MAX_PX)]
+Coefficient = Annotated[float, Field(ge=-_MAX_COEFFICIENT, le=_MAX_COEFFICIENT)]
+Row = tuple[Number, Number, Number]
+Length = Annotated[float, Field(gt=0.0, le=_MAX_CM)]
+Place = Annotated[float, Field(ge=-_MAX_CM, le=_MAX_CM)]
+#: Radians.
+Angle = Annotated[float, Field(gt=-_MAX_RAD, lt=_MAX_RAD)]
+Side = Annotated[int, Field(gt=0, le=_MAX_SIDE_PX)]
 
 _D_LENGTHS: dict[str, tuple[int, ...]] = {"fisheye": (4,), "pinhole": (4, 5)}
 _ROS_MODELS: dict[str, CameraModel] = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
@@ -26,11 +39,11 @@ class MountingFile(Settings):
     """The mounting as a camera file holds it; see :class:`lanenet.geometry.camera.Mounting`."""
 
     height_cm: Length
-    pitch_down_rad: float = 0.0
-    roll_rad: float = 0.0
-    yaw_rad: float = 0.0
-    ahead_of_front_axle_cm: float = 0.0
-    right_of_centre_cm: float = 0.0
+    pitch_down_rad: Angle = 0.0
+    roll_rad: Angle = 0.0
+    yaw_rad: Angle = 0.0
+    ahead_of_front_axle_cm: Place = 0.0
+    right_of_centre_cm: Place = 0.0
 
 
 class CarFile(Settings):
@@ -58,10 +71,10 @@ class CameraFile(Settings):
 
     format: Literal["lanenet-camera/1"]
     model: CameraModel
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: Side
+    height: Side
     K: tuple[Row, Row, Row]
-    D: tuple[float, ...]
+    D: tuple[Coefficient, ...]
     mounting: MountingFile
     car: CarFile
     method: str = ""
@@ -140,9 +153,9 @@ def write_camera(
 
 
 class _RosMatrix(Settings):
-    rows: int = Field(gt=0)
-    cols: int = Field(gt=0)
-    data: tuple[float, ...]
+    rows: int = Field(gt=0, le=16)
+    cols: int = Field(gt=0, le=16)
+    data: tuple[Number, ...]
 
     @field_validator("data")
     @classmethod
@@ -158,8 +171,8 @@ class RosCameraInfo(Settings):
 
     model_config = ConfigDict(extra="ignore")
 
-    image_width: int = Field(gt=0)
-    image_height: int = Field(gt=0)
+    image_width: Side
+    image_height: Side
     distortion_model: Literal["plumb_bob", "equidistant", "fisheye"]
     camera_matrix: _RosMatrix
     distortion_coefficients: _RosMatrix
@@ -262,11 +275,7 @@ def _checked_distortion(D: tuple[float, ...], model: str) -> tuple[float, ...]:
 
 
 def _read(schema: type[SettingsT], path: Path) -> SettingsT:
-    try:
-        data = read_yaml(Path(path))
-    except ConfigError as error:
-        raise CalibrationError(str(error)) from None
-    return _checked(schema, data, str(path))
+    return _checked(schema, read_yaml(Path(path), CalibrationError), str(path))
 
 
 def _checked(schema: type[SettingsT], data: dict[str, Any], where: str) -> SettingsT:

@@ -18,11 +18,12 @@ from pydantic import Field
 
 from lanenet.config import Settings, check_settings
 from lanenet.data.files import require
-from lanenet.data.tables import ParquetTable, float_array, list_array, png_bytes, png_size, write_parquet
+from lanenet.data.tables import ParquetTable, float_array, list_array, png_bytes, write_parquet
 from lanenet.errors import ConfigError, LabelFormatError
-from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
 from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.reading import image_size, parsing
 
 __all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
 
@@ -170,13 +171,21 @@ def read_labels(path: Path) -> LabelSet:
     """
     table = ParquetTable(path)
     meta = _meta_from_file(table.meta, str(path))
+    with parsing(path, LabelFormatError):
+        label_set = _label_set(table, meta)
+    _check_values(label_set, str(path))
+    return label_set
+
+
+def _label_set(table: ParquetTable, meta: LabelMeta) -> LabelSet:
     edge_columns = [table.lists(name) for name in _EDGE_COLUMNS]
     line_columns = [[table.lists(name, allow_nan=True) for name in names] for names in _LINE_COLUMNS]
     left, right = (
-        _stacked(names, columns, path) for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
+        _stacked(names, columns, table.path)
+        for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
     )
     _check_images(table, meta.window)
-    label_set = LabelSet(
+    return LabelSet(
         meta=meta,
         drive=table.texts("drive"),
         file=table.texts("file"),
@@ -185,24 +194,14 @@ def read_labels(path: Path) -> LabelSet:
         lap=table.ints("lap"),
         poses=np.stack([table.floats(name) for name in _POSE_COLUMNS], axis=1),
         points_cm=np.stack([table.floats(name, allow_null=True) for name in POINT_NAMES], axis=1),
-        edges=_stacked(_EDGE_COLUMNS, edge_columns, path),
+        edges=_stacked(_EDGE_COLUMNS, edge_columns, table.path),
         lines=list(zip(left, right, strict=True)),
         quality=table.floats("quality"),
         divides=np.stack([table.flags(name) for name in _DIVIDES_COLUMNS], axis=1),
     )
-    _check_values(label_set, str(path))
-    return label_set
 
 
 _UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 to 1"}
-
-
-class _WindowFile(Settings):
-    left_cm: float
-    near_cm: float
-    cell_cm: float = Field(gt=0.0)
-    rows: int = Field(gt=0)
-    columns: int = Field(gt=0)
 
 
 class _MetaFile(Settings):
@@ -212,7 +211,7 @@ class _MetaFile(Settings):
     rows_cm: tuple[float, ...]
     order: tuple[str, ...]
     units: dict[str, str]
-    window: _WindowFile
+    window: WindowFile
     camera_hash: str
     wheelbase_cm: float = Field(gt=0.0)
     lane_width_cm: float = Field(gt=0.0)
@@ -251,7 +250,7 @@ def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
             f"{file.rows_cm} in the order {', '.join(file.order)}"
         )
     shared = {item.name: getattr(file, item.name) for item in fields(LabelMeta)}
-    return LabelMeta(**{**shared, "window": BirdseyeWindow(**file.window.model_dump())})
+    return LabelMeta(**{**shared, "window": file.window.window()})
 
 
 def _check_values(label_set: LabelSet, where: str) -> None:
@@ -295,7 +294,7 @@ def _stacked(names: tuple[str, ...], columns: list[list[np.ndarray]], path: Path
 def _check_images(table: ParquetTable, window: BirdseyeWindow) -> None:
     expected = (window.columns, window.rows)
     for row, image in enumerate(table.raw("image")):
-        found = png_size(image["bytes"]) if isinstance(image, dict) and image.get("bytes") else None
+        found = image_size(image["bytes"]) if isinstance(image, dict) and image.get("bytes") else None
         if found != expected:
             shown = "no PNG" if found is None else f"{found[0]}x{found[1]} px"
             raise LabelFormatError(

@@ -6,9 +6,12 @@ Reading is strict: an error names the file, the line or row, and the column. pya
 
 from __future__ import annotations
 
+import array
 import csv
+import io
 import json
 import math
+import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +23,28 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.files import atomic_file, require, write_text
 from lanenet.errors import DriveFormatError, LabelFormatError, LanenetError, MapFormatError, did_you_mean
+from lanenet.reading import MEBIBYTE, first_line, is_regular, open_regular, parsing
 
 _INT64_MAX = 2**63 - 1
 #: Numbers above this are written in full: nine digits would lose the microseconds of Unix time.
 _SHORT_BELOW = 1e6
+#: Of a CSV file. Chosen: a million frames with all their columns have 150 MB.
+_MAX_CSV = 512 * MEBIBYTE
+#: Characters of one row; chosen: a thousand columns of text.
+_MAX_RECORD = 2**18
+_ARRAYS = {"float": "d", "int": "q"}
+#: Of a Parquet file. Chosen: a day of driving, and twenty times the columns of a label set.
+_MAX_ROWS, _MAX_COLUMNS = 5_000_000, 1000
+#: Texts and lists in a Parquet file's footer, [B]; chosen: the widest table's footer is far smaller.
+_MAX_FOOTER = 16 * MEBIBYTE
+#: What a Parquet file may unpack to: so much, and so many times its size. Chosen: label sets unpack to 2 to 20
+#: times their size, small ones of a still car to more.
+_MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
+#: Rows that are unpacked at a time, before the limit is checked.
+_BATCH_ROWS = 1024
+#: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares of
+#: more would lose the centimetres.
+MAX_PLACE = 1e6
 #: Key of the schema metadata that holds what the table is, as JSON.
 META_KEY = b"lanenet"
 
@@ -67,7 +88,7 @@ def read_csv(
         skip_torn: Leave out a last line that was cut off; see :func:`is_torn`.
 
     Returns:
-        An array per column that the file has: float64, int64 or text. Row i is line i + 2 of a file without
+        An array per column that the file has: float64, int64, or texts as objects. Row i is line i + 2 of a file without
         quoted line breaks.
 
     Raises:
@@ -75,50 +96,91 @@ def read_csv(
             names one twice, a line has more or fewer fields, or a cell is empty, not a number, NaN, infinite,
             out of range or out of order; names the file, the line and the column.
     """
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as stream:
-            lines = list(_lines(csv.reader(stream, strict=True)))
-    except FileNotFoundError:
-        raise error(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        raise error(f"{path}: cannot be read as CSV ({problem})") from None
-    if not lines:
+    path = Path(path)
+    torn = skip_torn and is_torn(path, error)
+    with (
+        open_regular(path, error, _MAX_CSV) as binary,
+        parsing(f"{path}: cannot be read as CSV", error),
+        io.TextIOWrapper(binary, encoding="utf-8-sig", newline="") as stream,
+    ):
+        try:
+            return _read_rows(path, _Records(stream, path, error), columns, torn)
+        except csv.Error as problem:
+            raise error(f"{path}: cannot be read as CSV ({problem})") from None
+
+
+class _Records:
+    """The records of a CSV file that are not blank, with the number of their last line; bounded in size."""
+
+    def __init__(self, stream: io.TextIOWrapper, path: Path, error: type[LanenetError]) -> None:
+        self.path, self.error = path, error
+        self._stream = stream
+        self._length = 0
+        self._reader = csv.reader(self._lines(), strict=True)
+
+    def _lines(self) -> Iterator[str]:
+        while line := self._stream.readline(_MAX_RECORD + 1):
+            # A record has several lines if line breaks are quoted.
+            self._length += len(line)
+            if self._length > _MAX_RECORD:
+                number = self._reader.line_num + 1
+                raise self.error(f"{self.path}: line {number}: longer than {_MAX_RECORD} characters")
+            yield line
+
+    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
+        for cells in self._reader:
+            self._length = 0
+            stripped = [cell.strip() for cell in cells]
+            if any(stripped):
+                yield self._reader.line_num, stripped
+
+
+def _read_rows(
+    path: Path, records: _Records, columns: dict[str, ColumnSpec], torn: bool
+) -> dict[str, np.ndarray]:
+    error, rows = records.error, iter(records)
+    _, header = next(rows, (0, []))
+    if not header:
         raise error(f"{path}: empty, expected a header with {', '.join(columns)}")
-    if skip_torn and is_torn(path):
-        lines.pop()
-    header = lines[0][1]
     _check_header(path, header, columns, error)
-    for number, cells in lines[1:]:
+    # Numbers as eight bytes each, not as Python's objects: a long drive has millions of cells.
+    values: dict[str, Any] = {
+        name: [] if columns[name].kind == "text" else array.array(_ARRAYS[columns[name].kind])
+        for name in header
+        if name in columns
+    }
+    wanted = [(k, name, columns[name], values[name]) for k, name in enumerate(header) if name in columns]
+    following = next(rows, None)
+    while following is not None:
+        (number, cells), following = following, next(rows, None)
+        if torn and following is None:
+            break
         if len(cells) != len(header):
             raise error(f"{path}: line {number}: expected {len(header)} fields, found {len(cells)}")
-    result: dict[str, np.ndarray] = {}
-    for k, name in enumerate(header):
-        if name not in columns:
-            continue
-        spec = columns[name]
-        values: list[Any] = []
-        for number, cells in lines[1:]:
+        for k, name, spec, found in wanted:
             try:
                 value = _parsed(cells[k], spec)
-                if spec.increasing and values and not value > values[-1]:
-                    raise ValueError(f"expected more than {values[-1]} of the row before, found {value}")
-                values.append(value)
+                if spec.increasing and found and not value > found[-1]:
+                    raise ValueError(f"expected more than {found[-1]} of the row before, found {value}")
+                found.append(value)
             except ValueError as problem:
                 raise error(f"{path}: line {number}, column {name!r}: {problem}") from None
-        result[name] = np.array(
-            values, dtype={"float": np.float64, "int": np.int64, "text": np.str_}[spec.kind]
-        )
-    return result
+    # Texts as objects: an array of fixed width would give every row the room of the longest.
+    dtypes = {"float": np.float64, "int": np.int64, "text": np.object_}
+    return {name: np.array(found, dtype=dtypes[columns[name].kind]) for name, found in values.items()}
 
 
-def is_torn(path: Path) -> bool:
+def is_torn(path: Path, error: type[LanenetError] = DriveFormatError) -> bool:
     """Tell whether the last line of a table was cut off while it was written, as by a power cut.
 
     Such a line has no line feed, and lacks fields or the text of the last field. A complete last line without
     a line feed, as some editors leave it, is not torn.
     """
-    head, _, rest = Path(path).read_bytes().partition(b"\n")
-    last = rest.rpartition(b"\n")[2]
+    with open_regular(Path(path), error, _MAX_CSV) as stream:
+        head = stream.readline(_MAX_RECORD).partition(b"\n")[0]
+        size = stream.seek(0, os.SEEK_END)
+        stream.seek(max(len(head) + 1, size - _MAX_RECORD))
+        last = stream.read().rpartition(b"\n")[2]
     return bool(last.strip()) and (last.count(b",") < head.count(b",") or last.endswith(b","))
 
 
@@ -149,14 +211,6 @@ def write_csv(
     ]
     rows = [",".join(row) for row in zip(*cells, strict=True)]
     write_text(path, "\n".join([",".join(_quoted(name) for name in arrays), *rows]) + "\n")
-
-
-def _lines(reader: Any) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and stripped cells of every line that is not blank."""
-    for cells in reader:
-        stripped = [cell.strip() for cell in cells]
-        if any(stripped):
-            yield reader.line_num, stripped
 
 
 def _check_header(
@@ -237,22 +291,20 @@ class ParquetTable:
         Raises:
             LabelFormatError: If there is no such file, it is not Parquet, or lanenet did not write it.
         """
-        parquet = require("pyarrow.parquet", "data")
         arrow = require("pyarrow", "data")
         self.path = Path(path)
-        if not self.path.is_file():
-            raise LabelFormatError(f"{path}: no such file")
+        if not is_regular(self.path):
+            found = "is no file" if self.path.exists() else "no such file"
+            raise LabelFormatError(f"{path}: {found}")
         try:
-            self._table = parquet.read_table(self.path, partitioning=None)
-        except (arrow.ArrowException, OSError, ValueError) as error:
-            raise LabelFormatError(f"{path}: not a readable Parquet file ({_first_line(error)})") from None
+            self._table = _bounded_table(self.path)
+        except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
+            raise LabelFormatError(f"{path}: not a readable Parquet file ({first_line(error)})") from error
         text = (self._table.schema.metadata or {}).get(META_KEY)
         if text is None:
             raise LabelFormatError(f"{path}: a Parquet file, but without lanenet's metadata")
-        try:
+        with parsing(f"{path}: lanenet's metadata is not JSON", LabelFormatError):
             meta = json.loads(text)
-        except ValueError:
-            meta = None
         if not isinstance(meta, dict):
             raise LabelFormatError(f"{path}: lanenet's metadata is not a JSON object")
         self.meta: dict[str, Any] = meta
@@ -353,6 +405,42 @@ class ParquetTable:
         return values.astype(dtype)
 
 
+def _bounded_table(path: Path) -> Any:
+    """Read a Parquet file, as far as it may be unpacked; a few bytes can stand for any number of rows."""
+    arrow = require("pyarrow", "data")
+    parquet = require("pyarrow.parquet", "data")
+    size = path.stat().st_size
+    limits = {"thrift_string_size_limit": _MAX_FOOTER, "thrift_container_size_limit": _MAX_FOOTER}
+    with parquet.ParquetFile(path, page_checksum_verification=True, **limits) as file:
+        about = file.metadata
+        if about.num_columns > _MAX_COLUMNS or about.num_rows > _MAX_ROWS:
+            raise ValueError(
+                f"{about.num_rows} rows of {about.num_columns} columns, expected at most {_MAX_ROWS} of "
+                f"{_MAX_COLUMNS}"
+            )
+        packed = sum(
+            about.row_group(g).column(c).total_uncompressed_size
+            for g in range(about.num_row_groups)
+            for c in range(about.num_columns)
+        )
+        most = _MAX_UNPACKED + _MAX_RATIO * size
+        batches, unpacked = [], 0
+        if packed <= most:
+            for batch in file.iter_batches(batch_size=_BATCH_ROWS):
+                batches.append(batch)
+                unpacked += batch.nbytes
+                if unpacked > most:
+                    break
+        if max(packed, unpacked) > most:
+            raise ValueError(
+                f"{size / MEBIBYTE:.1f} MB stand for {max(packed, unpacked) / MEBIBYTE:.0f} MB and more, "
+                f"expected at most {most / MEBIBYTE:.0f} MB"
+            )
+        table = arrow.Table.from_batches(batches, schema=file.schema_arrow)
+    table.validate(full=True)
+    return table
+
+
 def write_parquet(
     path: Path, arrays: dict[str, Any], meta: dict[str, Any], more_meta: dict[bytes, bytes] | None = None
 ) -> None:
@@ -369,7 +457,7 @@ def write_parquet(
     table = arrow.table(arrays)
     table = table.replace_schema_metadata({META_KEY: json.dumps(meta).encode(), **(more_meta or {})})
     with atomic_file(path) as temporary:
-        parquet.write_table(table, temporary, compression="zstd")
+        parquet.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
 def write_columns(path: Path, columns: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
@@ -393,21 +481,10 @@ def list_array(values: list[np.ndarray]) -> Any:
     return arrow.ListArray.from_arrays(arrow.array(offsets), arrow.array(flat, from_pandas=False))
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
-
-
 def png_bytes(image: UInt8[np.ndarray, "h w *c"]) -> bytes:
     """Encode an image as PNG; the same image always gives the same bytes."""
     _, data = cv2.imencode(".png", image)
     return bytes(data.tobytes())
-
-
-def png_size(data: bytes) -> tuple[int, int] | None:
-    """Read width and height from the header of a PNG; None if it is not one."""
-    if len(data) < 24 or data[:8] != b"\x89PNG\r\n\x1a\n":
-        return None
-    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
 TUM_HEADER = "# t_s x_m y_m z_m qx qy qz qw\n"

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from pydantic import Field
+
+from lanenet.config import Settings
 
 
 @dataclass(frozen=True)
@@ -80,3 +83,20 @@ class BirdseyeWindow:
             inside = (x >= 0.0) & (x < self.columns) & (y >= 0.0) & (y < self.rows)
         raster[y[inside].astype(np.intp), x[inside].astype(np.intp)] = 255
         return raster
+
+
+class WindowFile(Settings):
+    """A window in a file; see :class:`BirdseyeWindow`.
+
+    Bounds are chosen: ten metres, and sixteen times the cells of the default along each side.
+    """
+
+    left_cm: float = Field(ge=-1000.0, le=1000.0)
+    near_cm: float = Field(ge=-1000.0, le=1000.0)
+    cell_cm: float = Field(gt=0.0, le=100.0)
+    rows: int = Field(gt=0, le=2048)
+    columns: int = Field(gt=0, le=2048)
+
+    def window(self) -> BirdseyeWindow:
+        """Return the window that the file describes."""
+        return BirdseyeWindow(**self.model_dump())

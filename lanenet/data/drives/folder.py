@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -25,10 +26,11 @@ from lanenet.data.drives.recording import (
     write_drive_file,
 )
 from lanenet.data.files import atomic_folder
-from lanenet.data.tables import ColumnSpec, is_torn, read_csv, write_csv
+from lanenet.data.tables import MAX_PLACE, ColumnSpec, is_torn, read_csv, write_csv
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES
+from lanenet.reading import FolderFiles, is_regular
 
 FRAMES_FILE = "frames.csv"
 TRUTH_FILE = "truth.csv"
@@ -40,27 +42,33 @@ def read_folder(path: Path) -> RecordedFrames:
     """Read a drive folder; images stay on disk.
 
     Raises:
-        DriveFormatError: If ``frames.csv`` cannot be used.
+        DriveFormatError: If ``frames.csv`` cannot be used, or names a file outside the folder.
     """
     table = path / FRAMES_FILE
     columns, commands = read_times(table, file=ColumnSpec("text"))
     frames = columns["frame"]
-    images = ImageFiles([path / name for name in columns["file"].tolist()])
-    missing = [i for i, image in enumerate(images.paths) if not image.is_file()]
+    inside, names = FolderFiles(path), columns["file"].tolist()
+    images = ImageFiles(
+        [
+            inside.file(name, f"{table}: frame {number}, column 'file'", DriveFormatError)
+            for number, name in zip(frames, names, strict=True)
+        ]
+    )
+    missing = [i for i, image in enumerate(images.paths) if not is_regular(image)]
     problems: list[str] = []
     if is_torn(table):
         problems.append(f"{table}: its last line is cut off and left out")
     if missing:
         problems.append(
             f"{table}: {len(missing)} of {len(frames)} images are missing (first: frame "
-            f"{frames[missing[0]]}, {columns['file'][missing[0]]})"
+            f"{frames[missing[0]]}, {names[missing[0]]})"
         )
     return RecordedFrames(frames, columns["t_s"], commands, images, tuple(problems))
 
 
 FORMAT = DriveFormat(
     described=f"a drive folder ({FRAMES_FILE})",
-    recognises=lambda path: (path / FRAMES_FILE).is_file(),
+    recognises=lambda path: is_regular(path / FRAMES_FILE),
     read=read_folder,
     # The last two are the simulator's. Not the camera: calibration may write it.
     files=(FRAMES_FILE, DRIVE_FILE, TRUTH_FILE, "track.json", "simulation.yaml"),
@@ -82,10 +90,12 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
     """
     path = Path(path)
     file = path if path.name == TRUTH_FILE else path / TRUTH_FILE
-    if not file.exists():
+    if not os.path.lexists(file):
         return None
     specs = {"frame": ColumnSpec("int", low=0.0, increasing=True)}
-    specs |= {name: ColumnSpec(allow_empty=name in POINT_NAMES) for name in TRUTH_NAMES}
+    specs |= {
+        name: ColumnSpec(allow_empty=name in POINT_NAMES, low=-MAX_PLACE, high=MAX_PLACE) for name in TRUTH_NAMES
+    }
     return read_csv(file, specs)
 
 

@@ -7,12 +7,12 @@ The images are read on demand. A reader of a format returns :class:`RecordedFram
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 import yaml
 from jaxtyping import Bool, Float, Int, Integer, UInt8
@@ -24,6 +24,7 @@ from lanenet.data.files import write_text
 from lanenet.data.tables import ColumnSpec, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
+from lanenet.reading import FolderFiles, read_image
 
 #: A longer pause is a break: a car at 1 m/s would have lost its last frame from sight.
 MAX_PAUSE_S = 1.0
@@ -171,40 +172,7 @@ class ImageFiles:
 
     def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
         """Read one image; see :class:`ImageSource`."""
-        return read_image(self.paths[row])
-
-
-def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an image file, BGR.
-
-    Raises:
-        DriveFormatError: If the file is missing, is not an image, or ends too early: OpenCV fills the rest
-            of a truncated JPEG with gray without an error.
-    """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise DriveFormatError(f"{path}: no such image") from None
-    except OSError as error:
-        raise DriveFormatError(f"{path}: cannot be read ({error})") from None
-    if not data:
-        raise DriveFormatError(f"{path}: the image file is empty")
-    try:
-        image = None if _truncated(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise DriveFormatError(f"{path}: not a readable image (corrupt or cut off, {len(data)} bytes)")
-    return np.asarray(image)
-
-
-def _truncated(data: bytes) -> bool:
-    if data.startswith(b"\xff\xd8"):
-        # The end marker must follow the last scan: a thumbnail in the header has an end marker, too.
-        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data[-64:]
-    return False
+        return read_image(self.paths[row], DriveFormatError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +267,7 @@ class DriveFile(Settings):
 
     Attributes:
         format: Kind of folder and version.
-        camera: Camera file, relative to the folder.
+        camera: Camera file in the folder.
         lane_width_cm: Distance between the middles of the two lines of the driven lane.
         max_steering_rad: Steering angle at Donkeycar's angle -1.
         notes: Free text.
@@ -320,13 +288,16 @@ def read_drive_file(folder: Path) -> tuple[DriveFile, Camera | None]:
         CalibrationError: If the camera file cannot be used.
     """
     path = folder / DRIVE_FILE
-    if not path.exists():
+    # A link that leads nowhere is there, too.
+    if not os.path.lexists(path):
         return DriveFile(format="lanenet-drive/1"), None
     try:
         file = check_settings(DriveFile, read_yaml(path), str(path))
     except ConfigError as error:
         raise DriveFormatError(str(error)) from None
-    return file, None if file.camera is None else read_camera(folder / file.camera)
+    if file.camera is None:
+        return file, None
+    return file, read_camera(FolderFiles(folder).file(file.camera, f"{path}: key 'camera'", DriveFormatError))
 
 
 def write_drive_file(folder: Path, file: DriveFile) -> None:
@@ -335,13 +306,16 @@ def write_drive_file(folder: Path, file: DriveFile) -> None:
     write_text(folder / DRIVE_FILE, yaml.safe_dump(kept, sort_keys=False, allow_unicode=True))
 
 
+#: Bounds of what a recording may hold. Chosen: far above any car and clock, so that sums of them stay finite:
+#: Unix time in the year 5138, 360 km/h, and 16 turns a second.
+MAX_TIME_S, _MAX_SPEED_CM_S, _MAX_YAW_RATE_RAD_S = 1e11, 1e4, 100.0
 _COMMAND_SPECS: dict[str, ColumnSpec] = {
-    "speed_cm_s": ColumnSpec(required=False),
+    "speed_cm_s": ColumnSpec(required=False, low=-_MAX_SPEED_CM_S, high=_MAX_SPEED_CM_S),
     "throttle": ColumnSpec(required=False, low=-1.0, high=1.0),
     # No car steers by a right angle: such a value is in degrees.
     "steering_rad": ColumnSpec(required=False, low=-0.5 * math.pi, high=0.5 * math.pi),
     "angle": ColumnSpec(required=False, low=-1.0, high=1.0),
-    "yaw_rate_rad_s": ColumnSpec(required=False),
+    "yaw_rate_rad_s": ColumnSpec(required=False, low=-_MAX_YAW_RATE_RAD_S, high=_MAX_YAW_RATE_RAD_S),
 }
 
 
@@ -363,7 +337,7 @@ def read_times(path: Path, **more: ColumnSpec) -> tuple[dict[str, np.ndarray], C
     """
     specs: dict[str, Any] = {
         "frame": ColumnSpec("int", low=0.0, increasing=True),
-        "t_s": ColumnSpec(increasing=True),
+        "t_s": ColumnSpec(increasing=True, low=-MAX_TIME_S, high=MAX_TIME_S),
         **_COMMAND_SPECS,
         **more,
     }

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drives import find_format, formats_text, open_drive
-from lanenet.data.drives.recording import read_image
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.static import find_static, spread_frames
+from lanenet.reading import read_image
 
 PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
 #: Photos have no times; an annotated video shows one per second.
@@ -100,7 +100,7 @@ def _is_photo(path: Path) -> bool:
 
 def _photos(path: Path, files: list[Path]) -> Source:
     def image(i: int) -> UInt8[np.ndarray, "h w 3"]:
-        return read_image(files[i])
+        return read_image(files[i], DriveFormatError)
 
     count = len(files)
     times = np.full(count, np.nan)
@@ -169,13 +169,7 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "h w"]:
     """
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: expected 'auto' or a .png that is black except on the car")
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if picture is None:
-        raise ConfigError(f"{path}: not a readable PNG")
+    picture = read_image(path, ConfigError, cv2.IMREAD_UNCHANGED)
     if picture.ndim == 3:
         picture = picture[..., :3].max(axis=2)
     if picture.all():

@@ -10,6 +10,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, ImageFiles, RecordedFrames
+from lanenet.data.drives.recording import (
+    DRIVE_FILE,
+    MAX_TIME_S,
+    Commands,
+    DriveFormat,
+    ImageFiles,
+    RecordedFrames,
+)
 from lanenet.errors import DriveFormatError
+from lanenet.reading import MAX_JSON, MEBIBYTE, FolderFiles, is_regular, parsing, read_bytes, read_text
 
 MANIFEST_FILE = "manifest.json"
 #: Used where the timestamps cannot be those of the frames: Donkeycar's default rate (DRIVE_LOOP_HZ = 20).
@@ -31,6 +41,14 @@ _MIN_MEDIAN_STEP_S = 0.01
 _IRREGULAR_RATIO = 4.0
 #: Above this share of irregular steps the timestamps are not used; measured: 0 to 0.6 % in sound tubs.
 _IRREGULAR_SHARE = 0.2
+
+#: Of a catalog. Chosen: Donkeycar starts a new one every 1000 rows, which take 0.3 MB.
+_MAX_CATALOG = 256 * MEBIBYTE
+#: Rows are counted in 64 bits; chosen: exact as a float, too.
+_MAX_INDEX = 2**53
+#: A joystick at its stop: Donkeycar divides its 16 bits, -32768 to 32767, by 32767. Taken as 1.
+_LARGEST_COMMAND = 32768.0 / 32767.0 + 1e-9
+_MAX_FLOAT = sys.float_info.max
 
 
 @dataclass(frozen=True)
@@ -47,13 +65,15 @@ def read_tub(path: Path) -> RecordedFrames:
     """Read a tub; nothing is copied or converted.
 
     Rows that cannot be used (not JSON, no index, no image) are left out and counted in ``problems``. Rows
-    without an angle stay, with NaN.
+    without an angle stay, with NaN, as do those whose angle or throttle lies outside -1 to 1.
 
     Raises:
         DriveFormatError: If the manifest or all catalogs cannot be read, or no row can be used.
     """
     catalogs, deleted, image_key = _read_manifest(path / MANIFEST_FILE)
-    present = [name for name in catalogs if (path / name).is_file()]
+    inside = FolderFiles(path)
+    key = f"{path / MANIFEST_FILE}: key 'paths'"
+    present = [name for name in catalogs if is_regular(inside.file(name, key, DriveFormatError))]
     absent = [name for name in catalogs if name not in present]
     if not present:
         found = f"{', '.join(absent)} are not there" if absent else "the manifest lists no catalog"
@@ -74,7 +94,7 @@ def read_tub(path: Path) -> RecordedFrames:
     if len(ordered) < len(records):
         problems.append(f"{path}: {len(records) - len(ordered)} rows repeat an earlier index or go back")
     folder = path / "images"
-    there = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    there = _image_names(folder, inside)
     missing = [record for record in ordered if record.image not in there]
     if missing:
         problems.append(
@@ -99,6 +119,14 @@ def read_tub(path: Path) -> RecordedFrames:
             f"{path}: {np.isnan(angle).sum()} of {len(angle)} rows have no angle (first: frame "
             f"{frames[np.isnan(angle)][0]})"
         )
+    for name, values in (("angle", angle), ("throttle", throttle)):
+        outside = np.flatnonzero(np.abs(values) > 1.0)
+        if len(outside):
+            problems.append(
+                f"{path}: {len(outside)} of {len(values)} rows have '{name}' outside -1 to 1, left out "
+                f"(first: frame {frames[outside[0]]}, {values[outside[0]]:g})"
+            )
+            values[outside] = np.nan
     sessions = itertools.pairwise(record.session for record in records)
     return RecordedFrames(
         frames,
@@ -117,7 +145,7 @@ def read_tub(path: Path) -> RecordedFrames:
 
 FORMAT = DriveFormat(
     described=f"a Donkeycar tub ({MANIFEST_FILE})",
-    recognises=lambda path: (path / MANIFEST_FILE).is_file(),
+    recognises=lambda path: is_regular(path / MANIFEST_FILE),
     read=read_tub,
     files=(MANIFEST_FILE, DRIVE_FILE, "*.catalog", "*.catalog_manifest"),
 )
@@ -130,11 +158,12 @@ def is_old(path: Path) -> bool:
 
 def _read_manifest(path: Path) -> tuple[list[str], set[int], str]:
     """Return the names of the catalogs, the deleted indexes, and the key of the images."""
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8").split("\n") if line.strip()]
-        values = [json.loads(line) for line in lines]
-    except (OSError, ValueError) as error:
-        raise DriveFormatError(f"{path}: not a readable tub manifest ({error})") from None
+    lines = [line for line in read_text(path, DriveFormatError, MAX_JSON).split("\n") if line.strip()]
+    with parsing(f"{path}: not a readable tub manifest", DriveFormatError):
+        return _manifest_of(path, [json.loads(line) for line in lines])
+
+
+def _manifest_of(path: Path, values: list[Any]) -> tuple[list[str], set[int], str]:
     catalogs = [value for value in values if isinstance(value, dict) and "paths" in value]
     if not catalogs or not isinstance(catalogs[-1]["paths"], list):
         raise DriveFormatError(
@@ -149,7 +178,25 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int], str]:
         image_key = str(named.get("image_array", image_key))
     # macOS adds a "._name" beside each file that it copies.
     names = [str(name) for name in catalogs[-1]["paths"] if not Path(str(name)).name.startswith("._")]
-    return names, set(deleted), image_key
+    # Once each: a catalog that is listed a million times is still one.
+    return list(dict.fromkeys(names)), set(deleted), image_key
+
+
+def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
+    """Return the names of the files in the folder of the images, without links that lead elsewhere.
+
+    Raises:
+        DriveFormatError: If the folder itself, or a link in it, leads out of the tub.
+    """
+    if not folder.is_dir():
+        return set()
+    names = set()
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            inside.file(f"{folder.name}/{entry.name}", folder, DriveFormatError)
+            if entry.is_file():
+                names.add(entry.name)
+    return names
 
 
 def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]:
@@ -157,7 +204,8 @@ def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]
 
     A power cut leaves zero bytes and half a row behind; they count as bad rows.
     """
-    lines = path.read_bytes().decode("utf-8", errors="replace").split("\n")
+    data = read_bytes(path, DriveFormatError, _MAX_CATALOG)
+    lines = data.decode("utf-8", errors="replace").split("\n")
     rows = {number: _record(line, image_key) for number, line in enumerate(lines, start=1) if line.strip()}
     records = [record for record in rows.values() if record is not None]
     return records, [number for number, record in rows.items() if record is None]
@@ -166,21 +214,21 @@ def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]
 def _record(line: str, image_key: str) -> _Record | None:
     try:
         data = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(data, dict):
         return None
     index, image = data.get("_index"), data.get(image_key)
     if not isinstance(index, int) or isinstance(index, bool) or not isinstance(image, str):
         return None
-    if not image or Path(image).name != image:
+    if not image or Path(image).name != image or not 0 <= index <= _MAX_INDEX:
         return None
     # In the pilot's drive modes the pilot's commands moved the car, not the user's.
     mode = data.get("user/mode")
     return _Record(
         index=index,
         session=str(data.get("_session_id")),
-        time_ms=_number(data.get("_timestamp_ms")),
+        time_ms=_number(data.get("_timestamp_ms"), 1000.0 * MAX_TIME_S),
         image=image,
         angle=_command(data, "angle", mode in ("local", "local_angle")),
         throttle=_command(data, "throttle", mode == "local"),
@@ -189,13 +237,15 @@ def _record(line: str, image_key: str) -> _Record | None:
 
 def _command(data: dict[str, Any], name: str, by_pilot: bool) -> float:
     pilot = _number(data.get(f"pilot/{name}"))
-    return pilot if by_pilot and math.isfinite(pilot) else _number(data.get(f"user/{name}"))
+    value = pilot if by_pilot and math.isfinite(pilot) else _number(data.get(f"user/{name}"))
+    return math.copysign(1.0, value) if 1.0 < abs(value) <= _LARGEST_COMMAND else value
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+def _number(value: Any, most: float = math.inf) -> float:
+    # Whole numbers of any length are JSON.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
         return math.nan
-    return float(value)
+    return float(value) if abs(value) <= _MAX_FLOAT else math.nan
 
 
 def _in_order(records: list[_Record]) -> list[_Record]:

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from lanenet.data.drives.recording import Commands, DriveFormat, RecordedFrames, read_times
 from lanenet.errors import DriveFormatError
+from lanenet.reading import MAX_PIXELS, is_regular, open_regular
 
 VIDEO_ENDINGS: tuple[str, ...] = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
@@ -21,6 +22,31 @@ _MAX_FORWARD = 60
 _DEFAULT_FPS = 20.0
 #: A higher rate in a header is a time base, not a rate.
 _MAX_FPS = 1000.0
+
+#: Of a video; chosen: a day at 60 frames/s.
+_MAX_FRAMES = 5_000_000
+#: A larger number in a header is damaged.
+_MAX_LISTED = 1e12
+#: [B]; a day of video, too.
+_MAX_VIDEO = 2**40
+#: How the containers of the known endings begin; MPEG transport streams have their sign at the first byte.
+_CONTAINERS = (
+    *(b"\x1aE\xdf\xa3", b"RIFF", b"\0\0\1\xba", b"\0\0\1\xb3", b"\xff\xd8", b"G"),
+    *(b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"),
+)
+
+
+def _check_container(path: Path) -> None:
+    """Refuse what is no video by its first bytes: FFmpeg also reads playlists, which name other files.
+
+    Raises:
+        DriveFormatError: Naming the file.
+    """
+    with open_regular(path, DriveFormatError, _MAX_VIDEO) as stream:
+        start = stream.read(8)
+    # In QuickTime and MP4 a size goes before the name of the first atom.
+    if not start.startswith(_CONTAINERS[:6]) and start[4:] not in _CONTAINERS[6:]:
+        raise DriveFormatError(f"{path}: not a video that OpenCV can open (it begins with {start!r})")
 
 
 class VideoImages:
@@ -45,7 +71,8 @@ class VideoImages:
     @property
     def listed_frames(self) -> int:
         """Number of frames according to the header; 0 if it has none."""
-        return max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        count = float(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        return int(count) if 0.0 < count <= _MAX_LISTED else 0
 
     @property
     def fps(self) -> float:
@@ -78,20 +105,28 @@ class VideoImages:
         Tries the last frame of the header first; decodes the whole video only if that fails.
         """
         listed = self.listed_frames
-        if listed and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1) and self._capture.grab():
+        if 0 < listed <= _MAX_FRAMES and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1) and self._capture.grab():
             self._rewind()
             return listed
         self._rewind()
         n = 0
-        while self._capture.grab():
+        while n < _MAX_FRAMES and self._capture.grab():
             n += 1
         self._rewind()
         return n
 
     def _opened(self) -> Any:
-        capture = cv2.VideoCapture(str(self.path))
+        _check_container(self.path)
+        # The full path: a relative one such as "http:/a.mp4" would be taken for an address.
+        capture = cv2.VideoCapture(str(self.path.resolve()))
         if not capture.isOpened():
             raise DriveFormatError(f"{self.path}: not a video that OpenCV can open (or cut off at its end)")
+        size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if not size[0] * size[1] <= MAX_PIXELS:
+            raise DriveFormatError(
+                f"{self.path}: frames of {size[0]:g}x{size[1]:g} px, expected at most "
+                f"{MAX_PIXELS // 10**6} megapixels"
+            )
         return capture
 
     def _rewind(self) -> None:
@@ -145,7 +180,7 @@ def read_video(path: Path) -> RecordedFrames:
 
 FORMAT = DriveFormat(
     described=f"a video ({', '.join(VIDEO_ENDINGS)})",
-    recognises=lambda path: path.is_file() and path.suffix.lower() in VIDEO_ENDINGS,
+    recognises=lambda path: is_regular(path) and path.suffix.lower() in VIDEO_ENDINGS,
     read=read_video,
     files=("{stem}.csv",),
 )

@@ -72,7 +72,7 @@ def test_a_missing_image_is_a_problem_and_an_error(tmp_path: Path) -> None:
     drive = open_drive(path)
     assert len(drive.problems) == 1
     assert "1 of 5 images are missing (first: frame 3, images/000003.jpg)" in drive.problems[0]
-    with pytest.raises(DriveFormatError, match=r"frame 3: .*000003\.jpg: no such image"):
+    with pytest.raises(DriveFormatError, match=r"frame 3: .*000003\.jpg: no such file"):
         drive.image(3)
 
 

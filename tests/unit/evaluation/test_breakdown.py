@@ -7,7 +7,6 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.tables import png_size
 from lanenet.evaluation.comparison import SourceAnswers, compare_detectors
 from lanenet.evaluation.errors import (
     RELIABILITY_SHARES,
@@ -22,6 +21,7 @@ from lanenet.evaluation.errors import (
 from lanenet.evaluation.report import plot_breakdown
 from lanenet.evaluation.tables import as_markdown, lay_out
 from lanenet.geometry.lane import POINTS_FROM_PARABOLA
+from lanenet.reading import image_size
 
 NAN = float("nan")
 TRUTH = np.zeros((200, 6))
@@ -169,5 +169,5 @@ def test_a_comparison_tells_where_errors_come_from(tmp_path):
     for table in lay_out(wide):
         console.print(table.as_rich())
     assert "by light" in (text := console.export_text()) and "…" not in text
-    size = png_size(plot_breakdown(found))
+    size = image_size(plot_breakdown(found))
     assert size is not None and min(size) > 200

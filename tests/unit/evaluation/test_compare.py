@@ -6,11 +6,11 @@ import pytest
 from rich.console import Console
 
 from lanenet.data.files import write_json
-from lanenet.data.tables import png_size
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.comparison import FORMAT, SourceAnswers, compare_detectors
 from lanenet.evaluation.report import plot_errors
 from lanenet.evaluation.tables import as_markdown, lay_out
+from lanenet.reading import image_size
 
 NAN = float("nan")
 TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (5, 1))
@@ -103,7 +103,7 @@ def test_the_picture_is_a_picture_even_where_nothing_was_answered():
     mute = np.full_like(TRUTH, NAN)
     exact = TRUTH.copy()
     for answers in ({"mute": mute}, {"shy": shy(), "mute": mute, "exact": exact}):
-        size = png_size(plot_errors(compare_detectors([source(**answers)])))
+        size = image_size(plot_errors(compare_detectors([source(**answers)])))
         assert size is not None and min(size) > 200
 
 

@@ -1,0 +1,342 @@
+"""The front door for files: every reader opens, bounds and parses what it gets by the functions here.
+
+A file may come from anywhere, damaged or made to do harm. It has to be a regular file, not a device or a pipe;
+it is read up to a limit; a name that stands in a file may not lead out of that file's folder; and whatever a
+parser raises becomes one error that names the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from lanenet.errors import LanenetError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import UInt8
+
+MEBIBYTE = 2**20
+#: Chosen: lists in JSON take about twenty times their text in memory, so 32 MB stay below a gigabyte. The
+#: largest files, the lane lines of an hour's drive, have 2 MB.
+MAX_JSON = 32 * MEBIBYTE
+#: A photo, or an image of a drive. Chosen: above the 30 MB of a phone's best JPEG.
+MAX_IMAGE = 64 * MEBIBYTE
+#: Of an image. Chosen: above the 50 megapixels of a phone; 192 MB decoded.
+MAX_PIXELS = 64 * 10**6
+
+#: What parsers of Python, NumPy and PyYAML raise for bytes that they were not made for.
+_PARSER_ERRORS = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zlib.error,
+)
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+@contextmanager
+def parsing(where: object, error: type[LanenetError]) -> Iterator[None]:
+    """Turn what a parser raises into an error that names the file.
+
+    Args:
+        where: File, and key or line if they are known.
+        error: The error to raise; errors of lanenet pass as they are.
+
+    Raises:
+        LanenetError: Of the type ``error``.
+    """
+    try:
+        yield
+    except KeyError as problem:
+        raise error(f"{where}: key {problem} is missing") from problem
+    except RecursionError as problem:
+        raise error(f"{where}: nested too deeply") from problem
+    except MemoryError as problem:
+        raise error(f"{where}: too large for the memory") from problem
+    except _PARSER_ERRORS as problem:
+        raise error(f"{where}: {first_line(problem)}") from problem
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's text, or its type."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+def is_regular(path: Path) -> bool:
+    """Tell whether there is a regular file; False for a name that no file can have."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def open_regular(path: Path, error: type[LanenetError], most: int) -> Iterator[BinaryIO]:
+    """Open a file for reading, if it is one.
+
+    Args:
+        path: The file; a link is followed.
+        error: The error to raise.
+        most: Largest size, [B].
+
+    Raises:
+        LanenetError: Of the type ``error``, if it is missing, is no regular file, cannot be read or is larger.
+    """
+    try:
+        # Before it is opened: opening a device may already do something, and a pipe waits for its writer.
+        _check_regular(path, os.stat(path), error, most)
+        stream = open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")  # noqa: PTH123, SIM115
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except (OSError, ValueError) as problem:
+        raise error(f"{path}: cannot be read ({first_line(problem)})") from None
+    with stream:
+        _check_regular(path, os.fstat(stream.fileno()), error, most)
+        try:
+            yield stream
+        except OSError as problem:
+            raise error(f"{path}: cannot be read ({first_line(problem)})") from None
+
+
+def read_bytes(path: Path, error: type[LanenetError], most: int) -> bytes:
+    """Read a whole file; arguments and errors as for :func:`open_regular`."""
+    with open_regular(path, error, most) as stream:
+        # One more than the limit: a file may grow, and those of the kernel have no size.
+        data = stream.read(most + 1)
+    _check_size(path, len(data), error, most)
+    return data
+
+
+def read_text(path: Path, error: type[LanenetError], most: int) -> str:
+    """Read a whole text file, UTF-8; arguments and errors as for :func:`open_regular`."""
+    data = read_bytes(path, error, most)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        raise error(f"{path}: cannot be read as text ({problem})") from None
+
+
+def read_json(path: Path, error: type[LanenetError], most: int = MAX_JSON) -> Any:
+    """Read a JSON file; arguments and errors as for :func:`open_regular`."""
+    text = read_text(path, error, most)
+    with parsing(f"{path}: not valid JSON", error):
+        return json.loads(text)
+
+
+class FolderFiles:
+    """The files of a folder, by names that stand in one of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._real = os.path.realpath(folder)
+        self._parents: dict[str, bool] = {}
+
+    def file(self, name: str, where: object, error: type[LanenetError]) -> Path:
+        """Return the path of a file, which need not exist.
+
+        Args:
+            name: Relative to the folder; may name a folder below it.
+            where: File, and key or line, in which the name stands.
+            error: The error to raise.
+
+        Raises:
+            LanenetError: Of the type ``error``, if the name is absolute or leads out of the folder, also by a
+                link.
+        """
+        pure = PurePath(name)
+        plain = name and "\0" not in name and not pure.is_absolute() and ".." not in pure.parts
+        if not plain or not self._holds(name):
+            raise error(
+                f"{where}: found {name[:200]!r}, expected a file in {self.folder}; if it is elsewhere, copy it "
+                "there"
+            )
+        return self.folder / name
+
+    def _holds(self, name: str) -> bool:
+        """Tell whether links on the path to a file lead nowhere else."""
+        parent = os.path.dirname(name)  # noqa: PTH120
+        if parent not in self._parents:
+            self._parents[parent] = self._is_below(os.path.join(self.folder, parent))  # noqa: PTH118
+        if not self._parents[parent]:
+            return False
+        path = os.path.join(self.folder, name)  # noqa: PTH118
+        return not os.path.islink(path) or self._is_below(path)  # noqa: PTH114
+
+    def _is_below(self, path: str) -> bool:
+        real = os.path.realpath(path)
+        return real == self._real or real.startswith(self._real.rstrip(os.sep) + os.sep)
+
+
+def read_image(
+    path: Path, error: type[LanenetError], flags: int | None = None
+) -> UInt8[np.ndarray, "h w *c"]:
+    """Read an image file of a usual format.
+
+    Args:
+        path: JPEG, PNG, BMP, WebP, TIFF or Netpbm, by its content.
+        error: The error to raise.
+        flags: OpenCV's; None is colour, BGR.
+
+    Raises:
+        LanenetError: Of the type ``error``, if the file is missing, is no image, is too large, or ends too
+            early: OpenCV fills the rest of a truncated JPEG with gray without an error.
+    """
+    return decode_image(read_bytes(path, error, MAX_IMAGE), path, error, flags)
+
+
+def decode_image(
+    data: bytes, where: object, error: type[LanenetError], flags: int | None = None
+) -> UInt8[np.ndarray, "h w *c"]:
+    """Decode the bytes of an image file; arguments and errors as for :func:`read_image`."""
+    # Not at the top: settings are read where OpenCV would only cost time.
+    import cv2
+    import numpy as np
+
+    if not data:
+        raise error(f"{where}: the image file is empty")
+    size = image_size(data)
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise error(
+            f"{where}: image of {size[0]}x{size[1]} px, expected at most {MAX_PIXELS // 10**6} megapixels"
+        )
+    image = None
+    if size is not None and not _truncated(data):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if flags is None else flags)
+        except cv2.error:
+            image = None
+    if image is None:
+        raise error(f"{where}: not a readable image (corrupt or cut off, {len(data)} bytes)")
+    return np.asarray(image)
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Read width and height from an image's header; None if the format is unknown or the header damaged.
+
+    Formats: JPEG (ITU-T T.81, B.2.2), PNG, BMP, WebP (RFC 9649), TIFF 6.0, Netpbm. OpenCV reads others, too,
+    but no camera writes them.
+    """
+    try:
+        for start, read in _SIZE_READERS:
+            if data.startswith(start):
+                size = read(data)
+                return size if size is not None and min(size) > 0 else None
+    except (struct.error, ValueError, IndexError, KeyError):
+        pass
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while True:
+        while data[at] == 0xFF and data[at + 1] == 0xFF:
+            at += 1
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        # Frame headers, without the tables DHT, JPG and DAC between them.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        if marker in (0xD9, 0xDA):
+            return None
+        # Restart markers and TEM have no length.
+        at += 2 if 0xD0 <= marker <= 0xD7 or marker == 1 else 2 + struct.unpack_from(">H", data, at + 2)[0]
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def _bmp_size(data: bytes) -> tuple[int, int] | None:
+    if struct.unpack_from("<I", data, 14)[0] == 12:
+        width, height = struct.unpack_from("<HH", data, 18)
+    else:
+        width, height = struct.unpack_from("<ii", data, 18)
+    return abs(width), abs(height)
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    kind = data[8:16]
+    if kind == b"WEBPVP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if kind == b"WEBPVP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if kind == b"WEBPVP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    order = "<" if data[:2] == b"II" else ">"
+    directory = struct.unpack_from(order + "I", data, 4)[0]
+    found: dict[int, int] = {}
+    for k in range(struct.unpack_from(order + "H", data, directory)[0]):
+        at = directory + 2 + 12 * k
+        tag, kind = struct.unpack_from(order + "HH", data, at)
+        found[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)[0]
+    return found[256], found[257]
+
+
+def _netpbm_size(data: bytes) -> tuple[int, int] | None:
+    # A comment runs to the end of its line.
+    lines = (line.partition(b"#")[0] for line in data[2:4096].split(b"\n"))
+    words = b" ".join(lines).split()
+    return int(words[0]), int(words[1])
+
+
+_SIZE_READERS = (
+    (b"\xff\xd8", _jpeg_size),
+    (b"\x89PNG\r\n\x1a\n", _png_size),
+    (b"BM", _bmp_size),
+    (b"RIFF", _webp_size),
+    (b"II*\0", _tiff_size),
+    (b"MM\0*", _tiff_size),
+    *((b"P%d" % kind, _netpbm_size) for kind in (1, 2, 3, 4, 5, 6)),
+)
+
+
+def _truncated(data: bytes) -> bool:
+    if data.startswith(b"\xff\xd8"):
+        # The end marker must follow the last scan: a thumbnail in the header has an end marker, too.
+        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data[-64:]
+    return False
+
+
+def _check_regular(path: Path, status: os.stat_result, error: type[LanenetError], most: int) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        found = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
+        raise error(f"{path}: is {found}, expected a file")
+    _check_size(path, status.st_size, error, most)
+
+
+def _check_size(path: Path, size: int, error: type[LanenetError], most: int) -> None:
+    if size > most:
+        raise error(
+            f"{path}: has {size / MEBIBYTE:.0f} MB, expected at most {most / MEBIBYTE:.0f} MB of such a file"
+        )
