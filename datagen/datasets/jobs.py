@@ -26,6 +26,7 @@ from lanenet.config import Settings
 from lanenet.data.files import write_json, write_text
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, TrackingLostError
+from lanenet.reading import read_json
 
 Role = Literal["train", "validation", "test"]
 ROLES: tuple[Role, ...] = ("train", "validation", "test")
@@ -310,8 +311,8 @@ class Output:
     def done(self) -> bool:
         """Whether the file exists, is complete and was made from what the key stands for."""
         try:
-            marked = json.loads(self._marker.read_text(encoding="utf-8")) == {"key": self.key}
-        except (OSError, ValueError):  # missing, not text, or not JSON
+            marked = read_json(self._marker, ConfigError) == {"key": self.key}
+        except ConfigError:  # missing, not text, or not JSON
             return False
         return marked and self.path.is_file()
 

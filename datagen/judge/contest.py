@@ -12,14 +12,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
 from datagen.judge.settings import JudgeSettings, road_names, road_simulation
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.data.files import write_json
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
-from lanenet.errors import ConfigError
+from lanenet.errors import ConfigError, DriveFormatError, LanenetError
 from lanenet.processes import run_jobs
+from lanenet.reading import is_regular, read_json
 
 #: Of the runs; raise it when the same settings give other results.
 _VERSION = 2
@@ -147,11 +149,13 @@ def write_run(path: Path, key: str, result: RunResult, trajectory: Trajectory) -
 def read_run(path: Path, key: str) -> RunResult | None:
     """Read a finished run; None if there is none, or it was driven under other settings."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data.pop("key") != key or not path.with_suffix(".csv").is_file():
+        data = read_json(path, DriveFormatError)
+        if data.pop("key") != key or not is_regular(path.with_suffix(".csv")):
             return None
-        return RunResult(**data)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # missing, or not what was written
+        # As JSON: strictly, a dictionary is no result.
+        return TypeAdapter(RunResult).validate_json(json.dumps(data), strict=True)
+    # Missing, or not what was written; pydantic's error is a ValueError.
+    except (LanenetError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 

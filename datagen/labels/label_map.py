@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +28,11 @@ from lanenet.data.maps.mapped_drive import (
     open_mapped_drive,
     points_text,
 )
-from lanenet.errors import TrackingLostError
+from lanenet.errors import MapFormatError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
+from lanenet.reading import read_json
 
 _REPORT_FORMAT = "lanenet-label-report/1"
 #: Edge points up to this distance ahead count for the residual of a frame. Chosen: twice the farthest label
@@ -226,9 +226,8 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     if drive_map.meta.verdict != "reject":
         return
     try:
-        reasons = json.loads((map_folder / "report.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
-        reason = str(reasons[0])
-    except (OSError, ValueError, LookupError, TypeError):  # the verdict stands without its reasons
+        reason = str(read_json(map_folder / "report.json", MapFormatError)["verdict"]["reasons"][0])
+    except (MapFormatError, LookupError, TypeError):  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
     # A map without pictures has no page.

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.reading import read_image
 
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Fewest rows and columns of corners of a board that is cut off. Chosen: 16 corners for the six numbers of a
@@ -116,15 +117,7 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         CalibrationError: If it cannot be read as an image.
     """
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error})") from None
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if data.size else None
-    if image is None:
-        raise CalibrationError(f"{path}: cannot be read as an image")
-    return np.asarray(image)
+    return read_image(path, CalibrationError, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def find_view(name: str, image: np.ndarray, board: Board) -> BoardView | str:

@@ -6,7 +6,6 @@ Imports ``datagen`` and ``lanenet.learn`` inside the commands, since the car has
 from __future__ import annotations
 
 import functools
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,8 @@ from lanenet.cli import val as val_cli
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import ConfigArgument, MarkingOption, OverridesArgument
 from lanenet.config import Settings, dump_settings, load_settings
+from lanenet.errors import CheckpointError
+from lanenet.reading import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,7 +112,7 @@ def train(
     card = model_card(
         settings.name,
         read_model_meta(model),
-        json.loads((run_folder / METRICS_NAME).read_text(encoding="utf-8")),
+        read_json(run_folder / METRICS_NAME, CheckpointError),
         training,
         comparison,
         robustness,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,6 +40,7 @@ from lanenet.learn.network import LaneNet, new_network
 from lanenet.learn.predict import predict
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
+from lanenet.reading import read_json
 from lanenet.samples.dataset import LaneSamples, hash_files
 
 STATE_NAME = "last.pt"
@@ -164,10 +164,10 @@ def read_finished(folder: Path, run_hash: str) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics = read_json(path, CheckpointError)
         found, form = metrics["run_hash"], metrics["format"]
         best = float(metrics["val_rmse_cm"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (CheckpointError, ValueError, KeyError, TypeError):
         raise CheckpointError(f"{path}: not the metrics of a training run; {_ADVICE}") from None
     if form != METRICS_FORMAT:
         raise CheckpointError(f"{path}: format {form!r}, expected {METRICS_FORMAT!r}; {_ADVICE}")

@@ -33,12 +33,17 @@ from lanenet.perception.network.model_file import (
     MARKER_NAME,
     MODEL_NAME,
     OUTPUT_NAMES,
+    SELF_TEST_NAME,
+    SELF_TEST_TOLERANCE,
     WIDTH_NAME,
     ModelMeta,
     is_model,
     open_model,
+    sealed,
+    self_test,
     without_model,
 )
+from lanenet.reading import first_line, is_regular, parsing, read_image
 
 #: What onnxruntime 1.17, the oldest that the package accepts, can read (it stops at opset 20).
 OPSET = 18
@@ -59,6 +64,9 @@ CALIBRATION_NAME = "calibration_rasters.png"
 INT8_NAME = "model-int8.onnx"
 #: Largest RMS change of the points by quantisation. Chosen: a tenth of a good network's RMSE.
 TOLERANCE_CM = 0.05
+#: Largest difference of a quantised model's answer on another computer, [cm]. Chosen: five times what
+#: quantisation may change, since a processor rounds eight bits in its own way.
+INT8_SELF_TEST_TOLERANCE = 0.25
 #: Timed runs of each model, and untimed ones before them. Chosen: well below a second in all.
 _ROUNDS, _WARM_UP = 200, 20
 
@@ -88,17 +96,17 @@ def export_onnx(
     model = _to_onnx(deployed, meta)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as temporary:
-        temporary.write_bytes(model.SerializeToString())
         try:
-            session, _ = open_model(temporary)
+            session = _session(model)
+            difference = _largest_difference(deployed, session, rasters)
+            if not difference <= TOLERANCE:
+                raise CheckpointError(
+                    f"{path}: onnxruntime differs from PyTorch by {difference:.2g}, "
+                    f"expected at most {TOLERANCE:g}"
+                )
+            _write_tested(temporary, model, session, rasters)
         except ModelMismatchError as error:
             raise CheckpointError(f"{path}: the exported model cannot be used ({error})") from None
-        difference = _largest_difference(deployed, session, rasters)
-        if not difference <= TOLERANCE:
-            raise CheckpointError(
-                f"{path}: onnxruntime differs from PyTorch by {difference:.2g}, "
-                f"expected at most {TOLERANCE:g}"
-            )
     return difference
 
 
@@ -161,7 +169,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     except ConfigError as error:
         raise CheckpointError(str(error)) from None
     path = checkpoint / WEIGHTS_NAME
-    if not path.is_file():
+    if not is_regular(path):
         raise CheckpointError(f"{path}: no such file; was the training finished?")
     try:
         with safe_open(path, framework="pt") as file:
@@ -172,12 +180,15 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         raise CheckpointError(f"{path}: cannot be read as safetensors ({error})") from None
     except ModelMismatchError as error:
         raise CheckpointError(str(error)) from None
-    network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
     try:
-        network.load_state_dict(state)
+        with parsing(f"{path}: weights do not fit {checkpoint / CONFIG_NAME}", CheckpointError):
+            network = LaneNet(settings.network, meta.window.rows, meta.window.columns)
+            network.load_state_dict(state)
     except RuntimeError as error:
         detail = " ".join(str(error).split())[:300]
         raise CheckpointError(f"{path}: weights do not fit {checkpoint / CONFIG_NAME} ({detail})") from None
+    if not all(bool(torch.isfinite(value).all()) for value in state.values()):
+        raise CheckpointError(f"{path}: a weight is not finite")
     return network.eval(), meta
 
 
@@ -196,14 +207,14 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
     Raises:
         CheckpointError: If the image is missing or does not fit the window.
     """
-    if not path.is_file():
+    if not is_regular(path):
         raise CheckpointError(f"{path}: no such file; an export needs its rasters")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    image = read_image(path, CheckpointError, cv2.IMREAD_GRAYSCALE)
     rows, columns = meta.window.rows, meta.window.columns
-    if image is None or image.shape[1] != columns or image.shape[0] % rows:
-        found = "no image" if image is None else f"{image.shape[0]} x {image.shape[1]}"
+    if image.shape[1] != columns or image.shape[0] % rows:
+        found = f"{image.shape[0]} x {image.shape[1]}"
         raise CheckpointError(f"{path}: found {found}, expected rasters of {rows} x {columns}")
-    return np.asarray(image).reshape(-1, 1, rows, columns)
+    return image.reshape(-1, 1, rows, columns)
 
 
 @dataclass(frozen=True)
@@ -278,11 +289,10 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
             weight_type=QuantType.QInt8,
             per_channel=True,
         )
-        model = onnx.load(temporary)
         # The quantiser drops the description.
+        model = onnx.load(temporary)
         onnx.helper.set_model_props(model, meta.to_properties())
-        onnx.save(model, temporary)
-        small, _ = open_model(temporary)
+        small = _write_tested(temporary, model, _session(model), checks, INT8_SELF_TEST_TOLERANCE)
         size_bytes = temporary.stat().st_size
         names = ["points_cm"]
         off = small.run(names, {INPUT_NAME: checks})[0] - session.run(names, {INPUT_NAME: checks})[0]
@@ -299,6 +309,37 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
         )
     write_json(path.with_suffix(".json"), asdict(report) | {"recommended": report.recommended})
     return path, report
+
+
+def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # onnxruntime has no common base class of its own
+        raise ModelMismatchError(f"onnxruntime: {first_line(error)}") from None
+
+
+def _write_tested(
+    path: Path,
+    model: onnx.ModelProto,
+    session: onnxruntime.InferenceSession,
+    rasters: UInt8[np.ndarray, "n 1 r c"],
+    tolerance: float = SELF_TEST_TOLERANCE,
+) -> onnxruntime.InferenceSession:
+    """Write a model with its self-test and its hash; open it as the car does.
+
+    Raises:
+        ModelMismatchError: If it cannot be used.
+    """
+    # The raster with the most edges: its answer depends on the most weights.
+    fullest = rasters[int(np.argmax(np.count_nonzero(rasters, axis=(1, 2, 3)))), 0]
+    entry = model.metadata_props.add()
+    entry.key, entry.value = SELF_TEST_NAME, self_test(session, fullest, tolerance)
+    path.write_bytes(sealed(model.SerializeToString()))
+    return open_model(path)[0]
 
 
 def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:

@@ -6,7 +6,6 @@ a map is compared with.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +14,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lanenet.data.files import write_json
+from lanenet.data.tables import MAX_PLACE
 from lanenet.errors import DriveFormatError
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import rows_of_polyline
 from lanenet.geometry.poses import arc_chord
+from lanenet.reading import parsing, read_json
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
@@ -372,40 +373,44 @@ def read_track(path: Path) -> Track:
     Raises:
         DriveFormatError: If the file is missing, is not a track of this version, or its columns do not fit.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DriveFormatError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DriveFormatError(f"{path}: not valid JSON ({error})") from None
+    data = read_json(path, DriveFormatError)
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
     if found != FORMAT:
         raise DriveFormatError(f"{path}: expected format {FORMAT!r}, found {found!r}")
-    try:
-        columns: dict[str, Any] = {name: np.asarray(data[name], dtype=np.float64) for name in _COLUMNS}
-        columns["xy_cm"] = columns["xy_cm"].reshape(-1, 2)
-        markings = []
-        for m in data["markings"]:
-            blue, green, red = map(float, m["colour_bgr"])
-            painted_cm = np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2)
-            bgr = (blue, green, red)
-            markings.append(Marking(float(m["offset_cm"]), float(m["width_cm"]), bgr, painted_cm))
-        rest: dict[str, Any] = {
-            "closed": bool(data["closed"]),
-            "lane_width_cm": float(data["lane_width_cm"]),
-            "boxes": np.asarray(data["boxes"], dtype=np.float64).reshape(-1, 9),
-            "oncoming_cm": None if data["oncoming_cm"] is None else float(data["oncoming_cm"]),
-        }
-    except KeyError as error:
-        raise DriveFormatError(f"{path}: key {error} is missing") from None
-    except (TypeError, ValueError, IndexError) as error:
-        raise DriveFormatError(f"{path}: not the numbers of a track ({error})") from None
+    with parsing(f"{path}: not the numbers of a track", DriveFormatError):
+        return _track_of(path, data)
+
+
+def _track_of(path: Path, data: dict[str, Any]) -> Track:
+    columns: dict[str, Any] = {name: np.asarray(data[name], dtype=np.float64) for name in _COLUMNS}
+    columns["xy_cm"] = columns["xy_cm"].reshape(-1, 2)
+    markings = []
+    for m in data["markings"]:
+        blue, green, red = map(float, m["colour_bgr"])
+        painted_cm = np.asarray(m["painted_cm"], dtype=np.float64).reshape(-1, 2)
+        markings.append(Marking(float(m["offset_cm"]), float(m["width_cm"]), (blue, green, red), painted_cm))
+    if not isinstance(data["closed"], bool):
+        raise ValueError(f"key 'closed': expected true or false, found {data['closed']!r}")
+    rest: dict[str, Any] = {
+        "closed": data["closed"],
+        "lane_width_cm": float(data["lane_width_cm"]),
+        "boxes": np.asarray(data["boxes"], dtype=np.float64).reshape(-1, 9),
+        "oncoming_cm": None if data["oncoming_cm"] is None else float(data["oncoming_cm"]),
+    }
     lengths = [len(column) if column.ndim else 0 for column in columns.values()]
     if min(lengths) < 2 or len(set(lengths)) > 1:
         raise DriveFormatError(
             f"{path}: expected {', '.join(_COLUMNS)} of one length of at least 2, "
             f"found {', '.join(map(str, lengths))}"
         )
-    if not all(np.isfinite(column).all() for column in (*columns.values(), rest["boxes"])):
-        raise DriveFormatError(f"{path}: a number of the centre line or of a box is missing or not finite")
+    painted = [np.array([m.offset_cm, m.width_cm, *m.colour_bgr, *m.painted_cm.ravel()]) for m in markings]
+    sizes = np.array([rest["lane_width_cm"], rest["oncoming_cm"] or 0.0])
+    if not all((np.abs(v) <= MAX_PLACE).all() for v in (*columns.values(), rest["boxes"], *painted, sizes)):
+        raise ValueError(f"a number is missing, not finite or above {MAX_PLACE:g}")
+    steps_cm = np.diff(columns["s_cm"])
+    # Evenly spaced, but for the digits of the file.
+    if columns["s_cm"][0] != 0.0 or not (steps_cm > 0.0).all() or np.ptp(steps_cm) > 0.01 * steps_cm[0]:
+        raise ValueError("key 's_cm': expected evenly spaced distances from 0")
+    if not (rest["lane_width_cm"] > 0.0 and all(m.width_cm > 0.0 for m in markings)):
+        raise ValueError("keys 'lane_width_cm' and 'width_cm': expected more than 0")
     return Track(**columns, markings=tuple(markings), **rest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,16 +11,19 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 from jaxtyping import Bool, Float, Int
+from pydantic import Field
 
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
+from lanenet.data.drives.recording import MAX_TIME_S
 from lanenet.data.files import write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
 from lanenet.data.maps.line import LaneLine
-from lanenet.data.tables import ColumnSpec, read_csv, write_columns, write_csv, write_tum
+from lanenet.data.tables import MAX_PLACE, ColumnSpec, read_csv, write_columns, write_csv, write_tum
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
+from lanenet.reading import parsing, read_json
 
 FORMAT = "lanenet-map/1"
 _LANES_FORMAT = "lanenet-lanes/2"
@@ -31,6 +34,13 @@ SETTINGS_NAME = "settings.yaml"
 #: Columns of ``poses.csv``; the last ones say that images contradict the left, the right line.
 _POSE, _TILT = ("x_cm", "y_cm", "heading_rad"), ("pitch_rad", "roll_rad")
 _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
+
+#: A map is longer than this. Chosen: the first few frames of the slowest car.
+_LEAST_MAP_CM = 1.0
+#: Lines of one side, counted from the driven lane; chosen: no model road has as many lanes.
+_MAX_RANK = 20
+#: Positions at which the order of two lines is checked; chosen.
+_SIDES_CHECKED = 64
 
 
 class MapMeta(Settings):
@@ -49,11 +59,11 @@ class MapMeta(Settings):
 
     format: str
     drive: str
-    lane_width_cm: float
-    mapped_lane_cm: float
-    tape_cm: float
+    lane_width_cm: float = Field(gt=0.0, le=MAX_PLACE)
+    mapped_lane_cm: float = Field(gt=0.0, le=MAX_PLACE)
+    tape_cm: float = Field(ge=0.0, le=MAX_PLACE)
     scale_from: str
-    laps: int
+    laps: int = Field(ge=0)
     verdict: Literal["good", "usable", "reject"] | None = None
 
     @property
@@ -177,25 +187,28 @@ def read_map(folder: Path) -> DriveMap:
     """
     if not (folder / "map.yaml").is_file():
         raise MapFormatError(f"{folder}: is not a map (no map.yaml in it)")
+    path = folder / "map.yaml"
+    plain = read_yaml(path, MapFormatError)
+    if plain.get("format") != FORMAT:
+        raise MapFormatError(f"{path}: format is {plain.get('format')!r}, expected {FORMAT!r}")
     try:
-        plain = read_yaml(folder / "map.yaml")
-        if plain.get("format") != FORMAT:
-            raise MapFormatError(
-                f"{folder / 'map.yaml'}: format is {plain.get('format')!r}, expected {FORMAT!r}"
-            )
-        meta = check_settings(MapMeta, plain, str(folder / "map.yaml"))
+        meta = check_settings(MapMeta, plain, str(path))
     except ConfigError as error:
         raise MapFormatError(str(error)) from None
+    place = ColumnSpec(low=-MAX_PLACE, high=MAX_PLACE)
     table = read_csv(
         folder / "poses.csv",
         {
-            **{name: ColumnSpec("int") for name in ("frame", "lap", "segment")},
-            **{name: ColumnSpec() for name in ("t_s", *_POSE, "s_cm", *_TILT)},
-            "match": ColumnSpec(allow_empty=True),
+            "frame": ColumnSpec("int", low=0.0, increasing=True),
+            **{name: ColumnSpec("int", low=0.0, high=MAX_PLACE) for name in ("lap", "segment")},
+            **{name: place for name in (*_POSE, "s_cm", *_TILT)},
+            "t_s": ColumnSpec(low=-MAX_TIME_S, high=MAX_TIME_S),
+            "match": ColumnSpec(allow_empty=True, low=0.0, high=1.0),
             **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
         },
         error=MapFormatError,
     )
+    _check_poses(folder / "poses.csv", table)
     return DriveMap(
         meta=meta,
         camera=read_camera(folder / "camera.yaml"),
@@ -211,6 +224,18 @@ def read_map(folder: Path) -> DriveMap:
         held_out=table["held_out"] > 0,
         contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,
     )
+
+
+def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
+    """Refuse poses that no drive has: none, or a car that never moved."""
+    n = len(table["frame"])
+    if n == 0:
+        raise MapFormatError(f"{path}: no frames")
+    across_cm = max(float(np.ptp(table[name])) for name in ("x_cm", "y_cm"))
+    if n > 1 and across_cm < _LEAST_MAP_CM:
+        raise MapFormatError(
+            f"{path}: all {n} frames lie within {across_cm:g} cm, expected a map of at least {_LEAST_MAP_CM:g} cm"
+        )
 
 
 def kept_map(out: Path) -> str:
@@ -232,15 +257,13 @@ def kept_map(out: Path) -> str:
 
 
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
-    try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
+    plain = read_json(path, MapFormatError)
+    with parsing(f"{path}: lane lines cannot be read", MapFormatError):
         if plain["format"] != _LANES_FORMAT:
             raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {_LANES_FORMAT!r}")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
             lines.setdefault(int(item["segment"]), []).append(_line(item))
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise MapFormatError(f"{path}: lane lines cannot be read ({error!r})") from None
     for segment in sorted(segments):
         found = sorted(line.index for line in lines.get(segment, []))
         # No gaps: a lane lies between neighbouring lines.
@@ -249,7 +272,24 @@ def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
                 f"{path}: segment {segment} has lines {found} from left to right, expected consecutive "
                 "numbers that include 0 and 1, the lines of the driven lane"
             )
+        _check_sides(path, segment, sorted(lines[segment], key=lambda line: line.index))
     return lines
+
+
+def _check_sides(path: Path, segment: int, lines: list[LaneLine]) -> None:
+    """Refuse lines that do not lie beside each other in their order, seen in the path's direction."""
+    for left, right in itertools.pairwise(lines):
+        low, high = max(left.knots_cm[3], right.knots_cm[3]), min(left.knots_cm[-4], right.knots_cm[-4])
+        s_cm = np.linspace(low, high, _SIDES_CHECKED)
+        across = left.everywhere(s_cm) - right.everywhere(s_cm)
+        along = left.everywhere(s_cm, 1) + right.everywhere(s_cm, 1)
+        to_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+        known = left.supported(s_cm) & right.supported(s_cm)
+        # Where one of the lines was not seen, its course is a guess.
+        if known.any() and not np.median(to_left[known]) > 0.0:
+            raise MapFormatError(
+                f"{path}: segment {segment}: line {left.index} does not lie to the left of line {right.index}"
+            )
 
 
 def _line(item: dict[str, Any]) -> LaneLine:
@@ -259,26 +299,39 @@ def _line(item: dict[str, Any]) -> LaneLine:
     )
     if item["side"] not in ("left", "right"):
         raise ValueError(f"side is {item['side']!r}")
-    if len(knots) < 8 or coefficients.shape != (len(knots) - 4, 2):
+    if knots.ndim != 1 or len(knots) < 8 or coefficients.shape != (len(knots) - 4, 2):
         raise ValueError(f"{len(knots)} knots with coefficients of shape {coefficients.shape}")
-    if not (np.isfinite(knots).all() and np.isfinite(coefficients).all() and (np.diff(knots) >= 0.0).all()):
-        raise ValueError("knots must not decrease, and all numbers must be finite")
-    rank, period = int(item["rank"]), item["period_cm"]
-    if rank < 0:
-        raise ValueError(f"rank is {rank}")
+    supported = supported.reshape(-1, 2)
+    if not all(
+        (np.abs(values) <= MAX_PLACE).all() for values in (knots, coefficients, supported, sigma_s, sigma_at)
+    ):
+        raise ValueError(f"all numbers must be finite and at most {MAX_PLACE:g}")
+    # The three at either end may be equal: there the line begins and ends.
+    if not ((np.diff(knots) >= 0.0).all() and (np.diff(knots[3:-3]) > 0.0).all()):
+        raise ValueError("knots_cm must increase")
+    if not (supported[:, 1] >= supported[:, 0]).all():
+        raise ValueError("supported_cm must hold sections (from, to)")
+    rank, period = item["rank"], item["period_cm"]
+    if type(rank) is not int or not 0 <= rank <= _MAX_RANK:
+        raise ValueError(f"rank is {rank!r}, expected 0 to {_MAX_RANK}")
     if period is not None and not np.isclose(knots[-4] - knots[3], period):
         raise ValueError(f"period_cm is {period}, the knots span {knots[-4] - knots[3]}")
-    if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape or not np.isfinite([*sigma_s, *sigma_at]).all():
+    if sigma_s.ndim != 1 or sigma_s.shape != sigma_at.shape:
         raise ValueError(f"sigma_at_cm has shape {sigma_at.shape}, sigma_s_cm {sigma_s.shape}")
+    if not ((np.diff(sigma_s) >= 0.0).all() and (sigma_at >= 0.0).all()):
+        raise ValueError("sigma_s_cm must not decrease, and sigma_at_cm not be negative")
     residual, marking, unpainted = (
         float("nan") if item[name] is None else float(item[name])
         for name in ("residual_cm", "marking_cm", "bare_share")
     )
+    for name, value, most in (("residual_cm", residual, MAX_PLACE), ("marking_cm", marking, MAX_PLACE), ("bare_share", unpainted, 1.0)):
+        if value < 0.0 or value > most:
+            raise ValueError(f"{name} is {value:g}, expected 0 to {most:g}")
     return LaneLine(
         side=item["side"],
         knots_cm=knots,
         coefficients_cm=coefficients,
-        supported_cm=supported.reshape(-1, 2),
+        supported_cm=supported,
         residual_cm=residual,
         rank=rank,
         period_cm=None if period is None else float(period),

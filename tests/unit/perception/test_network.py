@@ -16,7 +16,7 @@ from lanenet.learn.network import new_network
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
-from lanenet.perception.network.model_file import ModelMeta, read_model_meta
+from lanenet.perception.network.model_file import HASH_NAME, ModelMeta, read_model_meta, sealed
 
 torch.set_num_threads(1)
 
@@ -71,10 +71,10 @@ def striped_frame():
 
 def change_properties(model_path, out, **changes):
     model = onnx.load(model_path)
-    properties = {p.key: p.value for p in model.metadata_props} | changes
+    properties = {p.key: p.value for p in model.metadata_props} | {HASH_NAME: None} | changes
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, {k: v for k, v in properties.items() if v is not None})
-    onnx.save(model, out)
+    out.write_bytes(sealed(model.SerializeToString()))
     return out
 
 
@@ -197,7 +197,10 @@ def test_files_that_are_no_models_are_refused(tmp_path):
     with pytest.raises(ModelMismatchError, match="no such file"):
         read_model_meta(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("hello")
-    with pytest.raises(ModelMismatchError, match="cannot be opened"):
+    with pytest.raises(ModelMismatchError, match=r"text\.onnx: has no hash"):
+        read_model_meta(tmp_path / "text.onnx")
+    (tmp_path / "text.onnx").write_bytes(sealed(b"hello"))
+    with pytest.raises(ModelMismatchError, match=r"text\.onnx: cannot be opened"):
         read_model_meta(tmp_path / "text.onnx")
 
 
@@ -222,7 +225,7 @@ def test_a_model_without_an_output_is_refused(model_path, tmp_path):
     model = onnx.load(model_path)
     for output in [o for o in model.graph.output if o.name in ("sigma_cm", "presence")]:
         model.graph.output.remove(output)
-    onnx.save(model, tmp_path / "bare.onnx")
+    (tmp_path / "bare.onnx").write_bytes(sealed(model.SerializeToString()))
     with pytest.raises(ModelMismatchError, match="outputs"):
         read_model_meta(tmp_path / "bare.onnx")
 
