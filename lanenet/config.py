@@ -103,10 +103,12 @@ _Loader.add_implicit_resolver(
 )
 _Loader.add_implicit_resolver(
     _FLOAT,
-    re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    re.compile(
+        r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+    ),
     list("-+.0123456789"),
 )
-_Loader.add_constructor(_INT, lambda loader, node: int(str(loader.construct_scalar(node)), 0))
+_Loader.add_constructor(_INT, lambda _, node: int(str(node.value), 0))
 
 
 def parse_yaml(text: str, where: object, error: type[LanenetError] = ConfigError) -> Any:
@@ -138,7 +140,9 @@ def _count_nodes(node: yaml.Node, known: dict[int, int]) -> int:
         return 1
     if id(node) not in known:
         known[id(node)] = _MAX_NODES + 1
-        parts = node.value if isinstance(node, yaml.SequenceNode) else [p for pair in node.value for p in pair]
+        parts = (
+            node.value if isinstance(node, yaml.SequenceNode) else [p for pair in node.value for p in pair]
+        )
         known[id(node)] = 1 + sum(_count_nodes(part, known) for part in parts)
     return known[id(node)]
 

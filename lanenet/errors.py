@@ -16,6 +16,7 @@ A message names what was found, what was expected and where (file, key, frame).
 """
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -29,6 +30,16 @@ def did_you_mean(name: str, known: Iterable[str], least: float = 0.6) -> str:
     """
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=least)
     return f", did you mean {close[0]!r}?" if close else ""
+
+
+#: What a terminal takes for commands (all control characters but tab and line feed), marks that turn the
+#: direction of writing, and halves of characters: names that are no UTF-8 have them, and printing fails.
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    """Return a text that may hold names from files as a terminal can show it: control characters by code."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 class LanenetError(Exception):

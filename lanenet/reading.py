@@ -1,8 +1,8 @@
 """The front door for files: every reader opens, bounds and parses what it gets by the functions here.
 
-A file may come from anywhere, damaged or made to do harm. It has to be a regular file, not a device or a pipe;
-it is read up to a limit; a name that stands in a file may not lead out of that file's folder; and whatever a
-parser raises becomes one error that names the file.
+A file may come from anywhere, damaged or made to do harm. It has to be a regular file, not a device or a
+pipe; it is read up to a limit; a name that stands in a file may not lead out of that file's folder; and
+whatever a parser raises becomes one error that names the file.
 """
 
 from __future__ import annotations
@@ -100,11 +100,11 @@ def open_regular(path: Path, error: type[LanenetError], most: int) -> Iterator[B
         most: Largest size, [B].
 
     Raises:
-        LanenetError: Of the type ``error``, if it is missing, is no regular file, cannot be read or is larger.
+        LanenetError: Of the type ``error``, if it is missing, no regular file, unreadable or larger.
     """
     try:
         # Before it is opened: opening a device may already do something, and a pipe waits for its writer.
-        _check_regular(path, os.stat(path), error, most)
+        _check_regular(path, path.stat(), error, most)
         stream = open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")  # noqa: PTH123, SIM115
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
@@ -167,8 +167,8 @@ class FolderFiles:
         plain = name and "\0" not in name and not pure.is_absolute() and ".." not in pure.parts
         if not plain or not self._holds(name):
             raise error(
-                f"{where}: found {name[:200]!r}, expected a file in {self.folder}; if it is elsewhere, copy it "
-                "there"
+                f"{where}: found {name[:200]!r}, expected a file in {self.folder}; copy it there if it is "
+                "elsewhere"
             )
         return self.folder / name
 

@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
+from lanenet.cli.shared import console
 from lanenet.errors import LanenetError
 
 _VERBS = (
@@ -50,7 +51,8 @@ class _Group(TyperGroup):
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise SystemExit(130) from None
-        typer.echo(f"error: {message}", err=True)
+        # One line: a name may hold a line feed, too.
+        console.say("error: " + message.replace("\n", "\\n"), err=True)
         raise SystemExit(1)
 
 

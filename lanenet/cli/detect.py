@@ -114,12 +114,12 @@ def detect(
             opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
         )
     console.show_problems(report.problems)
-    typer.echo(
+    console.say(
         f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
         f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
     if hint := getattr(chosen, "hint", ""):
-        typer.echo(f"hint: {hint}")
+        console.say(f"hint: {hint}")
     console.wrote(report.out, report.video)
     if report.video is None:
         again = {
@@ -151,7 +151,7 @@ def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarra
     if mask != "auto":
         return read_mask(Path(mask))
     found, message = find_mask(source)
-    typer.echo(message)
+    console.say(message)
     return found
 
 

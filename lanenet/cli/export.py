@@ -50,6 +50,6 @@ def export(
         from lanenet.learn.export import export_checkpoint
 
         path, rasters, difference = export_checkpoint(checkpoint, out, check or ())
-        typer.echo(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
+        console.say(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
         console.wrote(path)
     console.next_command("bench", "--model", path)

@@ -126,12 +126,10 @@ def val(
 
 def show(comparison: Comparison) -> None:
     """Print the tables of a comparison."""
-    from rich.console import Console
-
     from lanenet.evaluation.tables import lay_out
 
     for table in lay_out(comparison):
-        Console().print(table.as_rich())
+        console.show_rich(table.as_rich())
 
 
 def _next_words(
@@ -184,8 +182,6 @@ def _check_robust(model: Path | None, sources: Sequence[Opened]) -> None:
 
 def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[str, dict[str, object]]:
     """Measure, show and return the table as Markdown and as plain values."""
-    from rich.console import Console
-
     from lanenet.evaluation.answers import RasterModel
     from lanenet.evaluation.robustness import as_dict, measure_robustness, robust_table
 
@@ -194,7 +190,7 @@ def _robustness(models: Mapping[str, Path], sources: Sequence[Opened]) -> tuple[
     with console.progress_bar("robust") as progress:
         rows = measure_robustness(opened, label_sets, [str(source.path) for source in sources], progress)
     table = robust_table(rows)
-    Console().print(table.as_rich())
+    console.show_rich(table.as_rich())
     return table.as_markdown(), as_dict(rows)
 
 

@@ -37,13 +37,13 @@ _ARRAYS = {"float": "d", "int": "q"}
 _MAX_ROWS, _MAX_COLUMNS = 5_000_000, 1000
 #: Texts and lists in a Parquet file's footer, [B]; chosen: the widest table's footer is far smaller.
 _MAX_FOOTER = 16 * MEBIBYTE
-#: What a Parquet file may unpack to: so much, and so many times its size. Chosen: label sets unpack to 2 to 20
-#: times their size, small ones of a still car to more.
+#: What a Parquet file may unpack to: so much, and so many times its size. Chosen: label sets unpack to 2 to
+#: 20 times their size, small ones of a still car to more.
 _MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
 #: Rows that are unpacked at a time, before the limit is checked.
 _BATCH_ROWS = 1024
-#: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares of
-#: more would lose the centimetres.
+#: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares
+#: of more would lose the centimetres.
 MAX_PLACE = 1e6
 #: Key of the schema metadata that holds what the table is, as JSON.
 META_KEY = b"lanenet"
@@ -88,8 +88,8 @@ def read_csv(
         skip_torn: Leave out a last line that was cut off; see :func:`is_torn`.
 
     Returns:
-        An array per column that the file has: float64, int64, or texts as objects. Row i is line i + 2 of a file without
-        quoted line breaks.
+        An array per column that the file has: float64, int64, or texts as objects. Row i is line i + 2
+        of a file without quoted line breaks.
 
     Raises:
         LanenetError: Of the type ``error``, if the file is missing or not text, the header lacks a column or

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich import box
 from rich.table import Table
 
+from lanenet.errors import printable
 from lanenet.evaluation.comparison import Comparison
 from lanenet.evaluation.errors import GROUPS, INTERVALS, ErrorStats
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
@@ -48,14 +49,18 @@ class TextTable:
     def as_rich(self) -> Table:
         """Return a table narrow enough for a terminal of 80 columns."""
         table = Table(
-            title=self.title, title_justify="left", caption=self.note, box=box.SIMPLE, pad_edge=False
+            title=printable(self.title),
+            title_justify="left",
+            caption=self.note,
+            box=box.SIMPLE,
+            pad_edge=False,
         )
         for i, name in enumerate(self.header):
             justify = "left" if i < self.texts else "right"
-            table.add_column(name.replace(" ", "\n"), justify=justify, no_wrap=True)  # type: ignore[arg-type]
+            table.add_column(printable(name).replace(" ", "\n"), justify=justify, no_wrap=True)  # type: ignore[arg-type]
         nexts = [line[0] for line in self.lines[1:]]
         for line, following in zip(self.lines, [*nexts, ""], strict=True):
-            table.add_row(*line, end_section=self.grouped and following not in ("", line[0]))
+            table.add_row(*map(printable, line), end_section=self.grouped and following not in ("", line[0]))
         return table
 
 

@@ -29,7 +29,7 @@ def analyse(
     analysis = analyse_errors(read_camera(camera))
     console.show_table(str(camera), ("", "found", "paper"), figures(analysis))
     ahead_cm = analysis.settings.lookahead_cm
-    typer.echo(f"L and R: the middles of the lane's two lines, {ahead_cm:g} cm ahead; -: not seen")
+    console.say(f"L and R: the middles of the lane's two lines, {ahead_cm:g} cm ahead; -: not seen")
     if out is not None:
         write_bytes(out, png_bytes(draw_analysis(analysis)))
         console.wrote(out)

@@ -45,7 +45,7 @@ def doctor(
 
         checks += check_car(settings)
     for check in checks:
-        typer.echo(f"{check.state:8s}{check.name}: {check.text}")
+        console.say(f"{check.state:8s}{check.name}: {check.text}")
     problems = sum(check.state == "problem" for check in checks)
     if problems:
         raise LanenetError(f"{problems} problem(s) found, see above")

@@ -236,7 +236,7 @@ def _network_model(given: Path | None) -> Path:
     if given is None:
         if not SHIPPED_MODEL.exists():
             raise ConfigError(f"detector network: expected a model (--model), {SHIPPED_MODEL} is not there")
-        typer.echo(f"network: {SHIPPED_MODEL}; --model names another one")
+        console.say(f"network: {SHIPPED_MODEL}; --model names another one")
     return find_model(SHIPPED_MODEL if given is None else given).resolve()
 
 

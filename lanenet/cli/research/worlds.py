@@ -47,7 +47,7 @@ def track(
     picture = draw_track(drawn, picture_scale(drawn, size), settings.floor_bgr)
     tightest = float(np.max(np.abs(drawn.curvature_per_cm)))
     radius = f"{1.0 / tightest:.0f} cm" if tightest > 1e-6 else "none"
-    typer.echo(
+    console.say(
         f"{'loop' if drawn.closed else 'road'} of {drawn.length_cm:.0f} cm, {settings.lanes} lane(s) of "
         f"{drawn.lane_width_cm:g} cm, tightest bend {radius}, {len(drawn.markings)} lines, "
         f"{len(drawn.boxes)} painted rectangles"

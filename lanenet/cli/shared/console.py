@@ -1,4 +1,8 @@
-"""What the command line shows: progress, tables, warnings, and the next command."""
+"""What the command line shows: progress, tables, warnings, and the next command.
+
+All of it goes through :func:`say`, :func:`show_rich` or :func:`_write_stderr`: names from files may hold what
+a terminal, or Rich, takes for a command.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lanenet.errors import printable
+
 #: Reports progress: ``(done, total)``, or ``(stage, done, total)`` where work has stages.
 ProgressCall = Callable[..., None]
 
@@ -31,7 +37,7 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
     Yields:
         A function of the stage's key, its text, the number done and the total.
     """
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, emoji=False)
     if not console.is_terminal:
         due_s: dict[str, float] = {}
 
@@ -39,15 +45,21 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
             now_s = time.monotonic()
             if done == total or now_s >= due_s.get(key, 0.0):
                 due_s[key] = now_s + _LOG_EVERY_S
-                _write_stderr(f"{text}: {done} of {total}\n")
+                _write_stderr(f"{printable(text)}: {done} of {total}\n")
 
         yield log
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as progress:
         tasks: dict[str, Any] = {}
 
         def show(key: str, text: str, done: int, total: int) -> None:
+            text = printable(text)
             if key not in tasks:
                 tasks[key] = progress.add_task(text, total=total)
             progress.update(tasks[key], description=text, completed=done, total=total)
@@ -93,7 +105,7 @@ class _LiveLog(logging.Handler):
         self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
 
     def emit(self, record: logging.LogRecord) -> None:
-        _write_stderr(f"{self._clear}{self.format(record)}\n")
+        _write_stderr(f"{self._clear}{printable(self.format(record))}\n")
 
 
 @contextmanager
@@ -117,7 +129,7 @@ def live_line() -> Iterator[Callable[[Callable[[], str]], None]]:
         nonlocal due_s
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + every_s
-            _write_stderr(f"{clear}{text()}{end}")
+            _write_stderr(f"{clear}{printable(text())}{end}")
 
     try:
         yield show
@@ -133,35 +145,45 @@ def _write_stderr(text: str) -> None:
         sys.stderr.flush()
 
 
+def say(text: str, err: bool = False) -> None:
+    """Print a text on stdout, or on stderr."""
+    typer.echo(printable(text), err=err)
+
+
+def show_rich(table: Table) -> None:
+    """Print a table of printable cells."""
+    Console(markup=False, emoji=False).print(table)
+
+
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table whose first column is text and whose others are figures."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=printable(title), title_justify="left")
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right")
     for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+        table.add_row(*(printable(cell) for cell in row))
+    show_rich(table)
 
 
 def show_lines(lines: Sequence[str]) -> None:
     """Print the results of a stage, indented below its progress bar."""
     for line in lines:
-        typer.echo(f"  {line}")
+        say(f"  {line}")
 
 
 def show_problems(problems: Sequence[str], limit: int = 10) -> None:
     """Print problems that did not stop the work, on stderr."""
     for problem in problems[:limit]:
-        typer.echo(f"warning: {problem}", err=True)
+        say(f"warning: {problem}", err=True)
     if len(problems) > limit:
-        typer.echo(f"warning: and {len(problems) - limit} more", err=True)
+        say(f"warning: and {len(problems) - limit} more", err=True)
 
 
 def wrote(*paths: Path | None) -> None:
     """Say which files or folders were written."""
     for path in paths:
         if path is not None:
-            typer.echo(f"wrote {path}")
+            say(f"wrote {path}")
 
 
 def given(options: Mapping[str, Path | float | str | None]) -> list[str]:
@@ -175,4 +197,4 @@ def given(options: Mapping[str, Path | float | str | None]) -> list[str]:
 
 def next_command(*words: str | Path) -> None:
     """Say what to run next, quoted so that it can be pasted; words in capitals are to be filled in."""
-    typer.echo("next: " + shlex.join(["lanenet", *(str(word) for word in words)]))
+    say("next: " + shlex.join(["lanenet", *(str(word) for word in words)]))

@@ -94,7 +94,8 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
         return None
     specs = {"frame": ColumnSpec("int", low=0.0, increasing=True)}
     specs |= {
-        name: ColumnSpec(allow_empty=name in POINT_NAMES, low=-MAX_PLACE, high=MAX_PLACE) for name in TRUTH_NAMES
+        name: ColumnSpec(allow_empty=name in POINT_NAMES, low=-MAX_PLACE, high=MAX_PLACE)
+        for name in TRUTH_NAMES
     }
     return read_csv(file, specs)
 

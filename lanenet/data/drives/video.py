@@ -105,7 +105,11 @@ class VideoImages:
         Tries the last frame of the header first; decodes the whole video only if that fails.
         """
         listed = self.listed_frames
-        if 0 < listed <= _MAX_FRAMES and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1) and self._capture.grab():
+        if (
+            0 < listed <= _MAX_FRAMES
+            and self._capture.set(cv2.CAP_PROP_POS_FRAMES, listed - 1)
+            and self._capture.grab()
+        ):
             self._rewind()
             return listed
         self._rewind()

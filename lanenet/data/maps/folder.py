@@ -201,7 +201,7 @@ def read_map(folder: Path) -> DriveMap:
         {
             "frame": ColumnSpec("int", low=0.0, increasing=True),
             **{name: ColumnSpec("int", low=0.0, high=MAX_PLACE) for name in ("lap", "segment")},
-            **{name: place for name in (*_POSE, "s_cm", *_TILT)},
+            **dict.fromkeys((*_POSE, "s_cm", *_TILT), place),
             "t_s": ColumnSpec(low=-MAX_TIME_S, high=MAX_TIME_S),
             "match": ColumnSpec(allow_empty=True, low=0.0, high=1.0),
             **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
@@ -234,7 +234,7 @@ def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
     across_cm = max(float(np.ptp(table[name])) for name in ("x_cm", "y_cm"))
     if n > 1 and across_cm < _LEAST_MAP_CM:
         raise MapFormatError(
-            f"{path}: all {n} frames lie within {across_cm:g} cm, expected a map of at least {_LEAST_MAP_CM:g} cm"
+            f"{path}: all {n} frames lie within {across_cm:g} cm, expected at least {_LEAST_MAP_CM:g} cm"
         )
 
 
@@ -324,7 +324,11 @@ def _line(item: dict[str, Any]) -> LaneLine:
         float("nan") if item[name] is None else float(item[name])
         for name in ("residual_cm", "marking_cm", "bare_share")
     )
-    for name, value, most in (("residual_cm", residual, MAX_PLACE), ("marking_cm", marking, MAX_PLACE), ("bare_share", unpainted, 1.0)):
+    for name, value, most in (
+        ("residual_cm", residual, MAX_PLACE),
+        ("marking_cm", marking, MAX_PLACE),
+        ("bare_share", unpainted, 1.0),
+    ):
         if value < 0.0 or value > most:
             raise ValueError(f"{name} is {value:g}, expected 0 to {most:g}")
     return LaneLine(

@@ -4,9 +4,9 @@ Whether a model fits a camera is checked in :mod:`lanenet.perception.network.det
 
 Wherever a model is expected, its checkpoint folder will do.
 
-A model file ends with a hash of all that goes before it, and its description holds a raster with the answer that
-it got where the file was made. Both are checked whenever it is opened: a damaged weight still answers, and a
-computer may compute otherwise.
+A model file ends with a hash of all that goes before it, and its description holds a raster with the answer
+that it got where the file was made. Both are checked whenever it is opened: a damaged weight still answers,
+and another computer may compute otherwise.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ class ModelMeta:
             if value(key) != expected:
                 raise ModelMismatchError(f"{where}: {key} {value(key)}, expected {expected}")
         names = (*_MetaFile.model_fields,)
-        texts = {key: str(properties.get(key, "")) for key in ("training_hash", "reference")}
+        texts: dict[str, Any] = {key: str(properties.get(key, "")) for key in ("training_hash", "reference")}
         try:
             file = check_settings(
                 _MetaFile, {name: value(name) for name in names}, f"{where}: unreadable description"
@@ -300,7 +300,9 @@ def self_test(
     return json.dumps(data)
 
 
-def _run_self_test(session: onnxruntime.InferenceSession, text: str, window: BirdseyeWindow, where: str) -> None:
+def _run_self_test(
+    session: onnxruntime.InferenceSession, text: str, window: BirdseyeWindow, where: str
+) -> None:
     """Refuse a model that answers otherwise than where it was made.
 
     Raises:
@@ -329,8 +331,8 @@ def _run_self_test(session: onnxruntime.InferenceSession, text: str, window: Bir
         # Not ">", which NaN would pass.
         if not (off <= test.tolerance).all():
             raise ModelMismatchError(
-                f"{where}: self-test: {name} differs by {float(np.max(off)):.3g} from the answer where the model "
-                f"was exported, expected at most {test.tolerance:g}; is onnxruntime sound? {_REMEDY}"
+                f"{where}: self-test: {name} differs by {float(np.max(off)):.3g} from the answer where the "
+                f"model was exported, expected at most {test.tolerance:g}; is onnxruntime sound? {_REMEDY}"
             )
 
 
@@ -346,8 +348,8 @@ def _run(
 def sealed(model: bytes) -> bytes:
     """Return the bytes of an ONNX file with their hash at the end.
 
-    The hash is one more entry of the file's properties, as any tool reads them: messages of Protocol Buffers can
-    be lengthened at their end.
+    The hash is one more entry of the file's properties, as any tool reads them: messages of Protocol Buffers
+    can be lengthened at their end.
     """
     return model + _seal(model)
 
