@@ -41,7 +41,7 @@ _MAX_FOOTER = 16 * MEBIBYTE
 #: 20 times their size, small ones of a still car to more.
 _MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
 #: Rows that are unpacked at a time, before the limit is checked.
-_BATCH_ROWS = 1024
+_BATCH_ROWS = 64
 #: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares
 #: of more would lose the centimetres.
 MAX_PLACE = 1e6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ class Inner(Settings):
     """A section."""
 
     blur_px: float = 1.0
+    hold: bool = False
 
 
 class Outer(Settings):
@@ -37,6 +39,15 @@ def settings(what: str, text: str | bytes | None, *named: str, overrides: tuple[
     return Bad(what, act, ConfigError, named)
 
 
+def pipe(folder: Path) -> Any:
+    os.mkfifo(folder / "run.yaml")
+    return load_settings(Outer, folder / "run.yaml")
+
+
+NINE_TIMES = "a0: &a0 [1, 2]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 10)
+)
+
 BAD = [
     settings("no file", None, "run.yaml", "no such file"),
     settings("no text", b"\xff\xfe\x00\x81", "run.yaml"),
@@ -50,6 +61,29 @@ BAD = [
     settings("an override without a key", "", "key=value", "'=3'", overrides=("=3",)),
     settings("an override that is no YAML", "", "'epochs=['", "YAML", overrides=("epochs=[",)),
     settings("an override through a value", "epochs: 2\n", "'epochs.a=1'", overrides=("epochs.a=1",)),
+    settings("yes for a number", "edges: {blur_px: yes}\n", "run.yaml", "'edges.blur_px'", "True"),
+    settings("true for a whole number", "epochs: true\n", "run.yaml", "'epochs'", "True"),
+    settings("a number for yes", "edges: {hold: 1}\n", "run.yaml", "'edges.hold'", "found 1"),
+    settings("base sixty", "edges: {blur_px: 1:30}\n", "run.yaml", "'edges.blur_px'", "'1:30'"),
+    settings("base eight", "epochs: 010\n", "run.yaml", "'epochs'", "'010'"),
+    settings("an underscore", "epochs: 1_0\n", "run.yaml", "'epochs'", "'1_0'"),
+    settings("a quoted number", "edges: {blur_px: '2'}\n", "run.yaml", "'edges.blur_px'", "'2'"),
+    settings("a fraction of an epoch", "epochs: 2.0\n", "run.yaml", "'epochs'", "2.0"),
+    settings("a key twice", "epochs: 1\nedges: {}\nepochs: 2\n", "run.yaml", "line 3", "'epochs'", "line 1"),
+    settings("a key twice inside", "edges: {blur_px: 1, blur_px: 2}\n", "run.yaml", "line 1", "'blur_px'"),
+    settings("no date", "epochs: 2024-13-45\n", "run.yaml"),
+    settings("a number of 5000 digits", f"epochs: {'9' * 5000}\n", "run.yaml"),
+    settings("nested deeply", "epochs: " + "[" * 50_000, "run.yaml"),
+    settings("an alias of itself", "epochs: &a [*a]\n", "run.yaml", "aliases"),
+    settings("aliases of aliases", NINE_TIMES, "run.yaml", "aliases"),
+    settings("a hundred thousand values", f"epochs: [{'1,' * 100_000}]\n", "run.yaml", "20000"),
+    settings("a large file", "# " + "x" * 2**21, "run.yaml", "1 MB"),
+    settings("an override of yes", "", "'epochs'", "True", overrides=("epochs=yes",)),
+    Bad("a folder", lambda f: load_settings(Outer, f), ConfigError, ("a folder",)),
+    Bad(
+        "a device", lambda f: load_settings(Outer, Path("/dev/zero")), ConfigError, ("/dev/zero", "a device")
+    ),
+    Bad("a pipe", pipe, ConfigError, ("run.yaml", "a pipe")),
     settings("a bad override", "", "run.yaml epochs=x", "'epochs'", overrides=("epochs=x",)),
 ]
 
@@ -57,6 +91,13 @@ BAD = [
 @each(BAD)
 def test_bad_settings_are_refused(tmp_path: Path, bad: Bad) -> None:
     bad.check(tmp_path)
+
+
+def test_what_people_write_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text("epochs: 0x10\nedges: &e {blur_px: 1e-3, hold: on}\n")
+    found = load_settings(Outer, path, ["edges.hold=false"])
+    assert (found.epochs, found.edges.blur_px, found.edges.hold) == (16, 0.001, False)
 
 
 def config(tmp_path: Path, **changes: Any) -> Path:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +15,8 @@ from drives import edit, frame_image, record, write_drive, write_tub, write_vide
 
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
-from lanenet.data.drives.sources import open_source
-from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.data.drives.sources import open_source, read_mask
+from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 
 Open = Callable[[Path], Any]
 
@@ -90,9 +93,55 @@ def first_image(path: Path) -> Any:
     return open_source(path).image(0)
 
 
+def pipe(name: str) -> Open:
+    """A drive folder in which a pipe stands for one of its files, opened; its first image is read."""
+
+    def act(tmp_path: Path) -> Any:
+        path = write_drive(tmp_path / "lap", 1)
+        (path / name).unlink()
+        os.mkfifo(path / name)
+        return open_drive(path)
+
+    return act
+
+
+def piped(folder: Path) -> Path:
+    os.mkfifo(folder / "truth.csv")
+    return folder
+
+
+def linked(name: str, target: str) -> Open:
+    """A drive folder in which a link stands for one of its files or folders, opened."""
+
+    def act(tmp_path: Path) -> Any:
+        path = write_drive(tmp_path / "lap", 2)
+        (path / name).rename(tmp_path / "elsewhere")
+        (path / name).symlink_to(target.format(tmp_path))
+        return open_drive(path)
+
+    return act
+
+
+def manifest(**changes: Any) -> Open:
+    """A tub whose list of catalogs has other values, opened."""
+
+    def act(tmp_path: Path) -> Any:
+        path = write_tub(tmp_path / "tub", [record(0), record(1)]) / "manifest.json"
+        *first, last = path.read_text().splitlines()
+        path.write_text("\n".join([*first, json.dumps({**json.loads(last), **changes})]) + "\n")
+        return open_drive(tmp_path / "tub")
+
+    return act
+
+
+def png(width: int, height: int) -> bytes:
+    """The beginning of an image that would be this large."""
+    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", width, height) + b"\x08\x02\0\0\0" + b"IEND"
+
+
 ROW = "1,images/000001.jpg,0.05,60,0.01"
 LOST = ("no usable frames",)
-D, C = DriveFormatError, CalibrationError
+D, C, E = DriveFormatError, CalibrationError, ConfigError
 
 BAD = [
     Bad("no drive", holding("notes", "x"), D, ("frames.csv", "manifest.json", ".mp4")),
@@ -109,6 +158,19 @@ BAD = [
     Bad("no column of times", frames("t_s", "time"), D, ("frames.csv", "'t_s'", "missing")),
     Bad("no rows", holding("frames.csv", "frame,file,t_s\n"), D, ("frames.csv", "no frames")),
     Bad("no image", without("images/*"), D, ("lap", "2 frames", "000000.jpg")),
+    Bad(
+        "an image above", frames("images/000001.jpg", "../secret.jpg"), D, ("frame 1", "'file'", "../secret")
+    ),
+    Bad("an image below and above", frames("images/000001", "images/../../a"), D, ("frame 1", "'file'")),
+    Bad("an image elsewhere", frames("images/000001.jpg", "/dev/zero"), D, ("frame 1", "/dev/zero")),
+    Bad("an image of no name", frames("images/000001.jpg", "a\0b"), D, ("frames.csv",)),
+    Bad("an image by a link", linked("images/000001.jpg", "{}/elsewhere"), D, ("frame 1", "000001.jpg")),
+    Bad("images by a link", linked("images", "{}/elsewhere"), D, ("frame 0", "images/000000.jpg")),
+    Bad("an image that is a pipe", pipe("images/000000.jpg"), D, ("000000.jpg",)),
+    Bad("a truth that is a pipe", lambda f: read_truth(piped(f)), D, ("truth.csv", "a pipe")),
+    Bad("a table of pipes", pipe("frames.csv"), D, ("lap",)),
+    Bad("a speed beyond all cars", frames(",60,", ",1e300,"), D, ("line 2", "'speed_cm_s'")),
+    Bad("a time beyond all clocks", frames("0.05", "1e300"), D, ("line 3", "'t_s'")),
     # drive.yaml and its camera
     Bad(
         "another version",
@@ -130,6 +192,13 @@ BAD = [
     ),
     Bad("another size", folder(("camera.yaml", "width: 64", "width: 640")), D, ("64x48", "640x48")),
     Bad("no camera file", without("camera.yaml"), C, ("camera.yaml", "no such file")),
+    Bad(
+        "a camera file above",
+        folder(("drive.yaml", "camera.yaml", "../camera.yaml")),
+        D,
+        ("drive.yaml", "'camera'", "../camera.yaml"),
+    ),
+    Bad("a drive.yaml that is a pipe", pipe("drive.yaml"), D, ("drive.yaml", "a pipe")),
     # truth.csv
     Bad("an unknown pose", pose_unknown, D, ("truth.csv", "line 2", "'x_cm'")),
     # tubs
@@ -149,13 +218,38 @@ BAD = [
         D,
         ("manifest.json", "'deleted_indexes'"),
     ),
+    Bad("a catalog above", manifest(paths=["../x.catalog"]), D, ("manifest.json", "'paths'", "../x")),
+    Bad("a catalog elsewhere", manifest(paths=["/dev/zero"]), D, ("manifest.json", "'paths'", "/dev/zero")),
+    Bad("catalogs that are lists", manifest(paths=[["a"]]), D, ("manifest.json",)),
+    Bad("a manifest nested deeply", holding("manifest.json", "[" * 100_000), D, ("manifest.json",)),
+    Bad(
+        "types that are lists", holding("manifest.json", '[[1]]\n[[1]]\n{"paths": []}'), D, ("manifest.json",)
+    ),
+    Bad("an index beyond all counting", tub([record(10**30)]), D, LOST),
+    Bad("a row nested deeply", tub(["[" * 100_000]), D, LOST),
     # videos
+    Bad("a playlist", holding("lap.mp4", b"#EXTM3U\n/etc/passwd\n", "lap.mp4"), D, ("lap.mp4", "#EXTM3U")),
     Bad("no video", holding("lap.mp4", b"not a video at all" * 50, "lap.mp4"), D, ("lap.mp4", "OpenCV")),
     Bad("rows beyond the video", rows_beyond_the_video, D, ("lap.csv", "40 frames")),
     # photos
     Bad("no source", missing(open_source), D, ("nowhere", "no such")),
     Bad("a folder without photos", holding("notes", "x", then=open_source), D, ("frames.csv", ".jpg")),
     Bad("a table as a source", holding("t.xyz", "1", "t.xyz", open_source), D, ("t.xyz", ".mp4", ".jpg")),
+    Bad(
+        "a photo beyond all memory",
+        holding("b.png", png(60_000, 60_000), then=first_image),
+        D,
+        ("60000x60000",),
+    ),
+    Bad("a photo without a size", holding("b.png", png(0, 4), then=first_image), D, ("b.png",)),
+    Bad("another format", holding("b.jpg", b"GIF89a" + bytes(99), then=first_image), D, ("b.jpg",)),
+    Bad(
+        "a mask beyond all memory",
+        holding("m.png", png(60_000, 60_000), "m.png", read_mask),
+        E,
+        ("60000x60000",),
+    ),
+    Bad("a mask that is a device", lambda _: read_mask(Path("/dev/zero.png")), E, ("/dev/zero.png",)),
     Bad("a broken photo", holding("b.jpg", b"no jpeg", then=first_image), D, ("b.jpg",)),
 ]
 
@@ -168,3 +262,38 @@ def test_a_bad_drive_is_refused(tmp_path: Path, bad: Bad) -> None:
 def test_a_table_needs_distinct_rows() -> None:
     with pytest.raises(AssertionError, match="one name"):
         each([BAD[0], BAD[0]])
+
+
+def test_a_drive_may_use_its_own_folders(tmp_path: Path) -> None:
+    """Names below the folder, links within it, and a link to the drive itself."""
+    path = write_drive(tmp_path / "lap", 2)
+    (path / "more" / "deep").mkdir(parents=True)
+    (path / "images" / "000001.jpg").rename(path / "more" / "deep" / "b.jpg")
+    edit(path / "frames.csv", "images/000001.jpg", "./more/deep/b.jpg")
+    (path / "images" / "000000.jpg").rename(path / "more" / "a.jpg")
+    (path / "images" / "000000.jpg").symlink_to("../more/a.jpg")
+    (tmp_path / "link").symlink_to(path)
+    drive = open_drive(tmp_path / "link")
+    assert not drive.problems and drive.image(1).shape == drive.image(0).shape
+
+
+def test_a_tub_may_keep_its_catalogs_in_a_folder(tmp_path: Path) -> None:
+    path = write_tub(tmp_path / "tub", [record(0), record(1)])
+    (path / "data").mkdir()
+    (path / "catalog_0.catalog").rename(path / "data" / "catalog_0.catalog")
+    edit(path / "manifest.json", '"catalog_0.catalog"', '"data/catalog_0.catalog"')
+    assert len(open_drive(path)) == 2
+
+
+@pytest.mark.parametrize("value", [-7, 1e308, 10**400, True])
+def test_a_command_that_no_car_has_is_left_out_and_counted(tmp_path: Path, value: float) -> None:
+    rows = [record(k, **({"user/angle": value} if k == 1 else {})) for k in range(3)]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.commands.angle is not None
+    assert [angle == -0.25 for angle in drive.commands.angle] == [True, False, True]
+    assert any("frame 1" in problem and "angle" in problem for problem in drive.problems)
+
+
+def test_a_joystick_at_its_stop_is_at_its_stop(tmp_path: Path) -> None:
+    rows = [record(k, **{"user/angle": -32768 / 32767}) for k in range(3)]
+    assert open_drive(write_tub(tmp_path / "tub", rows)).commands.angle.tolist() == [-1.0] * 3

@@ -1,4 +1,4 @@
-"""Bad tables: CSV files to read, and detections that cannot be written."""
+"""Bad tables: CSV files and label sets to read, and detections that cannot be written."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow
+import pyarrow.parquet
 from bad_input import Bad, each
+from synthetic_labels import make_label_set
 
 from lanenet.data.detections import DetectionTable
-from lanenet.data.tables import ColumnSpec, read_csv
+from lanenet.data.label_set import read_labels, write_labels
+from lanenet.data.tables import META_KEY, ColumnSpec, read_csv
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.perception.estimate import LaneEstimate
 
@@ -60,6 +65,44 @@ def labels(what: str, act: Act, *named: str) -> Bad:
     return Bad(what, act, LabelFormatError, named)
 
 
+def parquet(meta: bytes, n: int = 3, text: str = "") -> Act:
+    """A table with a text that takes little room in the file, read as a label set."""
+
+    def act(folder: Path) -> Any:
+        column = pyarrow.DictionaryArray.from_arrays(np.zeros(n, np.int32), [text])
+        table = pyarrow.table({"file": column}).replace_schema_metadata({META_KEY: meta})
+        pyarrow.parquet.write_table(table, folder / "a.parquet", compression="zstd", store_schema=False)
+        return read_labels(folder / "a.parquet")
+
+    return act
+
+
+def label_set(old: str, new: str) -> Act:
+    """A label set with a text of its metadata replaced."""
+
+    def act(folder: Path) -> Any:
+        write_labels(folder / "a.parquet", make_label_set(2, 0))
+        table = pyarrow.parquet.read_table(folder / "a.parquet")
+        meta = table.schema.metadata[META_KEY].decode()
+        assert old in meta
+        table = table.replace_schema_metadata({META_KEY: meta.replace(old, new)})
+        pyarrow.parquet.write_table(table, folder / "a.parquet")
+        return read_labels(folder / "a.parquet")
+
+    return act
+
+
+def damaged_labels(folder: Path) -> Any:
+    path = folder / "a.parquet"
+    write_labels(path, make_label_set(2, 0))
+    column = pyarrow.parquet.read_metadata(path).row_group(0).column(3)
+    data = bytearray(path.read_bytes())
+    # The last byte of a page: of a number, which would read as another one.
+    data[column.data_page_offset + column.total_compressed_size - 1] ^= 4
+    path.write_bytes(data)
+    return read_labels(path)
+
+
 INF, NAN = float("inf"), float("nan")
 
 BAD = [
@@ -80,7 +123,20 @@ BAD = [
     csv("no increase", "frame,file,t_s\n1,a,1\n\n1,a,1\n", "line 4", "'frame'", "more than 1"),
     csv("out of range", "frame,file,t_s,angle\n0,a,1,-30\n", "line 2", "'angle'", "-1 to 1", "-30"),
     csv("semicolons", "frame;file;t_s\n0;a;1\n", "line 1", "'frame'", "frame;file;t_s"),
+    csv("a row without end", "frame,file,t_s\n0,a," + "1" * 2**20, "line 2"),
+    csv("a header without end", "," * 2**20, "line 1"),
+    csv("a cell of many lines", 'frame,file,t_s\n0,"' + "a\n" * 2**19 + '",1\n', "frames.csv"),
+    csv("a column of digits", f"frame,file,t_s\n{'9' * 5000},a,1\n", "line 2", "'frame'"),
     labels("no text", no_text, "a.csv"),
+    labels("a folder", lambda folder: read_csv(folder, SPECS, LabelFormatError), "a folder"),
+    labels("a device", lambda _: read_csv(Path("/dev/zero"), SPECS, LabelFormatError), "/dev/zero"),
+    labels("a label set that is a folder", read_labels, "is no file"),
+    labels("labels with metadata nested deeply", parquet(b"[" * 100_000), "a.parquet", "metadata"),
+    labels("labels with metadata of another kind", parquet(b"[1]"), "a.parquet", "metadata"),
+    labels("labels that unpack without end", parquet(b"{}", n=9000, text="x" * 2**16), "a.parquet", "MB"),
+    labels("labels of a window without end", label_set('"rows": 24', '"rows": 2400000'), "'window.rows'"),
+    labels("labels of yes for a width", label_set('"lane_width_cm": 40.0', '"lane_width_cm": true'), "True"),
+    labels("labels with a bit turned", damaged_labels, "a.parquet"),
     Bad("no file", lambda f: read_csv(f / "a.csv", SPECS), DriveFormatError, ("a.csv", "no such file")),
     labels("writes another ending", refused_to_write("seen.txt"), ".parquet", ".csv"),
     labels("writes no ending", refused_to_write("seen"), ".parquet", ".csv"),

@@ -204,6 +204,8 @@ def test_another_version_is_refused(folder, replacement):
         ("tape_cm: 2.1\n", "", "'tape_cm' is missing"),
         ("laps: 1", "lapps: 1", "lapps"),
         ("scale_from: lane width", "scale_from: [", "not valid YAML"),
+        ("mapped_lane_cm: 36.4", "mapped_lane_cm: 0", "'mapped_lane_cm'"),
+        ("laps: 1", "laps: yes", "'laps'"),
     ],
 )
 def test_damaged_meta_data(folder, old, new, message):
@@ -223,6 +225,28 @@ def test_poses_without_a_number_are_refused(folder, value):
     lines[5] = ",".join(cells)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(MapFormatError, match=r"poses\.csv: line 6"):
+        read_map(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"x_cm": "0.5", "y_cm": "0.25"},
+        {"frame": "7"},
+        {"x_cm": "1e300"},
+        {"match": "-3"},
+        {"segment": "-1"},
+    ],
+    ids=lambda change: "-".join(change),
+)
+def test_poses_that_no_drive_has_are_refused(folder, change):
+    path = folder / "poses.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    for name, value in change.items():
+        for row in rows[1:]:
+            row[rows[0].index(name)] = value
+    path.write_text("".join(",".join(row) + "\n" for row in rows))
+    with pytest.raises(MapFormatError, match=r"poses\.csv"):
         read_map(folder)
 
 
@@ -275,6 +299,25 @@ def _damage(plain: dict, what: str) -> object:
         line["sigma_s_cm"] = [1.0, 2.0]
     elif what == "one line":
         del plain["lines"][0]
+    elif what == "sides swapped":
+        for pair in (plain["lines"][:2], plain["lines"][2:]):
+            pair[0]["side"], pair[1]["side"] = "right", "left"
+    elif what == "equal knots":
+        line["knots_cm"][6] = line["knots_cm"][5]
+    elif what == "knots beyond all measure":
+        line["knots_cm"] = [1e300 * k for k in line["knots_cm"]]
+    elif what == "an infinite number":
+        line["coefficients_cm"][3] = [float("inf"), 0.0]
+    elif what == "support that ends before it begins":
+        line["supported_cm"] = [[80.0, 0.0]]
+    elif what == "a rank beyond all roads":
+        line["rank"] = 10**12
+    elif what == "a segment that is no number":
+        line["segment"] = float("inf")
+    elif what == "an unpainted share above one":
+        line["bare_share"] = 7.0
+    elif what == "a line that is a list":
+        plain["lines"][0] = []
     return plain
 
 
@@ -299,6 +342,15 @@ def _damage(plain: dict, what: str) -> object:
         "another period",
         "half an uncertainty",
         "one line",
+        "sides swapped",
+        "equal knots",
+        "knots beyond all measure",
+        "an infinite number",
+        "support that ends before it begins",
+        "a rank beyond all roads",
+        "a segment that is no number",
+        "an unpainted share above one",
+        "a line that is a list",
     ],
 )
 def test_damaged_lane_lines_are_refused(folder, what):
