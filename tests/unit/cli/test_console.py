@@ -1,6 +1,14 @@
-"""Progress where nobody looks at a terminal: in log files and pipes."""
+"""Progress where nobody looks at a terminal, in log files and pipes; names that hold commands of a terminal."""
 
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
 from lanenet.cli.shared import console
+from lanenet.evaluation.tables import TextTable
 
 
 def test_a_log_gets_a_line_at_once_now_and_then_and_at_the_end(capsys, monkeypatch):
@@ -25,3 +33,49 @@ def test_a_log_of_a_training_has_its_errors(capsys):
     with console.training_bar() as progress:
         progress(1, 1, 2.5, 1.25, 1500.0)
     assert capsys.readouterr().err == "train  RMSE 2.50 cm, validation 1.25 cm, 1500 samples/s: 1 of 1\n"
+
+
+#: An escape that clears the screen, one of eight bits, a carriage return, a mark that turns the direction of
+#: writing, and markup of Rich.
+NAME = "[red]x[/]\x1b[2J\x9b2J\rok\u202eb"
+SHOWN = r"[red]x[/]\x1b[2J\x9b2J\rok\u202eb"
+
+
+def _progress(name: str) -> None:
+    with console.progress_bar(name) as progress:
+        progress(1, 1)
+
+
+def _live(name: str) -> None:
+    with console.live_line() as show:
+        show(lambda: name)
+
+
+@pytest.mark.parametrize(
+    "show",
+    [
+        lambda name: console.wrote(Path(name)),
+        lambda name: console.show_lines([name]),
+        lambda name: console.show_problems([name]),
+        lambda name: console.next_command("detect", name),
+        lambda name: console.show_table(name, ["file"], [[name]]),
+        lambda name: console.show_rich(TextTable(name, ["file"], [[name]], name).as_rich()),
+        _progress,
+        _live,
+    ],
+    ids=["wrote", "lines", "problems", "next", "table", "comparison", "progress", "live"],
+)
+def test_names_are_shown_and_not_obeyed(capsys, show):
+    show(NAME)
+    told = "".join(capsys.readouterr())
+    assert SHOWN in told and not set(told) & set("\x1b\x9b\r\u202e")
+
+
+def test_an_error_is_one_line_whatever_the_name(tmp_path):
+    # The last byte is no UTF-8.
+    name = os.fsdecode(b"a\n\x1b[2J[b]\xff.yaml")
+    (tmp_path / name).write_text("epochs: [")
+    result = CliRunner().invoke(app, ["drive", str(tmp_path / name)])
+    assert result.exit_code == 1 and "Traceback" not in result.output
+    (line,) = result.stderr.splitlines()
+    assert r"a\n\x1b[2J[b]\udcff.yaml" in line and "\x1b" not in line

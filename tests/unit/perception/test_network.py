@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -288,3 +289,68 @@ def test_a_network_that_takes_the_width_gets_it(width_model_path, monkeypatch):
         told = {"raster": raster, "lane_width_cm": np.array([width], np.float32)}
         np.testing.assert_allclose(found, session.run(["points_cm"], told)[0][0], atol=1e-5)
     assert not np.allclose(answers[0], answers[1]) and not np.allclose(answers[1], answers[2])
+
+
+def test_no_damaged_byte_of_a_model_goes_unnoticed(model_path, tmp_path):
+    data, rng = model_path.read_bytes(), np.random.default_rng(0)
+    for at in [*rng.integers(0, len(data), 200).tolist(), 0, len(data) - 1, len(data) - 40]:
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        (tmp_path / "m.onnx").write_bytes(damaged)
+        with pytest.raises(ModelMismatchError, match=r"m\.onnx"):
+            read_model_meta(tmp_path / "m.onnx")
+    (tmp_path / "m.onnx").write_bytes(data[:-1])
+    with pytest.raises(ModelMismatchError, match=r"m\.onnx"):
+        read_model_meta(tmp_path / "m.onnx")
+
+
+def test_a_model_that_answers_otherwise_than_where_it_was_made_is_refused(model_path, tmp_path):
+    model = onnx.load(model_path)
+    bias = next(w for w in model.graph.initializer if w.data_type == onnx.TensorProto.FLOAT)
+    values = onnx.numpy_helper.to_array(bias) + np.float32(0.5)
+    bias.CopyFrom(onnx.numpy_helper.from_array(values, bias.name))
+    del model.metadata_props[-1]
+    (tmp_path / "m.onnx").write_bytes(sealed(model.SerializeToString()))
+    with pytest.raises(ModelMismatchError, match=r"m\.onnx: self-test: points_cm"):
+        read_model_meta(tmp_path / "m.onnx")
+
+
+@pytest.mark.parametrize(
+    "test",
+    [
+        None,
+        "{",
+        "[" * 100_000,
+        '{"raster": "AAAA", "answers": {}, "tolerance": 1}',
+        '{"raster": "?", "answers": {}, "tolerance": 1}',
+        '{"raster": "", "answers": {"points_cm": [NaN]}, "tolerance": 1}',
+    ],
+)
+def test_a_model_without_a_usable_self_test_is_refused(model_path, tmp_path, test):
+    path = change_properties(model_path, tmp_path / "m.onnx", self_test=test)
+    with pytest.raises(ModelMismatchError, match=r"m\.onnx.*self_test"):
+        read_model_meta(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"window": '{"left_cm": 0, "near_cm": 0, "cell_cm": 1, "rows": 1000000000, "columns": 1000000000}'},
+        {"window": '{"left_cm": 0, "near_cm": 0, "cell_cm": 0, "rows": 24, "columns": 32}'},
+        {"window": "[" * 100_000},
+        {"wheelbase_cm": "true"},
+        {"lane_width_cm": "1e308"},
+        {"perception": "[]"},
+        {"rmse_cm": '"abcdef"'},
+        {"camera_hashes": "3"},
+    ],
+)
+def test_impossible_descriptions_are_refused(model_path, tmp_path, changes):
+    path = change_properties(model_path, tmp_path / "m.onnx", **changes)
+    with pytest.raises(ModelMismatchError, match=rf"m\.onnx.*{next(iter(changes))}"):
+        read_model_meta(path)
+
+
+@pytest.mark.parametrize("name", ["small", "general"])
+def test_the_shipped_models_pass_their_self_test(name):
+    assert read_model_meta(Path(__file__).parents[3] / "checkpoints" / name).window.rows == 96
