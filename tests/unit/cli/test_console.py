@@ -1,4 +1,4 @@
-"""Progress where nobody looks at a terminal, in log files and pipes; names that hold commands of a terminal."""
+"""Progress where nobody looks at a terminal, in log files and pipes; names that hold its commands."""
 
 import os
 from pathlib import Path
