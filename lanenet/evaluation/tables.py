@@ -51,7 +51,7 @@ class TextTable:
         table = Table(
             title=printable(self.title),
             title_justify="left",
-            caption=self.note,
+            caption=printable(self.note),
             box=box.SIMPLE,
             pad_edge=False,
         )
