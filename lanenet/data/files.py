@@ -19,8 +19,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
 from lanenet.config import read_yaml
 from lanenet.errors import ConfigError, LanenetError, MissingExtraError
 
@@ -199,6 +197,9 @@ def sync_path(path: Path) -> None:
 
 
 def _plain(obj: Any) -> Any:
+    # Not above: what stops a car imports this module, and must not wait for NumPy.
+    import numpy as np
+
     if isinstance(obj, np.ndarray):
         return _plain(obj.tolist())
     if isinstance(obj, np.generic):

@@ -25,7 +25,7 @@ HEAVY = (
 NAMED_IMPORTS = {
     "lanenet/data/": {"pyarrow"},
     "lanenet/learn/sweep.py": {"optuna"},
-    "lanenet/onboard/actuators/": {"serial", "smbus2"},
+    "lanenet/onboard/actuators/": {"serial", "termios"},
     "lanenet/onboard/cameras/": {"picamera2"},
 }
 #: The one function that does it.

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
+from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.myconfig import with_myconfig
-from lanenet.onboard.actuators.pca9685 import PCA9685, PCA9685Settings
+from lanenet.onboard.actuators.pca9685 import PAUSE_S, PCA9685, PCA9685Settings, start_writes
 from lanenet.onboard.actuators.recorder import Recorder, RecorderSettings
 from lanenet.onboard.actuators.serial_board import SerialBoard, SerialBoardSettings
-from lanenet.onboard.devices import Actuator
 
-__all__ = ["ActuatorSettings", "make_actuator"]
+__all__ = ["ActuatorSettings", "actuator_from_json", "first_writes", "make_actuator"]
 
 ActuatorSettings = Annotated[
     PCA9685Settings | SerialBoardSettings | RecorderSettings, Field(discriminator="kind")
@@ -30,3 +30,30 @@ def make_actuator(settings: ActuatorSettings) -> Actuator:
     if isinstance(settings, SerialBoardSettings):
         return SerialBoard(settings)
     return Recorder(settings)
+
+
+def actuator_from_json(text: str) -> Actuator:
+    """Build an actuator from its settings as JSON; the device is not touched.
+
+    Raises:
+        ConfigError: As :func:`make_actuator`.
+    """
+    adapter: TypeAdapter[ActuatorSettings] = TypeAdapter(ActuatorSettings)
+    return make_actuator(adapter.validate_json(text))
+
+
+def first_writes(settings: ActuatorSettings) -> dict[str, Any] | None:
+    """Return what puts an actuator into neutral, prepared for a guard that has imported nothing yet.
+
+    Returns:
+        Bus, address, writes as hexadecimal text and the pause after each, [s]; None where the driver has to
+        be there first.
+
+    Raises:
+        ConfigError: As :func:`make_actuator`.
+    """
+    if not isinstance(settings, PCA9685Settings):
+        return None
+    settings = with_myconfig(settings)
+    writes = [data.hex() for data in start_writes(settings)]
+    return {"bus": settings.bus, "address": settings.address, "writes": writes, "pause_s": PAUSE_S}

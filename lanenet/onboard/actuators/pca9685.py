@@ -1,25 +1,25 @@
 """Servo and speed controller on a PCA9685, the 16-channel pulse generator of most Donkeycars, over I2C.
 
-The chip has no watchdog: it repeats the last pulses when the computer stops sending. Where that matters, use
-a board that has one (``firmware/lanenet_uno``).
+The chip has no watchdog: it repeats the last pulses when the computer stops sending. Where that matters, give
+it a ``heartbeat``, or use a board that has a watchdog (``firmware/lanenet_uno``).
 
 Source: NXP PCA9685 data sheet, revision 4: registers in 7.3, prescaler in 7.3.5, restart in 7.3.1.1.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
-from lanenet.data.files import require
 from lanenet.errors import HardwareError
+from lanenet.onboard.actuators.heartbeat import Heartbeat, HeartbeatSettings
 from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
+from lanenet.onboard.i2c import I2CChip
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
 RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
@@ -27,10 +27,8 @@ RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
 OUTDRV = 0x04
 OSCILLATOR_HZ = 25e6
 COUNTS = 4096
-#: The oscillator needs 0.5 ms to start after sleep.
-_OSCILLATOR_START_S = 0.001
-#: Motors disturb the bus now and then; a transfer without acknowledgement is repeated.
-_TRIES = 3
+#: After every write of the start; the oscillator needs 0.5 ms to start after sleep.
+PAUSE_S = 0.001
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +45,8 @@ class PCA9685Settings(PulseSettings):
         frequency_hz: Pulses per second; the chip takes the nearest rate it can.
         steering_channel: Output of the steering servo.
         throttle_channel: Output of the speed controller.
+        heartbeat: A GPIO line with a pulse for every command that the chip took, for a watchdog of hardware
+            at its OE pin; None if there is none.
     """
 
     kind: Literal["pca9685"] = "pca9685"
@@ -56,6 +56,7 @@ class PCA9685Settings(PulseSettings):
     frequency_hz: float = Field(default=60.0, ge=24.0, le=400.0)
     steering_channel: int = Field(default=1, ge=0, le=15)
     throttle_channel: int = Field(default=0, ge=0, le=15)
+    heartbeat: HeartbeatSettings | None = None
 
 
 def prescale_of(frequency_hz: float) -> int:
@@ -68,144 +69,200 @@ def counts_of(pulse_us: float, prescale: int) -> int:
     return round(pulse_us * 1e-6 * OSCILLATOR_HZ / (prescale + 1))
 
 
+def neutral_writes(settings: PCA9685Settings) -> list[bytes]:
+    """Return what stops the motor of a chip that runs, then straightens the wheels."""
+    pulses = neutral_pulses(settings)
+    return [
+        _pulse_write(settings, settings.throttle_channel, pulses.throttle_us),
+        _pulse_write(settings, settings.steering_channel, pulses.steering_us),
+    ]
+
+
+def start_writes(settings: PCA9685Settings) -> list[bytes]:
+    """Return what brings a chip into neutral from any state, with ``PAUSE_S`` after each.
+
+    The prescaler can be written only in sleep. Pulses are loaded before the chip wakes, so that the speed
+    controller's first pulse is neutral. Outputs that were running before the sleep start again with the
+    last bit.
+    """
+    return [
+        bytes([MODE1, AUTO_INCREMENT | SLEEP]),
+        bytes([MODE2, OUTDRV]),
+        bytes([PRE_SCALE, prescale_of(settings.frequency_hz)]),
+        *neutral_writes(settings),
+        bytes([MODE1, AUTO_INCREMENT]),
+        bytes([MODE1, AUTO_INCREMENT | RESTART]),
+    ]
+
+
+def _pulse_write(settings: PCA9685Settings, channel: int, pulse_us: float) -> bytes:
+    """Set an output high at count 0 and low at the pulse's end: ON_L, ON_H, OFF_L, OFF_H."""
+    off = counts_of(pulse_us, prescale_of(settings.frequency_hz))
+    return bytes([LED0_ON_L + 4 * channel, 0, 0, off & 0xFF, off >> 8])
+
+
 class PCA9685:
-    """Steering servo and motor on two outputs of a PCA9685; an ``Actuator``."""
+    """Steering servo and motor on two outputs of a PCA9685; an ``Actuator`` and a ``Spare``."""
 
     def __init__(self, settings: PCA9685Settings) -> None:
         self._settings = settings
-        self._prescale = prescale_of(settings.frequency_hz)
-        self._bus: Any = None
-        self._message: Any = None
+        self._chip: I2CChip | None = None
+        self._heartbeat: Heartbeat | None = None
         self._lock = threading.Lock()
+        self._neutral = neutral_writes(settings)
+        #: What the throttle's output holds as far as this program has written it.
+        self._throttle = self._neutral[0]
         #: Counts calls of ``neutral``, so that a command that hung meanwhile does not undo it.
         self._stops = 0
 
     def open(self) -> None:
-        """Set the rate, load neutral pulses, and only then wake the outputs.
+        """Become the chip's owner, set the rate, load neutral pulses, and only then wake the outputs.
+
+        Raises:
+            HardwareError: If bus or chip do not answer, the chip is no PCA9685, or another process owns it.
+            MissingExtraError: If smbus2 is not installed.
+        """
+        self._connect(owner=True)
+
+    def attach(self) -> None:
+        """Open a second access for neutral, beside the owner's; see :class:`Spare`.
+
+        Raises:
+            HardwareError: If the bus cannot be opened.
+            MissingExtraError: If smbus2 is not installed.
+        """
+        chip = I2CChip(self._settings.bus, self._settings.address)
+        chip.open()
+        self._chip = chip
+
+    def force_neutral(self) -> None:
+        """Open a second access and put the chip into neutral from any state, whoever owns it.
 
         Raises:
             HardwareError: If bus or chip do not answer, or the chip is no PCA9685.
             MissingExtraError: If smbus2 is not installed.
         """
-        smbus2 = require("smbus2", "car")
-        path = f"/dev/i2c-{self._settings.bus}"
+        self._connect(owner=False)
+
+    def owner(self) -> int:
+        """Return the id of the process that owns the chip; see :func:`lanenet.onboard.i2c.lock_owner`."""
+        return 0 if self._chip is None else self._chip.owner()
+
+    def _connect(self, *, owner: bool) -> None:
+        self.attach()
+        assert self._chip is not None
         try:
-            self._bus = smbus2.SMBus(self._settings.bus)
-        except OSError as error:
-            raise HardwareError(
-                f"{path}: cannot be opened ({error.strerror or error}); switch I2C on (sudo raspi-config, "
-                "Interface Options) and join its group (sudo usermod -aG i2c $USER)"
-            ) from None
-        self._message = smbus2.i2c_msg
-        try:
+            if owner:
+                self._chip.own()
             self._start()
+            if self._settings.heartbeat is not None and owner:
+                self._heartbeat = Heartbeat(self._settings.heartbeat)
+                self._heartbeat.open()
         except OSError as error:
-            self._release()
+            name = self._chip.name
+            self.release()
             raise HardwareError(
-                f"{path}: no PCA9685 answers at address 0x{self._settings.address:02x} "
-                f"({error.strerror or error}); look for it with i2cdetect -y {self._settings.bus}"
+                f"{name}: no PCA9685 answers ({error.strerror or error}); look for it with i2cdetect -y "
+                f"{self._settings.bus}"
             ) from None
         except HardwareError:
-            self._release()
+            self.release()
             raise
 
     def _start(self) -> None:
-        # The prescaler can be written only in sleep. Pulses are loaded before the chip wakes, so that the
-        # speed controller's first pulse is neutral.
-        self._write(MODE1, AUTO_INCREMENT | SLEEP)
-        self._write(MODE2, OUTDRV)
-        self._write(PRE_SCALE, self._prescale)
-        self._write_neutral()
-        self._write(MODE1, AUTO_INCREMENT)
-        time.sleep(_OSCILLATOR_START_S)
-        # Outputs that were running before the sleep start again with this bit.
-        self._write(MODE1, AUTO_INCREMENT | RESTART)
-        found = self._read(PRE_SCALE)
-        if found != self._prescale:
+        assert self._chip is not None
+        prescale = prescale_of(self._settings.frequency_hz)
+        for data in start_writes(self._settings):
+            self._chip.write(data)
+            time.sleep(PAUSE_S)
+        found = self._chip.read(PRE_SCALE, 1)[0]
+        if found != prescale:
             raise HardwareError(
-                f"/dev/i2c-{self._settings.bus}: register PRE_SCALE at address "
-                f"0x{self._settings.address:02x} holds {found}, expected {self._prescale}; is the chip there "
-                "a PCA9685, and does another program use it?"
+                f"{self._chip.name}: register PRE_SCALE holds {found}, expected {prescale}; is the chip "
+                "there a PCA9685, and does another program use it?"
             )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.devices.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not finite, or the chip did not answer or has
-                restarted.
+            HardwareError: If it is not open, a value is not finite, the chip did not answer or has restarted,
+                or another program has changed the throttle.
         """
-        stops = self._stops
-        pulses = command_pulses(self._settings, steering_rad, throttle)
-        if self._bus is None:
+        settings, stops, chip = self._settings, self._stops, self._chip
+        pulses = command_pulses(settings, steering_rad, throttle)
+        if chip is None:
             raise HardwareError("pca9685: not open")
         with self._lock:
             try:
-                self._write_channel(self._settings.steering_channel, pulses.steering_us)
-                if stops == self._stops:
-                    self._write_channel(self._settings.throttle_channel, pulses.throttle_us)
-                asleep = self._is_asleep()
+                asleep = self._is_asleep(chip)
+                foreign = None if asleep else self._foreign_counts(chip)
+                if not asleep and foreign is None:
+                    chip.write(_pulse_write(settings, settings.steering_channel, pulses.steering_us))
+                    if stops == self._stops:
+                        self._throttle = _pulse_write(settings, settings.throttle_channel, pulses.throttle_us)
+                        chip.write(self._throttle)
             except OSError as error:
                 raise HardwareError(
-                    f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} stopped "
-                    f"answering ({error.strerror or error}); check its cable and supply"
+                    f"{chip.name}: the PCA9685 stopped answering ({error.strerror or error}); check its "
+                    "cable and supply"
                 ) from None
         if asleep:
             raise HardwareError(
-                f"/dev/i2c-{self._settings.bus}: the PCA9685 at 0x{self._settings.address:02x} has restarted "
-                "and sends no pulses; check its supply"
+                f"{chip.name}: the PCA9685 has restarted and sends no pulses; check its supply"
             )
+        if foreign is not None:
+            raise HardwareError(
+                f"{chip.name}: channel {settings.throttle_channel} holds {foreign} counts, which lanenet did "
+                "not write; does another program move the car as well (Donkeycar's manage.py)? End it first"
+            )
+        self._beat()
 
     def neutral(self) -> None:
         """Stop the motor, then straighten the wheels; never raises."""
         self._stops += 1
-        if self._bus is None:
+        if self._chip is None:
             return
         with brief_lock(self._lock):
             try:
-                self._write_neutral()
+                self._throttle = self._neutral[0]
+                for data in self._neutral:
+                    self._chip.write(data)
             except Exception as error:
                 _log.error("pca9685: neutral could not be sent: %s", error)
+                return
+        self._beat()
 
     def close(self) -> None:
         """Go to neutral and release the bus; the chip keeps sending neutral pulses."""
         self.neutral()
-        self._release()
+        self.release()
 
-    def _release(self) -> None:
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            with contextlib.suppress(OSError):
-                bus.close()
+    def release(self) -> None:
+        """Release the bus and leave the chip as it is; harmless if it is not open."""
+        chip, self._chip = self._chip, None
+        heartbeat, self._heartbeat = self._heartbeat, None
+        if heartbeat is not None:
+            heartbeat.close()
+        if chip is not None:
+            chip.close()
 
-    def _write_neutral(self) -> None:
-        pulses = neutral_pulses(self._settings)
-        self._write_channel(self._settings.throttle_channel, pulses.throttle_us)
-        self._write_channel(self._settings.steering_channel, pulses.steering_us)
+    def _beat(self) -> None:
+        if self._heartbeat is not None:
+            self._heartbeat.beat()
 
-    def _write_channel(self, channel: int, pulse_us: float) -> None:
-        """Set an output high at count 0 and low at the pulse's end: ON_L, ON_H, OFF_L, OFF_H."""
-        off = counts_of(pulse_us, self._prescale)
-        self._write(LED0_ON_L + 4 * channel, 0, 0, off & 0xFF, off >> 8)
-
-    def _is_asleep(self) -> bool:
+    def _is_asleep(self, chip: I2CChip) -> bool:
         """Tell whether the chip has restarted: after a moment without supply it answers, but sleeps."""
         # Read twice: the bus has no checksum, and one wrong bit must not end a drive.
-        return all(self._read(MODE1) & SLEEP for _ in range(2))
+        return all(chip.read(MODE1, 1)[0] & SLEEP for _ in range(2))
 
-    def _write(self, register: int, *values: int) -> None:
-        self._transfer(self._message.write(self._settings.address, [register, *values]))
+    def _foreign_counts(self, chip: I2CChip) -> int | None:
+        """Return what another program has made of the throttle; None if it is as it was left, or neutral.
 
-    def _read(self, register: int) -> int:
-        answer = self._message.read(self._settings.address, 1)
-        self._transfer(self._message.write(self._settings.address, [register]), answer)
-        return int(next(iter(answer)))
-
-    def _transfer(self, *messages: Any) -> None:
-        for left in reversed(range(_TRIES)):
-            try:
-                self._bus.i2c_rdwr(*messages)
-                return
-            except OSError:
-                if not left:
-                    raise
+        No lock keeps out a program that does not ask for it.
+        """
+        for _ in range(2):
+            off = chip.read(self._throttle[0] + 2, 2)
+            if off in (self._throttle[3:], self._neutral[0][3:]):
+                return None
+        return off[0] | off[1] << 8

@@ -52,7 +52,7 @@ class Recorder:
         self.is_open = False
 
     def open(self) -> None:
-        """Start; see :class:`lanenet.onboard.devices.Actuator`."""
+        """Start; see :class:`lanenet.onboard.actuators.actuator.Actuator`."""
         self.is_open = True
         self.neutral()
 

@@ -247,7 +247,7 @@ class SerialBoard:
         )
 
     def send(self, steering_rad: float, throttle: float) -> None:
-        """Set both outputs; see :class:`lanenet.onboard.devices.Actuator`.
+        """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
             HardwareError: If it is not open, a value is not finite, or the board is gone, silent, accepts no

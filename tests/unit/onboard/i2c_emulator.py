@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import types
 
 MODE1, MODE2, PRE_SCALE = 0x00, 0x01, 0xFE
@@ -100,6 +101,8 @@ class Bus:
         self.broken = self.closed = False
         self.glitches = 0
         self.before_transfer = None
+        #: The device, for locks.
+        self.fd = os.memfd_create("i2c")
 
     def i2c_rdwr(self, *messages):
         for message in messages:
@@ -116,6 +119,9 @@ class Bus:
 
     def close(self):
         self.closed = True
+
+    def __del__(self):
+        os.close(self.fd)
 
 
 def install(monkeypatch, bus, number=1):

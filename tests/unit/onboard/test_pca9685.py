@@ -1,16 +1,24 @@
 from __future__ import annotations
 
+import fcntl
 import logging
+import os
+import struct
+import subprocess
+import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import i2c_emulator
 import pytest
 
 from lanenet.errors import HardwareError, MissingExtraError
+from lanenet.onboard import i2c
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.actuator import Actuator
+from lanenet.onboard.actuators.heartbeat import HeartbeatSettings
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
-from lanenet.onboard.devices import Actuator
 
 SETTINGS = PCA9685Settings(max_steering_rad=0.4)
 
@@ -120,16 +128,43 @@ def test_chip_that_lost_its_supply_is_noticed(bus, actuator):
 
 
 def test_one_wrong_bit_of_an_answer_ends_nothing(bus, actuator):
-    answers = iter([0x30])
-    right = bus.chip.read
-    bus.chip.read = lambda length: bytes([next(answers, right(length)[0])])
+    right, asked = bus.chip.read, {0x00: 0, 0x08: 0}
+
+    def read(length):
+        """Answer the first question after each register with one bit wrong."""
+        register = bus.chip.pointer
+        asked[register] += 1
+        answer = right(length)
+        return bytes([answer[0] ^ 0x10, *answer[1:]]) if asked[register] == 1 else answer
+
+    bus.chip.read = read
     actuator.send(0.0, 0.1)
-    assert next(answers, None) is None, "the chip was not asked"
+    assert asked == {0x00: 2, 0x08: 2}, "the chip was not asked again"
+
+
+def test_another_program_that_moves_the_car_is_noticed(bus, actuator):
+    """Donkeycar asks for no lock: what it writes is seen at the next command."""
+    actuator.send(0.1, 0.2)
+    bus.chip.write(bytes([0x06, 0, 0, 500 & 0xFF, 500 >> 8]))
+    with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x40: channel 0 holds 500 counts"):
+        actuator.send(0.1, 0.2)
+    assert bus.chip.counts(0) == 500, "nothing is sent against another program"
+
+
+def test_neutral_of_the_loops_process_is_no_other_program(bus, actuator):
+    actuator.send(0.1, 0.2)
+    spare = make_actuator(SETTINGS)
+    spare.attach()
+    spare.neutral()
+    spare.release()
+    assert bus.chip.counts(0) == 370
+    actuator.send(0.1, 0.2)
+    assert bus.chip.counts(0) > 370
 
 
 def test_lost_bus_is_an_error_and_neutral_only_logs(bus, actuator, caplog):
     bus.broken = True
-    with pytest.raises(HardwareError, match=r"/dev/i2c-1: the PCA9685 at 0x40 stopped answering"):
+    with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x40: the PCA9685 stopped answering"):
         actuator.send(0.0, 0.1)
     with caplog.at_level(logging.ERROR):
         actuator.neutral()
@@ -139,7 +174,7 @@ def test_lost_bus_is_an_error_and_neutral_only_logs(bus, actuator, caplog):
 def test_no_bus_no_chip_no_package(bus, monkeypatch):
     with pytest.raises(HardwareError, match=r"/dev/i2c-7: cannot be opened.*raspi-config"):
         make_actuator(PCA9685Settings(bus=7)).open()
-    with pytest.raises(HardwareError, match=r"no PCA9685 answers at address 0x41.*i2cdetect -y 1"):
+    with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x41: no PCA9685 answers.*i2cdetect -y 1"):
         make_actuator(PCA9685Settings(address=0x41)).open()
     assert bus.closed
     monkeypatch.setitem(__import__("sys").modules, "smbus2", None)
@@ -175,6 +210,91 @@ def test_command_that_hangs_cannot_undo_neutral(bus, actuator):
     assert bus.chip.counts(0) == 370
 
 
+def hold(bus, address):
+    """Another process that owns a chip on this bus, as a guard does."""
+    code = f"import fcntl; fcntl.lockf({bus.fd}, fcntl.LOCK_EX, 1, {address}); print(flush=True); input()"
+    words = [sys.executable, "-ISc", code]
+    process = subprocess.Popen(words, pass_fds=[bus.fd], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process.stdout.readline()
+    return process
+
+
+def end(process):
+    process.kill()
+    process.communicate()
+
+
+def test_one_owner_of_bus_and_address(bus):
+    other = hold(bus, 0x40)
+    try:
+        with pytest.raises(HardwareError, match=rf"/dev/i2c-1 at 0x40.*process {other.pid} \("):
+            make_actuator(SETTINGS).open()
+        assert bus.wire == [] and bus.closed, "what another process drives was touched"
+        # A second access for neutral is not refused, nor is another chip on the same bus.
+        spare = make_actuator(SETTINGS)
+        spare.attach()
+        assert spare.owner() == other.pid
+        spare.release()
+        bus.address = 0x41
+        make_actuator(PCA9685Settings(address=0x41)).open()
+    finally:
+        end(other)
+
+
+def test_the_owner_is_gone_with_its_process(bus, actuator):
+    other = hold(bus, 0x41)
+    assert i2c.lock_owner(os.fstat(bus.fd), 0x41) == other.pid
+    assert i2c.lock_owner(os.fstat(bus.fd), 0x40) == os.getpid()
+    end(other)
+    assert i2c.lock_owner(os.fstat(bus.fd), 0x41) == 0
+    actuator.close()
+    # The lock is that of the open file, which the emulator does not close.
+    assert i2c.describe_process(other.pid) == f"process {other.pid}"
+
+
+@pytest.fixture
+def line(monkeypatch, tmp_path):
+    """A GPIO line: what was asked of the kernel, and the levels that were set."""
+    asked, levels = [], []
+
+    def ioctl(handle, request, argument):
+        if request == 0xC250B407:  # GPIO_V2_GET_LINE_IOCTL of linux/gpio.h
+            asked.append(bytes(argument))
+            struct.pack_into("=i", argument, 588, os.open("/dev/null", os.O_RDWR))
+        else:
+            assert request == 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL
+            bits, mask = struct.unpack("=QQ", argument)
+            assert mask == 1
+            levels.append(bits)
+
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    return SimpleNamespace(asked=asked, levels=levels)
+
+
+def test_heart_beats_when_the_chip_took_a_command(bus, line):
+    actuator = make_actuator(PCA9685Settings(heartbeat=HeartbeatSettings(line=17, chip="/dev/null")))
+    actuator.open()
+    # offsets[0], consumer, flags (output), num_lines of struct gpio_v2_line_request.
+    [request] = line.asked
+    assert struct.unpack_from("=I", request) == (17,) and request[256:263] == b"lanenet"
+    assert struct.unpack_from("=Q", request, 288) == (8,) and struct.unpack_from("=I", request, 560) == (1,)
+    actuator.send(0.0, 0.1)
+    actuator.neutral()
+    assert line.levels == [1, 0, 1, 0]
+    bus.broken = True
+    actuator.neutral()
+    with pytest.raises(HardwareError):
+        actuator.send(0.0, 0.1)
+    assert line.levels == [1, 0, 1, 0]
+
+
+def test_a_line_that_cannot_be_had_is_named(bus):
+    settings = PCA9685Settings(heartbeat=HeartbeatSettings(line=17, chip="/nowhere"))
+    with pytest.raises(HardwareError, match="/nowhere: line 17"):
+        make_actuator(settings).open()
+    assert bus.closed and bus.chip.counts(0) == 370
+
+
 def test_messages_of_the_real_package(monkeypatch):
     """smbus2's own messages, as it would hand them to the kernel, make the same chip move."""
     smbus2 = pytest.importorskip("smbus2", reason="smbus2 is not installed")
@@ -183,6 +303,7 @@ def test_messages_of_the_real_package(monkeypatch):
     class Kernel:
         def __init__(self, number):
             assert number == 1
+            self.fd = os.memfd_create("i2c")
 
         def i2c_rdwr(self, *messages):
             for message in messages:
@@ -194,7 +315,7 @@ def test_messages_of_the_real_package(monkeypatch):
                     chip.write(bytes(message))
 
         def close(self):
-            pass
+            os.close(self.fd)
 
     monkeypatch.setattr(smbus2, "SMBus", Kernel)
     actuator = make_actuator(SETTINGS)

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from lanenet.errors import HardwareError, MissingExtraError
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.serial_board import (
     COMMAND_S,
     MAX_LINE,
@@ -32,7 +33,6 @@ from lanenet.onboard.actuators.serial_board import (
     decode,
     encode,
 )
-from lanenet.onboard.devices import Actuator
 
 PULSES = {
     "max_steering_rad": 0.4,
