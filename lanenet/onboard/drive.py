@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -18,7 +19,7 @@ from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_d
 from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.actuators import ActuatorSettings, make_actuator
+from lanenet.onboard.actuators import ActuatorSettings, first_writes, make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
@@ -172,7 +173,13 @@ def build_sink(settings: DriveSettings) -> CommandSink:
     actuator, safety = settings.actuator, settings.safety
     # Unset values stay unset, since a Donkeycar's myconfig.py may set them.
     text = actuator.model_dump_json(exclude_unset=True)
-    return GuardedActuator(text, lambda: make_actuator(actuator), safety.watchdog_s, safety.end_after_s)
+    return GuardedActuator(
+        text,
+        lambda: make_actuator(actuator),
+        safety.watchdog_s,
+        safety.end_after_s,
+        first_json=json.dumps(first_writes(actuator)),
+    )
 
 
 def _refuse_blind_drive(settings: DriveSettings) -> None:

@@ -3,38 +3,45 @@
 The loop sends commands with the time at which they expire. The guard (:mod:`lanenet.onboard.guard_process`)
 goes to neutral when the last one has expired, when the loop's process is gone, and when the actuator fails.
 It is a process, not a thread, so that it survives whatever stops the loop: a driver that hangs, a network
-that hangs, SIGKILL. If the guard itself dies, the loop opens the actuator again and puts it into neutral.
+that hangs, SIGKILL. If the guard itself is stopped or dies, a thread in the loop's process notices it by the
+silence of its pipe, and puts the actuator into neutral through a spare access. An actuator without one is
+opened again.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import select
 import socket
-import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from lanenet.errors import HardwareError
-from lanenet.onboard.devices import Actuator
+from lanenet.errors import HardwareError, LanenetError
+from lanenet.onboard.actuators.actuator import Actuator, Spare
+from lanenet.onboard.guard_process import DRIVE, MESSAGE, NEUTRAL, QUIT
+from lanenet.search_path import without_working_folder
 
 log = logging.getLogger(__name__)
 
-#: What runs in the guard's process.
-PROGRAM = (sys.executable, "-m", "lanenet.onboard.guard_process")
-#: Kind of message, its number, steering, throttle, and the time at which it expires.
-MESSAGE = struct.Struct("<cxxxIddd")
-DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
+#: What runs in the guard's process; -P: nothing is imported from the working folder.
+PROGRAM = (sys.executable, "-P", "-m", "lanenet.onboard.guard_process")
 #: For the interpreter, the driver and the device; chosen ample: imports are slow on a small board,
 #: and an Arduino restarts when its port is opened.
 _START_S = 30.0
 #: If commands stay unanswered for this long, the guard hangs in the actuator's driver. Chosen: three
 #: watchdog times.
 _STUCK_S = 0.25
+#: A guard without a sign of life for this long is stopped, and its last command may run on. Chosen: three of
+#: its turns; with the time of a write it leaves neutral within 100 ms of whatever stopped it.
+_SILENT_S = 0.05
+#: Neutral again this often, while it is silent.
+_AGAIN_S = 0.02
 #: Closing takes no longer than this; chosen, as a driver needs a few milliseconds.
 _CLOSE_S = 2.0
 #: A killed process is gone within this time, unless it hangs in the kernel.
@@ -97,6 +104,7 @@ class GuardedActuator:
         watchdog_s: float,
         give_up_s: float,
         program: Sequence[str] = PROGRAM,
+        first_json: str = "null",
     ) -> None:
         """Prepare; nothing is started.
 
@@ -106,9 +114,12 @@ class GuardedActuator:
             watchdog_s: The longest time that a command is valid.
             give_up_s: After a silence this long the guard accepts no more commands.
             program: Command that starts the guard; the socket and these values follow as arguments.
+            first_json: The actuator's first writes (:func:`lanenet.onboard.actuators.first_writes`).
         """
-        self._settings_json, self._make_actuator, self._program = settings_json, make_actuator, program
-        self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
+        self._values = (settings_json, first_json, str(watchdog_s), str(give_up_s))
+        self._make_actuator, self._program = make_actuator, program
+        self._spare: Spare | None = None
+        self._watch: _Watch | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
         self._heard = b""
@@ -127,17 +138,25 @@ class GuardedActuator:
         Raises:
             HardwareError: If the actuator does not answer; the message is the guard's.
         """
+        self._spare = _spare_of(self._make_actuator())
         ours, theirs = socket.socketpair()
+        heard, pulse = os.pipe()
         try:
-            values = (theirs.fileno(), self._settings_json, self._watchdog_s, self._give_up_s)
+            path = os.pathsep.join(without_working_folder(sys.path))
             # Its own session: Ctrl-C at the terminal is for the loop, which then ends the guard.
             self._process = subprocess.Popen(
-                [*self._program, *(str(value) for value in values)],
-                pass_fds=[theirs.fileno()],
+                [*self._program, str(theirs.fileno()), str(pulse), *self._values],
+                pass_fds=[theirs.fileno(), pulse],
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": path},
             )
+        except BaseException:
+            os.close(heard)
+            ours.close()
+            raise
         finally:
+            os.close(pulse)
             theirs.close()
         self._line = ours
         ours.setblocking(False)
@@ -150,8 +169,10 @@ class GuardedActuator:
                 select.select([ours], [], [], left_s)
                 self._listen()
         except BaseException:
+            os.close(heard)
             self.close()
             raise
+        self._watch = _Watch(heard, self._spare)
 
     def send(self, steering_rad: float, throttle: float, until_s: float) -> None:
         """Send a command; see :class:`CommandSink`.
@@ -205,6 +226,8 @@ class GuardedActuator:
         """Go to neutral, end the guard and wait for it; never raises."""
         if self._process is None:
             return
+        if self._watch is not None:
+            self._watch.end()
         with contextlib.suppress(HardwareError):
             self._post(QUIT, 0.0, 0.0, 0.0)
         try:
@@ -219,7 +242,9 @@ class GuardedActuator:
                 self._listen()
         if self._line is not None:
             self._line.close()
-        self._process = self._line = None
+        if self._spare is not None:
+            self._spare.release()
+        self._process = self._line = self._spare = self._watch = None
 
     def _post(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         if self._line is None:
@@ -281,9 +306,62 @@ class GuardedActuator:
     def _rescue(self) -> None:
         if not self._ready:
             return
+        if self._spare is not None:
+            self._spare.neutral()
+            return
         try:
             actuator = self._make_actuator()
             actuator.open()
             actuator.close()
         except Exception as error:
             log.critical("the actuator could not be put into neutral: %s; disconnect the battery", error)
+
+
+def _spare_of(actuator: Actuator) -> Spare | None:
+    """Return the actuator as a spare access, open; None if there is none."""
+    if not isinstance(actuator, Spare):
+        return None
+    try:
+        actuator.attach()
+    except LanenetError:
+        # The guard will say so.
+        return None
+    return actuator
+
+
+class _Watch:
+    """Puts the actuator into neutral while the guard gives no sign of life."""
+
+    def __init__(self, heard: int, spare: Spare | None) -> None:
+        """Start the thread; ``heard`` is the reading end of the guard's pipe."""
+        self._heard, self._spare = heard, spare
+        self._over = False
+        self._thread = threading.Thread(target=self._run, name="watch of the guard", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """End the thread, before the guard is ended."""
+        self._over = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        poll = select.poll()
+        poll.register(self._heard, select.POLLIN)
+        silent = False
+        while not self._over:
+            if poll.poll(1e3 * (_AGAIN_S if silent else _SILENT_S)):
+                if not os.read(self._heard, 4096):
+                    break
+                silent = False
+                continue
+            self._neutral()
+            if not silent:
+                log.warning("neutral: the guard of the actuator has been silent for %g s", _SILENT_S)
+            silent = True
+        if not self._over:
+            self._neutral()
+        os.close(self._heard)
+
+    def _neutral(self) -> None:
+        if self._spare is not None:
+            self._spare.neutral()

@@ -1,55 +1,72 @@
 """The guard's process: owns the actuator and goes to neutral when commands stay away.
 
-:mod:`lanenet.onboard.guard` starts it with the arguments ``LINE SETTINGS WATCHDOG_S GIVE_UP_S``: the number
-of an open socket and the actuator's settings as JSON. The loop sends messages of fixed size; the guard
-answers with lines of text: ``ready``, ``ok NUMBER`` for each message, ``neutral REASON``, ``failed REASON``
-and ``closed``.
+:mod:`lanenet.onboard.guard` starts it with the arguments ``LINE PULSE SETTINGS FIRST WATCHDOG_S GIVE_UP_S``:
+the numbers of an open socket and of a pipe, the actuator's settings and its first writes as JSON. The loop
+sends messages of fixed size; the guard answers with lines of text: ``ready``, ``ok NUMBER`` for each message,
+``neutral REASON``, ``failed REASON`` and ``closed``. Into the pipe goes a byte at every turn, so that the
+loop's process sees at once that the guard is stopped or gone.
+
+What needs time to import is imported after the first neutral.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import json
 import logging
 import math
 import os
 import select
 import signal
 import socket
+import struct
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-from pydantic import TypeAdapter
+from typing import TYPE_CHECKING
 
 from lanenet.errors import LanenetError
-from lanenet.onboard.actuators import ActuatorSettings, make_actuator
-from lanenet.onboard.devices import Actuator
-from lanenet.onboard.guard import DRIVE, MESSAGE, QUIT
+from lanenet.onboard.i2c import I2CChip
+
+if TYPE_CHECKING:
+    from lanenet.onboard.actuators.actuator import Actuator
 
 log = logging.getLogger("lanenet.onboard.guard")
 
+#: Kind of message, its number, steering, throttle, and the time at which it expires.
+MESSAGE = struct.Struct("<cxxxIddd")
+DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
 #: What holds is sent again this often, in case it was lost on the wire; chosen: half of the time for which a
 #: command holds on the Arduino board, which must not run out between two frames of a slow camera.
 _REFRESH_S = 0.04
+#: A sign of life at least this often: several within the loop's patience.
+_TURN_S = 0.015
 #: A driver needs a few milliseconds; after the first time it counts as hanging, checked at the second.
 _SLOW_S, _LOOK_S = 0.05, 0.02
+#: Lines of the log that wait for a terminal, after which the oldest are lost, and how long the end waits.
+_LOG_LINES, _LOG_S = 100, 0.2
 
 
 class Guard:
     """Owns the actuator: neutral, unless there is a valid command."""
 
-    def __init__(self, line: socket.socket, actuator: Actuator, watchdog_s: float, give_up_s: float) -> None:
-        self._line, self._actuator = line, actuator
+    def __init__(
+        self, line: socket.socket, pulse: int, actuator: Actuator, watchdog_s: float, give_up_s: float
+    ) -> None:
+        self._line, self._pulse, self._actuator = line, pulse, actuator
         self._watchdog_s, self._give_up_s = watchdog_s, give_up_s
         self._until_s = -math.inf
         self._heard_s = time.monotonic()
         self._logged_s = -math.inf
         self._driving = False
         self._command = (0.0, 0.0)
+        #: When the actuator was last told something.
+        self._told_s = -math.inf
         #: Why no command is accepted any more; empty while they are.
         self._over = ""
         #: When the present call of the driver began; infinite if there is none.
@@ -88,8 +105,11 @@ class Guard:
     def _serve(self) -> str:
         buffer = b""
         while True:
-            now_s = time.monotonic()
-            wait_s = min(_REFRESH_S, max(0.0, self._until_s - now_s)) if self._driving else _REFRESH_S
+            # The loop's process, not its loop, reads it: if it is full, nobody does.
+            with contextlib.suppress(OSError):
+                os.write(self._pulse, b".")
+            left_s = self._until_s - time.monotonic() if self._driving else _TURN_S
+            wait_s = min(_TURN_S, max(0.0, left_s))
             readable, _, _ = select.select([self._line], [], [], wait_s)
             if self.asked_to_end:
                 return "asked to end"
@@ -136,6 +156,7 @@ class Guard:
         try:
             with self._busy():
                 self._actuator.send(*self._command)
+            self._told_s = time.monotonic()
         except Exception as error:
             self._neutral()
             self._over = f"the actuator failed: {error}"
@@ -153,7 +174,7 @@ class Guard:
             if now_s - self._logged_s > 1.0:
                 self._logged_s = now_s
                 log.warning("neutral: %s", reason)
-        elif not readable:
+        elif not readable and now_s - self._told_s >= _REFRESH_S:
             if self._driving:
                 self._drive()
             else:
@@ -164,7 +185,7 @@ class Guard:
     def _neutral(self) -> None:
         with self._busy():
             self._actuator.neutral()
-        self._driving = False
+        self._driving, self._told_s = False, time.monotonic()
 
     def _say(self, text: str) -> None:
         _say(self._line, text)
@@ -176,35 +197,97 @@ def _say(line: socket.socket, text: str) -> None:
         line.send((text.replace("\n", " ") + "\n").encode(), socket.MSG_DONTWAIT)
 
 
+class PatientLog(logging.Handler):
+    """Writes lines from a thread: a terminal that takes nothing (Ctrl-S) must not hold up the guard."""
+
+    def __init__(self) -> None:
+        """Start the thread."""
+        super().__init__()
+        self.setFormatter(logging.Formatter("lanenet guard: %(message)s"))
+        self._lines: deque[bytes] = deque(maxlen=_LOG_LINES)
+        self._waiting, self._written = threading.Event(), threading.Event()
+        threading.Thread(target=self._run, name="log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Leave a line to the thread."""
+        self._written.clear()
+        self._lines.append(f"{self.format(record)}\n".encode())
+        self._waiting.set()
+
+    def _run(self) -> None:
+        while self._waiting.wait():
+            self._waiting.clear()
+            while self._lines:
+                # Past sys.stderr, whose lock a blocked writer would keep until after the end.
+                with contextlib.suppress(OSError, IndexError):
+                    os.write(2, self._lines.popleft())
+            self._written.set()
+
+    def close(self) -> None:
+        """Wait a moment for what is left."""
+        if self._lines or self._waiting.is_set():
+            self._written.wait(_LOG_S)
+        super().close()
+
+
 def actuator_from_json(text: str) -> Actuator:
     """Build an actuator from its settings as JSON; the device is not touched.
 
     Raises:
         ConfigError: If the settings name a file that cannot be used.
     """
-    adapter: TypeAdapter[ActuatorSettings] = TypeAdapter(ActuatorSettings)
-    return make_actuator(adapter.validate_json(text))
+    from lanenet.onboard.actuators import actuator_from_json
+
+    return actuator_from_json(text)
+
+
+def first_neutral(text: str) -> I2CChip | None:
+    """Put the actuator into neutral with what was prepared for it.
+
+    Args:
+        text: Of :func:`lanenet.onboard.actuators.first_writes`, as JSON.
+
+    Returns:
+        The chip, which stays owned until it is closed; None for an actuator without first writes.
+
+    Raises:
+        HardwareError: If its bus cannot be opened, or another process owns it.
+    """
+    first = json.loads(text)
+    if first is None:
+        return None
+    chip = I2CChip(first["bus"], first["address"])
+    chip.open()
+    chip.own()
+    # What does not answer is named when the actuator is opened.
+    with contextlib.suppress(OSError):
+        for data in first["writes"]:
+            chip.write(bytes.fromhex(data))
+            time.sleep(first["pause_s"])
+    return chip
 
 
 def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_json) -> int:
     """Open the actuator, serve, close it.
 
     Args:
-        arguments: As above, four texts.
+        arguments: As above, six texts.
         build: Makes the actuator from its settings.
 
     Returns:
         The exit code.
     """
-    line_number, settings_json, watchdog_s, give_up_s = arguments
+    line_number, pulse, settings_json, first, watchdog_s, give_up_s = arguments
     line = socket.socket(fileno=int(line_number))
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    logging.basicConfig(format="lanenet guard: %(message)s", level=logging.INFO)
+    os.set_blocking(int(pulse), False)
+    logging.basicConfig(level=logging.INFO, handlers=[PatientLog()])
     actuator: Actuator | None = None
     try:
+        chip = first_neutral(first)
         actuator = build(settings_json)
-        guard = Guard(line, actuator, float(watchdog_s), float(give_up_s))
+        guard = Guard(line, int(pulse), actuator, float(watchdog_s), float(give_up_s))
 
         def end(_number: int, _frame: FrameType | None) -> None:
             guard.asked_to_end = True
@@ -225,15 +308,26 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
         return 1
     except Exception as error:
         _say(line, f"failed the guard of the actuator failed: {type(error).__name__}: {error}")
-        raise
+        log.error("the guard failed: %s: %s", type(error).__name__, error)
+        return 1
     finally:
         if actuator is not None:
-            actuator.neutral()
-            actuator.close()
+            _close(actuator)
         _say(line, "closed")
-    # Logged after the motor has stopped: a terminal that is gone may block a writer for ever.
+        line.close()
+    if chip is not None:
+        chip.close()
     log.info("neutral: %s", reason)
     return 0
+
+
+def _close(actuator: Actuator) -> None:
+    try:
+        actuator.neutral()
+        actuator.close()
+    except Exception as error:
+        # A board that was unplugged: its driver's errors are not all of them OSError (termios.error).
+        log.error("the actuator was not closed: %s: %s", type(error).__name__, error)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from board_process import BoardProcess, build_host_board, build_uno
+from bus_wire import BUS, MONOSTABLE_S, SETTINGS, Wire
 from neutral_times import ALLOWED_S, FAULTS, seconds_to_neutral, sender, table
 
 STOPPED_US = 1500.0
@@ -56,3 +58,33 @@ def test_neutral_by_the_protocol(fault: str, board: BoardProcess, tmp_path: Path
 @pytest.mark.slow
 def test_neutral_on_the_pins_of_an_uno(uno: BoardProcess, tmp_path: Path) -> None:
     check_times("both killed", uno, tmp_path / "log")
+
+
+@pytest.fixture
+def strike_pca9685(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, float], float]:
+    """Strikes a car with a PCA9685 whose OE pin hangs on a watchdog of hardware."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")]))
+
+    def strike(fault: str, moment: float) -> float:
+        folder = tmp_path / str(moment)
+        folder.mkdir()
+        monkeypatch.setenv("LANENET_TEST_BUS", str(folder))
+        start = sender(SETTINGS.model_dump_json(exclude_unset=True), tmp_path / "log")
+        return seconds_to_neutral(fault, start, Wire(folder).motor, moment)
+
+    return strike
+
+
+def test_a_stopped_guard_does_not_drive_on(strike_pca9685: Callable[[str, float], float]) -> None:
+    assert strike_pca9685("guard stopped", 0.5) <= ALLOWED_S + LATE_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_neutral_of_a_pca9685(fault: str, strike_pca9685: Callable[[str, float], float]) -> None:
+    times_s = [strike_pca9685(fault, number / COUNT) for number in range(COUNT)]
+    print(table({fault: times_s}))  # noqa: T201 (the figures of the documentation)
+    # With nobody left it is the monostable, whose last pulse came with the last command.
+    allowed_s = MONOSTABLE_S if "both" in fault else ALLOWED_S
+    assert sorted(times_s)[COUNT // 2] <= allowed_s
+    assert max(times_s) <= allowed_s + LATE_S

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import termios
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ class WireLog:
         settings = json.loads(settings_json)
         self._path = settings["path"]
         self._fail_at, self._hang_at = settings.get("fail_at"), settings.get("hang_at")
-        self._refuse = settings.get("refuse", "")
+        self._refuse, self._unplugged = settings.get("refuse", ""), settings.get("unplugged", False)
         self._sent = 0
 
     def _write(self, kind: str, steering_rad: float = 0.0, throttle: float = 0.0) -> None:
@@ -50,6 +51,9 @@ class WireLog:
 
     def close(self) -> None:
         self._write("close")
+        if self._unplugged:
+            # As pyserial does; it is no OSError.
+            raise termios.error(5, "Input/output error")
 
 
 @dataclass(frozen=True)
