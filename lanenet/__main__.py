@@ -1,6 +1,28 @@
-"""``python -m lanenet`` is the command line."""
+"""``lanenet`` and ``python -m lanenet``: the command line; what stops a car does not wait for its imports."""
 
-from lanenet.cli.app import main
+from __future__ import annotations
+
+import sys
+
+from lanenet.search_path import without_working_folder
+
+
+def main() -> None:
+    """Run the command line; the entry point of the package."""
+    sys.path[:] = without_working_folder(sys.path)
+    verb, words = (sys.argv[1:2] or [""])[0], sys.argv[2:]
+    if verb == "stop" and words and not any(word.startswith("-") for word in words):
+        from lanenet.onboard import stop
+
+        raise SystemExit(stop.main(words))
+    if verb == "drive":
+        from lanenet.onboard import stop
+
+        stop.neutral_before_drive(words)
+    from lanenet.cli.app import main as command_line
+
+    command_line()
+
 
 if __name__ == "__main__":
     main()

@@ -13,13 +13,13 @@ import typer
 from typer.core import TyperGroup
 
 from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
-from lanenet.cli.car import analyse, bench, doctor, drive
+from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console
 from lanenet.errors import LanenetError
 
 _VERBS = (
-    *(simulate, map, label, train, sweep, calibrate, detect, bench, analyse, doctor, drive, export),
+    *(simulate, map, label, train, sweep, calibrate, detect, bench, analyse, doctor, drive, stop, export),
     *(localise, val, worlds, judge, reality),
 )
 #: The extra that brings a package, for the message when the package is missing.
@@ -67,7 +67,7 @@ for _verb in _VERBS:
 
 
 def main() -> None:
-    """Run the command line; the entry point of the package."""
+    """Run the command line; ``lanenet.__main__`` is the entry point of the package."""
     app()
 
 

@@ -1,0 +1,146 @@
+"""Stops a car, whatever drives it: neutral first, then the end of the process that owns the actuator.
+
+Reads the section ``actuator`` of the car's file and imports nothing else of lanenet: the car drives on
+meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
+from lanenet.errors import ConfigError, HardwareError, LanenetError
+from lanenet.onboard.actuators import ActuatorSettings, make_actuator
+from lanenet.onboard.actuators.pca9685 import PCA9685
+from lanenet.onboard.actuators.serial_board import SerialBoardSettings
+from lanenet.onboard.i2c import describe_process, lock_owner
+
+#: A guard that is asked to end is in neutral within a turn of 15 ms and gone some milliseconds later; chosen
+#: ample, since neutral is repeated meanwhile.
+_END_S = 0.5
+#: Neutral again this often until the owner has ended; a drive sends about 30 commands a second.
+_AGAIN_S = 0.01
+
+
+class _Car(Settings):
+    """The part of a car's file that says how to stop it."""
+
+    actuator: ActuatorSettings
+
+
+def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings:
+    """Read the actuator of a car's file; its other sections may be wrong.
+
+    Raises:
+        ConfigError: Naming the file, the key, what was found and what was expected.
+    """
+    data = apply_overrides(read_yaml(path), list(overrides))
+    if data.get("actuator") is None:
+        raise ConfigError(f"{path}: key 'actuator' is missing: there is no motor to stop")
+    return check_settings(_Car, {"actuator": data["actuator"]}, str(path)).actuator
+
+
+def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
+    """Put a car into neutral and end the process that drives it.
+
+    Args:
+        path: The car's file.
+        overrides: ``key=value`` after it, as for ``drive``.
+
+    Returns:
+        What was done, a sentence each.
+
+    Raises:
+        ConfigError: If the file does not describe an actuator.
+        HardwareError: If the actuator does not answer, or its owner cannot be ended.
+        MissingExtraError: If its driver is not installed.
+    """
+    settings = read_actuator(path, overrides)
+    if isinstance(settings, SerialBoardSettings):
+        return _stop_board(settings)
+    actuator = make_actuator(settings)
+    if not isinstance(actuator, PCA9685):
+        return [f"an actuator of kind {settings.kind} has no motor"]
+    try:
+        actuator.force_neutral()
+        owner = actuator.owner()
+        if not owner:
+            return ["neutral; nothing of lanenet was driving"]
+        return [f"neutral; ended {_end(owner, actuator.owner, actuator.neutral)}"]
+    finally:
+        actuator.release()
+
+
+def _stop_board(settings: SerialBoardSettings) -> list[str]:
+    """End the owner of a serial line: the board goes to neutral by its own watchdog."""
+
+    def owner() -> int:
+        return lock_owner(Path(settings.port).stat())
+
+    try:
+        first = owner()
+    except OSError as error:
+        raise HardwareError(f"{settings.port}: {error.strerror or error}; is the board plugged in?") from None
+    if not first:
+        return ["nothing was driving: the board is in neutral by its own watchdog"]
+    return [f"ended {_end(first, owner, lambda: None)}; the board is in neutral by its own watchdog"]
+
+
+def _end(pid: int, owner: Callable[[], int], neutral: Callable[[], None]) -> str:
+    """End the owner of a device, politely and then by force; returns its description."""
+    text = describe_process(pid)
+    if pid < 0:
+        raise HardwareError(f"neutral was set, but {text} still drives, which cannot be seen from here")
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        try:
+            os.kill(pid, number)
+            # A stopped process takes no other signal.
+            os.kill(pid, signal.SIGCONT)
+        except ProcessLookupError:
+            pass
+        except PermissionError:
+            raise HardwareError(
+                f"neutral was set, but {text} of another user still drives; end it with sudo"
+            ) from None
+        end_s = time.monotonic() + _END_S
+        while time.monotonic() < end_s:
+            neutral()
+            if owner() != pid:
+                neutral()
+                return text
+            time.sleep(_AGAIN_S)
+    raise HardwareError(f"neutral was set, but {text} cannot be ended; disconnect the battery")
+
+
+def neutral_before_drive(words: Sequence[str]) -> None:
+    """Put a car that nothing drives into neutral before ``drive`` has imported the rest; never raises.
+
+    Args:
+        words: After ``drive`` on the command line.
+    """
+    if {"--dry-run", "--help"} & set(words) or not words or words[0].startswith("-"):
+        return
+    overrides = [word for word in words[1:] if "=" in word and not word.startswith("-")]
+    # Whatever is wrong is said by the drive itself.
+    with contextlib.suppress(Exception):
+        actuator = make_actuator(read_actuator(Path(words[0]), overrides))
+        if isinstance(actuator, PCA9685):
+            actuator.open()
+            actuator.close()
+
+
+def main(words: Sequence[str]) -> int:
+    """Run ``lanenet stop`` without the command line's other verbs; returns the exit code."""
+    try:
+        lines = stop_car(Path(words[0]), words[1:])
+    except LanenetError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    sys.stdout.writelines(f"{line}\n" for line in lines)
+    return 0

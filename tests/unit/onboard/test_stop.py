@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import i2c_emulator
+import pytest
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
+from lanenet.errors import ConfigError, HardwareError
+from lanenet.onboard import stop
+
+#: Owns the chip, and ends as a guard does or, deaf, not at all by itself.
+OWNER = """
+import fcntl, signal, sys, time
+if sys.argv[1] == "deaf":
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+fcntl.lockf(0, fcntl.LOCK_EX, 1, 0x40)
+print(flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def bus(monkeypatch):
+    bus = i2c_emulator.Bus(i2c_emulator.Chip())
+    i2c_emulator.install(monkeypatch, bus)
+    return bus
+
+
+@pytest.fixture
+def car(tmp_path):
+    # Only the actuator counts: whoever needs to stop a car does not want to hear of its camera file.
+    path = tmp_path / "car.yaml"
+    path.write_text("camera: nowhere.yaml\nactuator: {kind: pca9685}\ncontrol: 3\n")
+    return path
+
+
+def drive(bus):
+    """Leave the chip as a killed drive would."""
+    for data in ("0030", "fe65", "060000f401", "0a00007701", "0020"):
+        bus.chip.write(bytes.fromhex(data))
+    assert bus.chip.counts(0) == 500
+
+
+def test_a_chip_that_nobody_drives_any_more(bus, car):
+    drive(bus)
+    assert stop.stop_car(car) == ["neutral; nothing of lanenet was driving"]
+    assert bus.chip.counts(0) == 370 and not bus.chip.asleep and bus.closed
+
+
+def test_neutral_is_that_of_the_file(bus, car):
+    drive(bus)
+    stop.stop_car(car, ["actuator.throttle_stopped_us=1469", "actuator.frequency_hz=50"])
+    assert bus.chip.pulse_us(0) == pytest.approx(1469, abs=3) and bus.chip.registers[0xFE] == 121
+
+
+@pytest.mark.parametrize("manner", ["polite", "deaf", "stopped"])
+def test_the_owner_is_ended(bus, car, manner, monkeypatch):
+    monkeypatch.setattr(stop, "_END_S", 0.2)
+    words = [sys.executable, "-ISc", OWNER, manner]
+    owner = subprocess.Popen(words, stdin=bus.fd, stdout=subprocess.PIPE)
+    try:
+        owner.stdout.readline()
+        if manner == "stopped":
+            os.kill(owner.pid, signal.SIGSTOP)
+        drive(bus)
+        [line] = stop.stop_car(car)
+        assert f"process {owner.pid}" in line and bus.chip.counts(0) == 370
+        assert owner.wait(5.0) == -(signal.SIGKILL if manner == "deaf" else signal.SIGTERM)
+    finally:
+        owner.kill()
+        owner.communicate()
+
+
+def test_the_owner_of_a_serial_line_is_ended(tmp_path):
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    master, slave = os.openpty()
+    port = f"serial.Serial({os.ttyname(slave)!r}, exclusive=True)"
+    words = [sys.executable, "-c", f"import serial; port = {port}; print(flush=True); input()"]
+    owner = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    car = tmp_path / "car.yaml"
+    car.write_text(f"actuator: {{kind: serial, port: {os.ttyname(slave)}}}\n")
+    try:
+        owner.stdout.readline()
+        [line] = stop.stop_car(car)
+        assert f"process {owner.pid}" in line and owner.wait(5.0) == -signal.SIGTERM
+        [line] = stop.stop_car(car)
+        assert "watchdog" in line
+    finally:
+        owner.kill()
+        owner.communicate()
+        os.close(master)
+        os.close(slave)
+
+
+def test_bad_input_is_named(bus, car, tmp_path):
+    with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x41: no PCA9685 answers"):
+        stop.stop_car(car, ["actuator.address=0x41"])
+    with pytest.raises(ConfigError, match=r"car\.yaml.*actuator\.pca9685\.steering_left"):
+        stop.stop_car(car, ["actuator.steering_left=3"])
+    car.write_text("camera: nowhere.yaml\n")
+    with pytest.raises(ConfigError, match=r"car\.yaml: key 'actuator'"):
+        stop.stop_car(car)
+    with pytest.raises(HardwareError, match="/nowhere: No such file"):
+        stop.stop_car(car, ["actuator={kind: serial, port: /nowhere}"])
+
+
+def test_the_verb(bus, car):
+    """With an option, or from Python; `lanenet stop CAR` itself does not get as far as these imports."""
+    drive(bus)
+    done = CliRunner().invoke(app, ["stop", str(car), "actuator.frequency_hz=50"])
+    assert done.exit_code == 0 and "neutral" in done.output
+    assert bus.chip.pulse_us(0) == pytest.approx(1509.6, abs=3)
+
+
+def test_it_waits_for_no_other_part_of_lanenet():
+    code = "import sys, lanenet.onboard.stop; print(*sorted(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in result.stdout.split()}
+    assert not {"cv2", "numpy", "onnxruntime", "jaxtyping", "typer", "rich", "serial"} & loaded
+
+
+def test_drive_is_neutral_before_it_has_imported_the_rest(bus, car):
+    drive(bus)
+    stop.neutral_before_drive([str(car), "--dry-run"])
+    assert bus.chip.counts(0) == 500
+    stop.neutral_before_drive([str(car), "--arm", "source.path=nowhere"])
+    assert bus.chip.counts(0) == 370
+    # What is wrong is left to the drive.
+    stop.neutral_before_drive([str(Path("/nowhere/car.yaml"))])
