@@ -26,10 +26,21 @@ if [ "$STAGE" = 1 ]; then
   done
   exit "$code"
 fi
-mount -t proc proc /proc || exit 77
-umount --lazy "$folder/cgroup" && umount --recursive --lazy /sys/fs/cgroup && mount -t cgroup2 cgroup2 /sys/fs/cgroup || exit 77
+umount --lazy "$folder/cgroup"
 mount --bind "$folder" "$folder"
-mount -o remount,bind,ro / || exit 77
+while read -r _ _ _ _ point _; do
+  [ "$point" = "$folder" ] || mount -o remount,bind,ro "$point" 2>/dev/null || true
+done </proc/self/mountinfo
+# Never without: a manager that is given the wrong units could empty /tmp.
+for place in / /tmp /var/tmp /dev/shm "$folder/.."; do
+  if touch "$place/lanenet-test-$$" 2>/dev/null; then
+    rm -f "$place/lanenet-test-$$"
+    exit 77
+  fi
+done
+touch "$folder/inside" || exit 77
+mount -t proc proc /proc || exit 77
+umount --recursive --lazy /sys/fs/cgroup && mount -t cgroup2 cgroup2 /sys/fs/cgroup || exit 77
 mount -t tmpfs tmpfs /run
 mkdir -p /run/systemd/system /run/user
 export SYSTEMD_UNIT_PATH=$folder/units XDG_RUNTIME_DIR=/run/user HOME=/run/user
