@@ -21,10 +21,11 @@ from datagen.slam.join import join_segments
 from datagen.slam.odometry.scans import Progress
 from datagen.slam.segment import SegmentSolver
 from lanenet.config import dump_settings
-from lanenet.data.files import atomic_folder, check_replaceable, clear_unfinished, write_text
-from lanenet.data.maps.folder import SETTINGS_NAME, kept_map, write_map
+from lanenet.data.files import atomic_folder, check_replaceable, write_text
+from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
 from lanenet.data.tables import write_tum
 from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.outputs import lock_output
 
 __all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive"]
 
@@ -51,18 +52,19 @@ def map_drive(
         TrackingLostError: If the drive is too short or shows no lane.
         CalibrationError: If the camera does not fit the images, or the lane on the road has another width
             than camera and lane width say.
-        LanenetError: If ``out`` is a file, or a folder that holds anything but an older map.
+        LanenetError: If ``out`` is a file, or a folder that holds anything but an older map, or if another
+            run is writing it.
     """
-    # Before the work, and also where it fails later.
-    clear_unfinished(out)
-    check_replaceable(out, "map")
-    try:
-        return _map_drive(request, settings, out, progress, pictures)
-    except CalibrationError as error:
-        raise CalibrationError(f"{error}{kept_map(out)}") from error
-    except TrackingLostError as error:
-        where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
-        raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}") from error
+    # Before the work: another run may be writing there.
+    with lock_output(out):
+        check_replaceable(out, "map")
+        try:
+            return _map_drive(request, settings, out, progress, pictures)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}{kept_map(out)}") from error
+        except TrackingLostError as error:
+            where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
+            raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}") from error
 
 
 def _map_drive(
@@ -87,7 +89,7 @@ def _map_drive(
         **checked.figures,
         "notes": notes,
     }
-    with atomic_folder(out, "map") as folder:
+    with atomic_folder(out, "map", check_map_files) as folder:
         drive_map, opened = checked.mapped.drive_map, assembled.open_poses
         edges = map_edges(assembled.segments, prepared.drive.frames, drive_map.camera, assembled.factor)
         write_map(folder, drive_map, edges, figures, camera.how)

@@ -26,6 +26,7 @@ from lanenet.config import Settings
 from lanenet.data.files import write_json, write_text
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, TrackingLostError
+from lanenet.outputs import lock_output
 from lanenet.reading import read_json
 
 Role = Literal["train", "validation", "test"]
@@ -139,7 +140,7 @@ class SyntheticJob:
         if not labels.done and failure.done:
             return LeftOut(failure.path.read_text(encoding="utf-8"))
         try:
-            labels.make(self._make_labels)
+            labels.make_alone(self._make_labels)
         except (TrackingLostError, CalibrationError, ConfigError) as error:
             if self.role == "test" or not self.data.synthetic.may_fail:
                 raise
@@ -238,7 +239,7 @@ class RecordedJob:
 
         if not all(part.labels.is_file() for part in parts):
             whole.forget()
-        whole.make(make)
+        whole.make_alone(make)
         return parts
 
 
@@ -330,3 +331,13 @@ class Output:
             self.forget()
             make()
             self.mark()
+
+    def make_alone(self, make: Callable[[], object]) -> None:
+        """As :meth:`make`, and keep other runs from making the file at the same time.
+
+        Raises:
+            LanenetError: If another run makes it.
+        """
+        if not self.done:
+            with lock_output(self.path):
+                self.make(make)

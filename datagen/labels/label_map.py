@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,13 @@ def label_map(
     mapped_frames = len(drive_map.frames)
     shares = labelled_points(found.points_cm, found.in_window)
     report = label_report(labels, residual_cm, mapped_frames, left_out, shares)
-    write_labels(out, labels)
-    write_json(out.with_suffix(".json"), report)
-    if pictures:
-        with atomic_file(out.with_suffix(".png")) as temporary:
-            draw_contact_sheet(temporary, mapped, rows[_shown(residual_cm)])
+    # All of them are written before the first gets its name.
+    with ExitStack() as stack:
+        if pictures:
+            picture = stack.enter_context(atomic_file(out.with_suffix(".png")))
+            draw_contact_sheet(picture, mapped, rows[_shown(residual_cm)])
+        write_json(stack.enter_context(atomic_file(out.with_suffix(".json"))), report)
+        write_labels(stack.enter_context(atomic_file(out)), labels)
     residual = report["residual_cm"]
     text = [
         f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",

@@ -16,6 +16,7 @@ from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console
+from lanenet.cli.shared.options import held_to_the_end
 from lanenet.errors import LanenetError
 
 _VERBS = (
@@ -37,9 +38,12 @@ class _Group(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
-        except (LanenetError, PermissionError, FileNotFoundError, IsADirectoryError) as error:
+            with held_to_the_end():
+                return super().invoke(ctx)
+        except (LanenetError, OSError) as error:
             message = str(error)
+        except MemoryError as error:
+            message = f"out of memory{f' ({error})' if str(error) else ''}"
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRA_OF:

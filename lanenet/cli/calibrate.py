@@ -17,6 +17,7 @@ from lanenet.cli.shared.options import (
     WheelbaseOption,
     check_ending,
     check_not_source,
+    lock_outputs,
 )
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, ConfigError
@@ -76,6 +77,7 @@ def chessboard(
     for path in (out, ros):
         if path is not None:
             check_ending(path, ".yaml", ".yml")
+    lock_outputs(out, ros)
     wanted = parse_board(board, square)
     paths = list_pictures(images)
     with console.progress_bar("calibrate") as progress:
@@ -147,6 +149,7 @@ def ground(
     from lanenet.data.camera_file import write_camera
 
     check_ending(out, ".yaml", ".yml")
+    lock_outputs(out)
     lens = _read_lens(camera)
     if wheelbase is not None:
         lens = replace(lens, wheelbase_cm=wheelbase)
@@ -222,6 +225,7 @@ def drive_(
 
     check_ending(out, ".yaml", ".yml")
     check_not_source(drive, out)
+    lock_outputs(out)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start, notes = starting_camera(drive, camera, refine)
     settings, start, note = with_wheelbase(settings, start, wheelbase)

@@ -14,6 +14,7 @@ from lanenet.cli.shared.options import (
     MarkingOption,
     ModelOption,
     check_not_source,
+    lock_outputs,
 )
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.perception.estimate import DetectorInputs
@@ -88,6 +89,7 @@ def detect(
     from lanenet.evaluation.detect import run_detector
 
     check_not_source(source, out, video)
+    lock_outputs(out, video)
     check_table_path(out)
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending
+from lanenet.cli.shared.options import check_ending, lock_outputs
 from lanenet.errors import ConfigError
 
 app = typer.Typer()
@@ -38,6 +38,7 @@ def export(
         check_ending(out, ".onnx")
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch; it cannot be combined with --int8")
+    lock_outputs(out)
     if int8:
         from lanenet.learn.export import export_int8
         from lanenet.perception.network.model_file import MODEL_NAME

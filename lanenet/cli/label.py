@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending, check_not_source
+from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
 
 app = typer.Typer()
 
@@ -31,6 +31,7 @@ def label(
 
     check_ending(out, ".parquet")
     check_not_source(map_folder, out, out.with_suffix(".json"), out.with_suffix(".png"))
+    lock_outputs(out)
     with console.progress_bar("label") as progress:
         weight = COLOUR_WEIGHT if colour_weight is None else colour_weight
         report = label_map(map_folder, out, progress, force=force, colour_weight=weight)

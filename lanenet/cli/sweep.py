@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import ConfigArgument, OverridesArgument
+from lanenet.cli.shared.options import ConfigArgument, OverridesArgument, lock_outputs
 from lanenet.cli.train import run_settings_schema
 from lanenet.config import load_settings
 
@@ -29,10 +29,11 @@ def sweep(
     from lanenet.learn.sweep import sweep as sweep_networks
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)
+    out = settings.work_folder / "sweep"
+    lock_outputs(out)
     check_start(settings.learn, settings.data.window, settings.data.perceptions)
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress)
-    out = settings.work_folder / "sweep"
     with console.progress_bar("trials") as progress:
         table = sweep_networks(
             settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress

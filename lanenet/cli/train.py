@@ -14,7 +14,7 @@ from pydantic import Field
 
 from lanenet.cli import val as val_cli
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import ConfigArgument, MarkingOption, OverridesArgument
+from lanenet.cli.shared.options import ConfigArgument, MarkingOption, OverridesArgument, lock_outputs
 from lanenet.config import Settings, dump_settings, load_settings
 from lanenet.errors import CheckpointError
 from lanenet.reading import read_json
@@ -81,8 +81,9 @@ def train(
     from lanenet.samples.dataset import compile_kernels
 
     settings: Any = load_settings(run_settings_schema(), config, overrides)
-    check_start(settings.learn, settings.data.window, settings.data.perceptions)
     checkpoint = settings.checkpoints_dir / settings.name
+    lock_outputs(checkpoint)
+    check_start(settings.learn, settings.data.window, settings.data.perceptions)
     with console.progress_bar("data") as progress:
         data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
     if data.left_out:

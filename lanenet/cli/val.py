@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source
+from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source, lock_outputs
 from lanenet.errors import ConfigError
 from lanenet.evaluation.comparison import default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
@@ -86,6 +86,7 @@ def val(
     if out is not None:
         for source in source_paths:
             check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
+    lock_outputs(out)
     meta = None if model is None else read_model_meta(model)
     window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
     sources = [open_source(path, window, perception, truth_labels) for path in source_paths]

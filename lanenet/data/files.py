@@ -1,7 +1,8 @@
 """Atomic files and folders, and packages that may be missing.
 
 Everything is written under a temporary name beside its destination and moved into place at the end, so that a
-crash, a full disk or Ctrl-C never leaves half a file under the final name.
+crash, a full disk or Ctrl-C never leaves half a file under the final name. One run at a time writes an output
+(:mod:`lanenet.outputs`).
 """
 
 from __future__ import annotations
@@ -10,10 +11,7 @@ import importlib
 import json
 import math
 import os
-import re
-import secrets
-import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -21,9 +19,18 @@ from typing import Any
 
 from lanenet.config import read_yaml
 from lanenet.errors import ConfigError, LanenetError, MissingExtraError
+from lanenet.outputs import is_unfinished, lock_output, put_in_place, sync_path, temporary_output
 
-#: Kinds of folder that may be replaced; each holds ``<kind>.yaml`` with ``format: lanenet-<kind>/n``.
-FOLDER_KINDS: tuple[str, ...] = ("drive", "map", "checkpoint")
+#: Kinds of folder that may be replaced, and the files without which none is complete. Each holds
+#: ``<kind>.yaml`` with ``format: lanenet-<kind>/n``.
+FOLDER_KINDS: dict[str, tuple[str, ...]] = {
+    "drive": ("drive.yaml", "frames.csv"),
+    "map": (
+        *("map.yaml", "settings.yaml", "camera.yaml", "poses.csv", "trajectory.tum"),
+        *("lanes.json", "edges.parquet", "report.json"),
+    ),
+    "checkpoint": ("checkpoint.yaml", "config.yaml", "metrics.json", "weights.safetensors", "model.onnx"),
+}
 
 
 def require(package: str, extra: str) -> ModuleType:
@@ -53,67 +60,60 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Write a file under a temporary name and move it to ``path`` when the block ends well.
 
     Args:
-        path: Destination; missing parent folders are made, an existing file is replaced.
+        path: Destination; missing parent folders are made, an existing file is replaced. A file of a folder
+            that is itself temporary gets its name at once.
 
     Yields:
         A path in the same folder with the same ending, for the block to write. Removed on any error.
 
     Raises:
-        LanenetError: If the destination is a folder, or cannot be written.
+        LanenetError: If the destination is a folder, cannot be written, or is being written by another run.
     """
     path = Path(path).resolve()
     if path.is_dir():
         raise LanenetError(f"{path}: is a folder, expected a file to write")
-    _make_parent(path)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
-    try:
+    if is_unfinished(path):
+        yield path
+        return
+    with lock_output(path), temporary_output(path, path.suffix) as temporary:
         yield temporary
-        try:
-            sync_path(temporary)
-            temporary.replace(path)
-            sync_path(path.parent)
-        except OSError as error:
-            raise LanenetError(f"{path}: cannot be written ({error})") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+        sync_path(temporary)
+        temporary.replace(path)
+        sync_path(path.parent)
 
 
 @contextmanager
-def atomic_folder(path: Path, kind: str | None = None) -> Iterator[Path]:
+def atomic_folder(path: Path, kind: str, check: Callable[[Path], object] | None = None) -> Iterator[Path]:
     """Fill a folder under a temporary name and move it to ``path`` when the block ends well.
 
     An existing folder is replaced only if it is empty or an earlier output: it must hold ``<kind>.yaml`` with
-    ``format: lanenet-<kind>/...``. The block has to write that file, or a second run will refuse.
+    ``format: lanenet-<kind>/...``. The new folder has to hold all files of :data:`FOLDER_KINDS`.
 
     Args:
         path: Destination; missing parent folders are made.
-        kind: What the folder is, one of :data:`FOLDER_KINDS`; None accepts an earlier output of any kind.
+        kind: What the folder is, one of :data:`FOLDER_KINDS`.
+        check: Reads the filled folder, and raises a LanenetError if that is not possible.
 
     Yields:
         The temporary folder. Removed with all its contents on any error.
 
     Raises:
-        LanenetError: If the destination is a file or a folder that lanenet did not write, or if it cannot be
-            written.
+        LanenetError: If the destination is a file or a folder that lanenet did not write, cannot be written,
+            or is being written by another run; or if the new folder is not complete.
     """
     path = Path(path).resolve()
-    check_replaceable(path, kind)
-    _make_parent(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        try:
-            temporary.mkdir()
-        except OSError as error:
-            raise LanenetError(f"{path}: cannot be written ({error})") from None
-        yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                sync_path(file)
-        # The destination may have changed while the block ran.
+    with lock_output(path):
         check_replaceable(path, kind)
-        _move_folder(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        with temporary_output(path) as temporary:
+            temporary.mkdir()
+            yield temporary
+            _check_complete(temporary, path, kind, check)
+            for inside in sorted(temporary.rglob("*")):
+                sync_path(inside)
+            sync_path(temporary)
+            # The destination may have changed while the block ran.
+            check_replaceable(path, kind)
+            put_in_place(temporary, path)
 
 
 def check_destination(path: Path) -> None:
@@ -133,12 +133,12 @@ def check_destination(path: Path) -> None:
         raise LanenetError(f"{path}: cannot be written, the folder {parent} is read-only")
 
 
-def check_replaceable(path: Path, kind: str | None = None) -> None:
+def check_replaceable(path: Path, kind: str) -> None:
     """Refuse a folder that :func:`atomic_folder` would not replace, before the work starts.
 
     Args:
         path: Destination; may be missing.
-        kind: What the folder will be, one of :data:`FOLDER_KINDS`; None accepts an earlier output of any.
+        kind: What the folder will be, one of :data:`FOLDER_KINDS`.
 
     Raises:
         LanenetError: If the destination is a file or a folder that lanenet did not write.
@@ -150,11 +150,9 @@ def check_replaceable(path: Path, kind: str | None = None) -> None:
         raise LanenetError(f"{path}: is a file, expected a folder to write")
     if not any(path.iterdir()):
         return
-    kinds = FOLDER_KINDS if kind is None else (kind,)
-    if not any(_holds_marker(path, name) for name in kinds):
-        markers = " or ".join(f"{name}.yaml" for name in kinds)
+    if not _holds_marker(path, kind):
         raise LanenetError(
-            f"{path}: the folder is not empty and holds no {markers} of lanenet, so it is not replaced; "
+            f"{path}: the folder is not empty and holds no {kind}.yaml of lanenet, so it is not replaced; "
             "choose another name or remove it"
         )
 
@@ -185,17 +183,6 @@ def write_json(path: Path, obj: Any) -> None:
     write_text(path, json_text(obj))
 
 
-def sync_path(path: Path) -> None:
-    """Sync a file or folder to the disk, so that it survives a power cut."""
-    if path.is_dir() and os.name == "nt":
-        return
-    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _plain(obj: Any) -> Any:
     # Not above: what stops a car imports this module, and must not wait for NumPy.
     import numpy as np
@@ -215,11 +202,18 @@ def _plain(obj: Any) -> Any:
     return obj
 
 
-def _make_parent(path: Path) -> None:
+def _check_complete(folder: Path, path: Path, kind: str, check: Callable[[Path], object] | None) -> None:
+    """Refuse to replace anything by a folder that lacks a file or cannot be read."""
+    empty = [n for n in FOLDER_KINDS[kind] if not ((folder / n).is_file() and (folder / n).stat().st_size)]
+    if empty or not _holds_marker(folder, kind):
+        raise LanenetError(
+            f"{path}: not written: of the new {kind} {', '.join(empty) or f'{kind}.yaml'} is missing or empty"
+        )
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LanenetError(f"{path.parent}: the folder cannot be made ({error})") from None
+        if check is not None:
+            check(folder)
+    except LanenetError as error:
+        raise LanenetError(f"{path}: not written: the new {kind} cannot be read ({error})") from error
 
 
 def _holds_marker(path: Path, kind: str) -> bool:
@@ -228,46 +222,3 @@ def _holds_marker(path: Path, kind: str) -> bool:
     except ConfigError:
         return False
     return isinstance(found, str) and found.startswith(f"lanenet-{kind}/")
-
-
-def _move_folder(temporary: Path, path: Path) -> None:
-    """Move a folder into place; an old one is set aside first and restored if the move fails."""
-    old = path.with_name(f".{path.name}.{secrets.token_hex(4)}.old.tmp") if path.exists() else None
-    try:
-        if old is not None:
-            path.rename(old)
-        try:
-            temporary.rename(path)
-        except OSError:
-            if old is not None:
-                old.rename(path)
-            raise
-        sync_path(path.parent)
-    except OSError as error:
-        raise LanenetError(f"{path}: cannot be written ({error})") from None
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
-
-
-def clear_unfinished(out: Path) -> None:
-    """Remove the temporary folders of killed runs beside an output folder.
-
-    A run that was killed between setting the old folder aside and moving the new one into place leaves the
-    old one under a temporary name: it is restored.
-
-    Args:
-        out: The folder, as for :func:`atomic_folder`.
-    """
-    out = out.resolve()
-    if not out.parent.is_dir():
-        return
-    # The names of atomic_folder; a name that only starts alike belongs to another output.
-    pattern = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]{{8}}(\.old)?\.tmp")
-    for left in sorted(out.parent.iterdir()):
-        found = pattern.fullmatch(left.name)
-        if found is None or not left.is_dir():
-            continue
-        if found[1] and not out.exists():
-            left.rename(out)
-        else:
-            shutil.rmtree(left, ignore_errors=True)

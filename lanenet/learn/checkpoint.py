@@ -39,7 +39,7 @@ from lanenet.learn.export import (
 from lanenet.learn.network import LaneNet, new_network
 from lanenet.learn.predict import predict
 from lanenet.perception.edges.road import PerceptionSettings
-from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta
+from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta, open_model
 from lanenet.reading import read_json
 from lanenet.samples.dataset import LaneSamples, hash_files
 
@@ -127,7 +127,10 @@ def write_state(path: Path, state: RunState, run_hash: str) -> None:
     history = [list(vars(record).values()) for record in state.history]
     data = {"run_hash": run_hash, **vars(state), "history": history}
     with atomic_file(path) as temporary:
-        torch.save(data, temporary)
+        try:
+            torch.save(data, temporary)
+        except RuntimeError as error:  # what torch makes of a full disk
+            raise CheckpointError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from error
 
 
 def read_state(path: Path, run_hash: str) -> RunState | None:
@@ -331,7 +334,7 @@ def publish(
     """
     if not (run_folder / METRICS_NAME).is_file():
         raise CheckpointError(f"{run_folder}: no {METRICS_NAME}, the run is not finished")
-    with atomic_folder(out, "checkpoint") as folder:
+    with atomic_folder(out, "checkpoint", _check_published) as folder:
         for path in sorted(run_folder.iterdir()):
             if path.is_file() and path.name != STATE_NAME:
                 shutil.copyfile(path, folder / path.name)
@@ -342,6 +345,12 @@ def publish(
             write_json(folder / "results.json", results)
         marker = {"format": CHECKPOINT_FORMAT, "name": name}
         write_text(folder / MARKER_NAME, yaml.safe_dump(marker, sort_keys=False))
+
+
+def _check_published(folder: Path) -> None:
+    """Refuse a checkpoint whose weights or model cannot be read."""
+    read_network(folder)
+    open_model(folder / MODEL_NAME)
 
 
 def check_start(

@@ -27,6 +27,7 @@ from lanenet.data.label_set import read_labels
 from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
+from lanenet.outputs import restore_output
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
     INPUT_NAME,
@@ -94,7 +95,6 @@ def export_onnx(
         raise CheckpointError(f"{path}: no raster to check the export with, expected at least one")
     deployed = DeployedLaneNet(network).eval()
     model = _to_onnx(deployed, meta)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as temporary:
         try:
             session = _session(model)
@@ -154,6 +154,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         CheckpointError: If a file is missing, cannot be read or is of another format version, or the weights
             do not fit the config.
     """
+    restore_output(checkpoint)
     if not checkpoint.is_dir():
         found = "is a file" if checkpoint.exists() else "no such folder"
         raise CheckpointError(f"{checkpoint}: {found}, expected a checkpoint folder")
@@ -277,8 +278,8 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
     session, meta = open_model(source)
     rasters = read_rasters(checkpoint / CALIBRATION_NAME, meta)
     checks = read_rasters(checkpoint / RASTERS_NAME, meta)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as temporary, _quiet():
+    described = path.with_suffix(".json")
+    with atomic_file(path) as temporary, atomic_file(described) as report_file, _quiet():
         quantize_static(
             onnx.load(source),
             temporary,
@@ -307,7 +308,7 @@ def export_int8(checkpoint: Path, out: Path | None = None) -> tuple[Path, Int8Re
         report = Int8Report(
             float(np.sqrt(np.mean(off**2))), largest_cm, small_ms, float_ms, size_bytes, float_bytes
         )
-    write_json(path.with_suffix(".json"), asdict(report) | {"recommended": report.recommended})
+        write_json(report_file, asdict(report) | {"recommended": report.recommended})
     return path, report
 
 

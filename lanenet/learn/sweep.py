@@ -22,6 +22,7 @@ from lanenet.learn.checkpoint import best_record, hash_run
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.train import TrainingRun, torch_threads
 from lanenet.learn.trunks import TRUNKS
+from lanenet.outputs import make_folder
 from lanenet.samples.dataset import LaneSamples, check_same
 
 _BEST = 10
@@ -150,7 +151,7 @@ def sweep(
     sets = [read_labels(path) for path in train_paths]
     val_sets = [read_labels(path) for path in val_paths]
     check_same(sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     study = _open_study(
         optuna, out / DATABASE_NAME, hash_run(settings, train_paths, val_paths), settings.seed
     )

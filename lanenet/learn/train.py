@@ -33,6 +33,7 @@ from lanenet.learn.config import LearnSettings
 from lanenet.learn.loss import lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
+from lanenet.outputs import lock_output, make_folder
 from lanenet.perception.network.model_file import MODEL_NAME
 from lanenet.samples.augment import Batch
 from lanenet.samples.dataset import LaneSamples, check_same
@@ -90,15 +91,26 @@ def train(
         CheckpointError: If the folder holds a run with other settings or data, or pretrained weights cannot
             be read.
         ConfigError: If a GPU is set and there is none.
-        LanenetError: If the training diverges.
+        LanenetError: If the training diverges, or another run trains into the folder.
     """
+    with lock_output(out):
+        return _train(settings, train_paths, val_paths, out, progress)
+
+
+def _train(
+    settings: LearnSettings,
+    train_paths: Sequence[Path],
+    val_paths: Sequence[Path],
+    out: Path,
+    progress: Progress | None,
+) -> TrainResult:
     run_hash = hash_run(settings, train_paths, val_paths)
     metrics = read_finished(out, run_hash)
     if metrics is not None:
         return TrainResult(out, out / MODEL_NAME, metrics["best_epoch"], metrics["val_rmse_cm"], False)
     saved = read_state(out / STATE_NAME, run_hash)
     samples, val = _read_both(settings, train_paths, val_paths)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     with torch_threads(settings.threads):
         run = TrainingRun(settings, samples, saved)
         with tensorboard_curve(out, len(run.history) + 1, settings.tensorboard) as show:

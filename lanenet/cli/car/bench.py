@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import CameraOption, ModelOption
+from lanenet.cli.shared.options import CameraOption, ModelOption, lock_outputs
 
 app = typer.Typer()
 
@@ -29,6 +29,7 @@ def bench(
     from lanenet.data.files import write_json
     from lanenet.onboard.bench import example_camera, time_paths, time_stages
 
+    lock_outputs(out)
     used_camera = example_camera() if camera is None else read_camera(camera)
     models = [path for path in (model, *(also or [])) if path is not None]
     with console.progress_bar("bench") as progress:

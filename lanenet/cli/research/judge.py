@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption
+from lanenet.cli.shared.options import AnyCameraOption, lock_outputs
 from lanenet.config import apply_overrides, check_settings, read_yaml
 from lanenet.errors import ConfigError
 from lanenet.perception.estimate import DetectorInputs
@@ -77,6 +77,7 @@ def judge(
     from datagen.judge.report import table_title, tables, write_report
     from datagen.judge.settings import JudgeSettings
 
+    lock_outputs(out)
     given: dict[str, Any] = {
         "tracks": None if tracks is None else [name.strip() for name in tracks.split(",")],
         "count": count,

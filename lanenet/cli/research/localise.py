@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import MappingOption, check_ending, check_not_source
+from lanenet.cli.shared.options import MappingOption, check_ending, check_not_source, lock_outputs
 from lanenet.errors import CalibrationError, ConfigError, HardwareError
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def localise(
     from lanenet.data.drives import open_drive
 
     check_ending(out, ".csv")
+    lock_outputs(out)
     given = source if live is None else live
     if given is None or (source is not None and live is not None):
         raise ConfigError(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lanenet.cli.shared import console
+from lanenet.cli.shared.options import lock_outputs
 from lanenet.config import check_settings, load_settings
 from lanenet.errors import CalibrationError, ConfigError
 
@@ -58,6 +59,7 @@ def reality(
     from lanenet.data.files import write_bytes
     from lanenet.data.tables import png_bytes
 
+    lock_outputs(out)
     settings, given = _synthetic(synthetic or [], {"count": count, "frames": frames, "seed": seed})
     opened = [open_drive(path) for path in drives]
     cameras = _cameras(opened, camera or [])

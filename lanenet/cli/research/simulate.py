@@ -10,7 +10,7 @@ import typer
 
 from lanenet.cli.research.judge import named_entrant, warn_of_widths
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import ConfigArgument, ModelOption, OverridesArgument
+from lanenet.cli.shared.options import ConfigArgument, ModelOption, OverridesArgument, lock_outputs
 from lanenet.config import load_settings
 from lanenet.errors import ConfigError
 
@@ -36,6 +36,7 @@ def simulate(
     from datagen.world.world import SimulationSettings
 
     settings = load_settings(SimulationSettings, config, overrides)
+    lock_outputs(out)
     if model is not None and detector is None:
         raise ConfigError("--model: is the network's, expected --detector network as well")
     width_cm = settings.track.lane_width_cm

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending
+from lanenet.cli.shared.options import check_ending, lock_outputs
 from lanenet.errors import ConfigError
 
 app = typer.Typer()
@@ -34,6 +34,7 @@ def track(
     from lanenet.data.tables import png_bytes
 
     check_ending(out, ".png")
+    lock_outputs(out)
     path = Path(road)
     if path.suffix.lower() in (".yaml", ".yml") or path.exists():
         settings = load_track_settings(path)
@@ -75,6 +76,7 @@ def sheets(
     for name in chosen:
         if name not in sheet_names():
             raise ConfigError(f"no sheet {name!r}, expected some of {', '.join(sheet_names())}")
+    lock_outputs(out)
     paths = [out / f"{name}.jpg" for name in chosen]
     with console.progress_bar("sheets") as progress:
         for done, (name, path) in enumerate(zip(chosen, paths, strict=True)):

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import fnmatch
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lanenet.errors import ConfigError
+from lanenet.outputs import lock_output
 from lanenet.perception.registry import detector_names, listed
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.")]
@@ -37,6 +41,35 @@ ModelOption = Annotated[
 AnyCameraOption = Annotated[
     bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
 ]
+
+#: Locks of the running command.
+_held_to_the_end: ContextVar[ExitStack] = ContextVar("held_to_the_end")
+
+
+def lock_outputs(*outs: Path | None) -> None:
+    """Keep other runs from writing these outputs until the command ends; see :mod:`lanenet.outputs`.
+
+    Args:
+        outs: Files and folders, or the name that several of them begin with; None for none.
+
+    Raises:
+        LanenetError: If another run writes one of them.
+    """
+    stack = _held_to_the_end.get()
+    for out in outs:
+        if out is not None:
+            stack.enter_context(lock_output(out))
+
+
+@contextmanager
+def held_to_the_end() -> Iterator[None]:
+    """Keep what :func:`lock_outputs` locks in the block until its end: that of the command."""
+    with ExitStack() as stack:
+        token = _held_to_the_end.set(stack)
+        try:
+            yield
+        finally:
+            _held_to_the_end.reset(token)
 
 
 def check_ending(path: Path, *endings: str) -> None:

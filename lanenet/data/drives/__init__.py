@@ -11,6 +11,7 @@ from lanenet.data.drives import folder, tub, video
 from lanenet.data.drives.folder import read_truth
 from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
 from lanenet.errors import DriveFormatError
+from lanenet.outputs import restore_output
 
 __all__ = ["FORMATS", "Commands", "Drive", "find_format", "formats_text", "open_drive", "read_truth"]
 
@@ -26,6 +27,7 @@ def open_drive(path: Path) -> Drive:
         CalibrationError: If the camera file that the drive names cannot be used.
     """
     path = Path(path)
+    restore_output(path)
     if not path.exists():
         raise DriveFormatError(f"{path}: no such drive")
     found = find_format(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -27,9 +27,10 @@ from lanenet.data.drives.recording import (
 )
 from lanenet.data.files import atomic_folder
 from lanenet.data.tables import MAX_PLACE, ColumnSpec, is_torn, read_csv, write_csv
-from lanenet.errors import DriveFormatError
+from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES
+from lanenet.outputs import is_locked_here, lock_output, remove
 from lanenet.reading import FolderFiles, is_regular
 
 FRAMES_FILE = "frames.csv"
@@ -100,6 +101,19 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
     return read_csv(file, specs)
 
 
+def clear_dead_recordings(parent: Path) -> None:
+    """Remove what recordings left that were killed: their locks, and their folders if they hold no frame."""
+    for lock in sorted(parent.glob(".*.lock")):
+        path = parent / lock.name[1:].removesuffix(".lock")
+        if is_locked_here(path):
+            continue
+        with suppress(LanenetError), lock_output(path):
+            # Only what a recorder makes before its first frame: a tub may have a drive.yaml, too.
+            made = {DRIVE_FILE, "camera.yaml", "images"}
+            if path.is_dir() and {file.name for file in path.iterdir() if file.name[0] != "."} <= made:
+                remove(path)
+
+
 class DriveWriter:
     """Writes a drive; the folder appears when the ``with`` block ends without an error, else not at all.
 
@@ -156,8 +170,10 @@ class DriveWriter:
         return len(self._rows)
 
     def __enter__(self) -> DriveWriter:
-        self._folder = self._stack.enter_context(atomic_folder(self.path, "drive"))
-        (self._folder / "images").mkdir()
+        with ExitStack() as stack:
+            folder = stack.enter_context(atomic_folder(self.path, "drive", _check_drive))
+            (folder / "images").mkdir()
+            self._folder, self._stack = folder, stack.pop_all()
         return self
 
     def add(
@@ -246,6 +262,13 @@ class DriveWriter:
         if self._camera is not None:
             write_camera(self.folder / "camera.yaml", self._camera, self._camera_method)
         write_drive_file(self.folder, self._file)
+
+
+def _check_drive(folder: Path) -> None:
+    """Refuse a drive that lacks images."""
+    problems = read_folder(folder).problems
+    if problems:
+        raise DriveFormatError("; ".join(problems))
 
 
 def image_name(number: int) -> str:

@@ -18,6 +18,7 @@ import queue
 import shutil
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -29,11 +30,12 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.folder import FRAMES_FILE, image_name
+from lanenet.data.drives.folder import FRAMES_FILE, clear_dead_recordings, image_name
 from lanenet.data.drives.recording import DRIVE_FORMAT, DriveFile, write_drive_file
-from lanenet.data.files import sync_path, write_text
+from lanenet.data.files import write_text
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.geometry.camera import Camera
+from lanenet.outputs import lock_output, remove, sync_path
 
 log = logging.getLogger(__name__)
 
@@ -118,12 +120,14 @@ class DriveRecorder:
         self.path, self._settings = path, settings
         self.recorded = self.dropped = 0
         self.problem = ""
+        clear_dead_recordings(path.parent)
+        self._lock = ExitStack()
+        self._lock.enter_context(lock_output(path))
         try:
-            (path / "images").mkdir(parents=True)
+            path.mkdir()
         except OSError as error:
+            self._lock.close()
             raise LanenetError(f"{path}: the drive cannot be recorded there ({error})") from None
-        if camera is not None:
-            write_camera(path / "camera.yaml", camera, "copied from the car")
         file = DriveFile.model_construct(
             format=DRIVE_FORMAT,
             camera=None if camera is None else "camera.yaml",
@@ -131,7 +135,17 @@ class DriveRecorder:
             max_steering_rad=max_steering_rad,
             notes=notes,
         )
-        write_drive_file(path, file)
+        try:
+            (path / "images").mkdir()
+            if camera is not None:
+                write_camera(path / "camera.yaml", camera, "copied from the car")
+            write_drive_file(path, file)
+        except BaseException as error:
+            remove(path)
+            self._lock.close()
+            if isinstance(error, OSError):
+                raise LanenetError(f"{path}: the drive cannot be recorded there ({error})") from None
+            raise
         self._queue: queue.Queue[_Item] = queue.Queue(settings.queue_frames)
         self._ending = threading.Event()
         self._number = 0
@@ -171,7 +185,8 @@ class DriveRecorder:
         if self._thread.is_alive():
             self._stop(f"the card did not answer for {_CLOSE_S:.0f} s")
         elif self.recorded == 0:
-            shutil.rmtree(self.path, ignore_errors=True)
+            remove(self.path)
+        self._lock.close()
 
     def _write(self) -> None:
         due_s = time.monotonic()

@@ -16,13 +16,14 @@ from pydantic import Field
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.drives.recording import MAX_TIME_S
-from lanenet.data.files import write_json, write_text
+from lanenet.data.files import require, write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.tables import MAX_PLACE, ColumnSpec, read_csv, write_columns, write_csv, write_tum
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
+from lanenet.outputs import restore_output
 from lanenet.reading import parsing, read_json
 
 FORMAT = "lanenet-map/1"
@@ -185,6 +186,7 @@ def read_map(folder: Path) -> DriveMap:
     Raises:
         MapFormatError: If it is not a map, is of another version, or a file is damaged.
     """
+    restore_output(folder)
     if not (folder / "map.yaml").is_file():
         raise MapFormatError(f"{folder}: is not a map (no map.yaml in it)")
     path = folder / "map.yaml"
@@ -236,6 +238,16 @@ def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
         raise MapFormatError(
             f"{path}: all {n} frames lie within {across_cm:g} cm, expected at least {_LEAST_MAP_CM:g} cm"
         )
+
+
+def check_map_files(folder: Path) -> None:
+    """Read all of a map that was written.
+
+    Raises:
+        LanenetError: If a file cannot be read.
+    """
+    read_map(folder)
+    require("pyarrow.parquet", "data").read_table(folder / "edges.parquet")
 
 
 def kept_map(out: Path) -> str:

@@ -30,6 +30,7 @@ from lanenet.config import Settings, check_settings
 from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM
+from lanenet.outputs import restore_output
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.reading import MEBIBYTE, first_line, is_regular, parsing, read_bytes
 
@@ -77,6 +78,7 @@ _SIGNS = {"x": "positive right", "y": "positive ahead", "steering_rad": "positiv
 
 def is_model(path: Path) -> bool:
     """Tell whether a path stands for a model: an ONNX file by its name, or a checkpoint folder."""
+    restore_output(path)
     return _is_checkpoint(path) or path.suffix.lower() == ".onnx"
 
 
@@ -87,6 +89,7 @@ def find_model(path: Path) -> Path:
         ModelMismatchError: If there is no such file, or none in the folder; names the folders in it that have
             one.
     """
+    restore_output(path)
     found = path / MODEL_NAME if path.is_dir() else path
     if is_regular(found):
         return found

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
 from lanenet.cli.shared.options import check_ending, check_not_source
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import ConfigError
+from lanenet.outputs import lock_output
 
 
 def touched(folder: Path, *names: str) -> Path:
@@ -95,3 +101,76 @@ def test_the_commands_ask(tmp_path):
         assert result.exit_code == 1, words
         assert "choose another name" in result.stderr, (words, result.stderr)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@contextmanager
+def written_by_another(out: Path) -> Iterator[None]:
+    """Another run, here a thread, has the lock of an output."""
+    locked, over = threading.Event(), threading.Event()
+
+    def run() -> None:
+        with lock_output(out):
+            locked.set()
+            over.wait()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    locked.wait()
+    yield
+    over.set()
+    thread.join()
+
+
+ROOT = Path(__file__).resolve().parents[3]
+#: Verbs with the option that names their output, and the output's name.
+WRITERS: list[tuple[tuple[object, ...], str, str]] = [
+    (("map", "nowhere", "--lane-width", "40"), "--out", "one"),
+    (("label", "nowhere"), "--out", "one.parquet"),
+    (("detect", "nowhere", "--detector", "painter"), "--out", "one.csv"),
+    (("detect", "nowhere", "--detector", "painter", "--out", "x.csv"), "--video", "one.mp4"),
+    (("localise", "nowhere"), "--out", "one.csv"),
+    (("export", ROOT / "checkpoints" / "small"), "--out", "one.onnx"),
+    (("calibrate", "chessboard", "nowhere.jpg", "--board", "9x6"), "--out", "one.yaml"),
+    (("calibrate", "ground", "nowhere.csv", "--camera", "nowhere.yaml"), "--out", "one.yaml"),
+    (("calibrate", "drive", "nowhere", "--lane-width", "40"), "--out", "one.yaml"),
+    (("judge",), "--out", "one"),
+    (("reality", "nowhere"), "--out", "one"),
+    (("track", "oval"), "--out", "one.png"),
+    (("sheets",), "--out", "one"),
+    (("bench",), "--out", "one.json"),
+    (("val", ROOT / "checkpoints" / "small", "nowhere"), "--out", "one"),
+    (("simulate", ROOT / "configs" / "drives" / "example.yaml"), "--out", "one"),
+]
+
+
+@pytest.mark.parametrize(("words", "option", "name"), WRITERS, ids=[f"{w[0]}-{o}" for w, o, _ in WRITERS])
+def test_what_another_run_writes_is_refused_before_the_work(
+    tmp_path: Path, words: tuple[object, ...], option: str, name: str
+) -> None:
+    with written_by_another(tmp_path / name):
+        line = refused(tmp_path, *words, option, tmp_path / name)
+    assert str(tmp_path / name) in line and f"process {os.getpid()} " in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_training_of_the_same_name_is_refused_before_the_work(tmp_path: Path) -> None:
+    config = ROOT / "configs" / "small.yaml"
+    with written_by_another(tmp_path / "one"):
+        line = refused(tmp_path, "train", config, "name=one", f"checkpoints_dir={tmp_path}")
+    assert str(tmp_path / "one") in line
+    with written_by_another(tmp_path / "work" / "sweep"):
+        assert "sweep" in refused(tmp_path, "sweep", config, f"work_dir={tmp_path / 'work'}")
+
+
+def test_a_full_disk_and_no_memory_are_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for error, word in (
+        (OSError(28, "No space left on device"), "No space"),
+        (MemoryError(), "out of memory"),
+    ):
+
+        def fail(*_: object, error: Exception = error) -> None:
+            raise error
+
+        monkeypatch.setattr("lanenet.data.camera_file.read_camera", fail)
+        assert word in refused(tmp_path, "analyse", "nowhere.yaml")

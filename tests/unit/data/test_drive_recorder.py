@@ -235,3 +235,23 @@ def test_times_go_on_without_commands(tmp_path: Path) -> None:
 def test_a_drive_without_a_frame_leaves_no_folder(tmp_path: Path) -> None:
     DriveRecorder(tmp_path / "nothing", settings()).close()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_that_was_killed_before_its_first_frame_goes(tmp_path: Path) -> None:
+    """And neither one that still runs nor one with frames."""
+    record(tmp_path / "frames", 1)
+    dead = DriveRecorder(tmp_path / "dead", settings())
+    dead.close()
+    shutil.copytree(tmp_path / "frames", tmp_path / "dead")
+    (tmp_path / "dead" / FRAMES_FILE).unlink()
+    tub = shutil.copytree(tmp_path / "dead", tmp_path / "tub")
+    (tub / "manifest.json").touch()
+    for name in ("dead", "frames", "gone", "tub"):
+        (tmp_path / f".{name}.lock").touch()
+    running = DriveRecorder(tmp_path / "running", settings())
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".running.lock", "frames", "running", "tub"]
+    DriveRecorder(tmp_path / "other", settings()).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".running.lock", "frames", "running", "tub"]
+    running.add(picture(0), 0.0)
+    running.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "running", "tub"]

@@ -54,11 +54,16 @@ def test_a_link_keeps_pointing_at_its_file(tmp_path: Path) -> None:
     assert (tmp_path / "real.txt").read_text() == "new"
 
 
+def fill(folder: Path, text: str) -> None:
+    (folder / "drive.yaml").write_text("format: lanenet-drive/1\n")
+    (folder / "frames.csv").write_text("frame,t_s,file\n")
+    (folder / "deep").mkdir()
+    (folder / "deep" / "a.txt").write_text(text)
+
+
 def make_folder(path: Path, text: str) -> None:
-    with atomic_folder(path, "map") as temporary:
-        (temporary / "map.yaml").write_text("format: lanenet-map/1\n")
-        (temporary / "deep").mkdir()
-        (temporary / "deep" / "a.txt").write_text(text)
+    with atomic_folder(path, "drive") as temporary:
+        fill(temporary, text)
 
 
 def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
@@ -67,14 +72,14 @@ def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
     (path / "stale.txt").write_text("from the first run")
     make_folder(path, "two")
     assert (path / "deep" / "a.txt").read_text() == "two"
-    assert names(path) == ["deep", "map.yaml"]
+    assert names(path) == ["deep", "drive.yaml", "frames.csv"]
     assert names(tmp_path) == ["out"]
 
 
 def test_an_error_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "out"
     make_folder(path, "one")
-    with pytest.raises(KeyboardInterrupt), atomic_folder(path) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(path, "drive") as temporary:
         (temporary / "half.txt").write_text("x")
         raise KeyboardInterrupt
     assert (path / "deep" / "a.txt").read_text() == "one"
@@ -84,39 +89,33 @@ def test_an_error_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     make_folder(tmp_path / "out", "one")
-    assert names(tmp_path / "out") == ["deep", "map.yaml"]
+    assert names(tmp_path / "out") == ["deep", "drive.yaml", "frames.csv"]
 
 
 @pytest.mark.parametrize(
     ("marker", "text"),
     [
         ("photo.jpg", "mine"),
-        ("map.yaml", "format: something-else/1"),
-        ("map.yaml", "[not, a, mapping]"),
+        ("drive.yaml", "format: something-else/1"),
+        ("drive.yaml", "[not, a, mapping]"),
         # A camera file may lie among anything.
         ("camera.yaml", "format: lanenet-camera/1"),
-        ("drive.yaml", "format: lanenet-drive/1"),
+        ("map.yaml", "format: lanenet-map/1"),
     ],
 )
 def test_a_folder_of_someone_else_is_kept(tmp_path: Path, marker: str, text: str) -> None:
     path = tmp_path / "out"
     path.mkdir()
     (path / marker).write_text(text)
-    with pytest.raises(LanenetError, match=r"out: the folder is not empty and holds no map\.yaml"):
+    with pytest.raises(LanenetError, match=r"out: the folder is not empty and holds no drive\.yaml"):
         make_folder(path, "one")
     assert (path / marker).read_text() == text
 
 
-def test_without_a_kind_any_earlier_output_is_replaced(tmp_path: Path) -> None:
-    make_folder(tmp_path / "out", "one")
-    with atomic_folder(tmp_path / "out") as temporary:
-        (temporary / "b.txt").write_text("x")
-    assert names(tmp_path / "out") == ["b.txt"]
-
-
 def test_a_folder_that_fills_up_meanwhile_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "out"
-    with pytest.raises(LanenetError, match="not replaced"), atomic_folder(path):
+    with pytest.raises(LanenetError, match="not replaced"), atomic_folder(path, "drive") as temporary:
+        fill(temporary, "one")
         path.mkdir()
         (path / "mine.txt").write_text("x")
     assert names(path) == ["mine.txt"]

@@ -8,84 +8,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_map import N, small_map
 
 from datagen.lanes.offset import CubicBasis
 from lanenet.data.files import require
-from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.folder import FORMAT, DriveMap, read_map, write_map
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import LanenetError, MapFormatError
-from lanenet.geometry.camera import Camera, Mounting
-
-N = 30
-CAMERA = Camera(
-    "fisheye",
-    160,
-    120,
-    np.array([[80.0, 0.0, 79.5], [0.0, 80.0, 59.5], [0.0, 0.0, 1.0]]),
-    np.array([-0.03, 0.0, 0.0, 0.0]),
-    Mounting(15.0, pitch_down_rad=0.25, ahead_of_front_axle_cm=-3.5),
-    17.0,
-)
-
-
-def _line(side: Side, y_cm: float, residual_cm: float = 0.12) -> LaneLine:
-    knots = np.concatenate([np.zeros(3), np.linspace(0.0, 200.0, 11), np.full(3, 200.0)])
-    rng = np.random.default_rng(0)
-    coefficients = np.column_stack([np.linspace(0.0, 200.0, 13), y_cm + rng.normal(size=13)])
-    supported = np.array([[0.0, 80.0], [120.0, 200.0]])
-    return LaneLine(side, knots, coefficients, supported, residual_cm)
-
-
-def _drive_map() -> DriveMap:
-    rng = np.random.default_rng(1)
-    poses = np.column_stack([rng.uniform(-300.0, 300.0, (N, 2)), np.linspace(0.0, 14.0, N)])
-    match = rng.uniform(0.2, 0.9, N)
-    match[0] = match[20] = np.nan
-    never_seen = LaneLine(
-        "right",
-        _line("right", -18.0).knots_cm,
-        _line("right", -18.0).coefficients_cm,
-        np.empty((0, 2)),
-        np.nan,
-    )
-    return DriveMap(
-        meta=MapMeta(
-            format=FORMAT,
-            drive="drives/circuit",
-            lane_width_cm=36.0,
-            mapped_lane_cm=36.4,
-            tape_cm=2.1,
-            scale_from="lane width",
-            laps=1,
-        ),
-        camera=CAMERA,
-        frames=np.arange(100, 100 + N),
-        t_s=0.05 * np.arange(N),
-        poses=poses,
-        lap=np.repeat([0, 1], N // 2),
-        segment=np.repeat([0, 1], [20, 10]),
-        s_cm=np.concatenate([np.linspace(0.0, 90.0, 20), np.linspace(0.0, 40.0, 10)]),
-        match=match,
-        lines={
-            0: [_line("left", 18.0), _line("right", -18.0)],
-            1: [_line("left", 18.0), never_seen],
-        },
-        tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
-        held_out=np.arange(N) % 10 == 3,
-        contradicted=np.arange(N)[:, None] // 4 == [2, 3],
-    )
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     edges = {"frame": np.arange(5), "x_cm": np.linspace(0.0, 1.0, 5).astype(np.float32)}
     report = {"frames": N, "figures": np.array([1.0, np.nan])}
-    write_map(tmp_path, _drive_map(), edges, report, "from the drive")
+    write_map(tmp_path, small_map(), edges, report, "from the drive")
     return tmp_path
 
 
 def test_round_trip(folder):
-    written, found = _drive_map(), read_map(folder)
+    written, found = small_map(), read_map(folder)
     assert found.meta.model_copy(update={"drive": ""}) == written.meta.model_copy(update={"drive": ""})
     assert found.camera.hash == written.camera.hash
     assert found.camera.wheelbase_cm == written.camera.wheelbase_cm
@@ -133,7 +74,7 @@ def _closed_map() -> DriveMap:
             0.3,
         )
 
-    plain = _drive_map()
+    plain = small_map()
     lines = [ring("left", 30.0), ring("right", 66.0), ring("right", 102.0, 1)]
     return replace(plain, segment=np.zeros(N, dtype=np.int64), lines={0: lines})
 
@@ -164,7 +105,7 @@ def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "map"
     out.mkdir()
-    write_map(out, _drive_map(), {"frame": np.arange(2)}, {}, "given")
+    write_map(out, small_map(), {"frame": np.arange(2)}, {}, "given")
     monkeypatch.chdir(out)
     assert read_map(out).meta.drive == str(tmp_path / "drives" / "circuit")
 
@@ -176,7 +117,7 @@ def test_other_tools_can_read_the_folder(folder):
     # A trajectory in metres, by the TUM convention: time, position, quaternion.
     tum = np.loadtxt(folder / "trajectory.tum")
     assert tum.shape == (N, 8)
-    np.testing.assert_allclose(100.0 * tum[:, 1:3], _drive_map().poses[:, :2], atol=1e-3)
+    np.testing.assert_allclose(100.0 * tum[:, 1:3], small_map().poses[:, :2], atol=1e-3)
     report = json.loads((folder / "report.json").read_text())
     assert report == {"format": "lanenet-map-report/1", "frames": N, "figures": [1.0, None]}
     assert "from the drive" in (folder / "camera.yaml").read_text()
