@@ -182,7 +182,9 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise LanenetError(f"{path}: the folder cannot be made ({error})") from None
+        file = next((found for found in (path, *path.parents) if found.is_file()), None)
+        reason = f" ({error})" if file is None else f", {file} is a file"
+        raise LanenetError(f"{path}: the folder cannot be made{reason}") from None
 
 
 def sync_path(path: Path) -> None:
