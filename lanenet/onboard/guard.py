@@ -25,12 +25,13 @@ from typing import Protocol, runtime_checkable
 from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.actuators.actuator import Actuator, Spare
 from lanenet.onboard.guard_process import DRIVE, MESSAGE, NEUTRAL, QUIT
+from lanenet.onboard.i2c import GUARD_MODULE
 from lanenet.search_path import without_working_folder
 
 log = logging.getLogger(__name__)
 
 #: What runs in the guard's process; -P: nothing is imported from the working folder.
-PROGRAM = (sys.executable, "-P", "-m", "lanenet.onboard.guard_process")
+PROGRAM = (sys.executable, "-P", "-m", GUARD_MODULE)
 #: For the interpreter, the driver and the device; chosen ample: imports are slow on a small board,
 #: and an Arduino restarts when its port is opened.
 _START_S = 30.0

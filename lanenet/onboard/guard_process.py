@@ -315,6 +315,7 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
             _close(actuator)
         _say(line, "closed")
         line.close()
+        os.close(int(pulse))
     if chip is not None:
         chip.close()
     log.info("neutral: %s", reason)

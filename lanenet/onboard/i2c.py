@@ -14,6 +14,8 @@ from typing import Any
 
 from lanenet.errors import HardwareError, MissingExtraError
 
+#: What a guard's process runs.
+GUARD_MODULE = "lanenet.onboard.guard_process"
 #: Motors disturb the bus now and then; a transfer without acknowledgement is repeated.
 _TRIES = 3
 
@@ -133,12 +135,23 @@ def lock_owner(device: os.stat_result, at: int | None = None) -> int:
 
 
 def describe_process(pid: int) -> str:
-    """Return a process's id and command, for messages."""
+    """Return a process's id and command, for messages; of a guard also the process that it guards."""
     if pid <= 0:
         return "another process"
+    words = _words_of(pid)
+    if GUARD_MODULE not in words:
+        return f"process {pid} ({' '.join(words)[:60]})"
+    status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    # "pid (name) state parent ..."; the name may hold anything.
+    parent = int(status.rpartition(")")[2].split()[1])
+    return f"process {pid}, the guard of process {parent} ({' '.join(_words_of(parent))[:60]})"
+
+
+def _words_of(pid: int) -> list[str]:
+    """Return the words of a process's command line without the program's folder; none if it is gone."""
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").split("\0")
+        text = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        words = []
-    command = " ".join(word for word in words if word)[:60]
-    return f"process {pid} ({command})" if command else f"process {pid}"
+        return ["gone"]
+    program, *words = text.split("\0")
+    return [Path(program).name, *filter(None, words)]

@@ -154,7 +154,12 @@ class PCA9685:
         try:
             if owner:
                 self._chip.own()
-            self._start()
+            if not owner and self._is_running(self._chip):
+                # Its owner must not find it asleep, and the pulses have no gap.
+                for data in self._neutral:
+                    self._chip.write(data)
+            else:
+                self._start()
             if self._settings.heartbeat is not None and owner:
                 self._heartbeat = Heartbeat(self._settings.heartbeat)
                 self._heartbeat.open()
@@ -250,6 +255,11 @@ class PCA9685:
     def _beat(self) -> None:
         if self._heartbeat is not None:
             self._heartbeat.beat()
+
+    def _is_running(self, chip: I2CChip) -> bool:
+        mode, prescale = chip.read(MODE1, 1)[0], chip.read(PRE_SCALE, 1)[0]
+        awake = mode & (SLEEP | AUTO_INCREMENT) == AUTO_INCREMENT
+        return awake and prescale == prescale_of(self._settings.frequency_hz)
 
     def _is_asleep(self, chip: I2CChip) -> bool:
         """Tell whether the chip has restarted: after a moment without supply it answers, but sleeps."""

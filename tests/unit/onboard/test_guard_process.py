@@ -33,5 +33,4 @@ def test_first_neutral_is_before_the_imports(monkeypatch):
         first = json.dumps(first_writes(PCA9685Settings()))
         assert guard_process.main([str(theirs.detach()), str(pulse), "{}", first, "0.1", "1"], build) == 1
         os.close(heard)
-        os.close(pulse)
     assert seen == [("{}", False, 370, os.getpid())]

@@ -249,7 +249,17 @@ def test_the_owner_is_gone_with_its_process(bus, actuator):
     assert i2c.lock_owner(os.fstat(bus.fd), 0x41) == 0
     actuator.close()
     # The lock is that of the open file, which the emulator does not close.
-    assert i2c.describe_process(other.pid) == f"process {other.pid}"
+    assert i2c.describe_process(other.pid) == f"process {other.pid} (gone)"
+
+
+def test_the_owner_is_named_with_what_it_guards():
+    words = [sys.executable, "-ISc", "input()", i2c.GUARD_MODULE]
+    guard = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        text = i2c.describe_process(guard.pid)
+        assert text.startswith(f"process {guard.pid}, the guard of process {os.getpid()} (")
+    finally:
+        end(guard)
 
 
 @pytest.fixture
