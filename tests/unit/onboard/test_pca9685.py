@@ -253,9 +253,10 @@ def test_the_owner_is_gone_with_its_process(bus, actuator):
 
 
 def test_the_owner_is_named_with_what_it_guards():
-    words = [sys.executable, "-ISc", "input()", i2c.GUARD_MODULE]
+    words = [sys.executable, "-ISc", "print(flush=True); input()", i2c.GUARD_MODULE]
     guard = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
+        guard.stdout.readline()
         text = i2c.describe_process(guard.pid)
         assert text.startswith(f"process {guard.pid}, the guard of process {os.getpid()} (")
     finally:
