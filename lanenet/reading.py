@@ -121,8 +121,10 @@ def open_regular(path: Path, error: type[LanenetError], most: int) -> Iterator[B
 def read_bytes(path: Path, error: type[LanenetError], most: int) -> bytes:
     """Read a whole file; arguments and errors as for :func:`open_regular`."""
     with open_regular(path, error, most) as stream:
-        # One more than the limit: a file may grow, and those of the kernel have no size.
-        data = stream.read(most + 1)
+        # At most what the file has now, since a buffer is as large as what is asked for. Files of the kernel
+        # have no size.
+        size = max(os.fstat(stream.fileno()).st_size, MEBIBYTE)
+        data = stream.read(min(size, most) + 1)
     _check_size(path, len(data), error, most)
     return data
 
