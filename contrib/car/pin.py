@@ -1,9 +1,9 @@
-"""Writes contrib/car/requirements-3.*.txt: all packages that a car installs, with the hashes of their wheels.
+"""Writes contrib/car/requirements-3.*.txt: all packages that a car installs, with their wheels' hashes.
 
     python contrib/car/pin.py        (needs the package index; a minute)
 
-pip resolves the base installation and the extra `car` under constraints.txt, once for each Python and processor
-below, without installing anything, and reports the wheels that it would take.
+pip resolves the base installation and the extra `car` under constraints.txt, once for each Python and
+processor below, without installing anything, and reports the wheels that it would take.
 """
 
 import json

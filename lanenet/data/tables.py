@@ -418,11 +418,8 @@ def _bounded_table(path: Path) -> Any:
                 f"{about.num_rows} rows of {about.num_columns} columns, expected at most {_MAX_ROWS} of "
                 f"{_MAX_COLUMNS}"
             )
-        packed = sum(
-            about.row_group(g).column(c).total_uncompressed_size
-            for g in range(about.num_row_groups)
-            for c in range(about.num_columns)
-        )
+        # Not by the columns: pyarrow 26 ends the process when a column's statistics are damaged.
+        packed = sum(about.row_group(group).total_byte_size for group in range(about.num_row_groups))
         most = _MAX_UNPACKED + _MAX_RATIO * size
         batches, unpacked = [], 0
         if packed <= most:

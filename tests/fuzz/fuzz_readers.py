@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-import yaml
 from cameras import ROS_FILE, make_camera
 from drives import CAMERA, frame_image, record, write_drive, write_tub, write_video
 from synthetic_labels import WINDOW, make_label_set
@@ -86,6 +84,7 @@ def make_truth(folder: Path) -> None:
 
 
 def make_map(folder: Path) -> None:
+    folder.mkdir()
     n, rng = 12, np.random.default_rng(0)
     knots = np.concatenate([np.zeros(3), np.linspace(0.0, 200.0, 11), np.full(3, 200.0)])
 
@@ -230,7 +229,7 @@ READERS: dict[str, Reader] = {
     "labels": Reader(
         lambda f: write_labels(f / "a.parquet", make_label_set(3, 0)), lambda f: read_labels(f / "a.parquet")
     ),
-    "map": Reader(make_map, read_whole_map),
+    "map": Reader(lambda f: make_map(f / "map"), lambda f: read_whole_map(f / "map")),
     "track": Reader(make_track, lambda f: read_track(f / "track.json")),
     "run": Reader(make_run, read_whole_run),
     "checkpoint": Reader(make_checkpoint, read_checkpoint),

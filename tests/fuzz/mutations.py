@@ -260,7 +260,9 @@ def mutate(folder: Path, rng: np.random.Generator) -> Path:
     path = pick(rng, sorted(p for p in folder.rglob("*") if p.is_file()))
     if rng.random() < 0.06:
         path.unlink()
-        pick(rng, (_pipe, _folder, _link_out, _device, _nothing, _dangling))(path)
+        # A file that a person names may be a link; one that a drive or a map holds may not lead out of it.
+        inside = path.parent != folder
+        pick(rng, (_pipe, _folder, _nothing, _dangling, *([_link_out, _device] if inside else ())))(path)
         return path
     data = path.read_bytes()
     for _ in range(int(rng.integers(1, 4))):
@@ -280,7 +282,9 @@ def _folder(path: Path) -> None:
 
 
 def _link_out(path: Path) -> None:
-    path.symlink_to(Path("..") / ".." / "canary.jpg")
+    # Beside the folder of the case, from a drive or from its images.
+    up = Path(*[".."] * (3 if path.parent.name == "images" else 2))
+    path.symlink_to(up / "canary.jpg")
 
 
 def _device(path: Path) -> None:

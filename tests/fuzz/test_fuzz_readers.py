@@ -1,7 +1,7 @@
 """Damaged and hostile files: every reader reads them or refuses them, and does nothing else.
 
-A case is a seed and a number. One that fails is kept in `corpus/READER/SEED-NUMBER--FILE`, and read again by every
-run. `LANENET_FUZZ_S=600 make test-slow` goes on for that many seconds, with cases that were never read before.
+A case is a seed and a number. One that fails is kept in `corpus/READER/SEED-NUMBER--FILE`, and read again by
+every run. `LANENET_FUZZ_S=600 make test-slow` goes on for that many seconds, with cases that are new.
 """
 
 from __future__ import annotations
@@ -109,9 +109,8 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path: Path) -> N
             if case["found"] not in FINE:
                 failed.append(case)
                 keep(tmp_path, case, seed)
-    print(
-        f"fuzz: seed {seed}, {number} cases: {dict(counts)}, {slowest_s:.1f} s, {most_bytes / 2**20:.0f} MB at most"
-    )
+    worst = f"{slowest_s:.1f} s, {most_bytes / 2**20:.0f} MB at most"
+    print(f"fuzz: seed {seed}, {number} cases: {dict(counts)}, {worst}")  # noqa: T201 (pytest -s shows it)
     assert not failed, "\n".join(json.dumps(case) for case in failed[:20])
     # Both happen, or the damage is none, or too much.
     assert min(counts[found] for found in FINE) > number / 20

@@ -95,7 +95,7 @@ def case(work: Path, name: str) -> Path:
 
 
 def say(**what: Any) -> None:
-    print(json.dumps(what), flush=True)
+    print(json.dumps(what), flush=True)  # noqa: T201 (what the process says)
 
 
 def main(work: Path, words: list[str]) -> None:

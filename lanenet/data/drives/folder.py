@@ -45,10 +45,11 @@ def read_folder(path: Path) -> RecordedFrames:
     Raises:
         DriveFormatError: If ``frames.csv`` cannot be used, or names a file outside the folder.
     """
-    table = path / FRAMES_FILE
+    inside = FolderFiles(path)
+    table = inside.file(FRAMES_FILE, path, DriveFormatError)
     columns, commands = read_times(table, file=ColumnSpec("text"))
     frames = columns["frame"]
-    inside, names = FolderFiles(path), columns["file"].tolist()
+    names = columns["file"].tolist()
     images = ImageFiles(
         [
             inside.file(name, f"{table}: frame {number}, column 'file'", DriveFormatError)
@@ -90,7 +91,8 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
         DriveFormatError: If ``truth.csv`` cannot be used; names line and column.
     """
     path = Path(path)
-    file = path if path.name == TRUTH_FILE else path / TRUTH_FILE
+    folder = path.parent if path.name == TRUTH_FILE else path
+    file = FolderFiles(folder).file(TRUTH_FILE, folder, DriveFormatError)
     if not os.path.lexists(file):
         return None
     specs = {"frame": ColumnSpec("int", low=0.0, increasing=True)}

@@ -287,7 +287,8 @@ def read_drive_file(folder: Path) -> tuple[DriveFile, Camera | None]:
         DriveFormatError: If the file is of an unknown version, or a key is misspelt or out of range.
         CalibrationError: If the camera file cannot be used.
     """
-    path = folder / DRIVE_FILE
+    inside = FolderFiles(folder)
+    path = inside.file(DRIVE_FILE, folder, DriveFormatError)
     # A link that leads nowhere is there, too.
     if not os.path.lexists(path):
         return DriveFile(format="lanenet-drive/1"), None
@@ -297,7 +298,7 @@ def read_drive_file(folder: Path) -> tuple[DriveFile, Camera | None]:
         raise DriveFormatError(str(error)) from None
     if file.camera is None:
         return file, None
-    return file, read_camera(FolderFiles(folder).file(file.camera, f"{path}: key 'camera'", DriveFormatError))
+    return file, read_camera(inside.file(file.camera, f"{path}: key 'camera'", DriveFormatError))
 
 
 def write_drive_file(folder: Path, file: DriveFile) -> None:

@@ -84,7 +84,7 @@ def open_source(path: Path) -> Source:
         raise DriveFormatError(f"{path}: no such file or folder")
     if find_format(path) is not None:
         return _recorded(path)
-    photos = [path] if path.is_file() else sorted(path.iterdir())
+    photos = sorted(path.iterdir()) if path.is_dir() else [path]
     photos = [photo for photo in photos if _is_photo(photo)]
     if not photos:
         raise DriveFormatError(

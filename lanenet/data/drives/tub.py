@@ -70,8 +70,8 @@ def read_tub(path: Path) -> RecordedFrames:
     Raises:
         DriveFormatError: If the manifest or all catalogs cannot be read, or no row can be used.
     """
-    catalogs, deleted, image_key = _read_manifest(path / MANIFEST_FILE)
     inside = FolderFiles(path)
+    catalogs, deleted, image_key = _read_manifest(inside.file(MANIFEST_FILE, path, DriveFormatError))
     key = f"{path / MANIFEST_FILE}: key 'paths'"
     present = [name for name in catalogs if is_regular(inside.file(name, key, DriveFormatError))]
     absent = [name for name in catalogs if name not in present]

@@ -24,7 +24,7 @@ from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 from lanenet.outputs import restore_output
-from lanenet.reading import parsing, read_json
+from lanenet.reading import FolderFiles, parsing, read_json
 
 FORMAT = "lanenet-map/1"
 _LANES_FORMAT = "lanenet-lanes/2"
@@ -189,7 +189,8 @@ def read_map(folder: Path) -> DriveMap:
     restore_output(folder)
     if not (folder / "map.yaml").is_file():
         raise MapFormatError(f"{folder}: is not a map (no map.yaml in it)")
-    path = folder / "map.yaml"
+    inside = FolderFiles(folder)
+    path = inside.file("map.yaml", folder, MapFormatError)
     plain = read_yaml(path, MapFormatError)
     if plain.get("format") != FORMAT:
         raise MapFormatError(f"{path}: format is {plain.get('format')!r}, expected {FORMAT!r}")
@@ -198,8 +199,9 @@ def read_map(folder: Path) -> DriveMap:
     except ConfigError as error:
         raise MapFormatError(str(error)) from None
     place = ColumnSpec(low=-MAX_PLACE, high=MAX_PLACE)
+    poses = inside.file("poses.csv", folder, MapFormatError)
     table = read_csv(
-        folder / "poses.csv",
+        poses,
         {
             "frame": ColumnSpec("int", low=0.0, increasing=True),
             **{name: ColumnSpec("int", low=0.0, high=MAX_PLACE) for name in ("lap", "segment")},
@@ -210,10 +212,11 @@ def read_map(folder: Path) -> DriveMap:
         },
         error=MapFormatError,
     )
-    _check_poses(folder / "poses.csv", table)
+    _check_poses(poses, table)
+    lines = inside.file("lanes.json", folder, MapFormatError)
     return DriveMap(
         meta=meta,
-        camera=read_camera(folder / "camera.yaml"),
+        camera=read_camera(inside.file("camera.yaml", folder, MapFormatError)),
         frames=table["frame"],
         t_s=table["t_s"],
         poses=np.stack([table[name] for name in _POSE], axis=1),
@@ -221,7 +224,7 @@ def read_map(folder: Path) -> DriveMap:
         segment=table["segment"],
         s_cm=table["s_cm"],
         match=table["match"],
-        lines=_read_lines(folder / "lanes.json", {int(segment) for segment in table["segment"]}),
+        lines=_read_lines(lines, {int(segment) for segment in table["segment"]}),
         tilt_rad=np.stack([table[name] for name in _TILT], axis=1),
         held_out=table["held_out"] > 0,
         contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,

@@ -175,9 +175,9 @@ def test_mask_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"m\.png: not a readable image"):
         read_mask(path)
     path.write_bytes(b"")
-    with pytest.raises(ConfigError, match=r"m\.png: not a readable image"):
+    with pytest.raises(ConfigError, match=r"m\.png: the image file is empty"):
         read_mask(path)
-    with pytest.raises(ConfigError, match=r"none\.png: cannot be read"):
+    with pytest.raises(ConfigError, match=r"none\.png: no such file"):
         read_mask(tmp_path / "none.png")
     with pytest.raises(ConfigError, match=r"expected 'auto' or a \.png"):
         read_mask(tmp_path / "m.jpg")
