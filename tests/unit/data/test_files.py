@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lanenet import outputs
 from lanenet.data.files import atomic_file, atomic_folder, require, write_json, write_text
 from lanenet.errors import LanenetError, MissingExtraError
 
@@ -148,3 +151,56 @@ def test_require_returns_the_module() -> None:
 def test_a_missing_package_names_its_extra() -> None:
     with pytest.raises(MissingExtraError, match=r"no_such_package .*pip install 'lanenet\[data\]'"):
         require("no_such_package.part", "data")
+
+
+@pytest.mark.parametrize("lost", ["drive.yaml", "frames.csv", "all", "its text"])
+def test_a_folder_that_lost_a_file_replaces_nothing(tmp_path: Path, lost: str) -> None:
+    path = tmp_path / "out"
+    make_folder(path, "one")
+    named = "drive.yaml" if lost == "drive.yaml" else "frames.csv"
+    refused = pytest.raises(LanenetError, match=rf"out: not written: .*{named}")
+    with refused, atomic_folder(path, "drive") as temporary:
+        fill(temporary, "two")
+        for name in ("drive.yaml", "frames.csv") if lost == "all" else (lost,):
+            (temporary / name).unlink(missing_ok=True)
+        if lost == "its text":
+            (temporary / "frames.csv").write_text("")
+    assert (path / "deep" / "a.txt").read_text() == "one"
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_folder_that_cannot_be_read_replaces_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    make_folder(path, "one")
+
+    def check(folder: Path) -> None:
+        raise LanenetError(f"{folder / 'frames.csv'}: line 7")
+
+    refused = pytest.raises(LanenetError, match=r"out: not written: .*frames\.csv: line 7")
+    with refused, atomic_folder(path, "drive", check) as temporary:
+        fill(temporary, "two")
+    assert (path / "deep" / "a.txt").read_text() == "one"
+
+
+def test_a_folder_is_on_the_disk_before_it_gets_its_name_and_its_name_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_folder(tmp_path / "out", "one")
+    done: list[str] = []
+    exchange, sync = outputs.exchange, os.fsync
+
+    def synced(handle: int) -> None:
+        sync(handle)
+        done.append(re.sub(r"\.out\.[^/]*", "new", os.readlink(f"/proc/self/fd/{handle}")))
+
+    def exchanged(one: Path, other: Path) -> bool:
+        done.append("exchange")
+        return exchange(one, other)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(outputs, "exchange", exchanged)
+    make_folder(tmp_path / "out", "two")
+    new = tmp_path / "new"
+    files = [new / "deep", new / "deep" / "a.txt", new / "drive.yaml", new / "frames.csv", new]
+    assert sorted(done[:-2]) == sorted(map(str, files)) and done[-3] == str(new)
+    assert done[-2:] == ["exchange", str(tmp_path)]
