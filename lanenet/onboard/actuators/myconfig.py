@@ -7,7 +7,10 @@ Source: donkeycar 5.3, ``templates/complete.py`` (``add_drivetrain``), ``parts/p
 from __future__ import annotations
 
 import ast
+import math
+import operator
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,8 @@ from lanenet.onboard.actuators.pca9685 import OSCILLATOR_HZ, PCA9685Settings, pr
 _FREQUENCY_HZ = 60.0
 #: For example ``PCA9685.1:40.7``: bus, hexadecimal address, channel.
 _PIN = re.compile(r"PCA9685\.(\d+):([0-9a-fA-F]+)\.(\d+)")
+#: Donkeycar's dictionary of a servo and a motor on one PCA9685.
+_SECTION = "PWM_STEERING_THROTTLE"
 _PULSES = {
     "STEERING_LEFT_PWM": "steering_left_us",
     "STEERING_RIGHT_PWM": "steering_right_us",
@@ -32,18 +37,32 @@ _OLD_PLACES = {
     "PCA9685_I2C_ADDR": "address",
     "PCA9685_I2C_BUSNUM": "bus",
 }
+#: All names of these files that this module uses.
+_USED = {
+    *_PULSES, *_OLD_PLACES, _SECTION, "DRIVE_TRAIN_TYPE", "PWM_STEERING_SCALE", "PWM_THROTTLE_SCALE",
+}  # fmt: skip
+#: Ways to change a variable without binding its name; a dictionary changes under any other name.
+_UNFOLLOWED = {
+    _SECTION, "*", "globals", "locals", "vars", "setattr", "delattr", "exec", "eval", "__dict__", "__setattr__",
+}  # fmt: skip
+_OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+}  # fmt: skip
 
 
 def read_assignments(path: Path) -> dict[str, Any]:
     """Read the plain ``NAME = value`` lines of a Python file without running it.
 
-    Values that are not literals (calls, arithmetic, names) are left out. Later lines replace earlier ones.
+    Values are literals, earlier names, and sums, differences, products and quotients of these. Others are
+    left out. Later lines replace earlier ones.
 
     Args:
         path: The file.
 
     Raises:
-        ConfigError: If the file is missing or is not Python.
+        ConfigError: If the file is missing or is not Python; naming the line, if it sets or may change
+            something of :func:`settings_from_myconfig` in another way.
     """
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -51,23 +70,100 @@ def read_assignments(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: no such file, expected a Donkeycar's myconfig.py") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as text ({error})") from None
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise ConfigError(f"{path}: not Python: {error}") from None
+    plain = [(statement.lineno, *_plain_assignment(statement)) for statement in tree.body]
+    targets = {target for _, names, _ in plain for target in names}
+    # Names that are bound in other ways are never known: a function may change them at any time.
+    bound: set[str] = set()
+    for part in ast.walk(tree):
+        names = [] if part in targets else _bound(part)
+        bound.update(names)
+        names = [name for name in names if name in _USED]
+        names += [] if part in targets else [name for name in _mentioned(part) if name in _UNFOLLOWED]
+        if names:
+            raise _not_understood(path, getattr(part, "lineno", 0), names[0])
     values: dict[str, Any] = {}
-    for node in tree.body:
-        if isinstance(node, ast.Assign):
-            targets, value = node.targets, node.value
-        elif isinstance(node, ast.AnnAssign) and node.value is not None:
-            targets, value = [node.target], node.value
-        else:
-            continue
-        for target in targets:
-            if isinstance(target, ast.Name):
-                try:
-                    values[target.id] = ast.literal_eval(value)
-                except ValueError:
-                    values.pop(target.id, None)
+    for line, assigned, expression in plain:
+        try:
+            known = {name: value for name, value in values.items() if name not in bound}
+            values |= dict.fromkeys([target.id for target in assigned], _value_of(expression, known))
+        except (ValueError, ArithmeticError, TypeError):
+            for target in assigned:
+                if target.id in _USED:
+                    raise _not_understood(path, line, target.id) from None
+                values.pop(target.id, None)
     return values
+
+
+def _plain_assignment(statement: ast.stmt) -> tuple[list[ast.Name], ast.expr]:
+    """Return names and value of ``NAME = value`` or ``NAME: type = value``; no names for other statements."""
+    if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and statement.value:
+        return [statement.target], statement.value
+    if isinstance(statement, ast.Assign):
+        names = [target for target in statement.targets if isinstance(target, ast.Name)]
+        if len(names) == len(statement.targets):
+            return names, statement.value
+    return [], ast.Constant(None)
+
+
+def _bound(part: ast.AST) -> list[str]:
+    """Return the names that one node sets or deletes."""
+    match part:
+        case ast.Name(id=name, ctx=ast.Store() | ast.Del()) | ast.Attribute(
+            attr=name, ctx=ast.Store() | ast.Del()
+        ):
+            return [name]
+        case ast.alias():
+            return [part.asname or part.name.partition(".")[0]]
+        case ast.MatchMapping(rest=str(name)):
+            return [name]
+        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+            return [part.name]
+        case ast.ExceptHandler(name=str(name)) | ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+            return [name]
+    return []
+
+
+def _mentioned(part: ast.AST) -> list[str]:
+    match part:
+        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.alias(name=name):
+            return [name]
+    return []
+
+
+def _value_of(node: ast.expr, known: Mapping[str, Any]) -> Any:
+    """Evaluate literals, known names and arithmetic of numbers.
+
+    Raises:
+        ValueError: If there is anything else.
+        ArithmeticError: If a division is by zero.
+    """
+    match node:
+        case ast.Name(id=name):
+            # What can be changed in place may be changed under another name.
+            if isinstance(known.get(name), int | float | str):
+                return known[name]
+            raise ValueError(name)
+        case ast.BinOp(left, op, right) if type(op) in _OPERATORS:
+            numbers = _value_of(left, known), _value_of(right, known)
+            if not all(isinstance(number, int | float) for number in numbers):
+                raise ValueError(ast.unparse(node))
+            return _OPERATORS[type(op)](*numbers)
+        case ast.Dict(keys, values) if None not in keys:
+            return {
+                ast.literal_eval(key): _value_of(value, known)
+                for key, value in zip(keys, values, strict=True)
+                if key is not None
+            }
+    return ast.literal_eval(node)
+
+
+def _not_understood(path: Path, line: int, name: str) -> ConfigError:
+    return ConfigError(
+        f"{path}, line {line}: {name!r}: this may change the car's pulses in a way that is not followed, "
+        "since the file is not run; expected plain lines NAME = value"
+    )
 
 
 def settings_from_myconfig(path: Path) -> dict[str, Any]:
@@ -82,15 +178,16 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
         Only what the files say.
 
     Raises:
-        ConfigError: If a file is not Python, the car has no PCA9685, or a value is not of Donkeycar's type.
+        ConfigError: If a file is not Python or not only plain lines set the pulses, the car has no PCA9685, or
+            a value is not of Donkeycar's type.
     """
     values: dict[str, Any] = {}
     base = path.with_name("config.py")
     if base.is_file() and base != path:
         values |= read_assignments(base)
     values |= read_assignments(path)
-    train = values.get("DRIVE_TRAIN_TYPE", "PWM_STEERING_THROTTLE")
-    if train == "PWM_STEERING_THROTTLE":
+    train = values.get("DRIVE_TRAIN_TYPE", _SECTION)
+    if train == _SECTION:
         section = values.get(train, {})
         if not isinstance(section, dict):
             raise ConfigError(f"{path}: {train}: expected a dictionary, found {section!r}")
@@ -133,7 +230,7 @@ def _pulses(values: dict[str, Any], path: Path) -> dict[str, float]:
         scale = values.get("PWM_STEERING_SCALE" if name.startswith("STEERING") else "PWM_THROTTLE_SCALE", 1.0)
         count = values[name]
         for what, value in ((name, count), (f"scale of {name}", scale)):
-            if isinstance(value, bool) or not isinstance(value, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise ConfigError(f"{path}: {what}: expected a number, found {value!r}")
         pulses[key] = round(int(count * scale) * count_us, 3)
     return pulses

@@ -94,7 +94,7 @@ def test_settings_in_the_yaml_win(write):
 def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
     mark = tmp_path / "mark"
     path = write(f"A = 1\nB = open({str(mark)!r}, 'w')\nA = A + 1\nC = D = -2.5\nif True:\n    E = 3\n")
-    assert read_assignments(path) == {"C": -2.5, "D": -2.5}
+    assert read_assignments(path) == {"A": 2, "C": -2.5, "D": -2.5}
     assert not mark.exists()
 
 
@@ -118,12 +118,77 @@ def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
             'DRIVE_TRAIN_TYPE = "I2C_SERVO"\nSTEERING_CHANNEL = "1"',
             "STEERING_CHANNEL: expected a whole number",
         ),
+        ("STEERING_LEFT_PWM = 1e999", "STEERING_LEFT_PWM: expected a number, found inf"),
         ("THIS IS NOT PYTHON", "not Python"),
     ],
 )
 def test_what_cannot_be_taken_over_is_named(write, text, message):
     with pytest.raises(ConfigError, match=message):
         settings_from_myconfig(write(text))
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("THROTTLE_STOPPED_PWM += 20", "THROTTLE_STOPPED_PWM"),
+        ("THROTTLE_STOPPED_PWM, A = 390, 1", "THROTTLE_STOPPED_PWM"),
+        ("print(THROTTLE_STOPPED_PWM := 390)", "THROTTLE_STOPPED_PWM"),
+        ("A = (THROTTLE_STOPPED_PWM := 390)", "THROTTLE_STOPPED_PWM"),
+        ("if A: THROTTLE_STOPPED_PWM = 390", "THROTTLE_STOPPED_PWM"),
+        ("for THROTTLE_STOPPED_PWM in (390,): pass", "THROTTLE_STOPPED_PWM"),
+        ("try: A()\nexcept E as THROTTLE_STOPPED_PWM: pass", "THROTTLE_STOPPED_PWM"),
+        ("with open(A) as THROTTLE_STOPPED_PWM: pass", "THROTTLE_STOPPED_PWM"),
+        ("def f():\n    global THROTTLE_STOPPED_PWM\n    THROTTLE_STOPPED_PWM = 390\nf()", "STOPPED_PWM"),
+        ("def THROTTLE_STOPPED_PWM(): pass", "THROTTLE_STOPPED_PWM"),
+        ("match 390:\n    case THROTTLE_STOPPED_PWM: pass", "THROTTLE_STOPPED_PWM"),
+        ("del THROTTLE_STOPPED_PWM", "THROTTLE_STOPPED_PWM"),
+        ("from pulses import *", r"\*"),
+        ("from pulses import STOP as THROTTLE_STOPPED_PWM", "THROTTLE_STOPPED_PWM"),
+        ("globals()['THROTTLE_STOPPED_PWM'] = 390", "globals"),
+        ("import sys\nsys.modules[__name__].THROTTLE_STOPPED_PWM = 390", "THROTTLE_STOPPED_PWM"),
+        ("setattr(A, B, 390)", "setattr"),
+        ("exec('THROTTLE_STOPPED_PWM = 390')", "exec"),
+        ("THROTTLE_STOPPED_PWM = int(390.5)", "THROTTLE_STOPPED_PWM"),
+        ("A = 390\nA += 1\nTHROTTLE_STOPPED_PWM = A", "THROTTLE_STOPPED_PWM"),
+        ("DRIVE_TRAIN_TYPE = A", "DRIVE_TRAIN_TYPE"),
+        ("PWM_STEERING_THROTTLE['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
+        ("PWM_STEERING_THROTTLE.update(THROTTLE_STOPPED_PWM=390)", "PWM_STEERING_THROTTLE"),
+        ("A = PWM_STEERING_THROTTLE\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
+        ("A = {}\nPWM_STEERING_THROTTLE = A\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
+        ("PWM_STEERING_THROTTLE = {**A}", "PWM_STEERING_THROTTLE"),
+        ("PWM_STEERING_THROTTLE |= {'THROTTLE_STOPPED_PWM': 390}", "PWM_STEERING_THROTTLE"),
+    ],
+)
+@pytest.mark.parametrize("name_of_file", ["myconfig.py", "config.py"])
+def test_a_pulse_that_changes_in_another_way_is_refused_by_its_line(write, line, name, name_of_file):
+    files = {"myconfig.py": NEW, "config.py": NEW}
+    files[name_of_file] += line
+    first = NEW.count("\n") + 1
+    for file, text in files.items():
+        path = write(text, file)
+    with pytest.raises(ConfigError, match=rf"{name_of_file}, line ({first}|{first + 1}|{first + 2}): .*{name}"):
+        settings_from_myconfig(path.with_name("myconfig.py"))
+
+
+def test_arithmetic_of_earlier_names_as_in_many_cars(write):
+    text = """
+import os
+CAR_PATH = PACKAGE_PATH = os.path.dirname(os.path.realpath(__file__))
+DATA_PATH, RATE = os.path.join(CAR_PATH, "data"), 20
+AUGMENTATIONS = []          # or ["MULTIPLY"]
+AUGMENTATIONS.append("BLUR")
+if RATE > 10:
+    MODEL = "linear"
+STEERING_CENTER_PWM = 370
+STEERING_WIDTH_PWM = 80
+STEERING_LEFT_PWM = STEERING_CENTER_PWM + STEERING_WIDTH_PWM
+STEERING_RIGHT_PWM = STEERING_CENTER_PWM - 2 * STEERING_WIDTH_PWM // 2
+PWM_STEERING_THROTTLE = {"THROTTLE_STOPPED_PWM": STEERING_CENTER_PWM - 10}
+print(STEERING_LEFT_PWM)
+"""
+    found, prescale = settings_from_myconfig(write(text)), prescale_of(60.0)
+    pulses = ("steering_left_us", "steering_right_us", "throttle_stopped_us")
+    assert [counts_of(found[key], prescale) for key in pulses] == [450, 290, 360]
 
 
 def test_values_out_of_range_name_the_file(write):
