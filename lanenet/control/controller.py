@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
+from lanenet.control.plausibility import JumpCheck, fault_of
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.geometry.lane import parabola_through
@@ -112,11 +113,13 @@ class Target:
         steering_rad: Steering, positive left; NaN when the lane is unknown.
         speed_cm_s: Speed for the bend ahead.
         estimate: The lane that it follows from, smoothed.
+        fault: Why the frame's lane cannot be the car's; empty if it can.
     """
 
     steering_rad: float
     speed_cm_s: float
     estimate: LaneEstimate = field(repr=False)
+    fault: str = ""
 
 
 class LaneController:
@@ -128,6 +131,7 @@ class LaneController:
         self._smoother = LaneSmoother(settings.smoothing, settings.steering.wheelbase_cm)
         self._steering = settings.steering
         self._memory = LaneMemory(settings.steering.lane_width_cm)
+        self._jumps = JumpCheck()
         self._t_s = math.nan
 
     @property
@@ -138,6 +142,7 @@ class LaneController:
     def reset(self) -> None:
         """Forget earlier frames; the lane's width stays, since the road is the same."""
         self._smoother.reset()
+        self._jumps.reset()
         self._t_s = math.nan
 
     def target(
@@ -152,8 +157,14 @@ class LaneController:
             steering_rad: Steering since then, positive left.
 
         Returns:
-            Steering and speed; NaN steering when the lane is unknown at the look-ahead distance.
+            Steering and speed; NaN steering when the lane is unknown at the look-ahead distance. An answer
+            that cannot be the car's lane counts as none.
         """
+        width_cm = self._memory.width_cm
+        fastest_cm_s = max(speed_cm_s, self._settings.speed.cruise_cm_s)
+        fault = fault_of(estimate, width_cm) or self._jumps.fault_of(estimate, t_s, fastest_cm_s, width_cm)
+        if fault:
+            estimate = LaneEstimate()
         dt_s = t_s - self._t_s if math.isfinite(self._t_s) else 0.0
         self._t_s = t_s
         smooth = self._smoother.update(estimate, dt_s, speed_cm_s * dt_s, steering_rad)
@@ -166,7 +177,7 @@ class LaneController:
             # A car that returns to a straight lane drives a bend of its own.
             own = abs(math.tan(steering)) / self._steering.wheelbase_cm
             curvature = own if not math.isfinite(curvature) else max(curvature, own)
-        return Target(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth)
+        return Target(steering, curve_speed_cm_s(curvature, self._settings.speed), smooth, fault)
 
     def _target_rad(self, estimate: LaneEstimate, smooth: LaneEstimate) -> float:
         if self._settings.own_target:

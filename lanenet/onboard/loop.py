@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from lanenet.control.controller import LaneController, SpeedSettings, throttle_of
+from lanenet.control.controller import LaneController, SpeedSettings, Target, throttle_of
 from lanenet.data.drives.recorder import DriveRecorder
 from lanenet.errors import HardwareError
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
@@ -193,7 +193,7 @@ class DriveLoop:
             )
             steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
             now_s = self._clock()
-            fault = self._fault_of_answer(frame, steering_rad, now_s)
+            fault = self._fault_of_answer(frame, target, now_s)
         verdict = self._judge.judge(now_s, fault, estimate.confidence)
         if now_s >= self._until_s:
             # The guard has been in neutral since then.
@@ -216,9 +216,9 @@ class DriveLoop:
             self._send(self._limiter.steering_rad, 0.0, now_s + self._safety.watchdog_s)
         return self._finish(frame, verdict, estimate.confidence)
 
-    def _fault_of_answer(self, frame: Frame, steering_rad: float, now_s: float) -> str:
-        if not math.isfinite(steering_rad):
-            return f"no lane in frame {frame.number}"
+    def _fault_of_answer(self, frame: Frame, target: Target, now_s: float) -> str:
+        if not math.isfinite(target.steering_rad):
+            return f"no lane in frame {frame.number}{f': {target.fault}' if target.fault else ''}"
         age_s = now_s - frame.t_s
         if age_s > self._safety.max_age_s:
             return f"the answer to frame {frame.number} came when it was {1e3 * age_s:.0f} ms old"

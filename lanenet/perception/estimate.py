@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -155,7 +156,7 @@ class DetectorKind:
 
 #: Presence below which a line is missing, and above which it is certain. Chosen: more likely than not, and
 #: nine in ten.
-_SEEN, _SURE = 0.5, 0.9
+SEEN, _SURE = 0.5, 0.9
 #: Frames whose widths are remembered, and how many are needed. Chosen: 5 s and half a second at 20 frames/s.
 _LENGTH, _ENOUGH = 100, 10
 #: Sigma of a remembered width as a share of it. Chosen: 0.8 cm of a lane of 40 cm, laid by hand.
@@ -197,7 +198,7 @@ class LaneMemory:
         if left <= _SURE or right <= _SURE:
             return
         width_cm = lane_width_cm(points_cm)
-        if width_cm > 0.0:
+        if 0.0 < width_cm < math.inf:
             self._widths_cm.append(width_cm)
 
     def reset(self) -> None:
@@ -227,7 +228,7 @@ class LaneMemory:
         """
         width_cm = self.width_cm
         self.learn(points_cm, presence)
-        if width_cm is None or (presence < _SEEN).sum() != 1:
+        if width_cm is None or (presence < SEEN).sum() != 1:
             return points_cm, sigma_cm
         missing = int(np.argmin(presence))
         # The right line, 1, lies to the right of the left one, 0.

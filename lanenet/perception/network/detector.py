@@ -156,32 +156,33 @@ def confidence(
 
     - the probability that at least one line is seen, ``1 - (1 - p_left) (1 - p_right)``;
     - ``1 / (1 + (s / (0.1 W))^2)`` with s the standard deviation of the lane's centre at y = 15 cm, half the
-      root of the sum of the squares of both lines', and W the middle of the known widths; 1 where no s is
-      known;
+      root of the sum of the squares of both lines', and W the middle of the known widths;
     - ``exp(-0.5 (d / (0.15 W'))^2)`` with d how far the width of the answer, across the lane, lies outside
       the known widths, and W' the nearest of these; 1 within them.
 
     Args:
         points_cm: The six points, frame car.
-        sigma_cm: Their standard deviations; NaN where unknown.
+        sigma_cm: Their standard deviations.
         presence: Probability that each line can be seen.
         width_range_cm: The narrowest and the widest lane that the network was trained on.
 
     Returns:
-        0 to 1; 0 if the right line does not lie to the right of the left one.
+        0 to 1; 0 if the right line does not lie to the right of the left one, or if anything is not a finite
+        number, a sigma is negative, or a presence is no probability.
 
     Source:
         Own choice; values in ``tests/unit/perception/test_confidence.py``.
     """
-    width_cm = lane_width_cm(points_cm)
-    if not width_cm > 0.0:
+    width_cm, sigmas, (left, right) = lane_width_cm(points_cm), sigma_cm.tolist(), presence.tolist()
+    # Written so that NaN fails as well.
+    if not (0.0 < width_cm < math.inf and 0.0 <= min(sigmas) and sum(sigmas) < math.inf):
+        return 0.0
+    if not (0.0 <= left <= 1.0 and 0.0 <= right <= 1.0):
         return 0.0
     low, high = width_range_cm
-    seen = 1.0 - (1.0 - float(presence[0])) * (1.0 - float(presence[1]))
-    centre_cm = 0.5 * math.hypot(float(sigma_cm[1]), float(sigma_cm[4]))
-    sure = 1.0
-    if math.isfinite(centre_cm):
-        sure = 1.0 / (1.0 + (centre_cm / (_CENTRE_TOLERANCE * 0.5 * (low + high))) ** 2)
+    seen = 1.0 - (1.0 - left) * (1.0 - right)
+    centre_cm = 0.5 * math.hypot(sigmas[1], sigmas[4])
+    sure = 1.0 / (1.0 + (centre_cm / (_CENTRE_TOLERANCE * 0.5 * (low + high))) ** 2)
     nearest_cm = min(max(width_cm, low), high)
     off = (width_cm - nearest_cm) / (_WIDTH_TOLERANCE * nearest_cm)
     return seen * sure * math.exp(-0.5 * off * off)

@@ -96,6 +96,7 @@ def test_angle_has_donkeycars_sign(pilot):
     pilot._detector.estimate = lane(-10.0)
     angle, throttle = pilot.run(IMAGE)
     assert angle < -0.2 and 0.1 < throttle <= 0.25, "the lane lies to the left, so the angle is negative"
+    pilot.shutdown()
     pilot._detector.estimate = lane(10.0)
     assert pilot.run(IMAGE)[0] == pytest.approx(-angle)
     pilot._detector.estimate = lane(35.0)

@@ -158,6 +158,17 @@ FAULTS: dict[str, tuple[str, Callable[[int], LaneEstimate] | None, str]] = {
         "no lane in frame",
     ),
     "nothing seen": ("answer", lambda k: LANE if k < 30 else NOTHING, "no lane in frame"),
+    "aside": ("answer", lambda k: LANE if k < 30 else replace(LANE, points_cm=LANE.points_cm + 500.0), "520 cm"),
+    "jump": (
+        "answer",
+        lambda k: replace(LANE, points_cm=LANE.points_cm + (40.0 if k % 2 and k >= 30 else 0.0 if k < 30 else -40.0)),
+        "the lane is in another place in every frame",
+    ),
+    "sigma": (
+        "answer",
+        lambda k: LANE if k < 30 else replace(LANE, sigma_cm=np.array([1.0, np.inf, 1.0, 1.0, 1.0, 1.0])),
+        "sigma",
+    ),
     "doubt": (
         "answer",
         lambda k: LANE if k < 30 else LaneEstimate(LANE.points_cm, confidence=0.1),

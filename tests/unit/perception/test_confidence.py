@@ -20,13 +20,28 @@ def test_values():
     # Half the root of 4^2 + (4 sqrt 3)^2 is 4 cm, a tenth of the width.
     sigma = np.array([0.0, 4.0, 0.0, 0.0, 4.0 * math.sqrt(3.0), 0.0])
     assert confidence(LANE, sigma, BOTH, WIDTHS) == pytest.approx(0.5)
-    assert confidence(LANE, np.full(6, np.nan), BOTH, WIDTHS) == 1.0
     # One tolerance (15 % of 40 cm) too wide.
     assert confidence(LANE * 1.15, SURE, BOTH, WIDTHS) == pytest.approx(math.exp(-0.5))
     assert confidence(LANE * 0.85, SURE, BOTH, WIDTHS) == pytest.approx(math.exp(-0.5))
     assert confidence(LANE * 1.15, SURE, BOTH, (30.0, 46.1)) == 1.0
     assert confidence(-LANE, SURE, BOTH, WIDTHS) == 0.0
     assert confidence(np.full(6, np.nan), SURE, BOTH, WIDTHS) == 0.0
+
+
+@pytest.mark.parametrize("sigma", [math.nan, math.inf, -1.0])
+def test_a_sigma_that_is_none_gives_no_confidence(sigma):
+    for at in range(6):
+        assert confidence(LANE, np.where(np.arange(6) == at, sigma, 1.0), BOTH, WIDTHS) == 0.0
+
+
+@pytest.mark.parametrize("presence", [math.nan, math.inf, -0.1, 4.85])
+def test_a_presence_that_is_no_probability_gives_no_confidence(presence):
+    for both in ([presence, 0.5], [0.5, presence]):
+        assert confidence(LANE, SURE, np.array(both), WIDTHS) == 0.0
+
+
+def test_lines_at_infinity_give_no_confidence():
+    assert confidence(np.where(np.arange(6) == 4, math.inf, LANE), SURE, BOTH, WIDTHS) == 0.0
 
 
 @given(turn=st.floats(-0.6, 0.6), shift=st.floats(-10, 10))

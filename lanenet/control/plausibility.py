@@ -1,0 +1,138 @@
+"""Answers that cannot be the car's lane: impossible in themselves, or after the answers before."""
+
+from __future__ import annotations
+
+import math
+
+from lanenet.geometry.lane import ROWS_CM, lane_width_cm
+from lanenet.perception.estimate import SEEN, LaneEstimate
+
+#: No point of a lane lies further to the side. Chosen: as far as edge points are looked for ahead
+#: (``RangeSettings.far_cm``), twice what the networks' windows show to the side.
+_REACH_CM = 120.0
+#: The lane's centre 15 cm ahead of a car that drives in it, at most, in lane widths to the side. Chosen: the
+#: car has left the lane at 0.5, and a car across its lane sees the centre half a lane further.
+_BESIDE_LANES = 1.25
+#: Narrowest and widest answer, as shares of the lane's width. Chosen: beyond what good frames give; on a
+#: synthetic drive the networks that ship answered 0.96 to 1.03, the lane filter 0.89 to 1.01.
+_NARROWEST, _WIDEST = 0.6, 1.6
+#: A line moves by this share of the lane's width from one frame to the next without the car's motion: noise.
+#: Chosen: half of what a change to the adjacent lane would be, less the car's motion.
+_NOISE_LANES = 0.35
+#: Width where none is known. Chosen: that of common tracks for 1:10 cars.
+_COMMON_WIDTH_CM = 40.0
+#: A line's place moves sideways by at most this share of the car's way: full lock of 0.45 rad turns a car of
+#: 17 cm wheelbase by 0.43 rad in 15 cm, which moves what is 15 cm ahead by half of that way, and a lane that
+#: is crossed at 45 degrees moves by all of it. Chosen: the sum.
+_SIDEWAYS = 1.5
+#: However long ago it was seen, a lane does not move by more than this share of its width. Chosen: less than to
+#: the adjacent lane.
+_MOST_LANES = 0.9
+#: Answers that contradict the lane before, but agree with each other for this long, are the lane. Chosen: a
+#: dozen frames of a common camera; by then an armed car is in neutral.
+SETTLE_S = 0.4
+#: Rounding error of frame times.
+_ROUNDING_S = 1e-6
+
+
+def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
+    """Return what makes an answer impossible in itself; empty if nothing does.
+
+    Args:
+        estimate: The lane of one frame.
+        width_cm: The lane's width; None while it is unknown.
+
+    Returns:
+        A value that is not finite or out of range (NaN is a known absence, of all sigmas or none), a point
+        out of reach, lines that cross, a lane too narrow or too wide, or beside the car.
+    """
+    points, sigmas = estimate.points_cm.tolist(), estimate.sigma_cm.tolist()
+    if not 0.0 <= estimate.confidence <= 1.0:
+        return f"confidence {estimate.confidence:g}"
+    if any(not (0.0 <= p <= 1.0 or math.isnan(p)) for p in estimate.presence.tolist()):
+        return f"presence {estimate.presence}"
+    if math.isinf(estimate.steering_rad):
+        return f"steering {estimate.steering_rad:g} rad"
+    if any(abs(x) > _REACH_CM for x in points):
+        return f"a line {max(abs(x) for x in points if x == x):.0f} cm to the side"
+    known = [sigma for x, sigma in zip(points, sigmas, strict=True) if x == x]
+    if not all(0.0 <= s < math.inf for s in known) and not all(math.isnan(s) for s in known):
+        return f"sigma {known}"
+    if any(right <= left for left, right in zip(points[:3], points[3:], strict=True)):
+        return "lines that cross"
+    if width_cm is None:
+        return ""
+    seen_cm = lane_width_cm(estimate.points_cm)
+    if not math.isnan(seen_cm) and not _NARROWEST * width_cm <= seen_cm <= _WIDEST * width_cm:
+        return f"a lane {seen_cm:.0f} cm wide, expected {width_cm:.0f} cm"
+    centre_cm = 0.5 * (points[1] + points[4])
+    if abs(centre_cm) > _BESIDE_LANES * width_cm:
+        return f"a lane {abs(centre_cm):.0f} cm beside the car"
+    return ""
+
+
+class JumpCheck:
+    """Finds answers that lie where the lane of the answers before cannot be."""
+
+    def __init__(self) -> None:
+        """Know no lane."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the answers before."""
+        # Both lines 15 cm ahead, and when: of the lane, and of the last answer that contradicted it.
+        self._lane: tuple[float, float] | None = None
+        self._lane_s = math.nan
+        self._other: tuple[float, float] | None = None
+        self._other_s = self._other_since_s = math.nan
+
+    def fault_of(self, estimate: LaneEstimate, t_s: float, speed_cm_s: float, width_cm: float | None) -> str:
+        """Return by how much a frame's lane has jumped; empty if it has not.
+
+        A lane that stays where it has jumped to is accepted after ``SETTLE_S``, as is the first answer after
+        as long without one.
+
+        Args:
+            estimate: The lane of one frame; of lines that are probably not seen the place does not count.
+            t_s: Time of the frame.
+            speed_cm_s: The car's largest speed.
+            width_cm: The lane's width; None while it is unknown.
+        """
+        at = ROWS_CM.index(15.0)
+        left, right = (
+            math.nan if presence < SEEN else x
+            for x, presence in zip(
+                estimate.points_cm.tolist()[at :: len(ROWS_CM)], estimate.presence.tolist(), strict=True
+            )
+        )
+        if math.isnan(left) and math.isnan(right):
+            return ""
+        lane, width_cm = (left, right), width_cm or _COMMON_WIDTH_CM
+
+        def allowed_cm(since_s: float) -> float:
+            moved_cm = _NOISE_LANES * width_cm + _SIDEWAYS * speed_cm_s * (t_s - since_s)
+            return min(moved_cm, _MOST_LANES * width_cm)
+
+        before = self._moved_cm(self._lane, lane, t_s - self._lane_s)
+        since_other = self._moved_cm(self._other, lane, t_s - self._other_s)
+        if (math.isnan(before) and math.isnan(since_other)) or before <= allowed_cm(self._lane_s):
+            self._lane, self._lane_s, self._other = lane, t_s, None
+            return ""
+        if not since_other <= allowed_cm(self._other_s):
+            self._other_since_s = t_s
+        self._other, self._other_s = lane, t_s
+        if t_s - self._other_since_s >= SETTLE_S - _ROUNDING_S:
+            self._lane, self._lane_s, self._other = lane, t_s, None
+            return ""
+        if math.isnan(before):
+            return "the lane is in another place in every frame"
+        return f"the lane has jumped by {before:.0f} cm"
+
+    @staticmethod
+    def _moved_cm(
+        before: tuple[float, float] | None, now: tuple[float, float], passed_s: float
+    ) -> float:
+        """Return how far the line that moved more has moved, 0 if no line is known twice; NaN if too long ago."""
+        if before is None or passed_s > SETTLE_S + _ROUNDING_S:
+            return math.nan
+        return max((abs(x - old) for x, old in zip(now, before, strict=True) if not math.isnan(x - old)), default=0.0)
