@@ -25,8 +25,8 @@ _COMMON_WIDTH_CM = 40.0
 #: 17 cm wheelbase by 0.43 rad in 15 cm, which moves what is 15 cm ahead by half of that way, and a lane that
 #: is crossed at 45 degrees moves by all of it. Chosen: the sum.
 _SIDEWAYS = 1.5
-#: However long ago it was seen, a lane does not move by more than this share of its width. Chosen: less than to
-#: the adjacent lane.
+#: However long ago it was seen, a lane does not move by more than this share of its width. Chosen: less than
+#: to the adjacent lane.
 _MOST_LANES = 0.9
 #: Answers that contradict the lane before, but agree with each other for this long, are the lane. Chosen: a
 #: dozen frames of a common camera; by then an armed car is in neutral.
@@ -129,10 +129,10 @@ class JumpCheck:
         return f"the lane has jumped by {before:.0f} cm"
 
     @staticmethod
-    def _moved_cm(
-        before: tuple[float, float] | None, now: tuple[float, float], passed_s: float
-    ) -> float:
-        """Return how far the line that moved more has moved, 0 if no line is known twice; NaN if too long ago."""
+    def _moved_cm(before: tuple[float, float] | None, now: tuple[float, float], passed_s: float) -> float:
+        """Return the larger motion of the two lines, 0 if none is known twice; NaN if it was too long ago."""
         if before is None or passed_s > SETTLE_S + _ROUNDING_S:
             return math.nan
-        return max((abs(x - old) for x, old in zip(now, before, strict=True) if not math.isnan(x - old)), default=0.0)
+        return max(
+            (abs(x - old) for x, old in zip(now, before, strict=True) if not math.isnan(x - old)), default=0.0
+        )

@@ -26,6 +26,7 @@ from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings
+from lanenet.perception.camera_check import CameraCheck
 from lanenet.perception.estimate import Detector, DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector
 
@@ -145,6 +146,7 @@ def build_loop(
         LaneController(settings.control),
         NoActuator() if dry_run else build_sink(settings),
         _recorder(settings, camera),
+        build_camera_check(settings, camera) if settings.safety.camera_check else None,
     )
     mode = DriveMode(arm or dry_run, steering_only, record_commands=not dry_run)
     return DriveLoop(parts, safety, settings.limits, settings.control.speed, mode, watch)
@@ -164,6 +166,14 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
         config=chosen.config,
     )
     return build_detector(chosen.kind, inputs)
+
+
+def build_camera_check(settings: DriveSettings, camera: Camera | None) -> CameraCheck | None:
+    """Return the comparison of images and camera file; None without a camera file."""
+    if camera is None:
+        return None
+    mask = settings.detector.mask
+    return CameraCheck(camera, None if mask is None else read_mask(mask))
 
 
 def build_sink(settings: DriveSettings) -> CommandSink:

@@ -36,6 +36,7 @@ from lanenet.onboard.safety import (
     State,
     Verdict,
 )
+from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import Detector, LaneEstimate
 
 log = logging.getLogger(__name__)
@@ -60,6 +61,7 @@ class CarParts:
         controller: Turns the lane into steering and speed.
         sink: Takes the commands.
         recorder: Keeps the frames; None for no recording.
+        camera_check: Compares the images with the calibration; None for no check.
     """
 
     source: FrameSource
@@ -67,6 +69,7 @@ class CarParts:
     controller: LaneController
     sink: CommandSink
     recorder: DriveRecorder | None = None
+    camera_check: CameraCheck | None = None
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,7 @@ class DriveLoop:
         self._verdict = Verdict(State.DISARMED, 0.0, False)
         self._step = Step(-1, State.DISARMED, "", 0.0, 0.0, math.nan)
         self._logged = (State.DISARMED, "")
+        self._finding = Finding()
         #: Why the drive was asked to end: a signal's name; empty while it goes on.
         self._asked = ""
 
@@ -194,7 +198,11 @@ class DriveLoop:
             steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
             now_s = self._clock()
             fault = self._fault_of_answer(frame, target, now_s)
-        verdict = self._judge.judge(now_s, fault, estimate.confidence)
+        finding = self._finding
+        if finding.concern is Concern.STOP and not fault:
+            fault = finding.text
+        caution = finding.text if finding.concern is Concern.SLOW else ""
+        verdict = self._judge.judge(now_s, fault, estimate.confidence, caution)
         if now_s >= self._until_s:
             # The guard has been in neutral since then.
             self._limiter.neutral(now_s)
@@ -250,6 +258,8 @@ class DriveLoop:
             commands = {"steering_rad": steering_rad} if recorded and self._mode.moves else {}
             commands |= {"throttle": throttle} if recorded and self._mode.armed else {}
             recorder.add(frame.image_bgr, frame.t_s, **commands)
+        if frame is not None and verdict.steers:
+            self._look_at_camera(frame)
         self.report.states[verdict.state] += 1
         number = -1 if frame is None else frame.number
         step = Step(number, verdict.state, verdict.reason, steering_rad, throttle, confidence)
@@ -260,6 +270,20 @@ class DriveLoop:
         if self._watch is not None:
             self._watch(step)
         return step
+
+    def _look_at_camera(self, frame: Frame) -> None:
+        """Compare what a moving car sees with the calibration, after the command, which does not wait."""
+        check = self._parts.camera_check
+        if check is None or self._limiter.throttle <= self._speed.throttle_at_rest:
+            return
+        # In a dry run somebody else steers.
+        steers = self._mode.armed and self._mode.record_commands
+        before = self._finding.concern
+        self._finding = check.look(
+            frame.image_bgr, frame.t_s, self._limiter.steering_rad if steers else math.nan
+        )
+        if self._finding.concern > before:
+            log.warning("camera: %s", self._finding.text)
 
     def _log(self, verdict: Verdict) -> None:
         """Log each change once; reasons that differ only in their digits are the same."""

@@ -59,6 +59,8 @@ class SafetySettings(Settings):
         end_after_s: If an armed car had to stop for this long, the drive ends: it does not start again.
         allow_repeated_frames: Accept a frame that equals the one before in every pixel. A camera sends such
             frames only when it hangs; a simulator without noise sends them while the car stands.
+        camera_check: Compare what the driving car sees with the camera file; warn, slow down and stop when
+            the camera seems to have moved.
     """
 
     watchdog_s: float = Field(default=0.08, gt=0.0, le=0.5)
@@ -70,6 +72,7 @@ class SafetySettings(Settings):
     slow_for_s: float = Field(default=3.0, gt=0.0)
     end_after_s: float = Field(default=1.0, ge=0.2)
     allow_repeated_frames: bool = False
+    camera_check: bool = True
 
     @model_validator(mode="after")
     def _check_order(self) -> SafetySettings:
@@ -121,13 +124,14 @@ class SafetyJudge:
         self._started = False
         self._ended = ""
 
-    def judge(self, now_s: float, fault: str, confidence: float = math.nan) -> Verdict:
+    def judge(self, now_s: float, fault: str, confidence: float = math.nan, caution: str = "") -> Verdict:
         """Judge one turn of the loop.
 
         Args:
             now_s: Time on the monotonic clock.
             fault: Why this turn gives no command; empty if it does.
             confidence: Of the estimate; NaN counts as 0.
+            caution: Why the car goes no faster than ``slow_share``; empty if it may.
 
         Returns:
             The verdict; the state ``ended`` is final.
@@ -159,6 +163,8 @@ class SafetyJudge:
             part = (confidence - s.stop_below) / (s.slow_below - s.stop_below)
             share = s.slow_share + (1.0 - s.slow_share) * part
             return Verdict(State.SLOW, share, True, f"confidence {confidence:.2f}, below {s.slow_below:g}")
+        if caution:
+            return Verdict(State.SLOW, s.slow_share, True, caution)
         return Verdict(State.DRIVING, 1.0, True)
 
     def _faulty(self, now_s: float, fault: str) -> Verdict:

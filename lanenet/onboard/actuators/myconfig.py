@@ -43,7 +43,8 @@ _USED = {
 }  # fmt: skip
 #: Ways to change a variable without binding its name; a dictionary changes under any other name.
 _UNFOLLOWED = {
-    _SECTION, "*", "globals", "locals", "vars", "setattr", "delattr", "exec", "eval", "__dict__", "__setattr__",
+    _SECTION, "*", "globals", "locals", "vars", "setattr", "delattr", "exec", "eval", "__dict__",
+    "__setattr__",
 }  # fmt: skip
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
@@ -110,8 +111,9 @@ def _plain_assignment(statement: ast.stmt) -> tuple[list[ast.Name], ast.expr]:
 def _bound(part: ast.AST) -> list[str]:
     """Return the names that one node sets or deletes."""
     match part:
-        case ast.Name(id=name, ctx=ast.Store() | ast.Del()) | ast.Attribute(
-            attr=name, ctx=ast.Store() | ast.Del()
+        case (
+            ast.Name(id=name, ctx=ast.Store() | ast.Del())
+            | ast.Attribute(attr=name, ctx=ast.Store() | ast.Del())
         ):
             return [name]
         case ast.alias():
@@ -178,8 +180,8 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
         Only what the files say.
 
     Raises:
-        ConfigError: If a file is not Python or not only plain lines set the pulses, the car has no PCA9685, or
-            a value is not of Donkeycar's type.
+        ConfigError: If a file is not Python or not only plain lines set the pulses, the car has no PCA9685,
+            or a value is not of Donkeycar's type.
     """
     values: dict[str, Any] = {}
     base = path.with_name("config.py")

@@ -175,7 +175,7 @@ def confidence(
     """
     width_cm, sigmas, (left, right) = lane_width_cm(points_cm), sigma_cm.tolist(), presence.tolist()
     # Written so that NaN fails as well.
-    if not (0.0 < width_cm < math.inf and 0.0 <= min(sigmas) and sum(sigmas) < math.inf):
+    if not (0.0 < width_cm < math.inf and min(sigmas) >= 0.0 and sum(sigmas) < math.inf):
         return 0.0
     if not (0.0 <= left <= 1.0 and 0.0 <= right <= 1.0):
         return 0.0

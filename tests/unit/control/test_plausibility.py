@@ -72,9 +72,7 @@ def test_what_a_detector_does_not_know_is_no_fault(answer: LaneEstimate) -> None
 
 def faults(offsets_cm: list[float], step_s: float = STEP_S, **changes: object) -> list[bool]:
     car = controller()
-    return [
-        car.target(beside(x, **changes), i * step_s, 60.0).fault != "" for i, x in enumerate(offsets_cm)
-    ]
+    return [car.target(beside(x, **changes), i * step_s, 60.0).fault != "" for i, x in enumerate(offsets_cm)]
 
 
 def test_a_lane_that_jumps_is_none_until_it_stays_there() -> None:

@@ -13,6 +13,7 @@ from lanenet.errors import HardwareError
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, LatencyHistogram, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings, State
+from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import LaneEstimate
 
 RATE_HZ = 30.0
@@ -100,6 +101,7 @@ class Car:
         count: int = 60,
         faults: dict[int, Callable[[], Frame | None]] | None = None,
         answer: Callable[[int], LaneEstimate] = lambda _: LANE,
+        check: CameraCheck | None = None,
         **options: bool,
     ) -> None:
         self.clock = Clock()
@@ -108,7 +110,7 @@ class Car:
         self.steps: list[Step] = []
         control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
-            CarParts(self.camera, Eye(answer), LaneController(control), self.wire),
+            CarParts(self.camera, Eye(answer), LaneController(control), self.wire, None, check),
             SafetySettings(countdown_s=0.0),
             LimitSettings(),
             control.speed,
@@ -149,6 +151,43 @@ def test_without_arming_the_motor_never_turns(options: dict[str, bool], steers: 
         assert sent[-1] > 0.1  # the lane is to the left
 
 
+class Doubting(CameraCheck):
+    """Finds something in the 20th frame that it is shown."""
+
+    def __init__(self, concern: Concern) -> None:
+        self.found, self.steering_rad = Finding(concern, "the camera was turned"), [0.0][:0]
+
+    def look(self, frame_bgr: np.ndarray, t_s: float, steering_rad: float = np.nan) -> Finding:
+        self.steering_rad.append(steering_rad)
+        return self.found if len(self.steering_rad) >= 20 else Finding()
+
+
+@pytest.mark.parametrize(
+    ("concern", "state"),
+    [(Concern.WARN, State.DRIVING), (Concern.SLOW, State.SLOW), (Concern.STOP, State.ENDED)],
+)
+def test_a_camera_that_has_moved_warns_slows_and_stops(
+    concern: Concern, state: State, caplog: pytest.LogCaptureFixture
+) -> None:
+    car = Car(120, check=Doubting(concern), armed=True)
+    with caplog.at_level(logging.WARNING):
+        report = car.loop.run()
+    assert car.steps[-1].state is state and report.by_fault is (state is State.ENDED)
+    assert "the camera was turned" in caplog.text
+    if state is State.SLOW:
+        # Half of 60 cm/s: 0.1 to begin to roll and 30 / 400 above it.
+        assert car.steps[-1].throttle == pytest.approx(0.175)
+
+
+def test_the_camera_is_compared_only_while_the_car_drives() -> None:
+    standing, dry = Doubting(Concern.NONE), Doubting(Concern.NONE)
+    Car(30, check=standing, steering_only=True).loop.run()
+    Car(30, check=dry, armed=True, record_commands=False).loop.run()
+    assert standing.steering_rad == []
+    # Whoever steers in a dry run, it is not the loop.
+    assert dry.steering_rad and np.isnan(dry.steering_rad).all()
+
+
 NOTHING = LaneEstimate()
 FAULTS: dict[str, tuple[str, Callable[[int], LaneEstimate] | None, str]] = {
     "nan": ("answer", lambda k: LANE if k < 30 else LaneEstimate(confidence=1.0), "no lane in frame"),
@@ -158,10 +197,16 @@ FAULTS: dict[str, tuple[str, Callable[[int], LaneEstimate] | None, str]] = {
         "no lane in frame",
     ),
     "nothing seen": ("answer", lambda k: LANE if k < 30 else NOTHING, "no lane in frame"),
-    "aside": ("answer", lambda k: LANE if k < 30 else replace(LANE, points_cm=LANE.points_cm + 500.0), "520 cm"),
+    "aside": (
+        "answer",
+        lambda k: LANE if k < 30 else replace(LANE, points_cm=LANE.points_cm + 500.0),
+        "520 cm",
+    ),
     "jump": (
         "answer",
-        lambda k: replace(LANE, points_cm=LANE.points_cm + (40.0 if k % 2 and k >= 30 else 0.0 if k < 30 else -40.0)),
+        lambda k: replace(
+            LANE, points_cm=LANE.points_cm + (40.0 if k % 2 and k >= 30 else 0.0 if k < 30 else -40.0)
+        ),
         "the lane is in another place in every frame",
     ),
     "sigma": (

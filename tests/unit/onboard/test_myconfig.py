@@ -166,7 +166,9 @@ def test_a_pulse_that_changes_in_another_way_is_refused_by_its_line(write, line,
     first = NEW.count("\n") + 1
     for file, text in files.items():
         path = write(text, file)
-    with pytest.raises(ConfigError, match=rf"{name_of_file}, line ({first}|{first + 1}|{first + 2}): .*{name}"):
+    with pytest.raises(
+        ConfigError, match=rf"{name_of_file}, line ({first}|{first + 1}|{first + 2}): .*{name}"
+    ):
         settings_from_myconfig(path.with_name("myconfig.py"))
 
 
