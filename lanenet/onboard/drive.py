@@ -21,6 +21,7 @@ from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import ActuatorSettings, first_writes, make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
+from lanenet.onboard.arming import ArmCheck, ArmGate, HoldFile
 from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
@@ -113,6 +114,7 @@ def build_loop(
     arm: bool = False,
     steering_only: bool = False,
     dry_run: bool = False,
+    hold: HoldFile | None = None,
     watch: Callable[[Step], None] | None = None,
 ) -> DriveLoop:
     """Put a car together; a recording's folder is made here, devices are opened when the loop runs.
@@ -122,6 +124,7 @@ def build_loop(
         arm: Let the motor turn, after the countdown.
         steering_only: Move the wheels and not the motor.
         dry_run: Send nothing; the loop behaves as that of an armed car.
+        hold: File that the operator of an armed car holds.
         watch: Called after every turn of the loop.
 
     Raises:
@@ -133,6 +136,8 @@ def build_loop(
         raise ConfigError("expected one of --arm, --steering-only and --dry-run, found several")
     if settings.actuator is None and not dry_run:
         raise ConfigError("key 'actuator' is missing: expected one, or --dry-run")
+    if hold is not None and not arm:
+        raise ConfigError(f"--hold {hold.path}: expected --arm as well: only an armed car is held")
     if arm:
         _refuse_blind_drive(settings)
     cv2.setNumThreads(settings.threads)
@@ -140,13 +145,19 @@ def build_loop(
     safety = settings.safety
     if dry_run:
         safety = safety.model_copy(update={"countdown_s": 0.0, "end_after_s": _NEVER_S})
+    detector = build_drive_detector(settings, camera)
+    camera_check = build_camera_check(settings, camera) if safety.camera_check else None
+    recorder = _recorder(settings, camera)
+    fits = _fits(settings, detector)
     parts = CarParts(
         open_source(settings.source),
-        build_drive_detector(settings, camera),
+        detector,
         LaneController(settings.control),
         NoActuator() if dry_run else build_sink(settings),
-        _recorder(settings, camera),
-        build_camera_check(settings, camera) if settings.safety.camera_check else None,
+        recorder,
+        camera_check,
+        ArmGate(fits, safety.slow_below, recorder, camera_check, hold) if arm else None,
+        hold,
     )
     mode = DriveMode(arm or dry_run, steering_only, record_commands=not dry_run)
     return DriveLoop(parts, safety, settings.limits, settings.control.speed, mode, watch)
@@ -166,6 +177,15 @@ def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Dete
         config=chosen.config,
     )
     return build_detector(chosen.kind, inputs)
+
+
+def _fits(settings: DriveSettings, detector: Detector) -> ArmCheck:
+    """Say how camera and detector fit; one that does not fit at all is not built."""
+    chosen, problems = settings.detector, "; ".join(getattr(detector, "problems", ()))
+    text = f"{chosen.kind if chosen.model is None else chosen.model} fits this camera"
+    if chosen.any_camera:
+        text = f"{chosen.model}: any camera was allowed (detector.any_camera)"
+    return ArmCheck("model", True, f"{text}; {problems}" if problems else text)
 
 
 def build_camera_check(settings: DriveSettings, camera: Camera | None) -> CameraCheck | None:

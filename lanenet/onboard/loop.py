@@ -25,6 +25,7 @@ from jaxtyping import Int
 from lanenet.control.controller import LaneController, SpeedSettings, Target, throttle_of
 from lanenet.data.drives.recorder import DriveRecorder
 from lanenet.errors import HardwareError
+from lanenet.onboard.arming import ArmGate, HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.guard import CommandSink
 from lanenet.onboard.safety import (
@@ -62,6 +63,8 @@ class CarParts:
         sink: Takes the commands.
         recorder: Keeps the frames; None for no recording.
         camera_check: Compares the images with the calibration; None for no check.
+        gate: Checks before the countdown of an armed car; None for none.
+        hold: The operator's file, without which the car stops; None for none.
     """
 
     source: FrameSource
@@ -70,6 +73,8 @@ class CarParts:
     sink: CommandSink
     recorder: DriveRecorder | None = None
     camera_check: CameraCheck | None = None
+    gate: ArmGate | None = None
+    hold: HoldFile | None = None
 
 
 @dataclass(frozen=True)
@@ -186,7 +191,7 @@ class DriveLoop:
         """
         frame = self._parts.source.read(_WAIT_S)
         begin_s = now_s = self._clock()
-        fault = self._check.fault_of(frame, now_s)
+        fault = frame_fault = self._check.fault_of(frame, now_s)
         steering_rad, speed_cm_s, estimate = math.nan, 0.0, LaneEstimate(confidence=math.nan)
         if frame is not None:
             self._count(frame)
@@ -198,9 +203,8 @@ class DriveLoop:
             steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
             now_s = self._clock()
             fault = self._fault_of_answer(frame, target, now_s)
+        fault = self._keeps_from_driving(frame, frame_fault, estimate.confidence, now_s) or fault
         finding = self._finding
-        if finding.concern is Concern.STOP and not fault:
-            fault = finding.text
         caution = finding.text if finding.concern is Concern.SLOW else ""
         verdict = self._judge.judge(now_s, fault, estimate.confidence, caution)
         if now_s >= self._until_s:
@@ -223,6 +227,17 @@ class DriveLoop:
             self._limiter.neutral(now_s)
             self._send(self._limiter.steering_rad, 0.0, now_s + self._safety.watchdog_s)
         return self._finish(frame, verdict, estimate.confidence)
+
+    def _keeps_from_driving(
+        self, frame: Frame | None, frame_fault: str, confidence: float, now_s: float
+    ) -> str:
+        """Return why the car must not drive whatever the lane is; empty if it may."""
+        hold, gate = self._parts.hold, self._parts.gate
+        if gate is not None and (fault := gate.fault_of(frame, frame_fault, confidence, now_s)):
+            return fault
+        if hold is not None and hold.fault:
+            return f"not held: {hold.fault}"
+        return self._finding.text if self._finding.concern is Concern.STOP else ""
 
     def _fault_of_answer(self, frame: Frame, target: Target, now_s: float) -> str:
         if not math.isfinite(target.steering_rad):

@@ -9,7 +9,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import OverridesArgument
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 
 app = typer.Typer()
 
@@ -25,19 +25,33 @@ def drive(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Use no actuator; show what would be sent.")
     ] = False,
+    hold: Annotated[
+        Path | None,
+        typer.Option(help="With --arm: the car drives only while this file exists; removed, it stops."),
+    ] = None,
+    hold_fresh: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="With --hold: the file must be touched at least this often, s."),
+    ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="End after this many frames.")] = None,
 ) -> None:
     """Drive the car by what its camera sees; without --arm the motor stays in neutral."""
+    from lanenet.onboard.arming import HoldFile
     from lanenet.onboard.drive import build_loop, load_drive_settings
     from lanenet.onboard.loop import Step
 
+    if hold_fresh is not None and hold is None:
+        raise ConfigError("--hold-fresh: expected --hold FILE as well")
+    held = None if hold is None else HoldFile(hold, hold_fresh)
     settings = load_drive_settings(config, overrides)
     with console.live_line() as show:
 
         def watch(step: Step) -> None:
             show(lambda: f"{loop.report.text}  {step.text}")
 
-        loop = build_loop(settings, arm=arm, steering_only=steering_only, dry_run=dry_run, watch=watch)
+        loop = build_loop(
+            settings, arm=arm, steering_only=steering_only, dry_run=dry_run, hold=held, watch=watch
+        )
         console.show_problems(loop.problems)
         report = loop.run(frames)
     console.show_lines(report.lines())

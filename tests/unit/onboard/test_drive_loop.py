@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
+from lanenet.onboard.arming import HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, LatencyHistogram, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings, State
@@ -102,6 +104,7 @@ class Car:
         faults: dict[int, Callable[[], Frame | None]] | None = None,
         answer: Callable[[int], LaneEstimate] = lambda _: LANE,
         check: CameraCheck | None = None,
+        hold: HoldFile | None = None,
         **options: bool,
     ) -> None:
         self.clock = Clock()
@@ -110,7 +113,7 @@ class Car:
         self.steps: list[Step] = []
         control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
-            CarParts(self.camera, Eye(answer), LaneController(control), self.wire, None, check),
+            CarParts(self.camera, Eye(answer), LaneController(control), self.wire, None, check, None, hold),
             SafetySettings(countdown_s=0.0),
             LimitSettings(),
             control.speed,
@@ -186,6 +189,21 @@ def test_the_camera_is_compared_only_while_the_car_drives() -> None:
     assert standing.steering_rad == []
     # Whoever steers in a dry run, it is not the loop.
     assert dry.steering_rad and np.isnan(dry.steering_rad).all()
+
+
+def test_a_car_that_is_let_go_stops_and_ends(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.touch()
+
+    def answer(number: int) -> LaneEstimate:
+        if number == 30:
+            key.unlink()
+        return LANE
+
+    car = Car(120, answer=answer, hold=HoldFile(key), armed=True)
+    report = car.loop.run()
+    assert report.by_fault and str(key) in report.ended
+    assert max(until for _, until in car.wire.moving()) <= 100.0 + 31.0 / RATE_HZ + 0.1
 
 
 NOTHING = LaneEstimate()
