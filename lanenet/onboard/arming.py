@@ -19,7 +19,9 @@ log = logging.getLogger(__name__)
 
 #: Frames in a row that have to be as they should. Chosen: a third of a second of a common camera.
 _FRAMES = 10
-#: A car that may not start says why after this time, and when that changes.
+#: A camera that is silent for longer is no slow one. Chosen: three frames of 10 a second.
+_PAUSE_S = 0.3
+#: A car that may not start says why after this time, and when that changes, at most this often.
 _PATIENCE_S = 3.0
 
 
@@ -102,6 +104,8 @@ class ArmGate:
         self._passed = False
         self._frames = 0
         self._views_rad: deque[float] = deque(maxlen=_FRAMES)
+        self._frame_s, self._fault = -math.inf, "not armed: frames: none yet"
+        # Since when nothing was said, and what was said then.
         self._since_s, self._said = math.nan, ""
 
     def fault_of(self, frame: Frame | None, frame_fault: str, confidence: float, now_s: float) -> str:
@@ -117,19 +121,25 @@ class ArmGate:
         """
         if self._passed:
             return ""
+        if frame is None and now_s - self._frame_s < _PAUSE_S:
+            # A slow camera: not every turn has a frame.
+            return self._fault
         self._frames = 0 if frame is None or frame_fault else self._frames + 1
-        if frame is not None and not frame_fault and self._camera_check is not None:
-            self._views_rad.append(self._camera_check.view(frame.image_bgr)[0])
+        if frame is not None and not frame_fault:
+            self._frame_s = now_s
+            if self._camera_check is not None:
+                self._views_rad.append(self._camera_check.view(frame.image_bgr)[0])
         self.checks = self._look(frame_fault, confidence)
         failed = [check for check in self.checks if not check.passed]
         self._passed = not failed
         self._since_s = now_s if math.isnan(self._since_s) else self._since_s
         names = ", ".join(check.name for check in failed)
         if self._passed or (now_s - self._since_s >= _PATIENCE_S and names != self._said):
-            self._said = names
+            self._since_s, self._said = now_s, names
             for check in self.checks:
                 log.log(logging.INFO if check.passed else logging.WARNING, "arm: %s", check)
-        return f"not armed: {failed[0].name}: {failed[0].text}" if failed else ""
+        self._fault = f"not armed: {failed[0].name}: {failed[0].text}" if failed else ""
+        return self._fault
 
     def _look(self, frame_fault: str, confidence: float) -> list[ArmCheck]:
         enough = self._frames >= _FRAMES

@@ -146,7 +146,9 @@ def build_loop(
     if dry_run:
         safety = safety.model_copy(update={"countdown_s": 0.0, "end_after_s": _NEVER_S})
     detector = build_drive_detector(settings, camera)
-    camera_check = build_camera_check(settings, camera) if safety.camera_check else None
+    camera_check = None
+    if safety.camera_check and camera is not None:
+        camera_check = build_camera_check(settings, camera)
     recorder = _recorder(settings, camera)
     fits = _fits(settings, detector)
     parts = CarParts(
@@ -188,10 +190,8 @@ def _fits(settings: DriveSettings, detector: Detector) -> ArmCheck:
     return ArmCheck("model", True, f"{text}; {problems}" if problems else text)
 
 
-def build_camera_check(settings: DriveSettings, camera: Camera | None) -> CameraCheck | None:
-    """Return the comparison of images and camera file; None without a camera file."""
-    if camera is None:
-        return None
+def build_camera_check(settings: DriveSettings, camera: Camera) -> CameraCheck:
+    """Return the comparison of images and camera file."""
     mask = settings.detector.mask
     return CameraCheck(camera, None if mask is None else read_mask(mask))
 

@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,14 @@ from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
-from lanenet.onboard.drive import DriveSettings, build_drive_detector
+from lanenet.onboard.drive import DriveSettings, build_camera_check, build_drive_detector
+from lanenet.perception.camera_check import SINGLE_VIEW_RAD, CameraCheck
+from lanenet.perception.estimate import Detector
 
 #: The camera is watched for this long: at 20 frames/s, 40 frames.
 _WATCH_S = 2.0
+#: Frames that are compared with the camera file; chosen: over the two seconds, four a second.
+_COMPARED = 8
 #: Below this share of the requested rate something is wrong; chosen: more than jitter takes.
 _LEAST_RATE_SHARE = 0.8
 #: A Raspberry Pi lowers its clock from 80 degrees Celsius on; warn 10 degrees earlier.
@@ -55,19 +59,28 @@ def check_car(settings: DriveSettings) -> list[Check]:
     camera = None
     if settings.camera is not None and checks[0].state != "problem":
         camera = read_camera(settings.camera)
-    checks += check_source(open_source(settings.source), getattr(settings.source, "rate_hz", None), camera)
-    checks.append(_detector(settings, camera))
+    frames: list[Frame] = []
+    rate_hz = getattr(settings.source, "rate_hz", None)
+    checks += check_source(open_source(settings.source), rate_hz, camera, frames)
+    found, detector = _detector(settings, camera)
+    checks.append(found)
+    if camera is not None and detector is not None and _fit(frames, camera):
+        comparison = build_camera_check(settings, camera)
+        checks.append(check_calibration(comparison, detector, frames, settings.safety.slow_below))
     checks.append(_actuator(settings))
     return [*checks, check_temperature(), check_throttling()]
 
 
-def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | None) -> list[Check]:
+def check_source(
+    source: FrameSource, rate_hz: float | None, camera: Camera | None, kept: list[Frame] | None = None
+) -> list[Check]:
     """Watch a camera for two seconds.
 
     Args:
         source: Not open yet; it is closed again.
         rate_hz: Requested frames per second; None if none were requested.
         camera: Camera whose size the images must have; None for no check.
+        kept: Takes the frames.
     """
     try:
         source.open()
@@ -76,6 +89,8 @@ def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | No
         return [Check("camera", "problem", str(error))]
     finally:
         source.close()
+    if kept is not None:
+        kept += frames
     if len(frames) < 2:
         return [Check("camera", "problem", f"{len(frames)} frames in {_WATCH_S:g} s, expected a stream")]
     height, width = frames[-1].image_bgr.shape[:2]
@@ -93,6 +108,31 @@ def check_source(source: FrameSource, rate_hz: float | None, camera: Camera | No
         text = f"mean brightness {brightness:.0f} of 255: is the lens covered, the room dark?"
         checks.append(Check("image", "note", text))
     return checks
+
+
+def check_calibration(
+    comparison: CameraCheck, detector: Detector, frames: Sequence[Frame], least_confidence: float
+) -> Check:
+    """Compare the lines in some frames with the camera file.
+
+    Args:
+        comparison: Of the camera file.
+        detector: Says in which frames there is a lane; others show nothing.
+        frames: Of the camera, of its size.
+        least_confidence: Of the lane.
+    """
+    name = "calibration"
+    images = [frame.image_bgr for frame in frames[:: max(1, len(frames) // _COMPARED)]]
+    seen = [image for image in images if detector.detect(image).confidence >= least_confidence]
+    off_rad = [pitch for pitch in (comparison.view(image)[0] for image in seen) if np.isfinite(pitch)]
+    if not off_rad:
+        text = f"not compared: no lane with two lines in {len(images)} frames; stand the car in its lane"
+        return Check(name, "note", text)
+    median_rad = float(np.median(off_rad))
+    text = f"the lines look as if the pitch were {np.rad2deg(abs(median_rad)):.1f} degrees off"
+    if abs(median_rad) >= SINGLE_VIEW_RAD:
+        return Check(name, "problem", f"{text}: has the camera moved since, is it upside down?")
+    return Check(name, "ok", f"{text}, in {len(off_rad)} views; one place may show some degrees")
 
 
 def check_temperature(sensor: Path = _THERMAL_ZONE) -> Check:
@@ -160,16 +200,20 @@ def _rate(frames: list[Frame], wanted_hz: float | None) -> Check:
     return Check("camera", "ok", text)
 
 
-def _detector(settings: DriveSettings, camera: Camera | None) -> Check:
+def _fit(frames: Sequence[Frame], camera: Camera) -> bool:
+    return bool(frames) and frames[-1].image_bgr.shape[:2] == (camera.height, camera.width)
+
+
+def _detector(settings: DriveSettings, camera: Camera | None) -> tuple[Check, Detector | None]:
     name = f"detector {settings.detector.kind}"
     try:
         detector = build_drive_detector(settings, camera)
     except LanenetError as error:
-        return Check(name, "problem", str(error))
+        return Check(name, "problem", str(error)), None
     if problems := getattr(detector, "problems", ()):
-        return Check(name, "note", "; ".join(problems))
+        return Check(name, "note", "; ".join(problems)), detector
     model = settings.detector.model
-    return Check(name, "ok", f"{model} fits this camera" if model is not None else "ready")
+    return Check(name, "ok", f"{model} fits this camera" if model is not None else "ready"), detector
 
 
 def _actuator(settings: DriveSettings) -> Check:

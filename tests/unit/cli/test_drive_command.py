@@ -12,6 +12,7 @@ from lanenet.cli.app import app
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.onboard.arming import HoldFile
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
 from lanenet.onboard.drive import build_loop, load_drive_settings
 from lanenet.onboard.safety import State
@@ -49,6 +50,12 @@ def test_the_wheelbase_is_the_cameras_unless_the_settings_say(car: Path) -> None
         load_drive_settings(car, ["camera=null"])
     with pytest.raises(CalibrationError, match=r"nowhere\.yaml"):
         load_drive_settings(car, ["camera=nowhere.yaml"])
+
+
+@pytest.mark.parametrize("words", [("--hold", "key"), ("--arm", "--hold-fresh", "1")])
+def test_a_hold_that_holds_nothing_is_refused(car: Path, words: tuple[str, ...]) -> None:
+    result = drive(car, "actuator={kind: recorder}", *words)
+    assert result.exit_code == 1 and "--hold" in result.output
 
 
 @pytest.mark.parametrize(
@@ -118,18 +125,28 @@ def test_an_armed_car_drives_through_its_guard(car: Path) -> None:
     steps = []
     report = build_loop(settings, arm=True, watch=steps.append).run()
     assert report.frames == 24 and not report.by_fault
-    assert {step.state for step in steps} == {State.DRIVING}
+    # The tenth good frame lets it start.
+    assert [step.state for step in steps] == [State.STOPPED] * 9 + [State.DRIVING] * 15
+    assert all("not armed" in step.reason for step in steps[:9])
     assert steps[-1].throttle > 0.0
     unarmed = drive(car, "actuator={kind: recorder}")
     assert unarmed.exit_code == 0 and "disarmed 100 %" in unarmed.output
     assert "--steering-only" in unarmed.output
 
 
-def test_an_armed_car_whose_camera_falls_silent_ends_with_an_error(car: Path) -> None:
-    silent = ("source.pace=real", "source.rate_hz=1", "safety.end_after_s=0.3")
-    result = drive(car, "actuator={kind: recorder}", *silent, "--arm")
+def test_an_armed_car_that_has_to_stop_ends_with_an_error(car: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = iter([""] * 40)
+    monkeypatch.setattr(HoldFile, "fault", property(lambda _: next(held, "the key is not there")))
+    again = ("source.loop=true", "safety.end_after_s=0.2")
+    result = drive(car, "actuator={kind: recorder}", *again, "--arm", "--hold", "key")
     assert result.exit_code == 1
-    assert "the car had to stop: no frame from the camera" in result.stderr
+    assert "the car had to stop: not held: the key is not there" in result.stderr
+
+
+def test_an_armed_car_with_too_few_frames_does_not_start(car: Path) -> None:
+    silent = ("source.pace=real", "source.rate_hz=3", "source.loop=false", "safety.end_after_s=0.3")
+    result = drive(car, "actuator={kind: recorder}", *silent, "--arm", "--frames", "3")
+    assert result.exit_code == 0 and "driving" not in result.output
 
 
 def test_a_recorded_drive_holds_the_frames_and_what_was_told(car: Path, tmp_path: Path) -> None:

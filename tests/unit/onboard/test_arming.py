@@ -74,6 +74,15 @@ def test_what_fails_keeps_the_car_and_is_named(
     assert sum(f"FAIL  {name}" in line for line in caplog.messages) == 1
 
 
+def test_a_slow_camera_has_turns_without_a_frame() -> None:
+    gate = ArmGate(FITS, 0.5)
+    for i in range(10):
+        fault = gate.fault_of(frame(i), "", 1.0, 0.1 * i)
+        assert bool(gate.fault_of(None, "no frame", math.nan, 0.1 * i + 0.05)) is bool(fault) is (i < 9)
+    silent = ArmGate(FITS, 0.5)
+    assert all(silent.fault_of(None if i % 2 else frame(i), "", 1.0, 0.4 * i) for i in range(40))
+
+
 def test_a_frame_that_fails_starts_the_count_again() -> None:
     gate = ArmGate(FITS, 0.5)
     faults(gate, 9)

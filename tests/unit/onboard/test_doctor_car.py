@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -17,8 +18,16 @@ from lanenet.onboard.bench import example_camera
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.doctor import car as doctor_car
 from lanenet.onboard.doctor import installation as doctor
-from lanenet.onboard.doctor.car import check_car, check_source, check_temperature, check_throttling
+from lanenet.onboard.doctor.car import (
+    check_calibration,
+    check_car,
+    check_source,
+    check_temperature,
+    check_throttling,
+)
 from lanenet.onboard.drive import DriveSettings
+from lanenet.perception.camera_check import CameraCheck
+from lanenet.perception.estimate import LaneEstimate
 
 ROOT = Path(__file__).resolve().parents[3]
 CHECKPOINT = ROOT / "checkpoints" / "small"
@@ -81,6 +90,26 @@ def test_what_is_wrong_with_a_camera(source, name, state, text):
     found = {check.name: check for check in check_source(source, 40.0, example_camera())}
     assert found[name].state == state and text in found[name].text
     assert source.closed
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "confidence", "state"),
+    [(3.0, 1.0, "ok"), (20.0, 1.0, "problem"), (20.0, 0.1, "note"), (math.nan, 1.0, "note")],
+)
+def test_the_lines_are_compared_with_the_camera_file(pitch_deg, confidence, state):
+    class Views(CameraCheck):
+        def view(self, frame_bgr):
+            return math.radians(pitch_deg), 0.0
+
+    class Eye:
+        def detect(self, frame_bgr):
+            return LaneEstimate(confidence=confidence)
+
+        def reset(self):
+            pass
+
+    frames = [Frame(np.zeros((240, 320, 3), np.uint8), 0.1 * i, i) for i in range(20)]
+    assert check_calibration(Views(example_camera()), Eye(), frames, 0.5).state == state
 
 
 @pytest.mark.parametrize(
