@@ -13,7 +13,7 @@ from pathlib import Path
 
 from lanenet.data.drives.recorder import DriveRecorder
 from lanenet.onboard.devices import Frame
-from lanenet.perception.camera_check import SINGLE_VIEW_RAD, CameraCheck
+from lanenet.perception.camera_check import GROSS_RAD, CameraCheck
 
 log = logging.getLogger(__name__)
 
@@ -178,4 +178,4 @@ class ArmGate:
             return ArmCheck("calibration", True, "not compared: no lines on both sides")
         off_rad = abs(statistics.median(known))
         text = f"the lines show a pitch {math.degrees(off_rad):.1f} degrees off"
-        return ArmCheck("calibration", off_rad < SINGLE_VIEW_RAD, text)
+        return ArmCheck("calibration", off_rad < GROSS_RAD, text)

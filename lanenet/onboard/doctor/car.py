@@ -19,7 +19,7 @@ from lanenet.onboard.cameras import open_source
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
 from lanenet.onboard.drive import DriveSettings, build_camera_check, build_drive_detector
-from lanenet.perception.camera_check import SINGLE_VIEW_RAD, CameraCheck
+from lanenet.perception.camera_check import GROSS_RAD, CameraCheck
 from lanenet.perception.estimate import Detector
 
 #: The camera is watched for this long: at 20 frames/s, 40 frames.
@@ -130,7 +130,7 @@ def check_calibration(
         return Check(name, "note", text)
     median_rad = float(np.median(off_rad))
     text = f"the lines look as if the pitch were {np.rad2deg(abs(median_rad)):.1f} degrees off"
-    if abs(median_rad) >= SINGLE_VIEW_RAD:
+    if abs(median_rad) >= GROSS_RAD:
         return Check(name, "problem", f"{text}: has the camera moved since, is it upside down?")
     return Check(name, "ok", f"{text}, in {len(off_rad)} views; one place may show some degrees")
 

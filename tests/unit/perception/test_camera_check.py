@@ -107,6 +107,10 @@ def test_a_camera_that_has_moved_is_noticed(check, concern: Concern, word: str) 
     assert finding.concern >= concern and word in finding.text
 
 
+def test_upside_down_shows_within_two_seconds() -> None:
+    assert drive(CAMERA, seconds=2.0, flipped=True).finding.concern is Concern.STOP
+
+
 def test_too_few_views_say_nothing() -> None:
     assert drive(turned(CAMERA, pitch_down=10.0), seconds=3.0).finding.concern is Concern.NONE
 
