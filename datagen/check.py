@@ -105,12 +105,12 @@ def check_lines_seen(
         return
     if free_lane_cm is not None:
         raise other_lane(lane_width_cm, free_lane_cm)
-    found = ", ".join(
-        f"of the {side} one {100.0 * line.coverage:.0f} % to {sd_px[side]:.1f} px"
+    found = " and ".join(
+        f"{100.0 * line.coverage:.0f} % of the {side} line's borders, {sd_px[side]:.1f} px off"
         for side, line in lines.items()
     )
     raise TrackingLostError(
         f"{drive.path}: {'one line only bounds the driven lane' if len(clutter) == 1 else 'no lane'}: "
-        f"held-out frames show {found} (robust sd); for the {' and the '.join(clutter)} one these are edges "
-        "met by chance"
+        f"held-out frames show edges along {found} (robust sd); those of the {' and the '.join(clutter)} "
+        "line are met by chance"
     )

@@ -46,11 +46,12 @@ class LiveReport:
         frames: Frames taken in.
         poses: Poses written.
         segments: Segments that gave poses.
-        localiser: With the steering that it found, and how many frames were unreadable, standing or left out.
+        localiser: With its map, the steering that it found, and how many frames it left out.
         factor: Typical distance factor (see :class:`datagen.slam.filter.motion.MotionModel`).
         speed_known: Whether the factor is the gain of a recorded speed, not a step length in cm.
         match: Median matched share of a frame's edges.
-        median_ms: Median time per frame of edges and filter together, over the last frames.
+        median_ms: Median time per frame of edges and filter together, over the last frames; NaN if all poses
+            were found at once, at the end.
         p99_ms: Its 99th percentile.
         process_mb: Peak memory of the process; None where the system does not tell.
     """

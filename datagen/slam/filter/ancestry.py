@@ -290,7 +290,8 @@ def grow(
     """
     # How many new particles stand before the copies of each old one.
     before = np.append(0, np.cumsum(np.bincount(chosen, minlength=len(chosen)))).astype(np.int32)
-    tree.span[...] = before[tree.span]
+    # take() needs a third of the time of an index.
+    tree.span[...] = before.take(tree.span)
     survivors = np.flatnonzero(np.diff(before))
     count = len(survivors)
     tree.span[row, :count] = np.stack([before[survivors], before[survivors + 1]], axis=1)

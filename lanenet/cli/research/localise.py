@@ -200,7 +200,9 @@ def _show(report: LiveReport) -> None:
     lines = [
         f"{report.poses} poses of {report.frames} frames, {report.segments} segment(s); "
         f"{localiser.unreadable} unreadable, {localiser.standing} standing, {localiser.dropped} left out",
-        f"{1e3 / report.median_ms:.0f} frames/s: {report.median_ms:.2f} ms per frame (median), "
+        "time per frame not measured: all poses were found at once, at the end"
+        if math.isnan(report.median_ms)
+        else f"{1e3 / report.median_ms:.0f} frames/s: {report.median_ms:.2f} ms per frame (median), "
         f"{report.p99_ms:.2f} ms (p99)",
         f"map {localiser.map_bytes / 1e6:.0f} MB"
         + ("" if report.process_mb is None else f", process {report.process_mb:.0f} MB at most"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.cli.app import app
-from lanenet.cli.research.localise import CameraFrames
+from lanenet.cli.research.localise import CameraFrames, _show
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.errors import HardwareError, LanenetError, TrackingLostError
@@ -45,7 +46,7 @@ def rows_of(path: Path) -> list[list[str]]:
     return [line.split(",") for line in text.splitlines()[1:]]
 
 
-def test_every_pose_is_on_disk_before_the_next_frame_comes(simulated, tmp_path):
+def test_every_pose_is_on_disk_before_the_next_frame_comes(simulated, tmp_path, capsys):
     drive, out = open_drive(simulated), tmp_path / "new" / "poses.csv"
     written: list[int] = []
 
@@ -67,6 +68,8 @@ def test_every_pose_is_on_disk_before_the_next_frame_comes(simulated, tmp_path):
     assert 0.0 < report.median_ms <= report.p99_ms and report.localiser.map_bytes > 1e6
     picture = cv2.imread(str(report.picture))
     assert (picture == 255).all(axis=2).sum() > 50
+    _show(replace(report, median_ms=math.nan, p99_ms=math.nan))
+    assert "nan" not in capsys.readouterr().out
 
 
 def test_ctrl_c_ends_the_drive_and_keeps_what_was_driven(simulated, tmp_path):

@@ -176,10 +176,10 @@ def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
     # A map that is bent is looked at, and rejected.
     check_lines_seen(shown(border(False, 0.9, 4.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
     with pytest.raises(
-        TrackingLostError, match=r"one line only .* left one 2\d % to 2.\d px.*for the left one"
+        TrackingLostError, match=r"one line only .* 2\d % of the left line.* 2\.\d px.*of the left line"
     ):
         check_lines_seen(shown(border(False, 0.25, 4.0, 1), right), drive, 40.0, None)
-    with pytest.raises(TrackingLostError, match=r"no lane: .*for the left and the right one"):
+    with pytest.raises(TrackingLostError, match=r"no lane: .*of the left and the right line"):
         check_lines_seen(shown(border(False, 0.25, 4.0, 1), border(True, 0.3, 4.0, 2)), drive, 40.0, None)
     with pytest.raises(TrackingLostError, match=r"no lane: .*along 1. %"):
         check_lines_seen(shown(border(False, 0.15, 4.0, 1), border(True, 0.15, 4.0, 2)), drive, 40.0, None)
