@@ -36,7 +36,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import SIDES
 
 #: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
-NOT_MAPPED, LABELLED = "stretch not mapped", "labelled"
+NOT_MAPPED, LABELLED = "segment not mapped", "labelled"
 #: Residuals up to this distance ahead count for the verdict. Chosen: the label rows and one row beyond.
 VERDICT_REACH_CM = 45.0
 #: Random stream for held-out frames, so that other draws do not depend on them.

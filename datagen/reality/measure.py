@@ -221,8 +221,8 @@ def edge_statistics(
         frame_bgr: The frame.
         table: From its pixels to the road.
         camera_height_cm: Of the camera that the table was made for; the unit of distances.
-        settings: How edges are found; None takes the defaults.
-        window: The network's window, with its origin below the camera; None takes the default.
+        settings: How edges are found.
+        window: The network's window, with its origin below the camera.
     """
     gray = to_gray(frame_bgr)
     pixels = find_edges(frame_bgr, settings.edges, table.keep, table.scale)

@@ -137,7 +137,7 @@ def moved_points(
 def standard_deviations(
     jacobian: Float[np.ndarray, "r p"], residuals: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "p"]:
-    """Return those of the parameters of a fit, from its residuals' spread; infinite where undetermined."""
+    """Return each fitted parameter's sigma, from the spread of the residuals; infinite where undetermined."""
     # Residuals below a twentieth of a pixel come from luck or a rendered board.
     freedom = max(jacobian.shape[0] - jacobian.shape[1], 1)
     spread = max(float(np.sqrt(np.sum(residuals**2) / freedom)), 0.05)

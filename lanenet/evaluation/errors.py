@@ -294,7 +294,7 @@ def bootstrap_segments(frames: Sequence[int]) -> tuple[Int[np.ndarray, "_"], str
         np.append(np.arange(a + SEGMENT_FRAMES, b - SEGMENT_FRAMES // 2, SEGMENT_FRAMES), b)
         for a, b in zip(starts, ends, strict=True)
     ]
-    return np.concatenate(cuts)[:-1], f"stretches of {SEGMENT_FRAMES} frames"
+    return np.concatenate(cuts)[:-1], f"segments of {SEGMENT_FRAMES} frames"
 
 
 def sigma_stats(errors_cm: Float[np.ndarray, "n 6"], sigma_cm: Float[np.ndarray, "n 6"]) -> SigmaStats | None:

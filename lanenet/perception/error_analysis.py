@@ -58,7 +58,7 @@ class ErrorAnalysis:
 
     @property
     def steering_error_rad(self) -> float:
-        """Steering error of that at the look-ahead; Kozlowski et al. 2024, eq. 3 and section 2.3."""
+        """Steering error that the position error causes; Kozlowski et al. 2024, eq. 3 and section 2.3."""
         return math.atan2(self.position_error_cm, self.settings.lookahead_cm)
 
 

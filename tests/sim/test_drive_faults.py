@@ -38,8 +38,8 @@ FAULTS: dict[str, tuple[int | None, str]] = {
     "SIGINT": (0, "neutral: SIGINT"),
     "SIGHUP": (0, "neutral: SIGHUP"),
 }
-#: A step's place in the loop makes no difference to what happens, and the unit tests of the frame check, the
-#: safety judge and the signals have the others.
+#: Which step of the loop raises or hangs makes no difference to what happens; the unit tests of the frame
+#: check, the safety judge and the signals cover the other faults.
 SLOW = {
     *(
         f"{step} {what}"

@@ -339,7 +339,7 @@ def agree_px(trapezoid_px: Float[np.ndarray, "4 2"], settings: PainterLineSettin
 
 
 def are_close(one: SolidLine, other: SolidLine | None, tolerance_px: float) -> bool:
-    """Return whether there is another line near to one, at the region's top and bottom."""
+    """Return whether the other line is known and lies near this one, at the region's top and bottom."""
     return (
         other is not None
         and abs(one.bottom_px - other.bottom_px) <= tolerance_px

@@ -82,12 +82,12 @@ def test_of_few_drives_stretches_are_drawn():
     assert cuts.tolist() == [100, 107] and over == "drives like these"
     # A rest of less than half a stretch belongs to the one before; no stretch reaches into another drive.
     cuts, over = bootstrap_segments([115, 70])
-    assert cuts.tolist() == [40, 80, 115, 155] and over == "stretches of 40 frames"
+    assert cuts.tolist() == [40, 80, 115, 155] and over == "segments of 40 frames"
     assert bootstrap_segments([99])[0].tolist() == [40]
     assert bootstrap_segments([10])[0].tolist() == []
     alike = np.repeat([1.0, 3.0], 60)[:, None] * np.ones((1, 6))
     low, high = rmse_interval_cm(np.split(alike, bootstrap_segments([120])[0]), np.random.default_rng(0))
-    # Three stretches, of mean squares 1, 5 and 9, drawn three at a time.
+    # Three segments, of mean squares 1, 5 and 9, drawn three at a time.
     assert low == pytest.approx(1.0) and high == pytest.approx(3.0)
 
 

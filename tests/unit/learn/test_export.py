@@ -130,12 +130,13 @@ def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
             ("weights.safetensors", "rubbish", "cannot be read as safetensors"),
             ("check_rasters.png", None, "no such file"),
             ("check_rasters.png", "rubbish", "not a readable image"),
+            ("checkpoint.yaml", "format: lanenet-checkpoint/9", r"checkpoint\.yaml: .*lanenet-checkpoint/9"),
         ]
     ):
         folder = tmp_path / str(i)
         shutil.copytree(checkpoint, folder)
         (folder / "model.onnx").unlink()
-        (folder / name).unlink()
+        (folder / name).unlink(missing_ok=True)
         with contextlib.suppress(TypeError):
             (folder / name).write_text(content)
         with pytest.raises(CheckpointError, match=message):
