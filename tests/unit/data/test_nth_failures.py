@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drives import CAMERA, frame_image, write_drive
-from nth_failure import DISK, MEMORY, Failure, check_each, every_failure
+from nth_failure import DISK, MEMORY, Failure, check_each, every_failure, report
 from small_map import small_map
 
 from lanenet import outputs
@@ -70,6 +70,7 @@ def test_a_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: boo
         return int(drive.commands.speed_cm_s[1])
 
     calls = check_each(write, read, tmp_path, [DISK, MEMORY])
+    report("drive folder", calls)
     assert len(calls) > 20
     assert sum(call.startswith("rename ") for call in calls) == (0 if exchanges else 3)
 
@@ -87,6 +88,7 @@ def test_the_files_of_a_map(tmp_path: Path) -> None:
         return int(json.loads((tmp_path / "one" / "report.json").read_text())["number"])
 
     calls = check_each(write, read, tmp_path, [DISK, MEMORY])
+    report("files of a map", calls)
     assert len(calls) > 25
 
 
@@ -119,9 +121,10 @@ def test_a_recording(tmp_path: Path) -> None:
                 kept.append(recorder.path)
         assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "earlier", *kept]), failure
 
-    count = 0
+    calls = []
     for failure in every_failure(record, [DISK, MEMORY]):
-        count += 1
+        calls.append(failure.call)
         look(failure)
+    report("recording", calls)
     assert len(open_drive(recorders[-1].path)) == 3 and len(open_drive(tmp_path / "earlier")) == 2
-    assert count > 25
+    assert len(calls) > 25
