@@ -24,9 +24,10 @@ from lanenet.data.drives import open_drive
 from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings
 from lanenet.errors import LanenetError
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
 from lanenet.onboard.actuators.serial_board import SerialBoardSettings
-from lanenet.onboard.devices import Actuator, Frame, SourceEnded
+from lanenet.onboard.devices import Frame, SourceEnded
 from lanenet.onboard.guard import GuardedActuator
 from lanenet.onboard.guard_process import Guard
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
@@ -68,9 +69,10 @@ class GuardThread:
 
     pid = 0
 
-    def __init__(self, line: socket.socket, actuator: Actuator, safety: SafetySettings) -> None:
-        self._line, self._actuator = line, actuator
-        self._guard = Guard(line, actuator, safety.watchdog_s, safety.end_after_s)
+    def __init__(self, line: socket.socket, pulse: int, actuator: Actuator, safety: SafetySettings) -> None:
+        self._line, self._pulse, self._actuator = line, pulse, actuator
+        os.set_blocking(pulse, False)
+        self._guard = Guard(line, pulse, actuator, safety.watchdog_s, safety.end_after_s)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -87,6 +89,7 @@ class GuardThread:
             self._actuator.close()
             self._line.send(b"closed\n")
             self._line.close()
+            os.close(self._pulse)
 
     def wait(self, timeout_s: float) -> None:
         self._thread.join(30.0)
@@ -104,8 +107,8 @@ def drive(folder: Path, settings: PCA9685Settings | SerialBoardSettings) -> None
     started: list[Any] = []
 
     def popen(*_: object, pass_fds: list[int], **__: object) -> GuardThread:
-        line = socket.socket(fileno=os.dup(pass_fds[0]))
-        started.append(GuardThread(line, make_actuator(settings), safety))
+        line, pulse = (os.dup(number) for number in pass_fds)
+        started.append(GuardThread(socket.socket(fileno=line), pulse, make_actuator(settings), safety))
         return started[0]
 
     control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
