@@ -25,6 +25,7 @@ A transformer for training and driving, here the bird's-eye view::
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -45,11 +46,16 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
+from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.edges.views import View, birdseye_view, undistorting_view
 from lanenet.perception.estimate import Detector, DetectorInputs, LaneEstimate
 from lanenet.perception.registry import build_detector
 
+log = logging.getLogger(__name__)
+
+#: Share of the speed that is left when the camera seems to have moved; chosen, as for ``lanenet drive``.
+_SLOW_SHARE = 0.5
 #: Donkeycar calls its pilot in every turn of its loop (20 Hz by default) unless a person drives: after a
 #: longer silence a person drove.
 _PAUSE_S = 0.5
@@ -69,6 +75,8 @@ class DonkeySettings(Settings):
         allow_repeated_frames: Treat an image that equals the one before in every pixel as a new one.
             Donkeycar repeats the last image of a camera that hangs; a simulator without noise gives equal
             images while the car stands.
+        camera_check: Compare what the driving car sees with the camera file; slow down to half the speed, and
+            stop, when the camera seems to have moved. It starts anew when a person has driven.
     """
 
     camera: Path | None = None
@@ -78,6 +86,7 @@ class DonkeySettings(Settings):
     min_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
     hold_s: float = Field(default=0.2, ge=0.0)
     allow_repeated_frames: bool = False
+    camera_check: bool = True
 
 
 class LanePilot:
@@ -105,8 +114,9 @@ class LanePilot:
         def found(path: Path | None) -> Path | None:
             return None if path is None else folder / path.expanduser()
 
-        camera, mask = found(settings.camera), found(settings.detector.mask)
+        camera, mask_path = found(settings.camera), found(settings.detector.mask)
         self.camera = None if camera is None else read_camera(camera)
+        mask = None if mask_path is None else read_mask(mask_path)
         self.estimate = LaneEstimate()
         self._settings = settings
         inputs = DetectorInputs(
@@ -114,11 +124,15 @@ class LanePilot:
             model=found(settings.detector.model),
             any_camera=settings.detector.any_camera,
             lane_width_cm=settings.detector.lane_width_cm,
-            mask=None if mask is None else read_mask(mask),
+            mask=mask,
             config=found(settings.detector.config),
         )
         self._detector: Detector = build_detector(settings.detector.kind, inputs)
         self._controller = LaneController(settings.control)
+        self._check: CameraCheck | None = None
+        if self.camera is not None and settings.camera_check:
+            self._check = CameraCheck(self.camera, mask)
+        self._finding = Finding()
         self._limiter = CommandLimiter(settings.limits)
         self._clock = clock
         self._before: UInt8[np.ndarray, "h w 3"] | None = None
@@ -149,6 +163,9 @@ class LanePilot:
             # A person drove meanwhile: the throttle starts from 0, and the lane memory is out of date.
             self._limiter.neutral(now_s)
             self._controller.reset()
+            self._finding = Finding()
+            if self._check is not None:
+                self._check.reset()
         self._run_s = now_s
         if image_rgb is None:
             self.estimate = LaneEstimate()
@@ -157,6 +174,7 @@ class LanePilot:
             bgr = _bgr_of(image_rgb)
             if self._is_new(bgr):
                 self.estimate = self._detector.detect(bgr)
+                self._look_at_camera(bgr, now_s)
                 self._follow(now_s)
         if now_s - self._seen_s > self._settings.hold_s:
             self._target = (self._target[0], 0.0)
@@ -175,8 +193,21 @@ class LanePilot:
     def _follow(self, now_s: float) -> None:
         target = self._controller.target(self.estimate, now_s, self._target[1], self._limiter.steering_rad)
         if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(target.steering_rad):
+            if self._finding.concern is Concern.STOP:
+                return
+            share = _SLOW_SHARE if self._finding.concern is Concern.SLOW else 1.0
             self._seen_s = now_s
-            self._target = (target.steering_rad, target.speed_cm_s)
+            self._target = (target.steering_rad, share * target.speed_cm_s)
+
+    def _look_at_camera(self, bgr: UInt8[np.ndarray, "h w 3"], now_s: float) -> None:
+        """Compare a moving car's view of its lane with the calibration."""
+        moves = self._limiter.throttle > self._settings.control.speed.throttle_at_rest
+        if self._check is None or not moves or self.estimate.confidence < self._settings.min_confidence:
+            return
+        before = self._finding.concern
+        self._finding = self._check.look(bgr, now_s, self._limiter.steering_rad)
+        if self._finding.concern > before:
+            log.warning("camera: %s", self._finding.text)
 
     def run_threaded(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
         """Same as :meth:`run`: the pilot is faster than the camera and needs no thread."""

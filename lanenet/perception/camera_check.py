@@ -161,6 +161,12 @@ class CameraCheck:
         self._pitches_rad: deque[float] = deque(maxlen=_LENGTH)
         # Direction of the lane, and of the car's own path there.
         self._directions_rad: deque[tuple[float, float]] = deque(maxlen=_LENGTH)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the views."""
+        self._pitches_rad.clear()
+        self._directions_rad.clear()
         self._looked_s = -math.inf
         self.finding = Finding()
 

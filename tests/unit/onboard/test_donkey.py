@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from lanenet.onboard.donkey import (
     LanePilot,
     UndistortTransformer,
 )
+from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import LaneEstimate
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -119,6 +121,35 @@ def test_gray_camera(pilot, shape):
     seen = pilot._detector.seen
     assert seen.shape == (24, 32, 3) and seen.dtype == np.uint8
     assert (seen[0, 0] == 255).all() and (seen[1:] == 100).all()
+
+
+class Doubting(CameraCheck):
+    def __init__(self, concern):
+        self._found = Finding(concern, "the camera was turned")
+        self.reset()
+
+    def reset(self):
+        self.finding = Finding()
+
+    def look(self, frame_bgr, t_s, steering_rad=math.nan):
+        self.finding = self._found
+        return self.finding
+
+
+@pytest.mark.parametrize(
+    ("concern", "share"), [(Concern.WARN, 1.0), (Concern.SLOW, 0.5), (Concern.STOP, None)]
+)
+def test_a_camera_that_has_moved_slows_and_stops_the_car(pilot, caplog, concern, share):
+    pilot._detector.estimate = lane(0.0)
+    pilot._check = Doubting(concern)
+    throttles = [pilot.run(IMAGE)[1] for _ in range(8)]
+    # 60 cm/s: 0.1 to begin to roll, and 60 / 400 above it.
+    assert throttles[0] == pytest.approx(0.25)
+    assert throttles[-1] == (0.0 if share is None else pytest.approx(0.1 + share * 0.15))
+    assert caplog.text.count("the camera was turned") == 1
+    # A person drove it on: the views start anew, the throttle from 0.
+    pilot._clock.now_s += 5.0
+    assert [pilot.run(IMAGE)[1] for _ in range(2)] == [0.0, pytest.approx(0.25)]
 
 
 def test_lost_lane_stops_the_car_after_its_time(pilot):
