@@ -250,9 +250,8 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     at = 2
-    while True:
-        while data[at] == 0xFF and data[at + 1] == 0xFF:
-            at += 1
+    # Chosen: far more segments than any camera writes; a file of nothing but markers would take seconds.
+    for _ in range(10_000):
         if data[at] != 0xFF:
             return None
         marker = data[at + 1]
@@ -262,8 +261,13 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             return width, height
         if marker in (0xD9, 0xDA):
             return None
-        # Restart markers and TEM have no length.
-        at += 2 if 0xD0 <= marker <= 0xD7 or marker == 1 else 2 + struct.unpack_from(">H", data, at + 2)[0]
+        if marker == 0xFF:  # a filling byte
+            at += 1
+        elif 0xD0 <= marker <= 0xD7 or marker == 1:  # restart markers and TEM have no length
+            at += 2
+        else:
+            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    return None
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
