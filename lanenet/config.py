@@ -22,8 +22,8 @@ from lanenet.reading import MEBIBYTE, parsing, read_text
 #: Of a file of settings. Chosen: the largest one here has 11 kB.
 _MAX_YAML = MEBIBYTE
 #: Values of a file, with every alias written out: nine aliases of nine aliases, nine times over, are 400
-#: million. Chosen: far above what a person writes; PyYAML reads that many in about a second.
-_MAX_NODES = 20_000
+#: million. Chosen: far above what a person writes; PyYAML reads that many in half a second.
+_MAX_NODES = 10_000
 
 
 def _with_strict_numbers(schema: Any) -> Any:

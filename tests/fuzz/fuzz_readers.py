@@ -40,10 +40,20 @@ from lanenet.learn.checkpoint import METRICS_FORMAT, read_finished
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.export import export_onnx, read_network, read_rasters, write_rasters, write_weights
 from lanenet.learn.network import new_network
+from lanenet.onboard.actuators.myconfig import settings_from_myconfig
 from lanenet.onboard.drive import load_drive_settings
 from lanenet.perception.hough.detector import HoughSettings
 from lanenet.perception.network.model_file import ModelMeta, open_model
 
+MYCONFIG = """
+DRIVE_TRAIN_TYPE = "PWM_STEERING_THROTTLE"
+PWM_STEERING_THROTTLE = {
+    "PWM_STEERING_PIN": "PCA9685.1:40.1", "PWM_STEERING_SCALE": 1.0, "PWM_STEERING_INVERTED": False,
+    "PWM_THROTTLE_PIN": "PCA9685.1:40.0", "PWM_THROTTLE_SCALE": 1.0, "PWM_THROTTLE_INVERTED": False,
+    "STEERING_LEFT_PWM": 460, "STEERING_RIGHT_PWM": 290,
+    "THROTTLE_FORWARD_PWM": 500, "THROTTLE_STOPPED_PWM": 370, "THROTTLE_REVERSE_PWM": 220,
+}
+"""
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = {"channels": (4, 8), "hidden": 8, "bins": 0}
 
@@ -234,6 +244,10 @@ READERS: dict[str, Reader] = {
     "run": Reader(make_run, read_whole_run),
     "checkpoint": Reader(make_checkpoint, read_checkpoint),
     "model": Reader(make_model, lambda f: open_model(f / "model.onnx")),
+    "myconfig": Reader(
+        lambda f: (f / "myconfig.py").write_text(MYCONFIG),
+        lambda f: settings_from_myconfig(f / "myconfig.py"),
+    ),
     "points": Reader(
         lambda f: (f / "points.csv").write_text("x_cm,y_cm,u_px,v_px\n1,20,30,40\n2,30,31,20\n"),
         lambda f: _read_points(f / "points.csv"),

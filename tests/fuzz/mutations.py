@@ -248,6 +248,7 @@ BY_ENDING: dict[str, tuple[Mutation, ...]] = {
     ".yaml": (*TEXTS, replaced(re.compile(rb"(?<=: )[^\n]+"), (*VALUES, *NAMES))),
     ".json": (*TEXTS, swap_json, swap_json, swap_json),
     ".catalog": (*TEXTS, swap_json, swap_json),
+    ".py": (*TEXTS, replaced(re.compile(rb"(?<=: )[^,]+"), (*VALUES, *NAMES))),
     ".png": (*BYTES, swap_png),
     ".onnx": (*BYTES, swap_onnx, swap_onnx, swap_onnx),
     ".safetensors": (*BYTES, swap_safetensors, swap_safetensors),

@@ -17,6 +17,7 @@ from typing import Any
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
 from lanenet.onboard.actuators.pca9685 import OSCILLATOR_HZ, PCA9685Settings, prescale_of
+from lanenet.reading import MEBIBYTE, read_text
 
 #: Donkeycar counts pulses in 4096ths of a period at this nominal rate.
 _FREQUENCY_HZ = 60.0
@@ -65,12 +66,9 @@ def read_assignments(path: Path) -> dict[str, Any]:
         ConfigError: If the file is missing or is not Python; naming the line, if it sets or may change
             something of :func:`settings_from_myconfig` in another way.
     """
+    text = read_text(path, ConfigError, MEBIBYTE)
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file, expected a Donkeycar's myconfig.py") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
+        tree = ast.parse(text, str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise ConfigError(f"{path}: not Python: {error}") from None
     plain = [(statement.lineno, *_plain_assignment(statement)) for statement in tree.body]
