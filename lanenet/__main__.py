@@ -18,7 +18,7 @@ def main() -> None:
     if verb == "drive":
         from lanenet.onboard import stop
 
-        stop.neutral_before_drive(words)
+        stop.prepare_drive(words)
     from lanenet.cli.app import main as command_line
 
     command_line()

@@ -220,6 +220,9 @@ class GuardedActuator:
 
     def neutral(self) -> None:
         """Go to neutral at once; never raises."""
+        if not self._ready:
+            # It is in neutral by itself, and a signal must not close the line on which ``open`` waits.
+            return
         with contextlib.suppress(HardwareError):
             self._post(NEUTRAL, 0.0, 0.0, 0.0)
 
@@ -299,6 +302,8 @@ class GuardedActuator:
             self._line = None
         if self._closed:
             raise HardwareError("the guard of the actuator was ended from outside; it went to neutral")
+        if not self._ready:
+            raise HardwareError(f"the guard of the actuator (process {self.pid}) died while it started")
         self._rescue()
         raise HardwareError(
             f"the guard of the actuator (process {self.pid}) died; neutral was set without it"

@@ -78,8 +78,8 @@ class I2CChip:
             ) from None
 
     def owner(self) -> int:
-        """Return the id of the process that owns the chip; see :func:`lock_owner`."""
-        return lock_owner(os.fstat(self._bus.fd), self._address)
+        """Return the id of the process that owns the chip; 0 if none does, as :func:`lock_owners` sees it."""
+        return next(iter(lock_owners(os.fstat(self._bus.fd), self._address)), 0)
 
     def write(self, data: bytes) -> None:
         """Send bytes to the chip.
@@ -116,13 +116,17 @@ class I2CChip:
                 bus.close()
 
 
-def lock_owner(device: os.stat_result, at: int | None = None) -> int:
-    """Return the process that has a lock on a device; 0 if none has, -1 for one in another container.
+def lock_owners(device: os.stat_result, at: int | None = None) -> list[int]:
+    """Return the processes that have a lock on a device or file; the kernel hides those of other containers.
 
     Args:
-        device: What ``os.stat`` says of the device.
+        device: What ``os.stat`` says of it.
         at: Byte of a record lock; None for a lock on the whole file (flock).
+
+    Returns:
+        Their ids; -1 for one that cannot be named.
     """
+    owners = []
     place = f"{os.major(device.st_dev):02x}:{os.minor(device.st_dev):02x}:{device.st_ino}"
     for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
         fields = line.split()
@@ -130,24 +134,29 @@ def lock_owner(device: os.stat_result, at: int | None = None) -> int:
         if len(fields) != 8 or fields[5] != place:
             continue
         if fields[1:2] == ["FLOCK"] if at is None else fields[1] == "POSIX" and fields[6] == str(at):
-            return int(fields[4]) or -1
-    return 0
+            owners.append(int(fields[4]) or -1)
+    return owners
 
 
 def describe_process(pid: int) -> str:
     """Return a process's id and command, for messages; of a guard also the process that it guards."""
     if pid <= 0:
         return "another process"
-    words = _words_of(pid)
+    words = words_of(pid)
+    text = f"process {pid} ({' '.join(words)[:60]})"
     if GUARD_MODULE not in words:
-        return f"process {pid} ({' '.join(words)[:60]})"
-    status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+        return text
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        # It ended since.
+        return text
     # "pid (name) state parent ..."; the name may hold anything.
     parent = int(status.rpartition(")")[2].split()[1])
-    return f"process {pid}, the guard of process {parent} ({' '.join(_words_of(parent))[:60]})"
+    return f"process {pid}, the guard of process {parent} ({' '.join(words_of(parent))[:60]})"
 
 
-def _words_of(pid: int) -> list[str]:
+def words_of(pid: int) -> list[str]:
     """Return the words of a process's command line without the program's folder; none if it is gone."""
     try:
         text = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace")

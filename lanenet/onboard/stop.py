@@ -1,12 +1,13 @@
 """Stops a car, whatever drives it: neutral first, then the end of the process that owns the actuator.
 
 Reads the section ``actuator`` of the car's file and imports nothing else of lanenet: the car drives on
-meanwhile.
+meanwhile. A drive that still starts owns nothing yet; it is known by a lock on its car's file.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import signal
 import sys
@@ -15,11 +16,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
-from lanenet.errors import ConfigError, HardwareError, LanenetError
+from lanenet.errors import ConfigError, HardwareError, LanenetError, printable
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator
 from lanenet.onboard.actuators.pca9685 import PCA9685
 from lanenet.onboard.actuators.serial_board import SerialBoardSettings
-from lanenet.onboard.i2c import describe_process, lock_owner
+from lanenet.onboard.i2c import describe_process, lock_owners, words_of
 
 #: A guard that is asked to end is in neutral within a turn of 15 ms and gone some milliseconds later; chosen
 #: ample, since neutral is repeated meanwhile.
@@ -47,7 +48,9 @@ def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings
 
 
 def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
-    """Put a car into neutral and end the process that drives it.
+    """Put a car into neutral, end the process that drives it, and the drives of its file that still start.
+
+    These are ended even if the file cannot be used or the actuator does not answer.
 
     Args:
         path: The car's file.
@@ -61,6 +64,16 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
         HardwareError: If the actuator does not answer, or its owner cannot be ended.
         MissingExtraError: If its driver is not installed.
     """
+    try:
+        done = _stop_actuator(path, overrides)
+    except LanenetError as error:
+        if not (ended := _end_drives(path)):
+            raise
+        raise type(error)("; ".join([str(error), *ended])) from None
+    return [*done, *_end_drives(path)]
+
+
+def _stop_actuator(path: Path, overrides: Sequence[str]) -> list[str]:
     settings = read_actuator(path, overrides)
     if isinstance(settings, SerialBoardSettings):
         return _stop_board(settings)
@@ -81,7 +94,7 @@ def _stop_board(settings: SerialBoardSettings) -> list[str]:
     """End the owner of a serial line: the board goes to neutral by its own watchdog."""
 
     def owner() -> int:
-        return lock_owner(Path(settings.port).stat())
+        return next(iter(lock_owners(Path(settings.port).stat())), 0)
 
     try:
         first = owner()
@@ -96,18 +109,9 @@ def _end(pid: int, owner: Callable[[], int], neutral: Callable[[], None]) -> str
     """End the owner of a device, politely and then by force; returns its description."""
     text = describe_process(pid)
     if pid < 0:
-        raise HardwareError(f"neutral was set, but {text} still drives, which cannot be seen from here")
+        raise HardwareError(f"{text} still drives, which cannot be seen from here; disconnect the battery")
     for number in (signal.SIGTERM, signal.SIGKILL):
-        try:
-            os.kill(pid, number)
-            # A stopped process takes no other signal.
-            os.kill(pid, signal.SIGCONT)
-        except ProcessLookupError:
-            pass
-        except PermissionError:
-            raise HardwareError(
-                f"neutral was set, but {text} of another user still drives; end it with sudo"
-            ) from None
+        _tell(pid, number)
         end_s = time.monotonic() + _END_S
         while time.monotonic() < end_s:
             neutral()
@@ -115,21 +119,49 @@ def _end(pid: int, owner: Callable[[], int], neutral: Callable[[], None]) -> str
                 neutral()
                 return text
             time.sleep(_AGAIN_S)
-    raise HardwareError(f"neutral was set, but {text} cannot be ended; disconnect the battery")
+    raise HardwareError(f"{text} cannot be ended; disconnect the battery")
 
 
-def neutral_before_drive(words: Sequence[str]) -> None:
-    """Put a car that nothing drives into neutral before ``drive`` has imported the rest; never raises.
+def _tell(pid: int, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        try:
+            os.kill(pid, number)
+            # A stopped process takes no other signal.
+            os.kill(pid, signal.SIGCONT)
+        except PermissionError:
+            text = describe_process(pid)
+            raise HardwareError(f"{text} of another user still drives; end it with sudo") from None
+
+
+def _end_drives(path: Path) -> list[str]:
+    """Ask the drives of a car's file to end, which is in neutral; returns a sentence each."""
+    try:
+        found = lock_owners(path.stat())
+    except OSError:
+        return []
+    # Other programs lock files, too: editors.
+    drives = {pid: describe_process(pid) for pid in found if "drive" in words_of(pid)}
+    for pid in drives:
+        _tell(pid, signal.SIGTERM)
+    return [f"told {text} to end" for text in drives.values()]
+
+
+def prepare_drive(words: Sequence[str]) -> None:
+    """Prepare a drive before its imports: ``lanenet stop`` finds it, and its car is in neutral; never raises.
+
+    The car's file stays locked until this process ends. A car that another process drives is left alone.
 
     Args:
         words: After ``drive`` on the command line.
     """
-    if {"--dry-run", "--help"} & set(words) or not words or words[0].startswith("-"):
+    if {"--dry-run", "--help"} & set(words):
         return
-    overrides = [word for word in words[1:] if "=" in word and not word.startswith("-")]
     # Whatever is wrong is said by the drive itself.
     with contextlib.suppress(Exception):
-        actuator = make_actuator(read_actuator(Path(words[0]), overrides))
+        path = next(path for path in map(Path, words) if path.is_file())
+        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_SH | fcntl.LOCK_NB)
+        overrides = [word for word in words if "=" in word and not word.startswith("-") and word != str(path)]
+        actuator = make_actuator(read_actuator(path, overrides))
         if isinstance(actuator, PCA9685):
             actuator.open()
             actuator.close()
@@ -140,7 +172,7 @@ def main(words: Sequence[str]) -> int:
     try:
         lines = stop_car(Path(words[0]), words[1:])
     except LanenetError as error:
-        sys.stderr.write(f"error: {error}\n")
+        sys.stderr.write(f"error: {printable(str(error))}\n")
         return 1
-    sys.stdout.writelines(f"{line}\n" for line in lines)
+    sys.stdout.writelines(f"{printable(line)}\n" for line in lines)
     return 0

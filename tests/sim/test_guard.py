@@ -174,6 +174,24 @@ def test_an_actuator_that_is_not_there_is_named(wire: Path) -> None:
     assert sink.pid == 0
 
 
+def test_a_signal_while_the_guard_dies_at_its_start_is_no_traceback() -> None:
+    # As after `lanenet stop`: the guard is gone, and the loop is told to end while it waits for it.
+    program = (sys.executable, "-ISc", "import os, signal; os.kill(os.getppid(), signal.SIGUSR1)")
+    sink = GuardedActuator("{}", lambda: Recorder(RecorderSettings()), 0.1, 1.0, program)
+
+    def told(number: int, frame: object) -> None:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+        sink.neutral()
+
+    before = signal.signal(signal.SIGUSR1, told)
+    try:
+        with pytest.raises(HardwareError, match="while it started"):
+            sink.open()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert sink.pid == 0
+
+
 def test_when_the_guard_is_killed_the_loop_sets_neutral(wire: Path) -> None:
     sink = guarded(wire)
     sink.open()

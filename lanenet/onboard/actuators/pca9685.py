@@ -145,7 +145,7 @@ class PCA9685:
         self._connect(owner=False)
 
     def owner(self) -> int:
-        """Return the id of the process that owns the chip; see :func:`lanenet.onboard.i2c.lock_owner`."""
+        """Return the id of the process that owns the chip; see :func:`lanenet.onboard.i2c.lock_owners`."""
         return 0 if self._chip is None else self._chip.owner()
 
     def _connect(self, *, owner: bool) -> None:

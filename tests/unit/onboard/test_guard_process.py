@@ -12,7 +12,7 @@ from lanenet.errors import HardwareError
 from lanenet.onboard import guard_process
 from lanenet.onboard.actuators import first_writes
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
-from lanenet.onboard.i2c import lock_owner
+from lanenet.onboard.i2c import lock_owners
 
 
 def test_first_neutral_is_before_the_imports(monkeypatch):
@@ -22,7 +22,7 @@ def test_first_neutral_is_before_the_imports(monkeypatch):
 
     def build(text):
         """Stands where the guard imports its driver."""
-        seen.append((text, bus.chip.asleep, bus.chip.counts(0), lock_owner(os.fstat(bus.fd), 0x40)))
+        seen.append((text, bus.chip.asleep, bus.chip.counts(0), lock_owners(os.fstat(bus.fd), 0x40)))
         raise HardwareError("this is far enough")
 
     ours, theirs = socket.socketpair()
@@ -33,4 +33,4 @@ def test_first_neutral_is_before_the_imports(monkeypatch):
         first = json.dumps(first_writes(PCA9685Settings()))
         assert guard_process.main([str(theirs.detach()), str(pulse), "{}", first, "0.1", "1"], build) == 1
         os.close(heard)
-    assert seen == [("{}", False, 370, os.getpid())]
+    assert seen == [("{}", False, 370, [os.getpid()])]

@@ -243,10 +243,10 @@ def test_one_owner_of_bus_and_address(bus):
 
 def test_the_owner_is_gone_with_its_process(bus, actuator):
     other = hold(bus, 0x41)
-    assert i2c.lock_owner(os.fstat(bus.fd), 0x41) == other.pid
-    assert i2c.lock_owner(os.fstat(bus.fd), 0x40) == os.getpid()
+    assert i2c.lock_owners(os.fstat(bus.fd), 0x41) == [other.pid]
+    assert i2c.lock_owners(os.fstat(bus.fd), 0x40) == [os.getpid()]
     end(other)
-    assert i2c.lock_owner(os.fstat(bus.fd), 0x41) == 0
+    assert i2c.lock_owners(os.fstat(bus.fd), 0x41) == []
     actuator.close()
     # The lock is that of the open file, which the emulator does not close.
     assert i2c.describe_process(other.pid) == f"process {other.pid} (gone)"
@@ -261,6 +261,11 @@ def test_the_owner_is_named_with_what_it_guards():
         assert text.startswith(f"process {guard.pid}, the guard of process {os.getpid()} (")
     finally:
         end(guard)
+
+
+def test_a_guard_that_ends_while_it_is_described_is_no_traceback(monkeypatch):
+    monkeypatch.setattr(i2c, "words_of", lambda pid: ["python", i2c.GUARD_MODULE])
+    assert i2c.describe_process(2**30).startswith(f"process {2**30} (python ")
 
 
 @pytest.fixture

@@ -11,9 +11,17 @@ import pytest
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
-from lanenet.errors import ConfigError, HardwareError
+from lanenet.errors import ConfigError, HardwareError, LanenetError
 from lanenet.onboard import stop
+from lanenet.onboard.i2c import lock_owners
 
+#: A drive that still starts, as far as others see.
+STARTING = """
+import fcntl, os, sys, time
+fcntl.flock(os.open(sys.argv[2], os.O_RDONLY), fcntl.LOCK_SH)
+print(flush=True)
+time.sleep(60)
+"""
 #: Owns the chip, and ends as a guard does or, deaf, not at all by itself.
 OWNER = """
 import fcntl, signal, sys, time
@@ -84,6 +92,32 @@ def test_the_owner_is_ended(bus, car, manner, monkeypatch):
         owner.communicate()
 
 
+@pytest.mark.parametrize("fault", ["", "broken file", "lost chip"])
+def test_a_drive_that_still_starts_is_ended(bus, car, fault):
+    words = [sys.executable, "-ISc", STARTING, "drive", car]
+    started = [subprocess.Popen(words, stdout=subprocess.PIPE) for _ in range(2)]
+    editor = subprocess.Popen([*words[:3], "edit", car], stdout=subprocess.PIPE)
+    try:
+        for process in (*started, editor):
+            process.stdout.readline()
+        bus.broken = fault == "lost chip"
+        if fault == "broken file":
+            car.write_text("control: [\n")
+        if fault:
+            with pytest.raises(LanenetError, match=rf"car\.yaml|0x40.*process {started[0].pid} ") as caught:
+                stop.stop_car(car)
+            text = str(caught.value)
+        else:
+            text = " ".join(stop.stop_car(car))
+        assert all(f"process {process.pid} " in text for process in started)
+        assert [process.wait(5.0) for process in started] == [-signal.SIGTERM] * 2
+        assert editor.poll() is None
+    finally:
+        for process in (*started, editor):
+            process.kill()
+            process.communicate()
+
+
 def test_the_owner_of_a_serial_line_is_ended(tmp_path):
     pytest.importorskip("serial", reason="pyserial is not installed")
     master, slave = os.openpty()
@@ -117,6 +151,11 @@ def test_bad_input_is_named(bus, car, tmp_path):
         stop.stop_car(car, ["actuator={kind: serial, port: /nowhere}"])
 
 
+def test_names_cannot_command_the_terminal(capsys):
+    assert stop.main(["\x1b[2Jcar.yaml"]) == 1
+    assert "car.yaml: no such file" in (told := capsys.readouterr().err) and "\x1b" not in told
+
+
 def test_the_verb(bus, car):
     """With an option, or from Python; `lanenet stop CAR` itself does not get as far as these imports."""
     drive(bus)
@@ -134,9 +173,11 @@ def test_it_waits_for_no_other_part_of_lanenet():
 
 def test_drive_is_neutral_before_it_has_imported_the_rest(bus, car):
     drive(bus)
-    stop.neutral_before_drive([str(car), "--dry-run"])
-    assert bus.chip.counts(0) == 500
-    stop.neutral_before_drive([str(car), "--arm", "source.path=nowhere"])
+    stop.prepare_drive([str(car), "--dry-run"])
+    assert bus.chip.counts(0) == 500 and lock_owners(car.stat()) == []
+    stop.prepare_drive(["--arm", "--frames", "9", str(car), "source.path=nowhere"])
     assert bus.chip.counts(0) == 370
+    # So that it is found while it owns nothing yet.
+    assert lock_owners(car.stat()) == [os.getpid()]
     # What is wrong is left to the drive.
-    stop.neutral_before_drive([str(Path("/nowhere/car.yaml"))])
+    stop.prepare_drive([str(Path("/nowhere/car.yaml"))])
