@@ -104,7 +104,7 @@ def test_a_drive_that_still_starts_is_ended(bus, car, fault):
         if fault == "broken file":
             car.write_text("control: [\n")
         if fault:
-            with pytest.raises(LanenetError, match=rf"car\.yaml|0x40.*process {started[0].pid} ") as caught:
+            with pytest.raises(LanenetError, match=r"car\.yaml|0x40") as caught:
                 stop.stop_car(car)
             text = str(caught.value)
         else:
