@@ -220,7 +220,6 @@ BAD = [
     ),
     Bad("a catalog above", manifest(paths=["../x.catalog"]), D, ("manifest.json", "'paths'", "../x")),
     Bad("a catalog elsewhere", manifest(paths=["/dev/zero"]), D, ("manifest.json", "'paths'", "/dev/zero")),
-    Bad("catalogs that are lists", manifest(paths=[["a"]]), D, ("manifest.json",)),
     Bad("a manifest nested deeply", holding("manifest.json", "[" * 100_000), D, ("manifest.json",)),
     Bad(
         "types that are lists", holding("manifest.json", '[[1]]\n[[1]]\n{"paths": []}'), D, ("manifest.json",)
@@ -241,8 +240,6 @@ BAD = [
         D,
         ("60000x60000",),
     ),
-    Bad("a photo without a size", holding("b.png", png(0, 4), then=first_image), D, ("b.png",)),
-    Bad("another format", holding("b.jpg", b"GIF89a" + bytes(99), then=first_image), D, ("b.jpg",)),
     Bad(
         "a mask beyond all memory",
         holding("m.png", png(60_000, 60_000), "m.png", read_mask),
@@ -285,7 +282,7 @@ def test_a_tub_may_keep_its_catalogs_in_a_folder(tmp_path: Path) -> None:
     assert len(open_drive(path)) == 2
 
 
-@pytest.mark.parametrize("value", [-7, 1e308, 10**400, True])
+@pytest.mark.parametrize("value", [-7, 1e308, 10**400], ids=["-7", "1e308", "10**400"])
 def test_a_command_that_no_car_has_is_left_out_and_counted(tmp_path: Path, value: float) -> None:
     rows = [record(k, **({"user/angle": value} if k == 1 else {})) for k in range(3)]
     drive = open_drive(write_tub(tmp_path / "tub", rows))
