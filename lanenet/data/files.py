@@ -67,11 +67,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
         A path in the same folder with the same ending, for the block to write. Removed on any error.
 
     Raises:
-        LanenetError: If the destination is a folder, cannot be written, or is being written by another run.
+        LanenetError: If the destination is no regular file, cannot be written, or is being written by another
+            run.
     """
     path = Path(path).resolve()
-    if path.is_dir():
-        raise LanenetError(f"{path}: is a folder, expected a file to write")
+    _check_no_other_kind(path)
     if is_unfinished(path):
         yield path
         return
@@ -120,12 +120,11 @@ def check_destination(path: Path) -> None:
     """Refuse a file that could not be written, before the work starts; creates nothing.
 
     Raises:
-        LanenetError: If the destination is a folder, or lies below a file or a folder that cannot be
+        LanenetError: If the destination is no regular file, or lies below a file or a folder that cannot be
             written to.
     """
     path = Path(path).resolve()
-    if path.is_dir():
-        raise LanenetError(f"{path}: is a folder, expected a file to write")
+    _check_no_other_kind(path)
     parent = next(folder for folder in path.parents if folder.exists())
     if not parent.is_dir():
         raise LanenetError(f"{path}: cannot be written, {parent} is a file, expected a folder")
@@ -141,13 +140,18 @@ def check_replaceable(path: Path, kind: str) -> None:
         kind: What the folder will be, one of :data:`FOLDER_KINDS`.
 
     Raises:
-        LanenetError: If the destination is a file or a folder that lanenet did not write.
+        LanenetError: If the destination is a file, a mounted disk or a folder that lanenet did not write.
     """
     path = Path(path).resolve()
     if not path.exists():
         return
     if not path.is_dir():
         raise LanenetError(f"{path}: is a file, expected a folder to write")
+    if path.is_mount():
+        # Only the names of folders on one file system can be exchanged.
+        raise LanenetError(
+            f"{path}: a disk is mounted there, which cannot be replaced; choose a folder on it"
+        )
     if not any(path.iterdir()):
         return
     if not _holds_marker(path, kind):
@@ -181,6 +185,14 @@ def json_text(obj: Any) -> str:
 def write_json(path: Path, obj: Any) -> None:
     """Write :func:`json_text` atomically."""
     write_text(path, json_text(obj))
+
+
+def _check_no_other_kind(path: Path) -> None:
+    """Refuse to replace what is there and no file: a folder, but also a device (``/dev/null``) or a pipe."""
+    if path.is_dir():
+        raise LanenetError(f"{path}: is a folder, expected a file to write")
+    if path.exists() and not path.is_file():
+        raise LanenetError(f"{path}: is a device or a pipe, expected a file to write")
 
 
 def _plain(obj: Any) -> Any:

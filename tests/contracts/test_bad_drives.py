@@ -226,6 +226,7 @@ BAD = [
     ),
     Bad("an index beyond all counting", tub([record(10**30)]), D, LOST),
     Bad("a row nested deeply", tub(["[" * 100_000]), D, LOST),
+    Bad("a row of 100 kB", tub([record(0, filler="x" * 100_000)]), D, (*LOST, "1 rows")),
     # videos
     Bad("a playlist", holding("lap.mp4", b"#EXTM3U\n/etc/passwd\n", "lap.mp4"), D, ("lap.mp4", "#EXTM3U")),
     Bad("no video", holding("lap.mp4", b"not a video at all" * 50, "lap.mp4"), D, ("lap.mp4", "OpenCV")),

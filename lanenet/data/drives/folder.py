@@ -35,6 +35,8 @@ from lanenet.reading import FolderFiles, is_regular
 
 FRAMES_FILE = "frames.csv"
 TRUTH_FILE = "truth.csv"
+#: The folder of a drive that the car records begins with it.
+RECORDING_NAME = "drive-"
 #: Columns of truth.csv beside ``frame``.
 TRUTH_NAMES: tuple[str, ...] = ("x_cm", "y_cm", "heading_rad", *POINT_NAMES)
 
@@ -105,14 +107,16 @@ def read_truth(path: Path) -> dict[str, np.ndarray] | None:
 
 def clear_dead_recordings(parent: Path) -> None:
     """Remove what recordings left that were killed: their locks, and their folders if they hold no frame."""
-    for lock in sorted(parent.glob(".*.lock")):
+    # By the names of recordings: other programs have locks, too.
+    for lock in sorted(parent.glob(f".{RECORDING_NAME}*.lock")):
         path = parent / lock.name[1:].removesuffix(".lock")
         if is_locked_here(path):
             continue
         with suppress(LanenetError), lock_output(path):
-            # Only what a recorder makes before its first frame: a tub may have a drive.yaml, too.
+            # Only what a recorder makes before the rows of its first frame: a tub may have a drive.yaml, too.
             made = {DRIVE_FILE, "camera.yaml", "images"}
-            if path.is_dir() and {file.name for file in path.iterdir() if file.name[0] != "."} <= made:
+            found = {file.name for file in path.glob("*") if file.name[0] != "."}
+            if found <= made and len(list(path.glob("images/*"))) <= 1:
                 remove(path)
 
 

@@ -30,7 +30,7 @@ from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
-from lanenet.data.drives.folder import FRAMES_FILE, clear_dead_recordings, image_name
+from lanenet.data.drives.folder import FRAMES_FILE, RECORDING_NAME, clear_dead_recordings, image_name
 from lanenet.data.drives.recording import DRIVE_FORMAT, DriveFile, write_drive_file
 from lanenet.data.files import write_text
 from lanenet.errors import DriveFormatError, LanenetError
@@ -77,7 +77,7 @@ def new_drive_folder(parent: Path, now: datetime) -> Path:
 
     A Raspberry Pi without a network does not know the time, so two drives may start at the same one.
     """
-    name = now.strftime("drive-%Y%m%d-%H%M%S")
+    name = RECORDING_NAME + now.strftime("%Y%m%d-%H%M%S")
     path, again = parent / name, 1
     while path.exists():
         again += 1

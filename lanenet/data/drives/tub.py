@@ -42,8 +42,10 @@ _IRREGULAR_RATIO = 4.0
 #: Above this share of irregular steps the timestamps are not used; measured: 0 to 0.6 % in sound tubs.
 _IRREGULAR_SHARE = 0.2
 
-#: Of a catalog. Chosen: Donkeycar starts a new one every 1000 rows, which take 0.3 MB.
-_MAX_CATALOG = 256 * MEBIBYTE
+#: Of a catalog. Chosen: a hundred times what Donkeycar writes, which starts a new one every 1000 rows.
+_MAX_CATALOG = 32 * MEBIBYTE
+#: Characters of a row. Chosen: rows have 300; lists in JSON take twenty times their text in memory.
+_MAX_ROW = 2**16
 #: Rows are counted in 64 bits; chosen: exact as a float, too.
 _MAX_INDEX = 2**53
 #: A joystick at its stop: Donkeycar divides its 16 bits, -32768 to 32767, by 32767. Taken as 1.
@@ -193,7 +195,9 @@ def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
     names = set()
     with os.scandir(folder) as entries:
         for entry in entries:
-            inside.file(f"{folder.name}/{entry.name}", folder, DriveFormatError)
+            # The rest lies where the folder does.
+            if not names or entry.is_symlink():
+                inside.file(f"{folder.name}/{entry.name}", folder, DriveFormatError)
             if entry.is_file():
                 names.add(entry.name)
     return names
@@ -205,10 +209,15 @@ def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]
     A power cut leaves zero bytes and half a row behind; they count as bad rows.
     """
     data = read_bytes(path, DriveFormatError, _MAX_CATALOG)
-    lines = data.decode("utf-8", errors="replace").split("\n")
-    rows = {number: _record(line, image_key) for number, line in enumerate(lines, start=1) if line.strip()}
-    records = [record for record in rows.values() if record is not None]
-    return records, [number for number, record in rows.items() if record is None]
+    records: list[_Record] = []
+    bad_rows: list[int] = []
+    for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), start=1):
+        record = _record(line, image_key) if line[:1] == "{" and len(line) <= _MAX_ROW else None
+        if record is not None:
+            records.append(record)
+        elif line and not line.isspace():
+            bad_rows.append(number)
+    return records, bad_rows
 
 
 def _record(line: str, image_key: str) -> _Record | None:

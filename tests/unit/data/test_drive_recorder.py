@@ -238,20 +238,27 @@ def test_a_drive_without_a_frame_leaves_no_folder(tmp_path: Path) -> None:
 
 
 def test_a_recording_that_was_killed_before_its_first_frame_goes(tmp_path: Path) -> None:
-    """And neither one that still runs nor one with frames."""
-    record(tmp_path / "frames", 1)
-    dead = DriveRecorder(tmp_path / "dead", settings())
-    dead.close()
-    shutil.copytree(tmp_path / "frames", tmp_path / "dead")
-    (tmp_path / "dead" / FRAMES_FILE).unlink()
-    tub = shutil.copytree(tmp_path / "dead", tmp_path / "tub")
-    (tub / "manifest.json").touch()
-    for name in ("dead", "frames", "gone", "tub"):
+    """And no other: one that still runs, one with frames, photos, or what another program has locked."""
+    frames, dead, tub, photos, running = (f"drive-{k}" for k in range(5))
+    record(tmp_path / frames, 1)
+    shutil.copytree(tmp_path / frames, tmp_path / dead)
+    (tmp_path / dead / FRAMES_FILE).unlink()
+    shutil.copytree(tmp_path / dead, tmp_path / tub)
+    (tmp_path / tub / "manifest.json").touch()
+    shutil.copytree(tmp_path / dead, tmp_path / photos)
+    (tmp_path / photos / "images" / "mine.jpg").touch()
+    shutil.copytree(tmp_path / dead, tmp_path / "other")
+    for name in (dead, frames, "drive-gone", tub, photos, "other"):
         (tmp_path / f".{name}.lock").touch()
-    running = DriveRecorder(tmp_path / "running", settings())
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".running.lock", "frames", "running", "tub"]
-    DriveRecorder(tmp_path / "other", settings()).close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".running.lock", "frames", "running", "tub"]
-    running.add(picture(0), 0.0)
-    running.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "running", "tub"]
+    kept = sorted([frames, tub, photos, running, "other", ".other.lock"])
+    runs = DriveRecorder(tmp_path / running, settings())
+    assert names(tmp_path) == sorted([*kept, f".{running}.lock"])
+    DriveRecorder(tmp_path / "drive-9", settings()).close()
+    assert names(tmp_path) == sorted([*kept, f".{running}.lock"])
+    runs.add(picture(0), 0.0)
+    runs.close()
+    assert names(tmp_path) == kept
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())

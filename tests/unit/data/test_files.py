@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from lanenet import outputs
-from lanenet.data.files import atomic_file, atomic_folder, require, write_json, write_text
+from lanenet.data.files import (
+    atomic_file,
+    atomic_folder,
+    check_destination,
+    check_replaceable,
+    require,
+    write_json,
+    write_text,
+)
 from lanenet.errors import LanenetError, MissingExtraError
 
 
@@ -41,6 +49,23 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
 def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
     with pytest.raises(LanenetError, match="is a folder"), atomic_file(tmp_path):
         pass
+
+
+def test_a_file_does_not_replace_a_pipe(tmp_path: Path) -> None:
+    """Nor a device: as root it would be gone for the whole system."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for refuses in (check_destination, lambda path: write_text(path, "x")):
+        with pytest.raises(LanenetError, match="pipe"):
+            refuses(pipe)
+    assert pipe.is_fifo()
+
+
+def test_a_mounted_disk_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Said before the work: in the end its name cannot be exchanged."""
+    monkeypatch.setattr(Path, "is_mount", lambda path: path == tmp_path)
+    with pytest.raises(LanenetError, match="mounted"):
+        check_replaceable(tmp_path, "drive")
 
 
 def test_a_file_below_a_file_is_refused(tmp_path: Path) -> None:
