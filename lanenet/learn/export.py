@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import logging
 import time
@@ -30,6 +31,7 @@ from lanenet.learn.network import DeployedLaneNet, LaneNet
 from lanenet.outputs import restore_output
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
+    HASH_NAME,
     INPUT_NAME,
     MARKER_NAME,
     MODEL_NAME,
@@ -142,17 +144,25 @@ def export_checkpoint(
 
 
 def write_weights(path: Path, network: LaneNet, meta: ModelMeta) -> None:
-    """Write weights and their description as safetensors."""
+    """Write weights, their hash and their description as safetensors."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    write_bytes(path, save(tensors, metadata=meta.to_properties()))
+    write_bytes(path, save(tensors, metadata=meta.to_properties() | {HASH_NAME: _hash_weights(tensors)}))
+
+
+def _hash_weights(tensors: dict[str, torch.Tensor]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(f"{name} {tuple(tensors[name].shape)} ".encode())
+        total.update(tensors[name].numpy().tobytes())
+    return total.hexdigest()
 
 
 def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     """Build the network of a checkpoint folder.
 
     Raises:
-        CheckpointError: If a file is missing, cannot be read or is of another format version, or the weights
-            do not fit the config.
+        CheckpointError: If a file is missing, damaged, cannot be read or is of another format version, or the
+            weights do not fit the config.
     """
     restore_output(checkpoint)
     if not checkpoint.is_dir():
@@ -176,6 +186,11 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
         with safe_open(path, framework="pt") as file:
             properties = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        # Weights of earlier versions have no hash.
+        if properties.get(HASH_NAME, "") not in ("", _hash_weights(state)):
+            raise CheckpointError(
+                f"{path}: was damaged or changed, expected the weights as they were trained"
+            )
         meta = ModelMeta.from_properties(properties, str(path))
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: cannot be read as safetensors ({error})") from None

@@ -275,7 +275,8 @@ class _SelfTestFile(Settings):
 
     raster: str
     answers: dict[str, tuple[float, ...]]
-    tolerance: float = Field(ge=0.0)
+    # Chosen: above that of eight bits; a larger one would test nothing.
+    tolerance: float = Field(ge=0.0, le=1.0)
 
 
 def self_test(

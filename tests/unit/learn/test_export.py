@@ -9,6 +9,8 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from synthetic_labels import WINDOW, make_label_set
 
 from lanenet.config import dump_settings
@@ -18,7 +20,7 @@ from lanenet.evaluation.answers import RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
-from lanenet.learn.export import export_checkpoint, export_onnx, write_rasters, write_weights
+from lanenet.learn.export import export_checkpoint, export_onnx, read_network, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
 from lanenet.perception.network.model_file import ModelMeta, read_model_meta, sealed
 
@@ -142,6 +144,25 @@ def test_faulty_checkpoints_are_refused(checkpoint, tmp_path):
         with pytest.raises(CheckpointError, match=message):
             export_checkpoint(folder)
         assert not (folder / "model.onnx").exists()
+
+
+def test_damaged_weights_are_refused(checkpoint, tmp_path):
+    """They are numbers, and a network; what is exported would answer otherwise."""
+    folder = tmp_path / "damaged"
+    shutil.copytree(checkpoint, folder)
+    path = folder / "weights.safetensors"
+    for at in (-2, -100_000):
+        data = bytearray(path.read_bytes())
+        data[at] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(CheckpointError, match=r"weights\.safetensors: was damaged"):
+            read_network(folder)
+        shutil.copy(checkpoint / path.name, path)
+    # Of an earlier version.
+    with safe_open(path, framework="pt") as file:
+        properties = {k: v for k, v in file.metadata().items() if k != "sha256"}
+    save_file(load_file(path), path, metadata=properties)
+    read_network(folder)
 
 
 def test_an_export_is_checked_on_labels_as_well(checkpoint, tmp_path):

@@ -332,6 +332,13 @@ def test_a_model_without_a_usable_self_test_is_refused(model_path, tmp_path, tes
         read_model_meta(path)
 
 
+def test_a_self_test_that_every_answer_passes_is_refused(model_path, tmp_path):
+    test = '{"raster": "", "answers": {}, "tolerance": 50}'
+    path = change_properties(model_path, tmp_path / "m.onnx", self_test=test)
+    with pytest.raises(ModelMismatchError, match="tolerance"):
+        read_model_meta(path)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
