@@ -12,6 +12,8 @@ from board_process import BoardProcess, build_host_board, build_uno
 from bus_wire import BUS, MONOSTABLE_S, SETTINGS, Wire
 from neutral_times import ALLOWED_S, FAULTS, seconds_to_neutral, sender, table
 
+from lanenet.onboard.actuators.pca9685 import PCA9685Settings
+
 STOPPED_US = 1500.0
 COUNT = 20
 #: The system may wake a process late, and a busy test machine does.
@@ -61,27 +63,28 @@ def test_neutral_on_the_pins_of_an_uno(uno: BoardProcess, tmp_path: Path) -> Non
 
 
 @pytest.fixture
-def strike_pca9685(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, float], float]:
-    """Strikes a car with a PCA9685 whose OE pin hangs on a watchdog of hardware."""
+def strike_pca9685(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., float]:
+    """Strikes a car with a PCA9685, whose OE pin hangs on a watchdog of hardware if the settings say so."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")]))
 
-    def strike(fault: str, moment: float) -> float:
+    def strike(fault: str, moment: float, settings: PCA9685Settings = SETTINGS) -> float:
         folder = tmp_path / str(moment)
         folder.mkdir()
         monkeypatch.setenv("LANENET_TEST_BUS", str(folder))
-        start = sender(SETTINGS.model_dump_json(exclude_unset=True), tmp_path / "log")
+        start = sender(settings.model_dump_json(exclude_unset=True), tmp_path / "log")
         return seconds_to_neutral(fault, start, Wire(folder).motor, moment)
 
     return strike
 
 
-def test_a_stopped_guard_does_not_drive_on(strike_pca9685: Callable[[str, float], float]) -> None:
-    assert strike_pca9685("guard stopped", 0.5) <= ALLOWED_S + LATE_S
+def test_a_stopped_guard_does_not_drive_on(strike_pca9685: Callable[..., float]) -> None:
+    # Without the watchdog at OE, which would be in time as well. The loop kills a guard only after 0.25 s.
+    assert strike_pca9685("guard stopped", 0.5, PCA9685Settings(kind="pca9685")) <= ALLOWED_S + LATE_S
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_neutral_of_a_pca9685(fault: str, strike_pca9685: Callable[[str, float], float]) -> None:
+def test_neutral_of_a_pca9685(fault: str, strike_pca9685: Callable[..., float]) -> None:
     times_s = [strike_pca9685(fault, number / COUNT) for number in range(COUNT)]
     print(table({fault: times_s}))  # noqa: T201 (the figures of the documentation)
     # With nobody left it is the monostable, whose last pulse came with the last command.

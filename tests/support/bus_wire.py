@@ -58,11 +58,14 @@ class Wire:
         raise AssertionError(f"not {'driving' if driving else 'neutral'} within {timeout_s} s")
 
     def motor(self) -> list[tuple[float, bool]]:
-        """When the motor was switched on or off: by the throttle, and by beats that stayed away."""
+        """When the motor was switched on or off: by the throttle, and by beats that stayed away.
+
+        Without any beat there is no watchdog.
+        """
         story: list[tuple[float, bool]] = []
-        throttle = powered = False
         beats = [w.t_s for w in self.writes() if w.register is None]
-        gaps = pairwise([*beats, time.monotonic()])
+        throttle, powered = False, not beats
+        gaps = pairwise([*beats, time.monotonic()] if beats else [])
         late = [early_s + MONOSTABLE_S for early_s, next_s in gaps if next_s - early_s > MONOSTABLE_S]
         events = [(t_s, "off") for t_s in late] + [(t_s, "on") for t_s in beats]
         events += [(w.t_s, "drive") for w in self.throttles(driving=True)]

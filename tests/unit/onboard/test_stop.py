@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import i2c_emulator
 import pytest
 from typer.testing import CliRunner
 
+from lanenet import __main__
 from lanenet.cli.app import app
 from lanenet.errors import ConfigError, HardwareError, LanenetError
 from lanenet.onboard import stop
@@ -169,6 +171,28 @@ def test_it_waits_for_no_other_part_of_lanenet():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.partition(".")[0] for name in result.stdout.split()}
     assert not {"cv2", "numpy", "onnxruntime", "jaxtyping", "typer", "rich", "serial"} & loaded
+
+
+def test_the_program_prepares_a_drive_before_it_imports_the_command_line(bus, car, monkeypatch):
+    seen = []
+    command_line = SimpleNamespace(main=lambda: seen.append((sys.argv[1], bus.chip.counts(0))))
+    monkeypatch.setitem(sys.modules, "lanenet.cli.app", command_line)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    drive(bus)
+    monkeypatch.setattr(sys, "argv", ["lanenet", "drive", str(car)])
+    __main__.main()
+    assert seen == [("drive", 370)]
+    assert lock_owners(car.stat()) == [os.getpid()]
+
+
+def test_the_program_stops_a_car_without_the_command_line(bus, car, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lanenet.cli.app", None)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    drive(bus)
+    monkeypatch.setattr(sys, "argv", ["lanenet", "stop", str(car)])
+    with pytest.raises(SystemExit) as ended:
+        __main__.main()
+    assert ended.value.code == 0 and bus.chip.counts(0) == 370
 
 
 def test_drive_is_neutral_before_it_has_imported_the_rest(bus, car):
