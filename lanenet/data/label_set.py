@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lanenet.config import Settings, check_settings
 from lanenet.data.files import require
-from lanenet.data.tables import ParquetTable, float_array, list_array, png_bytes, write_parquet
+from lanenet.data.tables import MAX_PLACE, ParquetTable, float_array, list_array, png_bytes, write_parquet
 from lanenet.errors import ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
@@ -254,18 +254,22 @@ def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
 
 
 def _check_values(label_set: LabelSet, where: str) -> None:
-    """Refuse missing and infinite numbers; :class:`ParquetTable` has refused most by their column's name."""
-    finite = {"t_s": label_set.t_s, "pose": label_set.poses, "quality": label_set.quality}
-    for name, values in finite.items():
-        if not np.isfinite(values).all():
+    """Refuse missing and huge numbers; :class:`ParquetTable` has refused most by their column's name."""
+    if not np.isfinite(label_set.t_s).all():
+        raise LabelFormatError(
+            f"{where}: column 't_s': not finite in row {_first(~np.isfinite(label_set.t_s))}"
+        )
+    places = np.column_stack([label_set.poses, label_set.points_cm])
+    for k, name in enumerate((*_POSE_COLUMNS, *POINT_NAMES)):
+        # A label may be missing, a pose not.
+        outside = ~(np.abs(places[:, k]) <= MAX_PLACE) & ~(np.isnan(places[:, k]) & (name in POINT_NAMES))
+        if outside.any():
+            row = _first(outside)
             raise LabelFormatError(
-                f"{where}: column {name!r}: not finite in row {_first(~np.isfinite(values))}"
+                f"{where}: column {name!r}, row {row}: found {places[row, k]:g}, expected at most "
+                f"{MAX_PLACE:g}"
             )
-    for k, name in enumerate(POINT_NAMES):
-        infinite = np.isinf(label_set.points_cm[:, k])
-        if infinite.any():
-            raise LabelFormatError(f"{where}: column {name!r}: infinite in row {_first(infinite)}")
-    outside = (label_set.quality < 0.0) | (label_set.quality > 1.0)
+    outside = ~((label_set.quality >= 0.0) & (label_set.quality <= 1.0))
     if outside.any():
         raise LabelFormatError(f"{where}: column 'quality': outside 0..1 in row {_first(outside)}")
     for row, (edges, (left, right)) in enumerate(zip(label_set.edges, label_set.lines, strict=True)):

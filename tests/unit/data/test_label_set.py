@@ -148,10 +148,13 @@ def with_value(labels: LabelSet, name: str, value: float) -> LabelSet:
     ("name", "value", "message"),
     [
         ("t_s", np.nan, "column 't_s': not finite in row 3"),
-        ("poses", np.inf, "column 'pose': not finite in row 3"),
-        ("points_cm", -np.inf, "column 'left_0_cm': infinite in row 3"),
+        ("poses", np.inf, "column 'x_cm', row 3: found inf"),
+        ("poses", np.nan, "column 'x_cm', row 3: found nan"),
+        ("poses", 1e300, "column 'x_cm', row 3: found 1e.300"),
+        ("points_cm", -np.inf, "column 'left_0_cm', row 3: found -inf"),
+        ("points_cm", -1e9, "column 'left_0_cm', row 3: found -1e.09"),
         ("quality", 1.5, "column 'quality': outside 0..1 in row 3"),
-        ("quality", np.nan, "column 'quality': not finite in row 3"),
+        ("quality", np.nan, "column 'quality': outside 0..1 in row 3"),
     ],
 )
 def test_writing_refuses_what_reading_would(tmp_path: Path, name: str, value: float, message: str) -> None:
