@@ -17,7 +17,7 @@ from typing import Any
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
 from lanenet.onboard.actuators.pca9685 import OSCILLATOR_HZ, PCA9685Settings, prescale_of
-from lanenet.reading import MEBIBYTE, read_text
+from lanenet.reading import MEBIBYTE, parsing, read_text
 
 #: Donkeycar counts pulses in 4096ths of a period at this nominal rate.
 _FREQUENCY_HZ = 60.0
@@ -193,6 +193,8 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
             raise ConfigError(f"{path}: {train}: expected a dictionary, found {section!r}")
         # Before Donkeycar 4.4 the same names stood at the top level.
         merged = {**{name: values[name] for name in _PULSES if name in values}, **section}
+        # Products of its numbers may be infinite.
+    with parsing(path, ConfigError):
         return {**_pulses(merged, path), **_pins(merged, path)}
     if train == "I2C_SERVO":
         places = {
