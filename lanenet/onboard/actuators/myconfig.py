@@ -194,15 +194,16 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
         # Before Donkeycar 4.4 the same names stood at the top level.
         merged = {**{name: values[name] for name in _PULSES if name in values}, **section}
         # Products of its numbers may be infinite.
-    with parsing(path, ConfigError):
-        return {**_pulses(merged, path), **_pins(merged, path)}
+        with parsing(path, ConfigError):
+            return {**_pulses(merged, path), **_pins(merged, path)}
     if train == "I2C_SERVO":
         places = {
             key: _whole(values, name, path)
             for name, key in _OLD_PLACES.items()
             if values.get(name) is not None
         }
-        return {**_pulses(values, path), **places}
+        with parsing(path, ConfigError):
+            return {**_pulses(values, path), **places}
     raise ConfigError(
         f"{path}: DRIVE_TRAIN_TYPE {train!r}, expected 'PWM_STEERING_THROTTLE' or 'I2C_SERVO': only a servo "
         "and a speed controller on a PCA9685 are supported"
