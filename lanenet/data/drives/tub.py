@@ -192,7 +192,7 @@ def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
     """
     if not folder.is_dir():
         return set()
-    names = set()
+    names: set[str] = set()
     with os.scandir(folder) as entries:
         for entry in entries:
             # The rest lies where the folder does.
