@@ -226,7 +226,7 @@ BAD = [
     ),
     Bad("an index beyond all counting", tub([record(10**30)]), D, LOST),
     Bad("a row nested deeply", tub(["[" * 100_000]), D, LOST),
-    Bad("a row of 100 kB", tub([record(0, filler="x" * 100_000)]), D, (*LOST, "1 rows")),
+    Bad("a row of 2 MB", tub([record(0, filler="x" * 2_000_000)]), D, (*LOST, "1 rows")),
     # videos
     Bad("a playlist", holding("lap.mp4", b"#EXTM3U\n/etc/passwd\n", "lap.mp4"), D, ("lap.mp4", "#EXTM3U")),
     Bad("no video", holding("lap.mp4", b"not a video at all" * 50, "lap.mp4"), D, ("lap.mp4", "OpenCV")),
@@ -273,6 +273,13 @@ def test_a_drive_may_use_its_own_folders(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(path)
     drive = open_drive(tmp_path / "link")
     assert not drive.problems and drive.image(1).shape == drive.image(0).shape
+
+
+def test_a_row_may_be_long_and_begin_with_a_space(tmp_path: Path) -> None:
+    long = record(1, **{"lidar/scan": [1.25] * 10_000})
+    path = write_tub(tmp_path / "tub", [record(0), long])
+    edit(path / "catalog_0.catalog", json.dumps(long), f"  {json.dumps(long)}")
+    assert open_drive(path).frames.tolist() == [0, 1]
 
 
 def test_a_tub_may_keep_its_catalogs_in_a_folder(tmp_path: Path) -> None:

@@ -42,10 +42,10 @@ _IRREGULAR_RATIO = 4.0
 #: Above this share of irregular steps the timestamps are not used; measured: 0 to 0.6 % in sound tubs.
 _IRREGULAR_SHARE = 0.2
 
-#: Of a catalog. Chosen: a hundred times what Donkeycar writes, which starts a new one every 1000 rows.
-_MAX_CATALOG = 32 * MEBIBYTE
-#: Characters of a row. Chosen: rows have 300; lists in JSON take twenty times their text in memory.
-_MAX_ROW = 2**16
+#: Of a catalog. Chosen: Donkeycar starts a new one every 1000 rows, which take 0.3 MB, or more with a lidar.
+_MAX_CATALOG = 64 * MEBIBYTE
+#: Characters of a row. Chosen: 50 000 numbers; lists in JSON take twenty times their text in memory.
+_MAX_ROW = 2**20
 #: Rows are counted in 64 bits; chosen: exact as a float, too.
 _MAX_INDEX = 2**53
 #: A joystick at its stop: Donkeycar divides its 16 bits, -32768 to 32767, by 32767. Taken as 1.
@@ -212,7 +212,7 @@ def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]
     records: list[_Record] = []
     bad_rows: list[int] = []
     for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), start=1):
-        record = _record(line, image_key) if line[:1] == "{" and len(line) <= _MAX_ROW else None
+        record = _record(line, image_key) if len(line) <= _MAX_ROW else None
         if record is not None:
             records.append(record)
         elif line and not line.isspace():
@@ -221,6 +221,8 @@ def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]
 
 
 def _record(line: str, image_key: str) -> _Record | None:
+    if not line.lstrip().startswith("{"):
+        return None
     try:
         data = json.loads(line)
     except (ValueError, RecursionError):
