@@ -19,6 +19,9 @@ from lanenet.data.label_set import read_labels
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.learn.export import read_network
 
+# `make chain`, a stage of the gate.
+pytestmark = pytest.mark.slow
+
 #: Fewer give no map.
 FRAMES = 60
 
@@ -97,7 +100,6 @@ def test_labels_come_from_the_map_and_are_close_to_the_truth(finished):
     assert read_labels(synthetic / "labels" / "test_00.parquet").meta.source == "truth"
 
 
-@pytest.mark.slow
 def test_a_second_run_does_nothing_again(finished):
     folder, config, _ = finished
     # Of the drives, and of the training, which writes its state after each epoch.
@@ -127,7 +129,6 @@ def test_the_model_works_on_its_own(finished):
     assert video.stat().st_size > 10_000
 
 
-@pytest.mark.slow
 def test_the_steps_one_by_one(finished):
     folder, _, _ = finished
     drive = folder / "work" / "synthetic" / "drives" / "validation_00"
@@ -155,7 +156,6 @@ def test_the_steps_one_by_one(finished):
     assert exported.stat().st_size == pytest.approx(model.stat().st_size, rel=0.01)
 
 
-@pytest.mark.slow
 def test_a_killed_train_resumes(tmp_path, finished):
     """Killed in the data stage and again while training, it ends with the weights of an undisturbed run."""
     folder, _, _ = finished
