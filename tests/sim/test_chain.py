@@ -176,9 +176,9 @@ def test_a_killed_train_resumes(tmp_path, finished):
 
     labels = tmp_path / "work" / "synthetic" / "labels"
     kill_when(lambda: (labels / "train_00.parquet").is_file())
-    assert not (tmp_path / "ck").exists()
+    assert not (tmp_path / "ck" / "tiny").exists()
     kill_when(lambda: any((tmp_path / "work").glob("train-*/last.pt")))
-    assert not (tmp_path / "ck").exists()
+    assert not (tmp_path / "ck" / "tiny").exists()
     invoke("train", config)
     undisturbed, killed = (read_network(f / "ck" / "tiny")[0].state_dict() for f in (folder, tmp_path))
     for name, value in undisturbed.items():
