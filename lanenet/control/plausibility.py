@@ -22,9 +22,9 @@ _NARROWEST, _WIDEST = 0.6, 1.6
 _NOISE_LANES = 0.35
 #: Width where none is known. Chosen: that of common tracks for 1:10 cars.
 _COMMON_WIDTH_CM = 40.0
-#: A line's place moves sideways by at most this share of the car's way: full lock of 0.45 rad turns a car of
-#: 17 cm wheelbase by 0.43 rad in 15 cm, which moves what is 15 cm ahead by half of that way, and a lane that
-#: is crossed at 45 degrees moves by all of it. Chosen: the sum.
+#: A line's place moves sideways by at most this share of the distance driven: full lock of 0.45 rad turns a
+#: car of 17 cm wheelbase by 0.43 rad in 15 cm, which moves what is 15 cm ahead by half of that distance, and
+#: a lane that is crossed at 45 degrees moves by all of it. Chosen: the sum.
 _SIDEWAYS = 1.5
 #: However long ago it was seen, a lane does not move by more than this share of its width. Chosen: less than
 #: to the adjacent lane.

@@ -31,7 +31,7 @@ class ArmCheck:
 
     Attributes:
         name: What was checked.
-        passed: Whether it keeps the car from starting.
+        passed: Whether it is as it should be; the car starts only when all are.
         text: What was found.
     """
 
