@@ -40,6 +40,8 @@ _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
 _LEAST_MAP_CM = 1.0
 #: Lines of one side, counted from the driven lane; chosen: no model road has as many lanes.
 _MAX_RANK = 20
+#: Largest size of a match, which is about a share. Chosen: no frame comes near it.
+_MOST_MATCH = 100.0
 #: Positions at which the order of two lines is checked; chosen.
 _SIDES_CHECKED = 64
 
@@ -86,7 +88,7 @@ class DriveMap:
         lap: Lap of each frame, from 0.
         segment: Segment of each frame.
         s_cm: Position along the segment's path; on a closed lap less than its length.
-        match: Matched share of each frame's edges, 0..1.
+        match: Matched share of each frame's edges; below 0 where most face the other way, NaN without edges.
         lines: Lines of each segment: left and right of the driven lane, then those of adjacent lanes.
         tilt_rad: Pitch and roll of each frame, added to the camera's mounting.
         held_out: Frames whose edge points were not used for the lines.
@@ -207,7 +209,8 @@ def read_map(folder: Path) -> DriveMap:
             **{name: ColumnSpec("int", low=0.0, high=MAX_PLACE) for name in ("lap", "segment")},
             **dict.fromkeys((*_POSE, "s_cm", *_TILT), place),
             "t_s": ColumnSpec(low=-MAX_TIME_S, high=MAX_TIME_S),
-            "match": ColumnSpec(allow_empty=True, low=0.0, high=1.0),
+            # Below 0 where most edges face the other way than those of the map.
+            "match": ColumnSpec(allow_empty=True, low=-_MOST_MATCH, high=_MOST_MATCH),
             **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
         },
         error=MapFormatError,

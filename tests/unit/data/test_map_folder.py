@@ -175,7 +175,7 @@ def test_poses_without_a_number_are_refused(folder, value):
         {"x_cm": "0.5", "y_cm": "0.25"},
         {"frame": "7"},
         {"x_cm": "1e300"},
-        {"match": "-3"},
+        {"match": "-300"},
         {"segment": "-1"},
     ],
     ids=lambda change: "-".join(change),
@@ -189,6 +189,15 @@ def test_poses_that_no_drive_has_are_refused(folder, change):
     path.write_text("".join(",".join(row) + "\n" for row in rows))
     with pytest.raises(MapFormatError, match=r"poses\.csv"):
         read_map(folder)
+
+
+def test_a_frame_whose_edges_face_the_other_way_is_read(folder):
+    path = folder / "poses.csv"
+    header, first, *rest = path.read_text().splitlines()
+    cells = first.split(",")
+    cells[header.split(",").index("match")] = "-0.12"
+    path.write_text("\n".join([header, ",".join(cells), *rest]) + "\n")
+    assert read_map(folder).match[0] == -0.12
 
 
 @pytest.mark.parametrize("name", ["pitch_rad", "held_out", "contradicted_right"])
