@@ -9,10 +9,11 @@ Source:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
+from numba import njit
 from pydantic import Field
 
 from datagen.slam.filter.ancestry import AncestryMap, Likelihood, MapLayout
@@ -185,7 +186,7 @@ class ParticleFilter:
         count = len(self.weights)
         if self.frame == 0 or effective_number(self.weights) >= self.settings.resample_below * count:
             return np.arange(count)
-        chosen = systematic_resample(self.weights, self.rng.random())
+        chosen: Int[np.ndarray, "p"] = systematic_resample(self.weights, self.rng.random())
         self.weights = np.full(count, 1.0 / count)
         return chosen
 
@@ -247,9 +248,9 @@ def smooth_lineages(history: list[Survivors], final: Float[np.ndarray, "u"]) -> 
     return smoothed
 
 
-def reweigh(
-    weights: Float[np.ndarray, "p"], scores: Float[np.ndarray, "p"], effective_share: float
-) -> Float[np.ndarray, "p"]:
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def reweigh(weights, scores, effective_share):
     """Turn match scores into weights, as sharply as the particles can bear.
 
     Edge points of one line are not independent, and the plain likelihood would leave one particle. The scores
@@ -263,22 +264,36 @@ def reweigh(
     Returns:
         Weights that add up to 1.
     """
-    below, temperature = scores - scores.max(), 1.0
+    new = np.empty(len(weights))
+    highest, temperature = scores[0], 1.0
+    for p in range(len(weights)):
+        highest = max(highest, scores[p])
     for _ in range(_TEMPERATURES):
-        new = weights * np.exp(below / temperature)
-        new /= new.sum()
+        total = 0.0
+        for p in range(len(weights)):
+            new[p] = weights[p] * np.exp((scores[p] - highest) / temperature)
+            total += new[p]
+        for p in range(len(weights)):
+            new[p] /= total
         if effective_number(new) >= effective_share * len(new):
             break
         temperature *= _COOLER
     return new
 
 
-def effective_number(weights: Float[np.ndarray, "p"]) -> float:
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def effective_number(weights):
     """Return how many equally weighted particles would be as good: 1 / sum of squares."""
-    return 1.0 / float(weights @ weights)
+    total = 0.0
+    for p in range(len(weights)):
+        total += weights[p] * weights[p]
+    return 1.0 / total
 
 
-def systematic_resample(weights: Float[np.ndarray, "p"], uniform: float) -> Int[np.ndarray, "p"]:
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def systematic_resample(weights, uniform):
     """Draw as many particles as there are, each N times its weight on average, with one random number.
 
     Args:
@@ -292,5 +307,12 @@ def systematic_resample(weights: Float[np.ndarray, "p"], uniform: float) -> Int[
         Kitagawa 1996; copies of each particle differ from N * weight by less than one.
     """
     n = len(weights)
-    at = np.searchsorted(np.cumsum(weights), (np.arange(n) + uniform) / n, side="right")
-    return np.minimum(at, n - 1)
+    chosen = np.empty(n, np.int64)
+    at, cumulative = 0, weights[0]
+    for k in range(n):
+        position = (k + uniform) / n
+        while at < n - 1 and cumulative <= position:
+            at += 1
+            cumulative += weights[at]
+        chosen[k] = at
+    return chosen

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 #: Columns of a particle: x, y, heading of the rear axle, distance factor, curvature offset.
 X, Y, HEADING, FACTOR, OFFSET = range(5)
@@ -39,6 +41,23 @@ class MotionModel:
     curvature_noise_per_cm: float
     max_curvature_per_cm: float
 
+    @property
+    def numbers(self) -> Float[np.ndarray, "8"]:
+        """The numbers that hold for every frame, as :func:`advance` takes them."""
+        mean, _ = self.factor_start
+        return np.array(
+            [
+                mean,
+                self.factor_pull,
+                self.factor_walk,
+                self.offset_decay,
+                self.offset_walk_per_cm,
+                self.distance_noise,
+                self.curvature_noise_per_cm,
+                self.max_curvature_per_cm,
+            ]
+        )
+
     def start(self, particles: int, rng: np.random.Generator) -> Float[np.ndarray, "p 5"]:
         """Draw particles at the origin of the map, heading along +x."""
         states = np.zeros((particles, 5))
@@ -47,29 +66,46 @@ class MotionModel:
         return states
 
     def predict(self, states: Float[np.ndarray, "p 5"], k: int, rng: np.random.Generator) -> None:
-        """Move particles in place from frame k - 1 to frame k.
-
-        Source:
-            Kozlowski et al. 2024, eq. 4-6, integrated exactly along an arc's chord (heading at mid-step),
-            with normal noise on distance and curvature (V and tan(beta) / L there).
-        """
+        """Move particles in place from frame k - 1 to frame k."""
         noise = rng.standard_normal((4, len(states)))
-        heading, factor, offset = states[:, HEADING], states[:, FACTOR], states[:, OFFSET]
-        pull = self.factor_pull * (self.factor_start[0] - factor)
-        factor[:] = np.abs(factor + (pull + self.factor_walk * noise[0]))
-        offset += self.offset_walk_per_cm * noise[1] - self.offset_decay * offset
-        distance = self.distance_cm[k] * factor * (1.0 + self.distance_noise * noise[2])
-        curvature = self.curvature_per_cm[k] + offset + self.curvature_noise_per_cm * noise[3]
-        turn = distance * np.clip(curvature, -self.max_curvature_per_cm, self.max_curvature_per_cm)
-        middle = heading + 0.5 * turn
-        states[:, X] += distance * np.cos(middle)
-        states[:, Y] += distance * np.sin(middle)
-        heading += turn
+        advance(states, noise, self.distance_cm[k], self.curvature_per_cm[k], self.numbers)
 
 
-def widen_steps(
-    before: Float[np.ndarray, "p 5"], states: Float[np.ndarray, "p 5"], every: int, factor: float
-) -> None:
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def advance(states, noise, distance_cm, curvature_per_cm, numbers):
+    """Move particles in place by one frame.
+
+    Args:
+        states: Particles.
+        noise: Four normal numbers for each particle.
+        distance_cm: Predicted distance.
+        curvature_per_cm: Predicted curvature.
+        numbers: See :attr:`MotionModel.numbers`.
+
+    Source:
+        Kozlowski et al. 2024, eq. 4-6, integrated exactly along an arc's chord (heading at mid-step), with
+        normal noise on distance and curvature (V and tan(beta) / L there).
+    """
+    mean, pull, walk, decay, offset_walk, distance_noise, curvature_noise, limit = numbers
+    for p in range(states.shape[0]):
+        factor = states[p, FACTOR]
+        factor = abs(factor + (pull * (mean - factor) + walk * noise[0, p]))
+        offset = states[p, OFFSET]
+        offset += -decay * offset + offset_walk * noise[1, p]
+        states[p, FACTOR], states[p, OFFSET] = factor, offset
+        distance = distance_cm * factor * (1.0 + distance_noise * noise[2, p])
+        curvature = curvature_per_cm + offset + curvature_noise * noise[3, p]
+        turn = distance * min(max(curvature, -limit), limit)
+        middle = states[p, HEADING] + 0.5 * turn
+        states[p, X] += distance * np.cos(middle)
+        states[p, Y] += distance * np.sin(middle)
+        states[p, HEADING] += turn
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def widen_steps(before, states, every, factor):
     """Let some particles stray further from the mean step than the motion model does, in place.
 
     Recorded drives jerk: a frame is missing, a wheel slips, the camera nods. Normal noise that is wide enough
@@ -86,12 +122,19 @@ def widen_steps(
     """
     if every <= 0:
         return
-    x, y, turns = (states - before)[:, : HEADING + 1].T
-    middle = before[:, HEADING] + 0.5 * turns
-    # A step is a chord in the direction of the middle heading, see MotionModel.predict.
-    steps = x * np.cos(middle) + y * np.sin(middle)
-    turn = turns.mean() + factor * (turns[::every] - turns.mean())
-    step = steps.mean() + factor * (steps[::every] - steps.mean())
-    middle = before[::every, HEADING] + 0.5 * turn
-    moved = np.stack([step * np.cos(middle), step * np.sin(middle), turn], axis=1)
-    states[::every, : HEADING + 1] = before[::every, : HEADING + 1] + moved
+    particles = len(states)
+    turns, steps = np.empty(particles), np.empty(particles)
+    for p in range(particles):
+        turns[p] = states[p, HEADING] - before[p, HEADING]
+        middle = before[p, HEADING] + 0.5 * turns[p]
+        # A step is a chord in the direction of the middle heading, see advance().
+        dx, dy = states[p, X] - before[p, X], states[p, Y] - before[p, Y]
+        steps[p] = dx * np.cos(middle) + dy * np.sin(middle)
+    mean_turn, mean_step = turns.mean(), steps.mean()
+    for p in range(0, particles, every):
+        turn = mean_turn + factor * (turns[p] - mean_turn)
+        step = mean_step + factor * (steps[p] - mean_step)
+        middle = before[p, HEADING] + 0.5 * turn
+        states[p, X] = before[p, X] + step * np.cos(middle)
+        states[p, Y] = before[p, Y] + step * np.sin(middle)
+        states[p, HEADING] = before[p, HEADING] + turn

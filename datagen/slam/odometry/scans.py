@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
+from numba import njit
 
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
@@ -164,16 +165,51 @@ def condense(scan: Scan, patch_cm: float, most: int) -> Scan:
         Weighted mean points, unit normals, and weights: the length of the sum of the weighted normals, so
         that normals that disagree weigh less.
     """
-    x, y = scan.points_cm.T
-    nx, ny = scan.normals.T
-    sector = np.rint(np.arctan2(ny, nx) * (_SECTORS / (2.0 * np.pi))).astype(np.int64) % _SECTORS
-    column, row = (np.floor(place / patch_cm).astype(np.int64) for place in (x, y))
-    patch = np.unique((column << 32) + row * _SECTORS + sector, return_inverse=True)[1]
-    values = np.stack([np.ones(len(x)), x, y, nx, ny]) * scan.weights
-    sums = np.stack([np.bincount(patch, value) for value in values], axis=1)
-    weight, length = sums[:, 0], np.hypot(sums[:, 3], sums[:, 4])
+    weights = scan.weights
+    # At most half of the slots of the hash table are taken, so that a search for a free one is short.
+    slots = np.full(2 << max(len(weights), 1).bit_length(), -1, np.int64)
+    sums, keys = np.zeros((len(weights), 5)), np.empty((len(weights), 2), np.int64)
+    count = _add_up(scan, patch_cm, slots, keys, sums)
+    weight, length = sums[:count, 0], np.hypot(sums[:count, 3], sums[:count, 4])
     kept = np.flatnonzero(length > 1e-9 * weight)
     if len(kept) > most:
         kept = np.sort(kept[np.argpartition(-length[kept], most)[:most]])
     mean, length = sums[kept], length[kept]
     return Scan(mean[:, 1:3] / mean[:, :1], mean[:, 3:5] / length[:, None], length)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def _add_up(scan, patch_cm, slots, keys, sums):
+    """Sum weight, weighted point and weighted normal of each patch and sector.
+
+    Args:
+        scan: Edge points.
+        patch_cm: Side of a patch.
+        slots: Which patch stands in each slot of a hash table, -1 for none; a power of two.
+        keys: Filled: column, and row with sector, of each patch.
+        sums: Filled.
+
+    Returns:
+        Number of patches.
+    """
+    points_cm, normals, weights = scan.points_cm, scan.normals, scan.weights
+    count, mask = 0, len(slots) - 1
+    for i in range(len(weights)):
+        x, y, nx, ny, weight = points_cm[i, 0], points_cm[i, 1], normals[i, 0], normals[i, 1], weights[i]
+        sector = int(np.rint(np.arctan2(ny, nx) * (_SECTORS / (2.0 * np.pi)))) % _SECTORS
+        column, row = int(np.floor(x / patch_cm)), int(np.floor(y / patch_cm)) * _SECTORS + sector
+        slot = (column * 40503 + row * 30011) & mask
+        while slots[slot] >= 0 and (keys[slots[slot], 0] != column or keys[slots[slot], 1] != row):
+            slot = (slot + 1) & mask
+        patch = slots[slot]
+        if patch < 0:
+            patch = slots[slot] = count
+            keys[count, 0], keys[count, 1] = column, row
+            count += 1
+        sums[patch, 0] += weight
+        sums[patch, 1] += weight * x
+        sums[patch, 2] += weight * y
+        sums[patch, 3] += weight * nx
+        sums[patch, 4] += weight * ny
+    return count
