@@ -1,6 +1,6 @@
 """Stops a car, whatever drives it: neutral first, then the end of the process that owns the actuator.
 
-Reads the section ``actuator`` of the car's file and imports nothing else of lanenet: the car drives on
+Reads the section ``actuator`` of the car's file and imports little of lanenet: the car drives on
 meanwhile. A drive that still starts owns nothing yet; it is known by a lock on its car's file.
 """
 
