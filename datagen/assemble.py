@@ -12,9 +12,12 @@ from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
-from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+
+#: Edge points up to this distance are drawn, in camera heights. Chosen: further ones scatter.
+_DRAWN_HEIGHTS = 3.0
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,16 @@ class AssembledMap:
         )
 
     @property
-    def scaled_scans(self) -> list[tuple[Scans, Float[np.ndarray, "n 3"], float]]:
-        """Of each segment the scans, the poses in centimetres, and the factor of the scans."""
-        scale = _pose_scale(self.factor)
-        return [(s.solved.scans, s.solved.poses * scale, self.factor) for s in self.segments]
+    def near_points(self) -> list[Float[np.ndarray, "_ 2"]]:
+        """Edge points of each frame that are near enough to be drawn, [cm], frame map."""
+        points = []
+        for solved in (s.solved for s in self.segments):
+            reach_cm = _DRAWN_HEIGHTS * solved.camera.mounting.height_cm
+            for k in range(len(solved.poses)):
+                seen = solved.scans.points_cm[solved.scans.frame(k)]
+                seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach_cm]
+                points.append(self.factor * map_from_car(seen, solved.poses[k], solved.camera.wheelbase_cm))
+        return points
 
 
 def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]) -> AssembledMap:

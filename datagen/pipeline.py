@@ -91,7 +91,7 @@ def _map_drive(
     }
     with atomic_folder(out, "map", check_map_files) as folder:
         drive_map, opened = checked.mapped.drive_map, assembled.open_poses
-        edges = map_edges(assembled.segments, prepared.drive.frames, drive_map.camera, assembled.factor)
+        edges = map_edges(assembled.segments, prepared.drive.frames, assembled.factor)
         write_map(folder, drive_map, edges, figures, camera.how)
         write_text(folder / SETTINGS_NAME, dump_settings(settings))
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
@@ -111,7 +111,7 @@ def _draw(
     """Draw the map, some of its frames, and the page of the report."""
     mapped = checked.mapped
     drive_map, opened = mapped.drive_map, assembled.open_poses
-    draw_map(folder / "map.png", drive_map, assembled.scaled_scans, mapped.starts)
+    draw_map(folder / "map.png", drive_map, assembled.near_points, mapped.starts)
     shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
     draw_contact_sheet(folder / "frames.png", mapped, shown)
     png = (folder / "map.png").read_bytes()

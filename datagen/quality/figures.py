@@ -13,7 +13,6 @@ from datagen.quality.verdict import LineEvidence, MapEvidence
 from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import known_lines
-from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 #: Of a line's residuals, in the order of :class:`datagen.quality.verdict.LineEvidence`.
@@ -29,14 +28,13 @@ class Report:
 
 
 def map_edges(
-    parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], camera: Camera, factor: float
+    parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], factor: float
 ) -> dict[str, np.ndarray]:
     """Return the columns of all edge points with their directions, frame map, as float32.
 
     Args:
         parts: Segments.
         numbers: Frame number of each position in the drive.
-        camera: The map's camera.
         factor: Converts the segments' lengths to centimetres.
     """
     points, normals, frames, segments = [], [], [], []
@@ -44,8 +42,10 @@ def map_edges(
         solved = part.solved
         for k in range(len(solved.poses)):
             points_of = solved.scans.frame(k)
-            pose = solved.poses[k] * [factor, factor, 1.0]
-            points.append(map_from_car(factor * solved.scans.points_cm[points_of], pose, camera.wheelbase_cm))
+            pose = solved.poses[k]
+            # The segment's own wheelbase scales with its lengths; the map's camera has the car's.
+            seen = map_from_car(solved.scans.points_cm[points_of], pose, solved.camera.wheelbase_cm)
+            points.append(factor * seen)
             normals.append(map_from_car_directions(solved.scans.normals[points_of], pose[2]))
             frames.append(np.full(points_of.stop - points_of.start, numbers[part.rows[k]]))
             segments.append(np.full(points_of.stop - points_of.start, i))

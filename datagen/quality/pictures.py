@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import REFERENCE_WIDTH
-from datagen.slam.odometry.scans import Scans
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.data.segments import true_runs
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
 
 #: Colours, BGR.
@@ -33,7 +31,7 @@ _COLUMNS, _TILES = 4, 8
 def draw_map(
     path: Path,
     drive_map: DriveMap,
-    parts: list[tuple[Scans, Float[np.ndarray, "n 3"], float]],
+    clouds: list[Float[np.ndarray, "_ 2"]],
     starts: Bool[np.ndarray, "f"],
     size_px: int = 1600,
 ) -> None:
@@ -42,18 +40,10 @@ def draw_map(
     Args:
         path: PNG to write.
         drive_map: The map.
-        parts: Per segment, its scans, its poses in map scale, and the scale factor of the scans.
+        clouds: Edge points of each frame, frame map.
         starts: Frames that do not continue the frame before them; no path is drawn between the two.
         size_px: Longer side of the picture.
     """
-    clouds = []
-    for scans, poses, factor in parts:
-        reach = 3.0 * drive_map.camera.mounting.height_cm
-        points = scans.points_cm * factor
-        for k in range(len(poses)):
-            seen = points[scans.frame(k)]
-            seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach]
-            clouds.append(map_from_car(seen, poses[k], drive_map.camera.wheelbase_cm))
     lanes = []
     for segment, lines in drive_map.lines.items():
         s = drive_map.s_cm[drive_map.segment == segment]

@@ -38,6 +38,8 @@ _SPEED_CM_S = {"wander": 60.0, "recover": 60.0, "fast": 100.0}
 _TRIM_AFTER = 5.0
 _MOST_TRIM_RAD = 0.15
 _TRIM_WITHIN_CM = 5.0
+#: Largest offset at which a kink is cut, in lane widths; chosen: half of the car stays in its lane.
+_MOST_CUT_LANES = 0.35
 
 
 class DriverSettings(Settings):
@@ -239,6 +241,8 @@ class Driver:
         self._lead_s = car.delay_s + 0.5 / rate_hz
         self.s_cm = start_s_cm + (0.0 if track.closed else car.wheelbase_cm)
         self._steered_rad, self._speed_cm_s, self._trim_rad = 0.0, 0.0, 0.0
+        self._least_radius_cm = car.wheelbase_cm / math.tan(car.max_steering_rad)
+        self._kinks = np.flatnonzero(track.kinks_rad)
 
     def start_pose(self) -> Float[np.ndarray, "3"]:
         """Pose with the front axle on the line at the current place (rear axle, frame map)."""
@@ -272,16 +276,38 @@ class Driver:
             pose, self._speed_cm_s * self._lead_s, self._steered_rad + self._trim_rad, self._wheelbase_cm
         )
         s_cm, offset_cm = self._place(ahead)
-        off_cm = offset_cm - self.script.offset_cm(s_cm)
+        cut_cm, cut_slope = self._cut(s_cm)
+        off_cm = offset_cm - self.script.offset_cm(s_cm) - cut_cm
         if abs(off_cm) < _TRIM_WITHIN_CM:
             # The trim is what the wheels do by themselves: to the left if the car drifts to the left.
             share = off_cm / self._aim_ahead_cm * (self.s_cm - before_cm) / (_TRIM_AFTER * self._aim_ahead_cm)
             self._trim_rad = min(max(self._trim_rad + share, -_MOST_TRIM_RAD), _MOST_TRIM_RAD)
-        direction = self.track.point(s_cm)[1] + math.atan(self.script.slope(s_cm))
+        direction = self.track.point(s_cm)[1] + math.atan(self.script.slope(s_cm) + cut_slope)
         wanted = direction - math.atan(off_cm / self._aim_ahead_cm) - float(ahead[2])
         steering = math.remainder(wanted, 2.0 * math.pi) - self._trim_rad
         self._steered_rad = min(max(steering, -self._max_steering_rad), self._max_steering_rad)
         return self._steered_rad
+
+    def _cut(self, s_cm: float) -> tuple[float, float]:
+        """Offset by which the path cuts a nearby kink, left positive, [cm], and its slope; 0 elsewhere.
+
+        The path is a parabola there, about as tight as the car turns.
+        """
+        if not len(self._kinks):
+            return 0.0, 0.0
+        past_cm = s_cm - (self._kinks + 0.5) * self.track.step_cm
+        if self.track.closed:
+            lap_cm = self.track.length_cm
+            past_cm = np.mod(past_cm + 0.5 * lap_cm, lap_cm) - 0.5 * lap_cm
+        nearest = int(np.argmin(np.abs(past_cm)))
+        past, turn_rad = float(past_cm[nearest]), float(self.track.kinks_rad[self._kinks[nearest]])
+        bend = math.tan(0.5 * abs(turn_rad))
+        radius_cm = min(self._least_radius_cm, 2.0 * _MOST_CUT_LANES * self.track.lane_width_cm / bend**2)
+        left_cm = radius_cm * bend - abs(past)
+        if left_cm <= 0.0:
+            return 0.0, 0.0
+        cut_cm = math.copysign(0.5 * left_cm**2 / radius_cm, turn_rad)
+        return cut_cm, -math.copysign(left_cm / radius_cm, turn_rad * past)
 
     def lane_cm(self, pose: Float[np.ndarray, "3"]) -> float:
         """Return the offset of the lane in which the middle of the front axle is, left positive.

@@ -147,6 +147,8 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
     road_cm = settings.lanes * settings.lane_width_cm
     middle_cm = 0.5 * (road_cm - settings.lane_width_cm)
     if settings.pieces:
+        if settings.lanes == 2 and any(piece.kind == "kink" for piece in settings.pieces):
+            raise ConfigError(f"{settings.origin}: key 'lanes': found 2, expected 1 on a road with kinks")
         line = lay_out(settings.pieces, settings.closed, settings.origin)
         found = comes_near_itself(
             line, road_cm + settings.line_width_cm, settings.closed, middle_cm=middle_cm

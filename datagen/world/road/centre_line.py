@@ -1,4 +1,4 @@
-"""Centre lines of roads: curves of piecewise linear curvature that keep clear of themselves.
+"""Centre lines of roads: curves of piecewise linear curvature, and kinks, that keep clear of themselves.
 
 They are sampled from sections, or drawn at random: straights, bends with clothoids and S-bends.
 """
@@ -43,6 +43,10 @@ _SHORTEST_STRAIGHT_CM = 2.0
 #: Length of a clothoid at either end of a bend; chosen: what a car at 60 cm/s takes to turn its wheels.
 _RAMP_CM = (20.0, 60.0)
 
+#: Length of a section that stands for a kink, and the curvature beyond which a section is one. Chosen: far
+#: below and above what any bend has; a kink of a degree has the curvature 17.
+_KINK_CM, _KINK_PER_CM = 1e-3, 5.0
+
 #: Smallest radius of left and of right bends, [cm].
 Radii = tuple[float, float]
 
@@ -50,6 +54,8 @@ Radii = tuple[float, float]
 @dataclass(frozen=True)
 class CentreLine:
     """A curve sampled evenly along its length; a closed one does not repeat its first sample.
+
+    A kink lies in the middle between two samples, whose headings differ by its angle.
 
     Attributes:
         xy_cm: Positions, [cm], frame map.
@@ -108,7 +114,32 @@ def sample_sections(sections: Sequence[Section], closed: bool) -> CentreLine:
     last = -1 if closed else None
     at = np.flatnonzero(is_sample)[:last]
     xy = np.stack([z.real, z.imag], axis=1)[at]
-    return CentreLine(xy, heading[at], curvature[at], float(knots[-1]) / (is_sample.sum() - 1))
+    line = CentreLine(xy, heading[at], curvature[at], float(knots[-1]) / (is_sample.sum() - 1))
+    lengths, starts, _ = np.array(sections).T
+    kinks = np.abs(starts) > _KINK_PER_CM
+    return _with_kinks(line, (np.cumsum(lengths) - lengths)[kinks])
+
+
+def _with_kinks(line: CentreLine, places_cm: Float[np.ndarray, "k"]) -> CentreLine:
+    """Move the two samples beside each kink along the road, until it lies in the middle between them.
+
+    Then the nearer of the two is the one on whose side of the kink a point lies.
+    """
+    xy, curvature, step_cm, n = line.xy_cm.copy(), line.curvature_per_cm.copy(), line.step_cm, len(line.xy_cm)
+    for place_cm in places_cm:
+        before = int(place_cm / step_cm + 1e-6)
+        past_cm = place_cm - before * step_cm
+        for i, along_cm in ((before, past_cm - 0.5 * step_cm), (before + 1, past_cm - 0.5 * step_cm)):
+            heading = line.heading_rad[i % n]
+            xy[i % n] += along_cm * np.array([np.cos(heading), np.sin(heading)])
+        # The sample on the kink has its curvature.
+        curvature[before] = curvature[before - 1]
+    return CentreLine(xy, line.heading_rad, curvature, step_cm)
+
+
+def kink_section(turn_rad: float) -> Section:
+    """Return the section that stands for a kink, whose turn is positive to the left."""
+    return _KINK_CM, turn_rad / _KINK_CM, turn_rad / _KINK_CM
 
 
 def _knots(

@@ -1,4 +1,4 @@
-"""Roads from pieces that are written down: straights, arcs, clothoids, S-bends.
+"""Roads from pieces that are written down: straights, arcs, clothoids, S-bends, kinks.
 
 A list in YAML has entries that say by one key what they are: ``- arc: {radius_cm: 80, angle_deg: 90}``.
 """
@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_serializer, model_validator
 
-from datagen.world.road.centre_line import CentreLine, Section, end_of, sample_sections
+from datagen.world.road.centre_line import CentreLine, Section, end_of, kink_section, sample_sections
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 
@@ -104,6 +104,21 @@ class SBendPiece(Settings):
     straight_cm: float = Field(default=0.0, ge=0.0)
 
 
+class KinkPiece(Settings):
+    """A corner without a bend, where the road goes from one straight to the next.
+
+    All lines turn at once, as tape does that is laid in straight sections: at the corner, the lane is wider
+    than elsewhere by one over the cosine of half the angle.
+
+    Attributes:
+        angle_deg: Of the turn.
+        direction: Where it turns.
+    """
+
+    angle_deg: float = Field(gt=0.0, le=100.0)
+    direction: Turn
+
+
 class Piece(OneOf):
     """One piece of a road, named by its key."""
 
@@ -111,6 +126,7 @@ class Piece(OneOf):
     arc: ArcPiece | None = None
     clothoid: ClothoidPiece | None = None
     s_bend: SBendPiece | None = None
+    kink: KinkPiece | None = None
 
     def sections(self) -> list[Section]:
         """Return its sections of evenly changing curvature."""
@@ -121,6 +137,8 @@ class Piece(OneOf):
         if isinstance(piece, ClothoidPiece):
             start, end = (0.0 if r is None else sign / r for r in (piece.from_radius_cm, piece.to_radius_cm))
             return [(piece.length_cm, start, end)]
+        if isinstance(piece, KinkPiece):
+            return [kink_section(sign * float(np.deg2rad(piece.angle_deg)))]
         k = sign / piece.radius_cm
         arc_cm = float(np.deg2rad(piece.angle_deg)) * piece.radius_cm
         if isinstance(piece, ArcPiece):

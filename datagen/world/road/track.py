@@ -7,6 +7,7 @@ a map is compared with.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from lanenet.data.files import write_json
 from lanenet.data.tables import MAX_PLACE
 from lanenet.errors import DriveFormatError
-from lanenet.geometry.frames import car_from_map, map_from_car
+from lanenet.geometry.frames import car_from_map, map_from_car, wrap_angle
 from lanenet.geometry.lane import rows_of_polyline
 from lanenet.geometry.poses import arc_chord
 from lanenet.reading import parsing, read_json
@@ -27,6 +28,9 @@ Bgr = tuple[float, float, float]
 
 #: Section of the lines that is given around the car: what labels and pictures of them need.
 _BEHIND_CM, _AHEAD_CM = 60.0, 150.0
+#: Least turn between two samples, beyond that of the bend, by which a kink is known. Chosen: half a degree;
+#: bends whose curvature changes leave a hundredth of it.
+_KINK_RAD = 0.5 * np.pi / 180.0
 #: Shortest random interruption of a line.
 _MIN_INTERRUPTION_CM = 10.0
 #: Mean length of what flakes off a worn line; chosen: about the width of the tape.
@@ -110,6 +114,34 @@ class Track:
         heading, offset_cm = self.heading_rad[index], np.asarray(offset_cm)[..., None]
         return self.xy_cm[index] + offset_cm * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
 
+    @cached_property
+    def kinks_rad(self) -> Float[np.ndarray, "n"]:
+        """Turn of the kink between each sample and the next one, positive left; 0 where there is none."""
+        following = np.roll(self.heading_rad, -1)
+        per_cm = 0.5 * (self.curvature_per_cm + np.roll(self.curvature_per_cm, -1))
+        turn = wrap_angle(following - self.heading_rad - per_cm * self.step_cm)
+        if not self.closed:
+            turn[-1] = 0.0
+        return np.where(np.abs(turn) > _KINK_RAD, turn, 0.0)
+
+    def line_beside(self, from_cm: float, to_cm: float, offset_cm: float) -> Float[np.ndarray, "k 2"]:
+        """Return the line beside a section of the road, with its corners at kinks, [cm], frame map."""
+        index = self._samples(from_cm, to_cm)
+        points, keep = self.beside(index, offset_cm), np.ones(len(index), dtype=bool)
+        corners = []
+        for k in np.flatnonzero(self.kinks_rad[index[:-1]]).tolist():
+            i, half_rad = index[k], 0.5 * float(self.kinks_rad[index[k]])
+            ahead, middle = self.heading_rad[i], self.heading_rad[i] + half_rad
+            corner = self.xy_cm[i] + 0.5 * self.step_cm * np.array([np.cos(ahead), np.sin(ahead)])
+            aside_cm = offset_cm / np.cos(half_rad)
+            corners.append((k, corner + aside_cm * np.array([-np.sin(middle), np.cos(middle)])))
+            # On the inside, the lines beside the two straights cross before they end.
+            cut = int(max(0.0, offset_cm * np.tan(half_rad) / self.step_cm + 0.5))
+            keep[max(0, k + 1 - cut) : k + 1 + cut] = False
+        for k, corner in reversed(corners):
+            points, keep = np.insert(points, k + 1, corner, axis=0), np.insert(keep, k + 1, True)
+        return points[keep]
+
     def curvature(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Return the curvature of the centre line at places along it, [1/cm], positive left."""
         return self.curvature_per_cm[self._nearest_samples(s_cm)[1]]
@@ -168,7 +200,7 @@ class Track:
         wheelbase_cm: float,
         near_s_cm: float | None = None,
         lane_cm: float = 0.0,
-    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+    ) -> tuple[Float[np.ndarray, "l 2"], Float[np.ndarray, "r 2"]]:
         """Return the left and right line around the car, [cm], frame car, in the direction of travel.
 
         Only the section from 60 cm behind the front axle to 150 cm ahead along the road, so that no other
@@ -182,8 +214,8 @@ class Track:
         """
         front = map_from_car(np.zeros((1, 2)), pose, wheelbase_cm)[0]
         s_cm, _ = self.nearest(front, near_s_cm)
-        index = self._samples(s_cm - _BEHIND_CM, s_cm + _AHEAD_CM)
-        left, right = (self.beside(index, self.line_offset_cm(side) + lane_cm) for side in SIDES)
+        span_cm = s_cm - _BEHIND_CM, s_cm + _AHEAD_CM
+        left, right = (self.line_beside(*span_cm, self.line_offset_cm(side) + lane_cm) for side in SIDES)
         return car_from_map(left, pose, wheelbase_cm), car_from_map(right, pose, wheelbase_cm)
 
     def truth(

@@ -93,6 +93,12 @@ def painted_bounds_cm(
 
 
 def _tape(track: Track, marking: Marking, start_cm: float, end_cm: float) -> Float[np.ndarray, "n 2"]:
+    if track.kinks_rad.any():
+        left, right = (
+            track.line_beside(start_cm, end_cm, marking.offset_cm + aside * 0.5 * marking.width_cm)
+            for aside in (1.0, -1.0)
+        )
+        return np.concatenate([left, right[::-1]])
     places = np.linspace(start_cm, end_cm, max(2, int(np.ceil((end_cm - start_cm) / _STEP_CM)) + 1))
     half_cm = 0.5 * marking.width_cm
     left, _ = track.points(places, marking.offset_cm + half_cm)

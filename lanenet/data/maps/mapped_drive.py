@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +56,20 @@ class MappedDrive:
     rows: Int[np.ndarray, "n"]
     perception: PerceptionSettings
 
-    @property
+    @cached_property
+    def certain(self) -> Bool[np.ndarray, "n"]:
+        """Frames whose edges match the map.
+
+        Where a run of frames starts, there is no map to match yet; its first frame is as certain as the next.
+        Without edges, nothing says where a frame is.
+        """
+        match = self.drive_map.match
+        following = np.append(match[1:], np.nan)
+        following[:-1][self.starts[1:]] = np.nan
+        match = np.where(np.isnan(match) & self.starts, following, match)
+        return np.asarray(match >= _MIN_MATCH)
+
+    @cached_property
     def starts(self) -> Bool[np.ndarray, "n"]:
         """Frames of the map that do not continue the frame before them."""
         rows, segment = self.rows, self.drive_map.segment
@@ -131,8 +144,7 @@ def label_frame(
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED
-    # NaN in the first frame of a segment, which has no map to match yet.
-    if mapped.drive_map.match[k] < _MIN_MATCH:
+    if not mapped.certain[k]:
         return UNCERTAIN
     if mapped.drive_map.lanes.between[k]:
         return BETWEEN_LANES

@@ -173,6 +173,16 @@ def test_why_a_frame_gets_no_labels(folder):
     assert not isinstance(label_frame(replace(mapped, drive=deleted), 13, window), str)
 
 
+def test_a_frame_without_edges_is_uncertain_unless_it_is_the_first(folder):
+    mapped, window = open_mapped_drive(folder), BirdseyeWindow()
+    match = mapped.drive_map.match.copy()
+    match[[7, 13]] = np.nan
+    lost = replace(mapped, drive_map=replace(mapped.drive_map, match=match))
+    reasons = [label_frame(lost, k, window) for k in (0, 7, 8, 12, 13)]
+    # The 12th frame starts a segment, but the next one says nothing of where it is.
+    assert [reason == UNCERTAIN for reason in reasons] == [False, True, False, True, True]
+
+
 def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folder):
     mapped = open_mapped_drive(folder)
     whole = label_frame(mapped, 6, BirdseyeWindow())

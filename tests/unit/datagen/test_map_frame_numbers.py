@@ -54,7 +54,7 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
 
 def test_edges_name_the_drives_own_frames():
     parts = [segment([0, 1, 5, 6], 1), segment([2, 3, 4], 2)]
-    edges = map_edges(parts, NUMBERS, CAMERA, 1.0)
+    edges = map_edges(parts, NUMBERS, 1.0)
     rows = [0, 1, 5, 6, 2, 3, 4]
     np.testing.assert_array_equal(edges["frame"], np.repeat(NUMBERS[rows], [row + 1 for row in rows]))
     np.testing.assert_array_equal(edges["segment"], np.repeat([0, 1], [1 + 2 + 6 + 7, 3 + 4 + 5]))
@@ -63,11 +63,14 @@ def test_edges_name_the_drives_own_frames():
 def test_each_edge_lies_where_its_frame_saw_it():
     part = segment([2, 3, 4], 2)
     for factor in (1.0, 2.5):
-        edges = map_edges([part], NUMBERS, CAMERA, factor)
+        edges = map_edges([part], NUMBERS, factor)
         at = edges["frame"] == NUMBERS[3]
         assert at.sum() == 4
         pose = part.solved.poses[1] * [factor, factor, 1.0]
-        seen = car_from_map(np.stack([edges["x_cm"], edges["y_cm"]], 1)[at], pose, CAMERA.wheelbase_cm)
+        seen = car_from_map(
+            np.stack([edges["x_cm"], edges["y_cm"]], 1)[at], pose, factor * CAMERA.wheelbase_cm
+        )
+        # On the map, the whole car is larger: also its wheelbase.
         np.testing.assert_allclose(
             seen, factor * part.solved.scans.points_cm[part.solved.scans.frame(1)], atol=1e-4
         )
@@ -77,6 +80,6 @@ def test_each_edge_lies_where_its_frame_saw_it():
 def test_the_edges_do_not_depend_on_where_the_frames_that_count_lie():
     part = segment([2, 3, 4], 2)
     shifted = replace(part, solved=replace(part.solved, rows=part.rows - 2))
-    moved = map_edges([shifted], NUMBERS[2:], CAMERA, 1.0)
-    for name, values in map_edges([part], NUMBERS, CAMERA, 1.0).items():
+    moved = map_edges([shifted], NUMBERS[2:], 1.0)
+    for name, values in map_edges([part], NUMBERS, 1.0).items():
         np.testing.assert_array_equal(moved[name], values)

@@ -13,12 +13,11 @@ from datagen.quality import page
 from datagen.quality.pictures import draw_map
 from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.commands import SteeringFit
-from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.data.maps.mapped_drive import MappedDrive
-from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
+from lanenet.perception.edges.road import PerceptionSettings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 #: Frames of the drive; of its four runs the third is not on the map, and the second in one of its own.
@@ -96,9 +95,7 @@ def test_a_run_starts_at_a_break_and_after_one_that_was_left_out(mapped):
 
 
 def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
-    no_edges = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))], 15.0)
-    parts = [(no_edges, mapped.drive_map.poses[:1], 1.0)]
-    draw_map(tmp_path / "map.png", mapped.drive_map, parts, mapped.starts, size_px=400)
+    draw_map(tmp_path / "map.png", mapped.drive_map, [np.empty((0, 2))], mapped.starts, size_px=400)
     image = cv2.imread(str(tmp_path / "map.png"))
     # Left of the metre of scale in the corner there is nothing else that is white.
     white = (image > 200).all(axis=2)[: image.shape[0] - 60]

@@ -50,6 +50,54 @@ def test_an_oval_is_two_straights_and_two_half_circles(tmp_path):
     np.testing.assert_allclose(track.xy_cm[back, 1], 160.0, atol=1e-6)
 
 
+def _kink(angle_deg: float, direction: str = "left") -> dict:
+    return {"kink": {"angle_deg": angle_deg, "direction": direction}}
+
+
+def test_a_kink_turns_all_lines_at_once(tmp_path):
+    straight = {"straight": {"length_cm": 100.4}}
+    track = load_track(_write(tmp_path, {"pieces": [straight, _kink(90), straight]}))
+    assert np.count_nonzero(track.kinks_rad) == 1
+    assert track.kinks_rad.sum() == pytest.approx(0.5 * np.pi)
+    assert np.abs(track.curvature_per_cm).max() < 1e-6
+    for offset_cm in (20.0, -20.0):
+        corner = np.array([100.4 - offset_cm, offset_cm])
+        line = track.line_beside(0.0, 200.0, offset_cm)
+        # Along +x to the corner, then along +y, without the ends that cross on the inside.
+        off = np.minimum(np.abs(line[:, 1] - corner[1]), np.abs(line[:, 0] - corner[0]))
+        assert off.max() < 2e-3 and np.linalg.norm(line - corner, axis=1).min() < 2e-3
+        assert (np.diff(line[:, 0]) > -2e-3).all() and (np.diff(line[:, 1]) > -2e-3).all()
+        # The renderer asks each place for its offset.
+        found = [track.nearest(point)[1] for point in line]
+        np.testing.assert_allclose(found, offset_cm, atol=2e-3)
+
+
+def test_a_loop_of_kinks_closes_and_the_driver_keeps_to_its_lane():
+    sides = [{"straight": {"length_cm": length}} for length in (150, 170, 130)]
+    pieces = [part for side in 2 * sides for part in (side, _kink(60))]
+    road = {"closed": True, "lane_width_cm": 60, "pieces": pieces}
+    world = build_world(
+        check_settings(SimulationSettings, {"frames": 2, "track": road, "driver": {"wander_cm": 0}}, "x")
+    )
+    assert np.rad2deg(world.track.kinks_rad.sum()) == pytest.approx(360.0, abs=0.1)
+    wheelbase_cm, offsets = world.settings.car.wheelbase_cm, []
+    for frame in range(300):
+        front = world.car.pose[:2] + wheelbase_cm * np.array(
+            [np.cos(world.car.pose[2]), np.sin(world.car.pose[2])]
+        )
+        offsets.append(world.track.nearest(front)[1])
+        world.car.step(*world.driver.command(world.car.pose, frame / 20.0), 0.05)
+    assert np.abs(offsets).max() < 0.3 * 60.0
+
+
+def test_a_road_of_two_lanes_has_no_kinks():
+    with pytest.raises(ConfigError, match="lanes"):
+        random_track(
+            check_settings(TrackSettings, {"lanes": 2, "pieces": [STRAIGHT, _kink(30), STRAIGHT]}, "x"),
+            np.random.default_rng(0),
+        )
+
+
 def test_a_clothoid_turns_by_half_of_what_its_arc_would():
     line = lay_out(
         _pieces({"clothoid": {"length_cm": 100, "to_radius_cm": 80, "direction": "right"}}), False, "x"
