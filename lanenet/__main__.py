@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from lanenet.search_path import without_working_folder
@@ -9,6 +10,9 @@ from lanenet.search_path import without_working_folder
 
 def main() -> None:
     """Run the command line; the entry point of the package."""
+    # Before NumPy is imported: in systems of a few hundred unknowns, threads of BLAS wait for each other for
+    # longer than they calculate, many times longer beside other work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.path[:] = without_working_folder(sys.path)
     verb, words = (sys.argv[1:2] or [""])[0], sys.argv[2:]
     if verb == "stop" and words and not any(word.startswith("-") for word in words):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -34,11 +33,30 @@ _STARTS_KEPT = 3
 _MAX_CORRELATION = 0.8
 
 
-#: Scale of the soft L1 loss, [px], most evaluations, and the least share by which a step lowers the cost.
+@dataclass(frozen=True)
+class _Search:
+    """How a least-squares search weighs residuals, and when it ends.
+
+    Attributes:
+        scale_px: Scale of the soft L1 loss, [px].
+        most_evaluations: Most points that are tried.
+        least_gain: Least share by which a step lowers the cost.
+    """
+
+    scale_px: float
+    most_evaluations: int
+    least_gain: float
+
+
 #: From a start that may be far off: corners count up to a few pixels, and a few digits are enough.
-_ROUGH_SEARCH: dict[str, Any] = {"f_scale": 3.0, "max_nfev": 25, "ftol": 1e-4}
+_ROUGH_SEARCH = _Search(scale_px=3.0, most_evaluations=25, least_gain=1e-4)
 #: Close to the solution: half a pixel is an error of a corner finder, more is an outlier.
-_FINE_SEARCH: dict[str, Any] = {"f_scale": 0.5, "max_nfev": 60, "ftol": 1e-8}
+_FINE_SEARCH = _Search(scale_px=0.5, most_evaluations=60, least_gain=1e-8)
+#: Damping of the first step, as a share of the diagonal; factors by which a step that fails raises and one
+#: that succeeds lowers it; its bounds. Usual values of the method, the least one against rounding.
+_FIRST_DAMPING, _MORE_DAMPING, _LESS_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 5.0, 10.0, 1e-10, 1e8
+#: A step that fails and is shorter than this share of the solution ends the search.
+_LEAST_MOVE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -152,7 +170,9 @@ def poses_of_views(
 ) -> Float[np.ndarray, "v 6"] | None:
     """Find each board's pose directly, for a known lens; None if a view does not determine one."""
     camera = camera_of_lens(model, lens, (views[0].width, views[0].height))
-    poses = [pose_of_plane(view.points_cm, camera.unproject(view.corners_px)) for view in views]
+    rays = camera.unproject(np.concatenate([view.corners_px for view in views]))
+    ends = np.cumsum([len(view.corners_px) for view in views])[:-1]
+    poses = [pose_of_plane(view.points_cm, r) for view, r in zip(views, np.split(rays, ends), strict=True)]
     found = [pose for pose in poses if pose is not None]
     return np.array(found) if len(found) == len(views) else None
 
@@ -192,50 +212,101 @@ def refine(
     Returns:
         The fit, with standard deviations from its Jacobian and the spread of its residuals.
     """
-    from scipy.optimize import least_squares
-
     n_free = int(np.count_nonzero(free))
     ends = 2 * np.cumsum([len(view.points_cm) for view in views])
+    measured = np.concatenate([view.corners_px for view in views])
 
     def unpack(x: Float[np.ndarray, "x"]) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "v 6"]]:
         full = lens.copy()
         full[free] = x[:n_free]
         return full, x[n_free:].reshape(-1, 6)
 
-    def residuals(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r"]:
-        full, moved = unpack(x)
-        return -np.concatenate([r.ravel() for r in view_residuals(model, full, moved, views)])
-
-    def jacobian(x: Float[np.ndarray, "x"]) -> Float[np.ndarray, "r x"]:
+    def linearised(x: Float[np.ndarray, "x"]) -> tuple[Float[np.ndarray, "r"], Float[np.ndarray, "r x"]]:
         full, moved = unpack(x)
         matrix = np.zeros((int(ends[-1]), len(x)))
         boards = [moved_points(pose, view.points_cm) for pose, view in zip(moved, views, strict=True)]
-        _, by_point, by_lens = project_points(model, full, np.concatenate([points for points, _ in boards]))
+        # One call for all views: the call costs more than the arithmetic.
+        found, by_point, by_lens = project_points(
+            model, full, np.concatenate([points for points, _ in boards])
+        )
         by_pose = by_point @ np.concatenate([derivatives for _, derivatives in boards])
         matrix[:, :n_free] = by_lens[:, :, free].reshape(-1, n_free)
         for k, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
             columns = slice(n_free + 6 * k, n_free + 6 * k + 6)
             matrix[start:end, columns] = by_pose[start // 2 : end // 2].reshape(-1, 6)
-        return matrix
+        return (found - measured).ravel(), matrix
 
-    result = least_squares(
-        residuals,
-        np.concatenate([lens[free], poses.ravel()]),
-        jacobian,
-        x_scale="jac",
-        loss="soft_l1",
-        **(_ROUGH_SEARCH if rough else _FINE_SEARCH),
-    )
-    full, moved = unpack(result.x)
-    errors = view_residuals(model, full, moved, views)
+    x = np.concatenate([lens[free], poses.ravel()])
+    x, residuals, jacobian, cost = _least_squares(linearised, x, _ROUGH_SEARCH if rough else _FINE_SEARCH)
+    full, moved = unpack(x)
     sigma = np.zeros(len(free))
-    sigma[free] = standard_deviations(jacobian(result.x), np.concatenate(errors).ravel())[:n_free]
+    sigma[free] = standard_deviations(jacobian, residuals)[:n_free]
     return LensFit(
         model=model,
         lens=full,
         free=free,
         poses=moved,
-        residuals_px=errors,
+        residuals_px=np.split(-residuals.reshape(-1, 2), ends[:-1] // 2),
         lens_sigma=sigma,
-        robust_cost=2.0 * float(result.cost),
+        robust_cost=cost,
     )
+
+
+def _least_squares(
+    linearised: Callable[[Float[np.ndarray, "x"]], tuple[Float[np.ndarray, "r"], Float[np.ndarray, "r x"]]],
+    x: Float[np.ndarray, "x"],
+    search: _Search,
+) -> tuple[Float[np.ndarray, "x"], Float[np.ndarray, "r"], Float[np.ndarray, "r x"], float]:
+    """Minimise the soft L1 loss of residuals by Levenberg-Marquardt steps.
+
+    The normal equations have a row per unknown; a decomposition of the whole Jacobian, as general solvers do
+    it, costs several times as much.
+
+    Args:
+        linearised: Residuals at a point, with their derivatives.
+        x: Where to start; its residuals are finite.
+        search: When to stop.
+
+    Returns:
+        The best point, its residuals and derivatives there, and twice its cost, [residuals^2].
+
+    Source:
+        Triggs et al. 2000, sections 4.3 and 6.1 (robust weights, step control); Marquardt 1963 (damping by
+        the diagonal).
+    """
+
+    def soft(residuals: Float[np.ndarray, "r"]) -> tuple[Float[np.ndarray, "r"], float]:
+        """Square roots in the loss, and twice the cost."""
+        root = np.hypot(1.0, residuals / search.scale_px)
+        return root, 2.0 * search.scale_px**2 * float(np.sum(root - 1.0))
+
+    residuals, jacobian = linearised(x)
+    root, cost = soft(residuals)
+    damping = _FIRST_DAMPING
+    for _ in range(search.most_evaluations - 1):
+        weighted = jacobian * root[:, None] ** -1.5
+        normal = weighted.T @ weighted
+        gradient = jacobian.T @ (residuals / root)
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        damped = normal / np.outer(size, size) + damping * np.eye(len(x))
+        try:
+            move = -np.linalg.solve(damped, gradient / size) / size
+        except np.linalg.LinAlgError:
+            damping *= _MORE_DAMPING
+            continue
+        # Where a step leads too far, the residuals are infinite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            tried, by_tried = linearised(x + move)
+            tried_root, tried_cost = soft(tried)
+        if not tried_cost < cost:
+            if np.linalg.norm(move) < _LEAST_MOVE * np.linalg.norm(x) or damping > _MOST_DAMPING:
+                break
+            damping *= _MORE_DAMPING
+            continue
+        gain = cost - tried_cost
+        x, residuals, jacobian, root = x + move, tried, by_tried, tried_root
+        damping = max(damping / _LESS_DAMPING, _LEAST_DAMPING)
+        cost = tried_cost
+        if gain < search.least_gain * cost:
+            break
+    return x, residuals, jacobian, cost

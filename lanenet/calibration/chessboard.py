@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -170,17 +172,26 @@ def find_views(
     """
     views: list[BoardView] = []
     left_out: dict[str, str] = {}
-    for done, path in enumerate(paths):
+
+    def find(path: Path) -> BoardView | str:
         try:
-            answer = find_view(str(path), read_picture(path), board)
+            return find_view(str(path), read_picture(path), board)
         except CalibrationError as error:
-            answer = str(error).removeprefix(f"{path}: ")
-        if isinstance(answer, BoardView):
-            views.append(answer)
-        else:
-            left_out[str(path)] = answer
-        if progress is not None:
-            progress(done + 1, len(paths))
+            return str(error).removeprefix(f"{path}: ")
+
+    # Threads are enough: OpenCV searches without holding Python's lock.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for path, answer in zip(paths, pool.map(find, paths), strict=True):
+                if isinstance(answer, BoardView):
+                    views.append(answer)
+                else:
+                    left_out[str(path)] = answer
+                if progress is not None:
+                    progress(len(views) + len(left_out), len(paths))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     if not any(view.complete for view in views):
         raise CalibrationError(
             f"none of {len(paths)} images shows a whole board with {board.columns}x{board.rows} inner "

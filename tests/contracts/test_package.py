@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -16,6 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 import lanenet
+from lanenet import __main__
 from lanenet.cli.app import app
 
 REPO = Path(__file__).resolve().parents[2]
@@ -55,6 +57,18 @@ def readme_lines() -> list[str]:
     blocks = re.findall(r"```(?:bash|sh|console)?\n(.*?)```", documents_text(), re.DOTALL)
     lines = (line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines())
     return [line for line in lines if line.startswith("lanenet ")]
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
+def test_small_systems_are_solved_by_one_thread_unless_given(monkeypatch, given, expected) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", given or "")
+    if given is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "argv", ["lanenet", "--version"])
+    with pytest.raises(SystemExit):
+        __main__.main()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == expected
 
 
 def test_the_version_stands_once() -> None:
