@@ -191,6 +191,10 @@ class DriveLoop:
         """
         frame = self._parts.source.read(_WAIT_S)
         begin_s = now_s = self._clock()
+        if frame is None and now_s < self._until_s:
+            # The last command is still valid: a slow camera has no frame for every turn, which is no fault
+            # and must not begin the countdown anew.
+            return self._step
         fault = frame_fault = self._check.fault_of(frame, now_s)
         steering_rad, speed_cm_s, estimate = math.nan, 0.0, LaneEstimate(confidence=math.nan)
         if frame is not None:
@@ -218,9 +222,7 @@ class DriveLoop:
             self.report.work.add(self._clock() - begin_s)
             self.report.latency.add(self._clock() - frame.t_s)
         elif now_s < self._until_s and verdict.state is not State.ENDED:
-            # The last command is still valid: a missing frame does no harm yet.
-            if frame is None:
-                return self._step
+            # The last command is still valid: a bad frame does no harm yet.
             verdict = self._verdict
         else:
             # The wheels stay as they are: a car that still rolls stays in its bend.

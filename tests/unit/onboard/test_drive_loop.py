@@ -105,6 +105,7 @@ class Car:
         answer: Callable[[int], LaneEstimate] = lambda _: LANE,
         check: CameraCheck | None = None,
         hold: HoldFile | None = None,
+        countdown_s: float = 0.0,
         **options: bool,
     ) -> None:
         self.clock = Clock()
@@ -114,7 +115,7 @@ class Car:
         control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
             CarParts(self.camera, Eye(answer), LaneController(control), self.wire, None, check, None, hold),
-            SafetySettings(countdown_s=0.0),
+            SafetySettings(countdown_s=countdown_s),
             LimitSettings(),
             control.speed,
             DriveMode(**options),
@@ -329,6 +330,13 @@ def test_a_source_that_cannot_be_opened_leaves_neutral_behind() -> None:
     with pytest.raises(HardwareError, match="no camera"):
         car.loop.run()
     assert [kind for _, kind, *_ in car.wire.log][-1] == "close"
+
+
+def test_a_camera_with_pauses_between_its_frames_ends_the_countdown() -> None:
+    """At 15 frames per second every second turn of the loop has none."""
+    car = Car(faults=dict.fromkeys(range(1, 60, 2), lambda: None), armed=True, countdown_s=0.5)
+    report = car.loop.run()
+    assert report.states[State.DRIVING] > 15 and State.STOPPED not in report.states
 
 
 def test_stop_is_neutral_at_once_and_for_good() -> None:
