@@ -362,7 +362,8 @@ class _Watch:
                 continue
             self._neutral()
             if not silent:
-                log.warning("neutral: the guard of the actuator has been silent for %g s", _SILENT_S)
+                done = "the board's watchdog stops the motor" if self._spare is None else "neutral"
+                log.warning("the guard of the actuator has been silent for %g s: %s", _SILENT_S, done)
             silent = True
         if not self._over:
             self._neutral()

@@ -72,10 +72,7 @@ class I2CChip:
         try:
             fcntl.lockf(self._bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self._address)
         except OSError:
-            raise HardwareError(
-                f"{self.name}: is driven by {describe_process(self.owner())} already; end that first, or "
-                "stop the car with: lanenet stop CAR.yaml"
-            ) from None
+            raise driven_already(self.name, self.owner()) from None
 
     def owner(self) -> int:
         """Return the id of the process that owns the chip; 0 if none does, as :func:`lock_owners` sees it."""
@@ -136,6 +133,14 @@ def lock_owners(device: os.stat_result, at: int | None = None) -> list[int]:
         if fields[1:2] == ["FLOCK"] if at is None else fields[1] == "POSIX" and fields[6] == str(at):
             owners.append(int(fields[4]) or -1)
     return owners
+
+
+def driven_already(name: str, pid: int) -> HardwareError:
+    """Return the error of a device that another process drives."""
+    return HardwareError(
+        f"{name}: is driven by {describe_process(pid)} already; end that first, or stop the car with: "
+        "lanenet stop CAR.yaml"
+    )
 
 
 def describe_process(pid: int) -> str:

@@ -33,10 +33,12 @@ restarted stays in neutral until the computer has noticed.
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
@@ -44,6 +46,7 @@ from pydantic import Field
 from lanenet.data.files import require
 from lanenet.errors import HardwareError
 from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
+from lanenet.onboard.i2c import driven_already, lock_owners
 
 VERSION = 2
 BAUD = 115200
@@ -189,7 +192,8 @@ class SerialBoard:
         """Send the neutral pulses, and wait until the board reports them.
 
         Raises:
-            HardwareError: If the port or the board do not answer, or the sketch is of another version.
+            HardwareError: If the port or the board do not answer, another process drives it (named), or the
+                sketch is of another version.
             MissingExtraError: If pyserial is not installed.
         """
         serial, termios = require("serial", "car"), require("termios", "car")
@@ -205,6 +209,10 @@ class SerialBoard:
             termios.tcsetattr(self._port.fd, termios.TCSANOW, attributes)
         except (OSError, ValueError, termios.error) as error:
             self._release()
+            if getattr(error, "errno", None) == errno.EAGAIN:
+                # The port is locked.
+                owner = next(iter(lock_owners(Path(settings.port).stat())), 0)
+                raise driven_already(settings.port, owner) from None
             raise HardwareError(
                 f"{settings.port}: cannot be opened ({error}); is the board plugged in (ls "
                 "/dev/serial/by-id), and are you in its group (sudo usermod -aG dialout $USER)?"
@@ -263,7 +271,9 @@ class SerialBoard:
                 self._check()
                 self._command(round(pulses.steering_us), round(pulses.throttle_us))
             except OSError as error:
-                raise HardwareError(f"{self._settings.port}: the board is gone ({error})") from None
+                raise HardwareError(
+                    f"{self._settings.port}: the board is gone, or this computer is overloaded ({error})"
+                ) from None
 
     def _check(self) -> None:
         """Compare the newest report with what was sent."""

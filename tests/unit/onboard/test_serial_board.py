@@ -369,6 +369,11 @@ def test_lost_board_is_noticed(board, actuator):
     actuator.neutral()
 
 
+def test_a_second_owner_is_refused_and_names_the_first(board, actuator):
+    with pytest.raises(HardwareError, match=rf"process {os.getpid()} .*lanenet stop"):
+        make_actuator(SerialBoardSettings(port=board.port)).open()
+
+
 def test_restarted_board_is_noticed(board, actuator):
     actuator.send(0.0, 0.1)
     os.write(board.master, encode("B", VERSION))
