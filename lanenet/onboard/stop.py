@@ -1,7 +1,8 @@
 """Stops a car, whatever drives it: neutral first, then the end of the process that owns the actuator.
 
 Reads the section ``actuator`` of the car's file and imports little of lanenet: the car drives on
-meanwhile. A drive that still starts owns nothing yet; it is known by a lock on its car's file.
+meanwhile. A drive that still starts owns nothing yet; it is known by a lock on its car's file, and by its
+command line, should an editor have replaced the file.
 """
 
 from __future__ import annotations
@@ -67,9 +68,12 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
     try:
         done = _stop_actuator(path, overrides)
     except LanenetError as error:
-        if not (ended := _end_drives(path)):
+        if not (done := _end_drives(path)):
+            # A name that was mistyped in a hurry.
+            done = [f"{describe_process(pid)} drives" for pid in _drives()]
+        if not done:
             raise
-        raise type(error)("; ".join([str(error), *ended])) from None
+        raise type(error)("; ".join([str(error), *done])) from None
     return [*done, *_end_drives(path)]
 
 
@@ -135,15 +139,29 @@ def _tell(pid: int, number: signal.Signals) -> None:
 
 def _end_drives(path: Path) -> list[str]:
     """Ask the drives of a car's file to end, which is in neutral; returns a sentence each."""
-    try:
-        found = lock_owners(path.stat())
-    except OSError:
-        return []
-    # Other programs lock files, too: editors.
-    drives = {pid: describe_process(pid) for pid in found if "drive" in words_of(pid)}
+    found = {pid for pid, files in _drives().items() if path.resolve() in files}
+    with contextlib.suppress(OSError):
+        # Other programs lock files, too: editors.
+        found |= {pid for pid in lock_owners(path.stat()) if "drive" in words_of(pid)}
+    drives = {pid: describe_process(pid) for pid in sorted(found)}
     for pid in drives:
         _tell(pid, signal.SIGTERM)
     return [f"told {text} to end" for text in drives.values()]
+
+
+def _drives() -> dict[int, list[Path]]:
+    """Return the processes that run ``lanenet drive``, and what each word after it would be as a file."""
+    drives = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        words = words_of(int(folder.name))
+        at = words.index("drive") if "drive" in words else 0
+        if not any(Path(word).name == "lanenet" for word in words[:at]):
+            continue
+        # Of another user, or gone.
+        with contextlib.suppress(OSError):
+            here = (folder / "cwd").readlink()
+            drives[int(folder.name)] = [(here / word).resolve() for word in words[at + 1 :]]
+    return drives
 
 
 def prepare_drive(words: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from lanenet.onboard.i2c import lock_owners
 #: A drive that still starts, as far as others see.
 STARTING = """
 import fcntl, os, sys, time
-fcntl.flock(os.open(sys.argv[2], os.O_RDONLY), fcntl.LOCK_SH)
+fcntl.flock(os.open(sys.argv[3], os.O_RDONLY), fcntl.LOCK_SH)
 print(flush=True)
 time.sleep(60)
 """
@@ -94,16 +94,20 @@ def test_the_owner_is_ended(bus, car, manner, monkeypatch):
         owner.communicate()
 
 
-@pytest.mark.parametrize("fault", ["", "broken file", "lost chip"])
+@pytest.mark.parametrize("fault", ["", "broken file", "replaced file", "removed file", "lost chip"])
 def test_a_drive_that_still_starts_is_ended(bus, car, fault):
-    words = [sys.executable, "-ISc", STARTING, "drive", car]
-    started = [subprocess.Popen(words, stdout=subprocess.PIPE) for _ in range(2)]
-    editor = subprocess.Popen([*words[:3], "edit", car], stdout=subprocess.PIPE)
+    words = [sys.executable, "-ISc", STARTING, "lanenet", "drive", car.name]
+    options = {"stdout": subprocess.PIPE, "cwd": car.parent}
+    started = [subprocess.Popen(words, **options) for _ in range(2)]
+    editor = subprocess.Popen([*words[:4], "edit", car], **options)
     try:
         for process in (*started, editor):
             process.stdout.readline()
         bus.broken = fault == "lost chip"
-        if fault == "broken file":
+        if fault in ("replaced file", "removed file"):
+            # As many editors save.
+            car.rename(car.with_name("before.yaml"))
+        if fault in ("broken file", "replaced file"):
             car.write_text("control: [\n")
         if fault:
             with pytest.raises(LanenetError, match=r"car\.yaml|0x40") as caught:
@@ -118,6 +122,19 @@ def test_a_drive_that_still_starts_is_ended(bus, car, fault):
         for process in (*started, editor):
             process.kill()
             process.communicate()
+
+
+def test_a_mistyped_name_is_told_what_drives(car):
+    words = [sys.executable, "-ISc", STARTING, "lanenet", "drive", car]
+    drive = subprocess.Popen(words, stdout=subprocess.PIPE)
+    try:
+        drive.stdout.readline()
+        with pytest.raises(ConfigError, match=rf"cra\.yaml.*process {drive.pid} ") as caught:
+            stop.stop_car(car.with_name("cra.yaml"))
+        assert "drives" in str(caught.value) and drive.poll() is None
+    finally:
+        drive.kill()
+        drive.communicate()
 
 
 def test_the_owner_of_a_serial_line_is_ended(tmp_path):
