@@ -86,7 +86,10 @@ def read_assignments(path: Path) -> dict[str, Any]:
     for line, assigned, expression in plain:
         try:
             known = {name: value for name, value in values.items() if name not in bound}
-            values |= dict.fromkeys([target.id for target in assigned], _value_of(expression, known))
+            value = _value_of(expression, known)
+            if len(assigned) > 1 and not isinstance(value, int | float | str):
+                raise ValueError("what can be changed in place may be changed under its other name")
+            values |= dict.fromkeys([target.id for target in assigned], value)
         except (ValueError, ArithmeticError, TypeError):
             for target in assigned:
                 if target.id in _USED:
