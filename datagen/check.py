@@ -8,7 +8,13 @@ from typing import Any
 from datagen.assemble import AssembledMap
 from datagen.lanes.trace import other_lane
 from datagen.prepare import PreparedDrive
-from datagen.quality.figures import free_lane_cm, map_evidence, map_figures, map_notes
+from datagen.quality.figures import (
+    free_lane_cm,
+    map_evidence,
+    map_figures,
+    map_notes,
+    steering_correlation,
+)
 from datagen.quality.measure import MapQuality, measure_map, quality_figures
 from datagen.quality.residuals import REFERENCE_WIDTH, contradicted_lines, summarise
 from datagen.quality.verdict import Verdict, judge
@@ -65,6 +71,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     quality = measure_map(replace(mapped, drive_map=drive_map))
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
     figures |= quality_figures(quality, drive.width)
+    figures["steering_correlation"] = steering_correlation(mapped)
     labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
     notes.append(f"{labelled}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, camera_figures | figures, drive.deleted[assembled.rows], free_cm)

@@ -98,7 +98,8 @@ def _map_drive(
         if pictures:
             _draw(folder, assembled, checked, figures, settings)
     verdict = checked.verdict
-    return Report((f"verdict: {verdict.grade}", *verdict.reasons, *notes, *verdict.remarks), figures)
+    first = f"verdict: {verdict.grade}: {verdict.sentence}"
+    return Report((first, *verdict.reasons, *notes, *verdict.remarks), figures)
 
 
 def _draw(

@@ -224,12 +224,12 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     """Refuse to label a rejected map.
 
     Raises:
-        TrackingLostError: With the first reason, and the file that holds the others.
+        TrackingLostError: With the verdict's sentence, and the file that holds its figures.
     """
     if drive_map.meta.verdict != "reject":
         return
     try:
-        reason = str(read_json(map_folder / "report.json", MapFormatError)["verdict"]["reasons"][0])
+        reason = str(read_json(map_folder / "report.json", MapFormatError)["verdict"]["sentence"])
     except (MapFormatError, LookupError, TypeError):  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME

@@ -44,7 +44,7 @@ body{font:16px/1.45 system-ui,sans-serif;max-width:60rem;margin:0 auto;padding:0
 h1{font-size:1.4rem}h2{font-size:1.15rem;margin-top:2rem;border-bottom:1px solid #ddd}
 img{max-width:100%;height:auto;display:block;margin:.5rem 0}
 .verdict{padding:.6rem 1rem;border-radius:.5rem;color:#fff}
-.verdict strong{font-size:1.5rem;text-transform:uppercase}
+.verdict strong{font-size:1.5rem;text-transform:uppercase}.verdict p{margin:.3rem 0;font-size:1.1rem}
 .good{background:#2e7d32}.usable{background:#b26a00}.reject{background:#b71c1c}
 .scroll{overflow-x:auto}table{border-collapse:collapse;font-size:.9rem}
 td,th{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}
@@ -52,7 +52,7 @@ td:first-child,th:first-child{text-align:left;white-space:normal}
 p.note{color:#555;font-size:.9rem}
 </style></head><body>
 <h1>$title</h1>
-<div class="verdict $grade"><strong>$grade</strong><ul>$reasons</ul></div>
+<div class="verdict $grade"><strong>$grade</strong><p>$sentence</p></div>
 $body
 </body></html>
 """
@@ -90,6 +90,9 @@ def report_page(
     held = figures["held_out"]
     chance = held["coverage_by_chance"]
     body = [
+        _section("What the verdict rests on"),
+        _list([*verdict.reasons, *verdict.remarks]),
+        _section("The drive"),
         _list(figures["notes"]),
         _section("Held-out frames"),
         _note(
@@ -117,7 +120,6 @@ def report_page(
         _section("Camera and scale"),
         _table(camera_rows(drive_map.camera, figures.get("calibration"))),
         _table(scale_rows(drive_map.meta)),
-        _list(verdict.remarks),
         _section("Steering and speed"),
         _plot(steering_plot, mapped, fits)
         or _note("There is no steering command, or it does not explain the path."),
@@ -126,7 +128,7 @@ def report_page(
     return _PAGE.substitute(
         title=html.escape(f"Map of {drive.name}"),
         grade=verdict.grade,
-        reasons="".join(f"<li>{html.escape(reason)}</li>" for reason in verdict.reasons),
+        sentence=html.escape(verdict.sentence[:1].upper() + verdict.sentence[1:] + "."),
         body="\n".join(part for part in body if part),
     )
 

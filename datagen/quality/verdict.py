@@ -1,10 +1,10 @@
-"""The verdict on a map: good, usable or reject, with reasons."""
+"""The verdict on a map: good, usable or reject, in one sentence, with the figures that it rests on."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field
 
@@ -48,6 +48,10 @@ class MapEvidence:
         given_lane_cm: Lane width that the user gave.
         found_lane_cm: Lane width that the camera measures; None if the lane sets the scale.
         contradicted_share: Share of the frames' lines that the images contradict.
+        height_cm: Height of the camera that follows from the scale.
+        tape_cm: Width of the markings that follows from it.
+        steering: Correlation of the path's curvature with the steering command, both positive to the left;
+            None where it is too weak to tell, or nothing was commanded.
     """
 
     lines: dict[str, LineEvidence]
@@ -63,6 +67,9 @@ class MapEvidence:
     given_lane_cm: float
     found_lane_cm: float | None
     contradicted_share: float = 0.0
+    height_cm: float = float("nan")
+    tape_cm: float = float("nan")
+    steering: float | None = None
 
 
 Grade = Literal["good", "usable", "reject"]
@@ -97,6 +104,10 @@ class VerdictSettings(Settings):
             scale, up to which a map is good. Chosen: lanes of one road vary by less.
         lane_reject: The same, beyond which a map is rejected. Chosen: short of a lane mistaken for a road.
         usable: Factor on the bounds of a good map up to which it is usable. Chosen.
+        height_cm, tape_cm: Least and largest height of the camera, and width of the markings, of a 1:10 car.
+            Where the lane width sets the scale, a map beyond them is usable, for the lane width may be that
+            of the whole road, or in another unit. Chosen: the three recorded drives have 10 to 20 and 2 to 4
+            cm; a factor of two is left on either side.
     """
 
     max_sd_px: float = Field(default=0.5, gt=0.0)
@@ -111,6 +122,8 @@ class VerdictSettings(Settings):
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     lane_reject: float = Field(default=0.6, gt=0.0)
     usable: float = Field(default=2.0, gt=1.0)
+    height_cm: tuple[float, float] = (5.0, 40.0)
+    tape_cm: tuple[float, float] = (0.8, 8.0)
 
 
 @dataclass(frozen=True)
@@ -119,39 +132,78 @@ class Verdict:
 
     Attributes:
         grade: The worst grade of all checks.
-        reasons: Why it is not better; if it is good, what that is based on.
+        sentence: What that comes from and what to do about it, in plain words.
+        reasons: The figures behind it, the worst first, with the bounds that they exceed; if the map is good,
+            what that is based on.
         remarks: What else to know.
     """
 
     grade: Grade
+    sentence: str
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
 
 
-#: The grades of one check, with their reasons; none if the map is good.
-_Findings = Iterator[tuple[Grade, str]]
+class Finding(NamedTuple):
+    """What keeps a map from being good.
+
+    Attributes:
+        grade: Usable or reject.
+        cause: What is wrong, in plain words.
+        remedy: What to do about it.
+        figures: What was measured and expected, with the name of the bound.
+    """
+
+    grade: Grade
+    cause: str
+    remedy: str
+    figures: str
+
+
+#: What one check finds; nothing if the map is good.
+_Findings = Iterator[Finding]
+
+#: What helps where the camera may be wrong: known, or found from the drive.
+_CHECK_CAMERA = "check that the camera file and the lane width are those of this car and road"
+_DRIVE_AGAIN = "drive two laps of a closed road along the same path, or give a camera file (--camera)"
 
 
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
-    checks = (_residuals, _labelled, _contradicted, _camera, _lane_width)
+    checks = (_residuals, _labelled, _contradicted, _camera, _lane_width, _scale)
     found = [finding for check in checks for finding in check(evidence, settings)]
     # The worst first.
-    found.sort(key=lambda finding: -_ORDER.index(finding[0]))
-    reasons = [reason for _, reason in found]
-    if not found:
-        sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
-        reasons = [
-            f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; "
-            f"{_percent(evidence.labelled_share)} of the frames have labels"
-        ]
-    remarks: tuple[str, ...] = ()
-    if evidence.found_lane_cm is None:
-        remarks = (
-            f"the lane width of {evidence.given_lane_cm:g} cm is the one thing that sets the scale: if it is "
-            "wrong, every length is wrong by the same share, and no check here can show it",
+    found.sort(key=lambda finding: -_ORDER.index(finding.grade))
+    remarks = tuple(_remarks(evidence))
+    if found:
+        worst = found[0]
+        more = f" ({len(found) - 1} more below)" if len(found) > 1 else ""
+        sentence = f"{worst.cause}{more}: {worst.remedy}"
+        return Verdict(worst.grade, sentence, tuple(finding.figures for finding in found), remarks)
+    sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
+    labelled = f"{_percent(evidence.labelled_share)} of the frames have labels"
+    sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is"
+    figures = f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; {labelled}"
+    return Verdict("good", sentence, (figures,), remarks)
+
+
+def _remarks(e: MapEvidence) -> Iterator[str]:
+    """What a person can check who has the car and the road before them."""
+    if e.steering is not None and e.steering < 0.0:
+        yield (
+            f"the car turns right where it was steered left (correlation {e.steering:.2f}): the sign of the "
+            "steering is reversed, or the images are mirrored; the map follows the images"
         )
-    return Verdict(found[0][0] if found else "good", tuple(reasons), remarks)
+    if e.found_lane_cm is not None:
+        return
+    yield (
+        f"with the given lane width the camera is {e.height_cm:.0f} cm high and the tape {e.tape_cm:.1f} cm "
+        "wide: measure one of them if in doubt"
+    )
+    yield (
+        f"the lane width of {e.given_lane_cm:g} cm is the one thing that sets the scale: if it is wrong, "
+        "every length is wrong by the same share, and no check here can show it"
+    )
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:
@@ -161,86 +213,163 @@ def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:
     return "usable" if value <= settings.usable * bound else "reject"
 
 
+def _at_most(name: str, bound: float, settings: VerdictSettings, unit: str = "") -> str:
+    """Say what was expected of a number that should be small, and from where on the map is rejected."""
+    return f"expected {bound:g}{unit} at most, rejected above {settings.usable * bound:g}{unit} ({name})"
+
+
 def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
 def _residuals(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.coverage != e.coverage:
-        yield "usable", "no frame was held out that shows the lines, so the map could not be checked"
+        yield Finding(
+            "usable",
+            "nothing has checked this map",
+            "map a longer drive, or hold frames out from its lines",
+            "no frame was held out that shows the lines (held_out_every)",
+        )
         return
+    remedy = _CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN
     if not e.coverage > 0.0:
-        yield "reject", "no edge was found where the map expects the borders of its lines"
+        yield Finding(
+            "reject",
+            "the images show nothing where the map has its lines",
+            remedy,
+            "no edge was found where the map expects the borders of its lines (min_coverage)",
+        )
         return
     for side, line in e.lines.items():
-        yield from _line(side, line, s)
+        yield from _line(side, line, s, remedy)
     if e.p95_px > s.max_p95_px:
-        p95 = f"residual on held-out frames: p95 {e.p95_px:.2f} px"
-        yield "usable", f"{p95}, expected {s.max_p95_px:g} at most"
+        yield Finding(
+            "usable",
+            "some sections of the lines lie beside those in the images",
+            f"look at the worst frames of the report; {remedy}",
+            f"residual on held-out frames: p95 {e.p95_px:.2f} px, expected {s.max_p95_px:g} px at most "
+            "(max_p95_px)",
+        )
     if e.coverage < s.min_coverage:
-        met = f"{_percent(e.coverage)} of the lines' borders in view met an edge"
-        grade: Grade = "usable" if e.coverage >= s.min_coverage / s.usable else "reject"
-        yield grade, f"{met}, expected {_percent(s.min_coverage)} at least"
+        least = s.min_coverage / s.usable
+        yield Finding(
+            "usable" if e.coverage >= least else "reject",
+            "the images rarely show the lines",
+            "renew worn tape, and light the road evenly",
+            f"{_percent(e.coverage)} of the lines' borders in view met an edge, expected "
+            f"{_percent(s.min_coverage)} at least, rejected below {_percent(least)} (min_coverage)",
+        )
 
 
-def _line(side: str, line: LineEvidence, s: VerdictSettings) -> _Findings:
+def _line(side: str, line: LineEvidence, s: VerdictSettings, remedy: str) -> _Findings:
     """Judge one line by its residuals; its coverage says little, since dashes and worn lines lower it."""
     if line.samples < s.min_samples:
-        shown = f"held-out frames show {line.samples} places of the {side} line"
-        yield "usable", f"{shown}, expected {s.min_samples} at least to check it"
+        yield Finding(
+            "usable",
+            f"the {side} line was in view too rarely to be checked",
+            "turn or tilt the camera so that it sees both lines, or drive longer",
+            f"held-out frames show {line.samples} places of the {side} line, expected {s.min_samples} at "
+            "least to check it (min_samples)",
+        )
         return
     if not line.coverage > 0.0:
-        yield "reject", f"no edge was found where the map expects the borders of its {side} line"
+        yield Finding(
+            "reject",
+            f"the images show nothing where the map has its {side} line",
+            f"drive between two lines; {remedy}",
+            f"no edge was found where the map expects the borders of its {side} line (min_coverage)",
+        )
         return
     what = f"residual of the {side} line on held-out frames"
+    beside = f"the {side} line lies beside the one in the images"
     grade = _bounded(line.robust_sd_px, s.max_sd_px, s)
     if grade != "good":
-        yield grade, f"{what}: robust sd {line.robust_sd_px:.2f} px, expected {s.max_sd_px:g} at most"
+        sd = f"{what}: robust sd {line.robust_sd_px:.2f} px"
+        yield Finding(grade, beside, remedy, f"{sd}, {_at_most('max_sd_px', s.max_sd_px, s, ' px')}")
     bound = s.usable * s.max_p95_px
     if line.p95_px > bound:
-        yield "usable", f"{what}: p95 {line.p95_px:.2f} px, expected {bound:g} at most for one line"
+        yield Finding(
+            "usable",
+            f"{beside} in some sections",
+            f"look at the worst frames of the report; {remedy}",
+            f"{what}: p95 {line.p95_px:.2f} px, expected {bound:g} px at most for one line (max_p95_px)",
+        )
 
 
 def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
-    expected = f"have labels, expected {_percent(s.min_labelled)}"
+    expected = f"have labels, expected {_percent(s.min_labelled)} at least"
     grade = _bounded(1.0 - e.labelled_share, 1.0 - s.min_labelled, s)
     if grade != "good":
         causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
-        yield grade, f"{_percent(e.labelled_share)} of the frames {expected} ({causes})"
+        most = next(iter(e.not_labelled), "unknown")
+        yield Finding(
+            grade,
+            f"only {_percent(e.labelled_share)} of the frames have labels (most of the others: {most})",
+            f"look at the strip of frames in the report, and {_DRIVE_AGAIN}",
+            f"{_percent(e.labelled_share)} of the frames {expected} ({causes}), rejected below "
+            f"{_percent(1.0 - s.usable * (1.0 - s.min_labelled))} (min_labelled)",
+        )
     for side, share in e.point_shares.items():
         if share < s.min_labelled:
-            points = f"{_percent(share)} of the {side} line's points in the window"
-            yield "usable", f"{points} {expected} (frames: {_percent(e.labelled_share)})"
+            yield Finding(
+                "usable",
+                f"the {side} line has few labels",
+                "turn or tilt the camera so that it sees both lines of the lane",
+                f"{_percent(share)} of the {side} line's points in the window {expected} (frames: "
+                f"{_percent(e.labelled_share)}; min_labelled)",
+            )
 
 
 def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
     grade = _bounded(e.contradicted_share, s.max_contradicted, s)
     if grade != "good":
-        share = f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map"
-        yield grade, f"{share}, expected {_percent(s.max_contradicted)} at most"
+        bound, most = (_percent(b * s.max_contradicted) for b in (1.0, s.usable))
+        yield Finding(
+            grade,
+            "in many frames the images disagree with the map",
+            f"look at the worst frames of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
+            f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map, "
+            f"expected {bound} at most, rejected above {most} (max_contradicted)",
+        )
 
 
 def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.closure_across_heights is not None and e.closure_across_heights > s.max_closure_heights:
-        error = f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights"
-        grade = _bounded(e.closure_across_heights, s.max_closure_heights, s)
-        yield grade, f"{error}, expected {s.max_closure_heights:g} at most"
+        yield Finding(
+            _bounded(e.closure_across_heights, s.max_closure_heights, s),
+            "the laps do not lie on one another",
+            _CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN,
+            f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights, "
+            f"{_at_most('max_closure_heights', s.max_closure_heights, s)}",
+        )
     if e.camera_known:
         return
     if not e.revisits:
         sigma = e.sigma["focal"]
-        yield (
+        yield Finding(
             max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
-            "the camera was found from the drive, but no place was seen twice, so its focal length is only a "
-            f"guess, here within {_percent(sigma)}: drive two laps of a closed road, the second along the "
-            "same path, or calibrate the camera and give it",
+            "the drive does not show what camera this is, for no place was seen twice",
+            _DRIVE_AGAIN,
+            f"no place was seen twice, so the focal length is only a guess, here within {_percent(sigma)}, "
+            f"expected {_percent(s.max_focal_sigma)} at most (max_focal_sigma)",
         )
     elif (sigma := e.sigma.get("focal", 0.0)) > s.max_focal_sigma:
-        grade = _bounded(sigma, s.max_focal_sigma, s)
-        yield grade, f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %"
+        yield Finding(
+            _bounded(sigma, s.max_focal_sigma, s),
+            "the drive does not show the focal length well enough",
+            _DRIVE_AGAIN,
+            f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %, expected "
+            f"{_percent(s.max_focal_sigma)} at most, rejected above {_percent(s.usable * s.max_focal_sigma)} "
+            "(max_focal_sigma)",
+        )
     if (sigma := e.sigma.get("pitch", 0.0)) > s.max_pitch_sigma_rad:
-        grade = _bounded(sigma, s.max_pitch_sigma_rad, s)
-        yield grade, f"the drive leaves the camera's pitch open by {sigma:.3f} rad"
+        yield Finding(
+            _bounded(sigma, s.max_pitch_sigma_rad, s),
+            "the drive does not show the camera's pitch well enough",
+            _DRIVE_AGAIN,
+            f"the drive leaves the camera's pitch open by {sigma:.3f} rad, "
+            f"{_at_most('max_pitch_sigma_rad', s.max_pitch_sigma_rad, s, ' rad')}",
+        )
 
 
 def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
@@ -248,8 +377,33 @@ def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
         return
     ratio = max(e.found_lane_cm / e.given_lane_cm, e.given_lane_cm / e.found_lane_cm)
     if ratio > 1.0 + s.lane_mismatch:
-        yield (
-            "usable" if ratio <= 1.0 + s.lane_reject else "reject",
-            f"the lane measures {e.found_lane_cm:.0f} cm with this camera, but {e.given_lane_cm:g} cm was "
-            "given: either the lane width or the camera's height is wrong",
+        rejects = ratio > 1.0 + s.lane_reject
+        yield Finding(
+            "reject" if rejects else "usable",
+            f"the lane measures {e.found_lane_cm:.0f} cm with this camera, not {e.given_lane_cm:g} cm",
+            "measure the lane between the middles of its two lines, and the camera's height",
+            f"the lane measures {e.found_lane_cm:.1f} cm, {e.given_lane_cm:g} cm was given: a factor of "
+            f"{ratio:.2f}, expected {1.0 + s.lane_mismatch:g} at most (lane_mismatch), rejected above "
+            f"{1.0 + s.lane_reject:g} (lane_reject)",
         )
+
+
+def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    """Question a lane width that makes another car of this one; only where it sets the scale."""
+    if e.found_lane_cm is not None:
+        return
+    for name, value, (least, most) in (
+        ("height_cm", e.height_cm, s.height_cm),
+        ("tape_cm", e.tape_cm, s.tape_cm),
+    ):
+        if value < least or value > most:
+            yield Finding(
+                "usable",
+                f"with a lane width of {e.given_lane_cm:g} cm, the camera would be {e.height_cm:.0f} cm high "
+                f"and the tape {e.tape_cm:.1f} cm wide",
+                "is the lane width right? It is the distance between the middles of the two lines that bound "
+                "the driven lane, in cm",
+                f"{'camera height' if name == 'height_cm' else 'tape width'} {value:.1f} cm, expected "
+                f"{least:g} to {most:g} cm on a 1:10 car ({name})",
+            )
+            return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from datagen.quality import page
+from datagen.quality.figures import steering_correlation
 from datagen.quality.pictures import draw_map
 from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.commands import SteeringFit
@@ -124,3 +126,20 @@ def test_steps_and_curvature_across_a_break_are_left_out(mapped, drawn):
     page.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
     # Of the first segment's 25 frames, two begin a run.
     assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0, None])
+def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, sign):
+    """The car turns as it is steered, the other way round, or for reasons of its own; two frames later."""
+    n = len(ROWS)
+    steered = mapped.drive.commands.angle[np.maximum(ROWS - 2, 0)]
+    # Donkeycar's angle is positive to the right.
+    turn = np.random.default_rng(0).normal(size=n) if sign is None else -sign * steered
+    heading = 0.05 * np.cumsum(turn)
+    poses = np.cumsum(2.0 * np.column_stack([np.cos(heading), np.sin(heading), 0.0 * heading]), axis=0)
+    poses[:, 2] = heading
+    turned = replace(mapped, drive_map=replace(mapped.drive_map, poses=poses))
+    found = steering_correlation(turned)
+    assert found is None if sign is None else abs(found - sign) < 0.05
+    blind = replace(mapped, drive=replace(mapped.drive, commands=Commands()))
+    assert steering_correlation(blind) is None
