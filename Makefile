@@ -19,7 +19,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain golden golden-renew arm neutral check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install chain traps golden golden-renew arm neutral check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -27,6 +27,7 @@ help:
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
+	@echo "make traps        maps of sixty simulated drives that are hard to map; goes on where it stopped"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
@@ -55,6 +56,10 @@ test-base-install: $(VENV)/.stamp-dev
 # Each file stays in one process, for its fixtures.
 chain: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow --dist loadfile tests/sim/test_chain.py tests/contracts/test_configs.py
+
+# Most of an hour on one core; TRAPS adds arguments, such as --drives 0:20 --processes 2.
+traps: $(VENV)/.stamp-dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
 
 golden: $(VENV)/.stamp-dev
 	$(PYTEST) tests/golden

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from datagen.world.car.driver import LostLane, Pilot, PilotSettings, Sight, place_on_track
+from datagen.world.car.recording import BangBang
 from datagen.world.render.renderer import Renderer
 from datagen.world.render.sensor import as_jpeg
 from datagen.world.road.track import write_track
@@ -25,7 +26,7 @@ from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import dump_settings
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.files import write_text
-from lanenet.errors import LanenetError
+from lanenet.errors import ConfigError, LanenetError
 from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.processes import prepare_process
@@ -220,17 +221,24 @@ def simulate_drive(
     )
     frames: Iterator[tuple[DriveState, Image]]
     if pilot is None:
-        states = list(scripted_states(world))
+        states = [s for s in scripted_states(world) if world.recorded is None or world.recorded[s.frame]]
         frames = zip(states, _render_states(world, states, workers), strict=True)
     else:
+        if world.recorded is not None:
+            raise ConfigError("gaps: found a pilot, who records all that he drives, expected none")
         frames = _piloted(world, pilot(world), pilot_settings or PilotSettings(), quality)
+    total = settings.frames if world.recorded is None else int(world.recorded.sum())
+    bang = BangBang() if world.settings.angles == "bang" else None
     with writer:
         for done, (state, image) in enumerate(frames, start=1):
             pose = dict(zip(("x_cm", "y_cm", "heading_rad"), map(float, state.pose), strict=True))
             points = dict(zip(POINT_NAMES, map(float, state.points_cm), strict=True))
-            writer.add(image, state.t_s, truth={**pose, **points}, **_recorded_command(world, state))
+            command = _recorded_command(world, state)
+            if bang is not None:
+                command["angle"] = bang.angle(command["angle"])
+            writer.add(image, state.t_s, truth={**pose, **points}, **command)
             if progress is not None:
-                progress(done, settings.frames)
+                progress(done, total)
         write_track(writer.folder / "track.json", world.track)
         write_text(writer.folder / "simulation.yaml", dump_settings(world.settings))
     return out

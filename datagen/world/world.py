@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool
 from pydantic import Field
 
 from datagen.world.car.camera import CameraSettings
 from datagen.world.car.car import Car, CarSettings, DonkeyCommands, DonkeySettings, draw_donkey
 from datagen.world.car.driver import Driver, DriverSettings
+from datagen.world.car.recording import Gaps, Levels, recorded_frames
 from datagen.world.render.appearance import Appearance, random_appearance
 from datagen.world.render.ground import NEAR_CM
 from datagen.world.render.renderer import Renderer
@@ -37,7 +39,7 @@ class SimulationSettings(Settings):
 
     Attributes:
         seed: Of everything random: road, appearance, driver and car each draw from their own child.
-        frames: Number of frames.
+        frames: Number of frames that are driven.
         rate_hz: Frames per second.
         camera: The camera.
         track: The road.
@@ -46,6 +48,9 @@ class SimulationSettings(Settings):
         look: The appearance of the drive.
         random_look: Draw what ``look`` does not set.
         recording: ``commands`` records speed and steering; ``donkeycar`` throttle and angle only.
+        gaps: Frames that are driven and not recorded: none, those between ``pulses`` of the throttle, or
+            ``pauses``.
+        angles: ``bang`` records the angles of a keyboard, -1, 0 and 1, instead of ``all``.
         donkey: What throttle and angle do; recorded in the resolved settings only.
     """
 
@@ -59,6 +64,8 @@ class SimulationSettings(Settings):
     look: Appearance = Appearance()
     random_look: bool = True
     recording: Literal["commands", "donkeycar"] = "commands"
+    gaps: Gaps = "none"
+    angles: Levels = "all"
     donkey: DonkeySettings = DonkeySettings()
 
 
@@ -74,6 +81,7 @@ class World:
         car: At the start.
         build_renderer: Makes the renderer, once.
         donkey: Set when throttle and angle are recorded.
+        recorded: Which frames are recorded; None for all.
     """
 
     settings: SimulationSettings
@@ -83,6 +91,7 @@ class World:
     car: Car
     build_renderer: Callable[[], Renderer]
     donkey: DonkeyCommands | None = None
+    recorded: Bool[np.ndarray, "n"] | None = None
 
     @functools.cached_property
     def renderer(self) -> Renderer:
@@ -114,13 +123,15 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
         ConfigError: If the settings contradict each other.
     """
     # The order is part of the format: a new part of the world takes a new child at the end.
-    children = np.random.default_rng(settings.seed).spawn(6)
-    track_rng, look_rng, scene_rng, driver_rng, car_rng, donkey_rng = children
+    children = np.random.default_rng(settings.seed).spawn(7)
+    track_rng, look_rng, scene_rng, driver_rng, car_rng, donkey_rng, gap_rng = children
     track = _drawn_track(settings, track_rng)
     if settings.driver.change_lanes_every_cm is not None and track.oncoming_cm is None:
         raise ConfigError(
             "driver.change_lanes_every_cm: found a road with one lane, expected one with two (track.lanes: 2)"
         )
+    if settings.angles == "bang" and settings.recording != "donkeycar":
+        raise ConfigError("angles: found bang for a recording of commands, expected recording: donkeycar")
     look = settings.look
     if settings.track.floor_bgr is not None and "floor_bgr" not in look.model_fields_set:
         look = look.model_copy(update={"floor_bgr": settings.track.floor_bgr})
@@ -139,7 +150,8 @@ def assemble_world(settings: SimulationSettings, compress: bool = True) -> World
         look = look.model_copy(update={"jpeg_quality": None})
     build_renderer = functools.partial(Renderer, camera, track, look, scene_rng)
     commands = DonkeyCommands(donkey) if settings.recording == "donkeycar" else None
-    return World(settings, track, camera, driver, car, build_renderer, commands)
+    kept = None if settings.gaps == "none" else recorded_frames(settings.gaps, settings.frames, gap_rng)
+    return World(settings, track, camera, driver, car, build_renderer, commands, kept)
 
 
 def draw_track(settings: SimulationSettings) -> Track:

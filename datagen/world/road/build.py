@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from datagen.world.road.centre_line import (
     CentreLine,
@@ -22,6 +23,11 @@ from lanenet.errors import ConfigError
 
 #: Between the outer lines of two sections of a random road, in lane widths: no line is near another road's.
 _CLEARANCE_LANES = 0.5
+#: Stretch over which a lane widens before a bend; chosen: a wide lane begins a little before the bend.
+_WIDENS_OVER_CM = 40.0
+#: Length of the pieces of tape that make up a line beside a lane that widens: a bend of 40 cm leaves them by
+#: 0.03 cm.
+_TAPE_PIECE_CM = 3.0
 
 
 def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
@@ -68,11 +74,15 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
         for name in settings.lines
         for marking in _line(settings, name, track, kind_rng, interruption_rng, wear_rng)
     ]
-    return replace(
-        track,
-        markings=tuple(_without_cuts(marking, things, track) for marking in markings),
-        boxes=np.concatenate([np.empty((0, 9)), *(thing.boxes for thing in things)]),
-    )
+    markings = [_without_cuts(marking, things, track) for marking in markings]
+    if settings.crosses:
+        markings = [_open_at_crossings(marking, track) for marking in markings]
+    boxes = [np.empty((0, 9)), *(thing.boxes for thing in things)]
+    if settings.widening > 0.0:
+        track = replace(track, widths=_widths(track, settings.widening))
+        boxes += [_pieces_of_tape(marking, track) for marking in markings]
+        markings = []
+    return replace(track, markings=tuple(markings), boxes=np.concatenate(boxes))
 
 
 def check_drivable(
@@ -149,9 +159,13 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
     if settings.pieces:
         if settings.lanes == 2 and any(piece.kind == "kink" for piece in settings.pieces):
             raise ConfigError(f"{settings.origin}: key 'lanes': found 2, expected 1 on a road with kinks")
-        line = lay_out(settings.pieces, settings.closed, settings.origin)
+        line = lay_out(settings.pieces, settings.closed, settings.origin, settings.crosses)
         found = comes_near_itself(
-            line, road_cm + settings.line_width_cm, settings.closed, middle_cm=middle_cm
+            line,
+            road_cm + settings.line_width_cm,
+            settings.closed,
+            middle_cm=middle_cm,
+            crosses=settings.crosses,
         )
         if found is not None:
             first, second, distance, least_cm = found
@@ -226,6 +240,59 @@ def _dashes(
     along_cm = length_beside(s_cm, per_cm, offset_cm)
     dashes = paint_dashes(float(along_cm[-1]), track.closed, marking.dash_cm, marking.gap_cm, phase)
     return np.interp(dashes, along_cm, s_cm)
+
+
+def _open_at_crossings(marking: Marking, track: Track) -> Marking:
+    """Interrupt a line where it would lie on another section of the road."""
+    reach_cm = track.half_width_cm + marking.width_cm
+    on_cm = track.middle_cm
+    line_cm = track.beside(np.arange(len(track.s_cm)), marking.offset_cm)
+    road_cm = track.beside(np.arange(len(track.s_cm)), on_cm)
+    painted_cm, lap_cm = marking.painted_cm, track.length_cm
+    for k, near in enumerate(cKDTree(road_cm).query_ball_point(line_cm, reach_cm)):
+        along_cm = np.abs(track.s_cm[near] - track.s_cm[k])
+        if (np.minimum(along_cm, lap_cm - along_cm) > np.pi * reach_cm).any():
+            painted_cm = cut(painted_cm, track.s_cm[k] - track.step_cm, track.s_cm[k] + track.step_cm)
+    return replace(marking, painted_cm=painted_cm)
+
+
+def _widths(track: Track, widening: float) -> Float[np.ndarray, "n"]:
+    """Lane width at each sample over that of a straight: it grows with the curvature, over half a metre."""
+    bend = np.abs(track.curvature_per_cm)
+    n = max(1, round(0.5 * _WIDENS_OVER_CM / track.step_cm))
+    bend = np.pad(bend, 2 * n, mode="wrap" if track.closed else "edge")
+    for _ in range(2):  # twice, so that the lines have no kinks
+        bend = np.convolve(bend, np.full(2 * n + 1, 1.0 / (2 * n + 1)), "valid")
+    return 1.0 + widening * bend / max(float(bend.max()), 1e-9)
+
+
+def _pieces_of_tape(marking: Marking, track: Track) -> Float[np.ndarray, "b 9"]:
+    """Lay a line beside a lane that widens as short pieces of tape: rows of ``Track.boxes``."""
+    rows = [np.empty((0, 9))]
+    at_cm = np.append(track.s_cm, track.s_cm[-1] + track.step_cm)
+    index = np.arange(len(at_cm)) % len(track.s_cm) if track.closed else np.arange(len(track.s_cm))
+    at_cm = at_cm[: len(index)]
+    line_cm = track.beside(index, marking.offset_cm * track.width_factors[index])
+    for start_cm, end_cm in marking.painted_cm:
+        places_cm = np.linspace(
+            start_cm, end_cm, max(2, int(np.ceil((end_cm - start_cm) / _TAPE_PIECE_CM)) + 1)
+        )
+        points_cm = np.stack([np.interp(places_cm, at_cm, line_cm[:, k]) for k in range(2)], axis=1)
+        along_cm = np.diff(points_cm, axis=0)
+        length_cm = np.linalg.norm(along_cm, axis=1, keepdims=True)
+        n = len(along_cm)
+        rows.append(
+            np.hstack(
+                [
+                    points_cm[:-1] + 0.5 * along_cm,
+                    along_cm / length_cm,
+                    0.5 * length_cm + 0.1 * marking.width_cm,  # they overlap: no floor shows in bends
+                    np.full((n, 1), 0.5 * marking.width_cm),
+                    np.broadcast_to(marking.colour_bgr, (n, 3)),
+                ]
+            )
+        )
+    return np.concatenate(rows)
 
 
 def _without_cuts(marking: Marking, things: list[Painted], track: Track) -> Marking:

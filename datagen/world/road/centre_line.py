@@ -22,6 +22,9 @@ _CHECK_CM = 5.0
 #: Newton steps that close a loop; two or three suffice.
 _CLOSING_STEPS = 8
 
+#: Least angle at which a road may cross itself; chosen: each section's lines still lead straight on.
+_CROSSING_RAD = math.radians(45.0)
+
 #: Length, [cm], and curvature at its start and end, [1/cm], positive left; linear in between.
 Section = tuple[float, float, float]
 #: Open roads: draws of one piece before pieces are taken back, how often that happens, and how many go first;
@@ -98,7 +101,9 @@ def sample_sections(sections: Sequence[Section], closed: bool) -> CentreLine:
     bend = np.zeros(len(knots))
     heading, z = _integrate(k0, k1, np.diff(knots))
     for _ in range(_CLOSING_STEPS if closed else 0):
-        gap = np.array([2.0 * np.pi * np.sign(heading[-1]) - heading[-1], -z[-1].real, -z[-1].imag])
+        # A figure of eight does not turn at all in sum.
+        turned = 2.0 * np.pi * np.rint(heading[-1] / (2.0 * np.pi))
+        gap = np.array([turned - heading[-1], -z[-1].real, -z[-1].imag])
         if np.max(np.abs(gap)) < 1e-10:
             break
         # The least additional curvature that closes the gap is linear in position: turning by 1 at z moves
@@ -172,7 +177,12 @@ def end_of(sections: Sequence[Section]) -> tuple[float, complex]:
 
 
 def comes_near_itself(
-    line: CentreLine, separation_cm: float, closed: bool, after_cm: float = 0.0, middle_cm: float = 0.0
+    line: CentreLine,
+    separation_cm: float,
+    closed: bool,
+    after_cm: float = 0.0,
+    middle_cm: float = 0.0,
+    crosses: bool = False,
 ) -> tuple[float, float, float, float] | None:
     """Find two sections of a road that lie closer together than they should.
 
@@ -183,6 +193,7 @@ def comes_near_itself(
         closed: Whether the end joins the start.
         after_cm: Only points further along than this are compared with the whole curve.
         middle_cm: Offset of the road's middle, whose distance counts.
+        crosses: Whether sections may cross at 45 to 90 degrees.
 
     Returns:
         The two places along the road, their distance, and what it should be, [cm]: ``separation_cm`` and what
@@ -199,6 +210,8 @@ def comes_near_itself(
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     along_cm = np.abs(s_cm[i] - s_cm[j])
     near = (np.minimum(along_cm, lap_cm - along_cm) > 0.5 * np.pi * separation_cm) & (s_cm[i] >= after_cm)
+    if crosses:
+        near &= np.abs(np.sin(heading[i] - heading[j])) < math.sin(_CROSSING_RAD)
     if not near.any():
         return None
     first, other = min(zip(i[near].tolist(), j[near].tolist(), strict=True))

@@ -163,7 +163,7 @@ def length_of(pieces: Sequence[Piece]) -> float:
     return float(sum(section[0] for piece in pieces for section in piece.sections()))
 
 
-def lay_out(pieces: Sequence[Piece], closed: bool, where: str) -> CentreLine:
+def lay_out(pieces: Sequence[Piece], closed: bool, where: str, crosses: bool = False) -> CentreLine:
     """Join pieces to a centre line, from the origin along +x.
 
     A loop whose ends miss each other a little is bent evenly until they meet.
@@ -172,13 +172,14 @@ def lay_out(pieces: Sequence[Piece], closed: bool, where: str) -> CentreLine:
         pieces: The pieces in the direction of travel.
         closed: Whether the end joins the start.
         where: What errors call the road.
+        crosses: Whether the road may cross itself; a figure of eight turns by 0 degrees in sum.
 
     Raises:
         ConfigError: If a loop does not close, with the gap in cm and degrees.
     """
     sections = [section for piece in pieces for section in piece.sections()]
     heading, end = end_of(sections)
-    laps = 1.0 if heading > 0.0 else -1.0
+    laps = round(heading / (2.0 * np.pi)) if crosses else np.copysign(1.0, heading)
     turn_deg = float(np.rad2deg(heading - laps * 2.0 * np.pi))
     gap_cm = float(abs(end))
     if closed and (gap_cm > _GAP_CM or abs(turn_deg) > _GAP_DEG):

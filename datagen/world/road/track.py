@@ -71,6 +71,8 @@ class Track:
         boxes: Painted rectangles (stop lines, bars, arrows, side roads, bays): x, y, cos and sin of the
             direction, half length, half width, blue, green, red; frame map.
         oncoming_cm: Offset of the middle of the oncoming lane, left positive; None on a road of one lane.
+        widths: Width of the lane at each sample, in ``lane_width_cm``; None where it is the same everywhere.
+            The lines of a lane that widens are among the boxes.
     """
 
     s_cm: Float[np.ndarray, "n"]
@@ -82,6 +84,12 @@ class Track:
     markings: tuple[Marking, ...]
     boxes: Float[np.ndarray, "b 9"] = field(default_factory=lambda: np.empty((0, 9)))
     oncoming_cm: float | None = None
+    widths: Float[np.ndarray, "n"] | None = None
+
+    @property
+    def width_factors(self) -> Float[np.ndarray, "n"]:
+        """``widths`` in any case: ones where the lane is the same everywhere."""
+        return np.ones(len(self.s_cm)) if self.widths is None else self.widths
 
     @property
     def step_cm(self) -> float:
@@ -127,7 +135,8 @@ class Track:
     def line_beside(self, from_cm: float, to_cm: float, offset_cm: float) -> Float[np.ndarray, "k 2"]:
         """Return the line beside a section of the road, with its corners at kinks, [cm], frame map."""
         index = self._samples(from_cm, to_cm)
-        points, keep = self.beside(index, offset_cm), np.ones(len(index), dtype=bool)
+        points = self.beside(index, offset_cm * self.width_factors[index])
+        keep = np.ones(len(index), dtype=bool)
         corners = []
         for k in np.flatnonzero(self.kinks_rad[index[:-1]]).tolist():
             i, half_rad = index[k], 0.5 * float(self.kinks_rad[index[k]])
@@ -252,6 +261,7 @@ class Track:
             xy_cm=xy_cm,
             heading_rad=np.unwrap(heading_rad + np.pi),
             curvature_per_cm=-curvature / (1.0 - offset_cm * curvature),
+            widths=None if self.widths is None else np.interp(places_cm, self.s_cm, self.widths),
             markings=tuple(
                 replace(
                     m,
@@ -396,6 +406,8 @@ def write_track(path: Path, track: Track) -> None:
         "markings": [vars(marking) for marking in track.markings],
         "boxes": track.boxes,
     }
+    if track.widths is not None:
+        data["widths"] = track.widths
     write_json(path, data)
 
 
@@ -429,10 +441,12 @@ def _track_of(path: Path, data: dict[str, Any]) -> Track:
         "boxes": np.asarray(data["boxes"], dtype=np.float64).reshape(-1, 9),
         "oncoming_cm": None if data["oncoming_cm"] is None else float(data["oncoming_cm"]),
     }
+    if data.get("widths") is not None:  # older files have none
+        columns["widths"] = np.asarray(data["widths"], dtype=np.float64)
     lengths = [len(column) if column.ndim else 0 for column in columns.values()]
     if min(lengths) < 2 or len(set(lengths)) > 1:
         raise DriveFormatError(
-            f"{path}: expected {', '.join(_COLUMNS)} of one length of at least 2, "
+            f"{path}: expected {', '.join(columns)} of one length of at least 2, "
             f"found {', '.join(map(str, lengths))}"
         )
     painted = [np.array([m.offset_cm, m.width_cm, *m.colour_bgr, *m.painted_cm.ravel()]) for m in markings]

@@ -74,6 +74,8 @@ class TrackSettings(Settings):
             degrees at up to 1.25 times ``min_radius_cm``, as tape laid round a garage has them, each with a
             straight behind it.
         closed: A loop instead of a road with two ends.
+        crosses: The road may cross itself, as a figure of eight does; it has no lines on the crossing.
+        widening: Share by which the lane is wider in the tightest bend of this road, in easier bends less.
         length_cm: Along the centre line; None: as long as the drive needs, or 1200 cm for a loop. Given by
             the pieces where there are any.
         lanes: One, or two with traffic in both directions.
@@ -96,6 +98,8 @@ class TrackSettings(Settings):
     min_radius_cm: float = Field(default=60.0, gt=0.0)
     corners: float = Field(default=0.0, ge=0.0, le=1.0)
     closed: bool = False
+    crosses: bool = False
+    widening: float = Field(default=0.0, ge=0.0, lt=1.0)
     length_cm: float | None = Field(default=None, gt=100.0)
     lanes: Literal[1, 2] = 1
     left: MarkingSettings | None = MarkingSettings(kind="random", colour="random")
@@ -133,6 +137,13 @@ class TrackSettings(Settings):
                     f"key {name!r}: a road of {settings.lanes} lane(s) has the lines {', '.join(wanted)}; "
                     f"the others are null, found {'a line' if found else 'none'} for {name}"
                 )
+        if settings.widening > 0.0 and settings.lanes == 2:
+            raise ValueError(
+                f"key 'widening': found {settings.widening:g} for a road of two lanes, expected 0: only "
+                "roads of one lane widen"
+            )
+        if settings.crosses and not settings.pieces:
+            raise ValueError("key 'crosses': found true for a road drawn at random, expected one from pieces")
         if settings.corners > 0.0 and (settings.closed or settings.pieces):
             kind = "from pieces" if settings.pieces else "that is a loop"
             raise ValueError(
