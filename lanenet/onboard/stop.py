@@ -155,7 +155,9 @@ def _drives() -> dict[int, list[Path]]:
     for folder in Path("/proc").glob("[0-9]*"):
         words = words_of(int(folder.name))
         at = words.index("drive") if "drive" in words else 0
-        if not any(Path(word).name == "lanenet" for word in words[:at]):
+        # Not the terminal, shell or ssh that it was started from.
+        own = words[0].startswith(("python", "lanenet"))
+        if not own or not any(Path(word).name == "lanenet" for word in words[:at]):
             continue
         # Of another user, or gone.
         with contextlib.suppress(OSError):

@@ -137,6 +137,19 @@ def test_a_mistyped_name_is_told_what_drives(car):
         drive.communicate()
 
 
+def test_the_terminal_of_a_drive_is_left_alone(tmp_path, car):
+    terminal = tmp_path / "tmux"
+    terminal.symlink_to(sys.executable)
+    words = [terminal, "-ISc", "print(flush=True); input()", "lanenet", "drive", car]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        process.stdout.readline()
+        assert process.pid not in stop._drives()
+    finally:
+        process.kill()
+        process.communicate()
+
+
 def test_the_owner_of_a_serial_line_is_ended(tmp_path):
     pytest.importorskip("serial", reason="pyserial is not installed")
     master, slave = os.openpty()
