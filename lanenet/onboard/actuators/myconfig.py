@@ -7,9 +7,11 @@ Source: donkeycar 5.3, ``templates/complete.py`` (``add_drivetrain``), ``parts/p
 from __future__ import annotations
 
 import ast
+import io
 import math
 import operator
 import re
+import tokenize
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -44,8 +46,9 @@ _USED = {
 }  # fmt: skip
 #: Ways to change a variable without binding its name; a dictionary changes under any other name.
 _UNFOLLOWED = {
-    _SECTION, "*", "globals", "locals", "vars", "setattr", "delattr", "exec", "eval", "__dict__",
-    "__setattr__",
+    _SECTION, "*", "globals", "locals", "vars", "getattr", "setattr", "delattr", "exec", "eval", "__dict__",
+    "__setattr__", "__globals__", "f_globals", "f_locals", "builtins", "__builtins__", "__import__", "__self__",
+    "modules",
 }  # fmt: skip
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
@@ -69,6 +72,7 @@ def read_assignments(path: Path) -> dict[str, Any]:
     text = read_text(path, ConfigError, MEBIBYTE)
     try:
         tree = ast.parse(text, str(path))
+        _check_encoding(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise ConfigError(f"{path}: not Python: {error}") from None
     plain = [(statement.lineno, *_plain_assignment(statement)) for statement in tree.body]
@@ -84,6 +88,9 @@ def read_assignments(path: Path) -> dict[str, Any]:
             raise _not_understood(path, getattr(part, "lineno", 0), names[0])
     values: dict[str, Any] = {}
     for line, assigned, expression in plain:
+        if len(assigned) > 1 and any(target.id == _SECTION for target in assigned):
+            # One dictionary under two names.
+            raise _not_understood(path, line, _SECTION)
         try:
             known = {name: value for name, value in values.items() if name not in bound}
             value = _value_of(expression, known)
@@ -96,6 +103,14 @@ def read_assignments(path: Path) -> dict[str, Any]:
                     raise _not_understood(path, line, target.id) from None
                 values.pop(target.id, None)
     return values
+
+
+def _check_encoding(text: str) -> None:
+    """Raise ValueError if the file's line ``# coding: ...`` makes Python read another text than UTF-8 does."""
+    raw = text.encode()
+    encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
+    if raw.decode(encoding).removeprefix("\ufeff") != text.removeprefix("\ufeff"):
+        raise ValueError(f"its encoding is {encoding}, expected utf-8")
 
 
 def _plain_assignment(statement: ast.stmt) -> tuple[list[ast.Name], ast.expr]:
@@ -205,8 +220,10 @@ def settings_from_myconfig(path: Path) -> dict[str, Any]:
             for name, key in _OLD_PLACES.items()
             if values.get(name) is not None
         }
+        # Donkeycar has scales in its dictionary only.
+        counts = {name: values[name] for name in _PULSES if name in values}
         with parsing(path, ConfigError):
-            return {**_pulses(values, path), **places}
+            return {**_pulses(counts, path), **places}
     raise ConfigError(
         f"{path}: DRIVE_TRAIN_TYPE {train!r}, expected 'PWM_STEERING_THROTTLE' or 'I2C_SERVO': only a servo "
         "and a speed controller on a PCA9685 are supported"

@@ -158,6 +158,11 @@ def test_what_cannot_be_taken_over_is_named(write, text, message):
         ("A = PWM_STEERING_THROTTLE = {}\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
         ("PWM_STEERING_THROTTLE = {**A}", "PWM_STEERING_THROTTLE"),
         ("PWM_STEERING_THROTTLE |= {'THROTTLE_STOPPED_PWM': 390}", "PWM_STEERING_THROTTLE"),
+        ("A = PWM_STEERING_THROTTLE = {}\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
+        ("A.f_globals['THROTTLE_STOPPED_PWM'] = 390", "f_globals"),
+        ("(lambda: 0).__globals__['THROTTLE_STOPPED_PWM'] = 390", "__globals__"),
+        ("getattr(A, 'ex' + 'ec')('THROTTLE_STOPPED_PWM = 390')", "getattr"),
+        ("import builtins", "builtins"),
     ],
 )
 @pytest.mark.parametrize("name_of_file", ["myconfig.py", "config.py"])
@@ -198,6 +203,18 @@ def test_values_out_of_range_name_the_file(write):
     path = write("STEERING_LEFT_PWM = 4000")
     with pytest.raises(ConfigError, match=r"myconfig\.py: key 'steering_left_us'.*2500"):
         with_myconfig(PCA9685Settings(myconfig=path))
+
+
+def test_the_old_names_have_no_scale(write):
+    found = settings_from_myconfig(write(OLD + "PWM_STEERING_SCALE = 0.5\n"))
+    assert counts_of(found["steering_left_us"], prescale_of(60.0)) == 300
+
+
+def test_an_encoding_that_hides_a_line_is_refused(write):
+    path = write("# coding: utf-7\n#+AAo-THROTTLE_STOPPED_PWM = 390\n")
+    with pytest.raises(ConfigError, match="utf-7"):
+        settings_from_myconfig(path)
+    assert settings_from_myconfig(write("# coding: latin-1\nSTEERING_LEFT_PWM = 300\n"))
 
 
 def test_missing_file(tmp_path):
