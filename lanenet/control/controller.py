@@ -162,15 +162,20 @@ class LaneController:
         """
         width_cm = self._memory.width_cm
         fastest_cm_s = max(speed_cm_s, self._settings.speed.cruise_cm_s)
-        fault = fault_of(estimate, width_cm) or self._jumps.fault_of(estimate, t_s, fastest_cm_s, width_cm)
+        impossible = fault_of(estimate, None)
+        # A frame of another width counts as well: else a wrong one, once learned, would refuse all others.
+        if self._settings.width_memory and not impossible and estimate.confidence >= _WIDTH_CONFIDENCE:
+            self._memory.learn(estimate.points_cm, estimate.presence)
+        fault = (
+            impossible
+            or fault_of(estimate, width_cm)
+            or self._jumps.fault_of(estimate, t_s, fastest_cm_s, width_cm)
+        )
         if fault:
             estimate = LaneEstimate()
         dt_s = t_s - self._t_s if math.isfinite(self._t_s) else 0.0
         self._t_s = t_s
         smooth = self._smoother.update(estimate, dt_s, speed_cm_s * dt_s, steering_rad)
-        # The frame's own points: a line that is only held adds no information.
-        if self._settings.width_memory and estimate.confidence >= _WIDTH_CONFIDENCE:
-            self._memory.learn(estimate.points_cm, estimate.presence)
         steering = self._target_rad(estimate, smooth)
         curvature = lane_curvature_per_cm(smooth, self._steering.look_ahead_cm)
         if math.isfinite(steering):

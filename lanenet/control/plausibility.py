@@ -32,6 +32,8 @@ _MOST_LANES = 0.9
 #: Answers that contradict the lane before, but agree with each other for this long, are the lane. Chosen: a
 #: dozen frames of a common camera; by then an armed car is in neutral.
 SETTLE_S = 0.4
+#: Place of the row whose points are compared.
+_AT = ROWS_CM.index(15.0)
 #: Rounding error of frame times.
 _ROUNDING_S = 1e-6
 
@@ -45,14 +47,15 @@ def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
 
     Returns:
         A value that is not finite or out of range (NaN is a known absence, of all sigmas or none), a point
-        out of reach, lines that cross, a lane too narrow or too wide, or beside the car.
+        out of reach, lines that cross, a lane too narrow or too wide, or beside the car; where one line is
+        missing, it lies a width beside the other.
     """
     points, sigmas = estimate.points_cm.tolist(), estimate.sigma_cm.tolist()
     if not 0.0 <= estimate.confidence <= 1.0:
         return f"confidence {estimate.confidence:g}"
     if any(not (0.0 <= p <= 1.0 or math.isnan(p)) for p in estimate.presence.tolist()):
         return f"presence {estimate.presence}"
-    if math.isinf(estimate.steering_rad):
+    if abs(estimate.steering_rad) > 0.5 * math.pi:
         return f"steering {estimate.steering_rad:g} rad"
     if any(abs(x) > _REACH_CM for x in points):
         return f"a line {max(abs(x) for x in points if x == x):.0f} cm to the side"
@@ -66,10 +69,15 @@ def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
     seen_cm = lane_width_cm(estimate.points_cm)
     if not math.isnan(seen_cm) and not _NARROWEST * width_cm <= seen_cm <= _WIDEST * width_cm:
         return f"a lane {seen_cm:.0f} cm wide, expected {width_cm:.0f} cm"
-    centre_cm = 0.5 * (points[1] + points[4])
+    left, right = points[_AT :: len(ROWS_CM)]
+    centre_cm = 0.5 * (_or(left, right - width_cm) + _or(right, left + width_cm))
     if abs(centre_cm) > _BESIDE_LANES * width_cm:
         return f"a lane {abs(centre_cm):.0f} cm beside the car"
     return ""
+
+
+def _or(x: float, other: float) -> float:
+    return other if math.isnan(x) else x
 
 
 class JumpCheck:
@@ -94,28 +102,26 @@ class JumpCheck:
         as long without one.
 
         Args:
-            estimate: The lane of one frame; of lines that are probably not seen the place does not count.
+            estimate: The lane of one frame; the place of a line that is probably not seen does not count,
+                unless neither is.
             t_s: Time of the frame.
             speed_cm_s: The car's largest speed.
             width_cm: The lane's width; None while it is unknown.
         """
-        at = ROWS_CM.index(15.0)
-        left, right = (
-            math.nan if presence < SEEN else x
-            for x, presence in zip(
-                estimate.points_cm.tolist()[at :: len(ROWS_CM)], estimate.presence.tolist(), strict=True
-            )
-        )
+        left, right = estimate.points_cm.tolist()[_AT :: len(ROWS_CM)]
+        left_seen, right_seen = (not presence < SEEN for presence in estimate.presence.tolist())
+        if left_seen != right_seen:
+            left, right = left if left_seen else math.nan, right if right_seen else math.nan
         if math.isnan(left) and math.isnan(right):
             return ""
-        lane, width_cm = (left, right), width_cm or _COMMON_WIDTH_CM
+        lane, unit_cm = (left, right), width_cm or _COMMON_WIDTH_CM
 
         def allowed_cm(since_s: float) -> float:
-            moved_cm = _NOISE_LANES * width_cm + _SIDEWAYS * speed_cm_s * (t_s - since_s)
-            return min(moved_cm, _MOST_LANES * width_cm)
+            moved_cm = _NOISE_LANES * unit_cm + _SIDEWAYS * speed_cm_s * (t_s - since_s)
+            return min(moved_cm, _MOST_LANES * unit_cm)
 
-        before = self._moved_cm(self._lane, lane, t_s - self._lane_s)
-        since_other = self._moved_cm(self._other, lane, t_s - self._other_s)
+        before = self._moved_cm(self._lane, lane, t_s - self._lane_s, width_cm)
+        since_other = self._moved_cm(self._other, lane, t_s - self._other_s, width_cm)
         if (math.isnan(before) and math.isnan(since_other)) or before <= allowed_cm(self._lane_s):
             self._lane, self._lane_s, self._other = lane, t_s, None
             return ""
@@ -130,10 +136,17 @@ class JumpCheck:
         return f"the lane has jumped by {before:.0f} cm"
 
     @staticmethod
-    def _moved_cm(before: tuple[float, float] | None, now: tuple[float, float], passed_s: float) -> float:
-        """Return the larger motion of the two lines, 0 if none is known twice; NaN if it was too long ago."""
+    def _moved_cm(
+        before: tuple[float, float] | None, now: tuple[float, float], passed_s: float, width_cm: float | None
+    ) -> float:
+        """Return the larger motion of the two lines; NaN if it was too long ago.
+
+        If none is known twice, it is that of one line against the parallel of the other; 0 without a width.
+        """
         if before is None or passed_s > SETTLE_S + _ROUNDING_S:
             return math.nan
-        return max(
-            (abs(x - old) for x, old in zip(now, before, strict=True) if not math.isnan(x - old)), default=0.0
-        )
+        left, right = now[0] - before[0], now[1] - before[1]
+        if math.isnan(left) and math.isnan(right):
+            across = _or(now[1] - before[0], before[1] - now[0])
+            return 0.0 if width_cm is None else abs(across - width_cm)
+        return max(abs(_or(left, 0.0)), abs(_or(right, 0.0)))

@@ -47,8 +47,8 @@ _USED = {
 #: Ways to change a variable without binding its name; a dictionary changes under any other name.
 _UNFOLLOWED = {
     _SECTION, "*", "globals", "locals", "vars", "getattr", "setattr", "delattr", "exec", "eval", "__dict__",
-    "__setattr__", "__globals__", "f_globals", "f_locals", "builtins", "__builtins__", "__import__", "__self__",
-    "modules",
+    "__setattr__", "__globals__", "f_globals", "f_locals", "builtins", "__builtins__", "__import__",
+    "__self__", "modules",
 }  # fmt: skip
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
@@ -106,7 +106,7 @@ def read_assignments(path: Path) -> dict[str, Any]:
 
 
 def _check_encoding(text: str) -> None:
-    """Raise ValueError if the file's line ``# coding: ...`` makes Python read another text than UTF-8 does."""
+    """Raise ValueError if a line ``# coding: ...`` makes Python read another text than UTF-8 does."""
     raw = text.encode()
     encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
     if raw.decode(encoding).removeprefix("\ufeff") != text.removeprefix("\ufeff"):

@@ -131,5 +131,5 @@ def test_smoothing_does_not_carry_a_blind_frame() -> None:
 def test_the_detectors_own_target_stays_within_the_lock() -> None:
     controller = LaneController(settings(own_target=True))
     assert controller.target(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1
-    assert controller.target(LaneEstimate(steering_rad=-2.0), 0.03).steering_rad == -0.45
+    assert controller.target(LaneEstimate(steering_rad=-1.5), 0.03).steering_rad == -0.45
     assert math.isnan(controller.target(LaneEstimate(), 0.06).steering_rad)

@@ -30,6 +30,14 @@ def controller(lane_width_cm: float | None = 40.0) -> LaneController:
     return LaneController(ControlSettings(steering=steering))
 
 
+def only_left(x_cm: float) -> LaneEstimate:
+    return LaneEstimate(np.array([x_cm] * 3 + [math.nan] * 3), confidence=1.0)
+
+
+def only_right(x_cm: float) -> LaneEstimate:
+    return LaneEstimate(np.array([math.nan] * 3 + [x_cm] * 3), confidence=1.0)
+
+
 @pytest.mark.parametrize(
     ("answer", "word"),
     [
@@ -41,9 +49,12 @@ def controller(lane_width_cm: float | None = 40.0) -> LaneController:
         (replace(LANE, confidence=4.85), "confidence"),
         (replace(LANE, confidence=math.nan), "confidence"),
         (replace(LANE, steering_rad=math.inf), "steering"),
+        (replace(LANE, steering_rad=2.0), "steering"),
         (replace(LANE, points_cm=with_value(LANE.points_cm, -math.inf)), "inf"),
         (beside(500.0), "520 cm"),
         (beside(60.0), "60 cm beside"),
+        (only_left(75.0), "95 cm beside"),
+        (only_right(-75.0), "95 cm beside"),
         (replace(LANE, points_cm=-LANE.points_cm), "cross"),
         (replace(LANE, points_cm=2.0 * LANE.points_cm), "80 cm wide, expected 40 cm"),
         (replace(LANE, points_cm=0.4 * LANE.points_cm), "16 cm wide, expected 40 cm"),
@@ -61,7 +72,8 @@ def test_an_answer_that_cannot_be_the_lane_is_none(answer: LaneEstimate, word: s
         LANE,
         beside(25.0),
         LaneEstimate(LANE.points_cm, confidence=0.5),
-        LaneEstimate(np.where(np.arange(6) < 3, np.nan, LANE.points_cm), confidence=0.5),
+        only_right(20.0),
+        only_left(20.0),
         LaneEstimate(),
         LaneEstimate(steering_rad=0.3, confidence=1.0),
     ],
@@ -101,6 +113,32 @@ def test_the_place_of_a_line_that_is_not_seen_does_not_count() -> None:
     presence = np.array([1.0, 0.1])
     answers = [replace(LANE, points_cm=points, presence=presence) for points in guesses]
     assert not any(car.target(answer, i * STEP_S).fault for i, answer in enumerate(answers))
+
+
+def test_a_line_that_takes_the_other_ones_place_is_a_jump() -> None:
+    car = controller()
+    assert not car.target(only_left(-20.0), 0.0).fault
+    assert "40 cm" in car.target(only_right(-20.0), STEP_S).fault
+    assert not car.target(only_right(20.0), 2.0 * STEP_S).fault
+    assert not car.target(only_left(-20.0), 3.0 * STEP_S).fault
+    # Nothing is known of the other line without a width.
+    car = controller(None)
+    assert not car.target(only_left(-20.0), 0.0).fault
+    assert not car.target(only_right(-20.0), STEP_S).fault
+
+
+def test_a_jump_counts_if_neither_line_is_probable() -> None:
+    car, unsure = controller(), np.array([0.49, 0.49])
+    assert not car.target(LANE, 0.0).fault
+    assert "40 cm" in car.target(beside(40.0, presence=unsure), STEP_S).fault
+
+
+def test_a_wrong_width_that_was_learned_is_forgotten() -> None:
+    car, wrong = controller(None), replace(LANE, points_cm=0.5 * LANE.points_cm)
+    for i in range(20):
+        car.target(wrong, i * STEP_S)
+    refused = [car.target(LANE, (20 + i) * STEP_S).fault != "" for i in range(60)]
+    assert refused[0] and not any(refused[30:])
 
 
 def test_the_first_lane_after_a_pause_or_a_reset_is_accepted() -> None:
