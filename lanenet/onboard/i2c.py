@@ -113,24 +113,25 @@ class I2CChip:
                 bus.close()
 
 
-def lock_owners(device: os.stat_result, at: int | None = None) -> list[int]:
+def lock_owners(device: os.stat_result, at: int | range | None = None) -> list[int]:
     """Return the processes that have a lock on a device or file; the kernel hides those of other containers.
 
     Args:
         device: What ``os.stat`` says of it.
-        at: Byte of a record lock; None for a lock on the whole file (flock).
+        at: Byte of a record lock, or several; None for a lock on the whole file (flock).
 
     Returns:
         Their ids; -1 for one that cannot be named.
     """
     owners = []
+    places = range(at, at + 1) if isinstance(at, int) else at
     place = f"{os.major(device.st_dev):02x}:{os.minor(device.st_dev):02x}:{device.st_ino}"
     for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
         fields = line.split()
         # "1: POSIX ADVISORY WRITE pid place first last"; one that waits has an arrow in the second field.
         if len(fields) != 8 or fields[5] != place:
             continue
-        if fields[1:2] == ["FLOCK"] if at is None else fields[1] == "POSIX" and fields[6] == str(at):
+        if fields[1] == "FLOCK" if places is None else fields[1] == "POSIX" and int(fields[6]) in places:
             owners.append(int(fields[4]) or -1)
     return owners
 

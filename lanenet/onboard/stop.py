@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
@@ -21,13 +22,16 @@ from lanenet.errors import ConfigError, HardwareError, LanenetError, printable
 from lanenet.onboard.actuators import ActuatorSettings, make_actuator
 from lanenet.onboard.actuators.pca9685 import PCA9685
 from lanenet.onboard.actuators.serial_board import SerialBoardSettings
-from lanenet.onboard.i2c import describe_process, lock_owners, words_of
+from lanenet.onboard.i2c import GUARD_MODULE, describe_process, lock_owners, words_of
 
 #: A guard that is asked to end is in neutral within a turn of 15 ms and gone some milliseconds later; chosen
 #: ample, since neutral is repeated meanwhile.
 _END_S = 0.5
 #: Neutral again this often until the owner has ended; a drive sends about 30 commands a second.
 _AGAIN_S = 0.01
+#: Where actuators are, if no file says it: I2C buses and serial lines.
+_DEVICES = Path("/dev")
+_NAMES = ("i2c-*", "ttyACM*", "ttyUSB*", "ttyAMA*", "ttyS*", "ttyTHS*")
 
 
 class _Car(Settings):
@@ -51,7 +55,8 @@ def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings
 def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
     """Put a car into neutral, end the process that drives it, and the drives of its file that still start.
 
-    These are ended even if the file cannot be used or the actuator does not answer.
+    These are ended even if the file cannot be used or the actuator does not answer. If the file cannot be
+    used, it is not known which actuator is meant, and the guard of each one is ended.
 
     Args:
         path: The car's file.
@@ -68,7 +73,10 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
     try:
         done = _stop_actuator(path, overrides)
     except LanenetError as error:
-        if not (done := _end_drives(path)):
+        done = _end_drives(path)
+        if isinstance(error, ConfigError):
+            done += _end_guards()
+        if not done:
             # A name that was mistyped in a hurry.
             done = [f"{describe_process(pid)} drives" for pid in _drives()]
         if not done:
@@ -164,6 +172,33 @@ def _drives() -> dict[int, list[Path]]:
             here = (folder / "cwd").readlink()
             drives[int(folder.name)] = [(here / word).resolve() for word in words[at + 1 :]]
     return drives
+
+
+def _end_guards() -> list[str]:
+    """End the guards of all actuators, which is in neutral; returns a sentence each."""
+    done = []
+    for device in sorted(path for name in _NAMES for path in _DEVICES.glob(name)):
+        for pid in _guards_of(device):
+            owner = partial(_owner_if, device, pid)
+            try:
+                done.append(f"ended {_end(pid, owner, lambda: None)}, which had {device}")
+            except HardwareError as error:
+                done.append(str(error))
+    return done
+
+
+def _guards_of(device: Path) -> list[int]:
+    try:
+        found = device.stat()
+    except OSError:
+        # Unplugged since.
+        return []
+    owners = [*lock_owners(found), *lock_owners(found, range(0x80))]
+    return [pid for pid in owners if GUARD_MODULE in words_of(pid)]
+
+
+def _owner_if(device: Path, pid: int) -> int:
+    return pid if pid in _guards_of(device) else 0
 
 
 def prepare_drive(words: Sequence[str]) -> None:

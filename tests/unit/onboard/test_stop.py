@@ -15,7 +15,7 @@ from lanenet import __main__
 from lanenet.cli.app import app
 from lanenet.errors import ConfigError, HardwareError, LanenetError
 from lanenet.onboard import stop
-from lanenet.onboard.i2c import lock_owners
+from lanenet.onboard.i2c import GUARD_MODULE, lock_owners
 
 #: A drive that still starts, as far as others see.
 STARTING = """
@@ -148,6 +148,34 @@ def test_the_terminal_of_a_drive_is_left_alone(tmp_path, car):
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.parametrize("lock", ["lockf(bus, fcntl.LOCK_EX, 1, 0x40)", "flock(bus, fcntl.LOCK_EX)"])
+def test_without_a_usable_file_every_guard_is_ended(tmp_path, monkeypatch, lock):
+    monkeypatch.setattr(stop, "_DEVICES", tmp_path)
+    device = tmp_path / ("i2c-7" if "lockf" in lock else "ttyACM3")
+    device.touch()
+    take = f"import fcntl, sys, time; bus = open(sys.argv[2], 'r+'); fcntl.{lock}"
+    code = f"{take}; print(flush=True); time.sleep(60)"
+    words = [[sys.executable, "-ISc", code, name, device] for name in (GUARD_MODULE, "something.else")]
+    guard = subprocess.Popen(words[0], stdout=subprocess.PIPE)
+    try:
+        guard.stdout.readline()
+        with pytest.raises(ConfigError, match=rf"no such file.*process {guard.pid}.*{device.name}"):
+            stop.stop_car(tmp_path / "car.yaml")
+        assert guard.wait(5.0) == -signal.SIGTERM
+    finally:
+        guard.kill()
+        guard.communicate()
+    other = subprocess.Popen(words[1], stdout=subprocess.PIPE)
+    try:
+        other.stdout.readline()
+        with pytest.raises(ConfigError):
+            stop.stop_car(tmp_path / "car.yaml")
+        assert other.poll() is None
+    finally:
+        other.kill()
+        other.communicate()
 
 
 def test_the_owner_of_a_serial_line_is_ended(tmp_path):
