@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import stat
 import statistics
 import time
 from collections import deque
@@ -64,10 +65,14 @@ class HoldFile:
     def fault(self) -> str:
         """Why the car is not held; empty if it is."""
         try:
-            touched_ns = self.path.stat().st_mtime_ns
+            found = self.path.stat()
         except OSError:
             self._touched_ns = -1
             return f"{self.path} is not there"
+        if not stat.S_ISREG(found.st_mode):
+            # A folder or a device is always there, and a folder's time changes with what is in it.
+            return f"{self.path} is not a plain file"
+        touched_ns = found.st_mtime_ns
         now_s = self._clock()
         if touched_ns != self._touched_ns:
             # A file that was there before the drive may have been forgotten.
@@ -167,8 +172,12 @@ class ArmGate:
     def _recording(self) -> ArmCheck:
         if self._recorder is None:
             return ArmCheck("recording", True, "declined: the car's file has no section 'recording'")
-        problem = self._recorder.problem
-        return ArmCheck("recording", not problem, problem or f"to {self._recorder.path}")
+        if problem := self._recorder.problem:
+            return ArmCheck("recording", False, problem)
+        if not self._recorder.recorded:
+            # A card that is slow, or hangs, has reported nothing.
+            return ArmCheck("recording", False, f"no frame is in {self._recorder.path} yet")
+        return ArmCheck("recording", True, f"to {self._recorder.path}")
 
     def _calibration(self) -> ArmCheck:
         if self._camera_check is None:

@@ -88,9 +88,6 @@ def read_assignments(path: Path) -> dict[str, Any]:
             raise _not_understood(path, getattr(part, "lineno", 0), names[0])
     values: dict[str, Any] = {}
     for line, assigned, expression in plain:
-        if len(assigned) > 1 and any(target.id == _SECTION for target in assigned):
-            # One dictionary under two names.
-            raise _not_understood(path, line, _SECTION)
         try:
             known = {name: value for name, value in values.items() if name not in bound}
             value = _value_of(expression, known)

@@ -31,9 +31,9 @@ class Views(CameraCheck):
         return math.radians(self._pitch_deg), 0.0
 
 
-class FullCard(DriveRecorder):
-    def __init__(self) -> None:
-        self.problem = "the card is full"
+class Card(DriveRecorder):
+    def __init__(self, problem: str = "", recorded: int = 0) -> None:
+        self.path, self.problem, self.recorded = Path("drives"), problem, recorded
 
 
 def faults(gate: ArmGate, count: int = 30, fault: str = "", confidence: float = 1.0) -> list[str]:
@@ -41,7 +41,7 @@ def faults(gate: ArmGate, count: int = 30, fault: str = "", confidence: float = 
 
 
 def test_ten_good_frames_let_the_car_start_and_are_listed(caplog: pytest.LogCaptureFixture) -> None:
-    gate = ArmGate(FITS, 0.5, camera_check=Views(1.0))
+    gate = ArmGate(FITS, 0.5, Card(recorded=1), camera_check=Views(1.0))
     with caplog.at_level(logging.INFO):
         seen = faults(gate)
     assert all(seen[:9]) and not any(seen[9:])
@@ -57,7 +57,8 @@ def test_ten_good_frames_let_the_car_start_and_are_listed(caplog: pytest.LogCapt
         (lambda: ArmGate(FITS, 0.5), {"fault": "frame 3 is 300 ms old"}, "frames"),
         (lambda: ArmGate(FITS, 0.5), {"confidence": 0.4}, "lane"),
         (lambda: ArmGate(FITS, 0.5), {"confidence": math.nan}, "lane"),
-        (lambda: ArmGate(FITS, 0.5, FullCard()), {}, "recording"),
+        (lambda: ArmGate(FITS, 0.5, Card("the card is full", 1)), {}, "recording"),
+        (lambda: ArmGate(FITS, 0.5, Card()), {}, "recording"),
         (lambda: ArmGate(FITS, 0.5, None, Views(20.0)), {}, "calibration"),
         (lambda: ArmGate(FITS, 0.5, hold=HoldFile(Path("/nowhere/key"))), {}, "hold"),
     ],
@@ -97,6 +98,18 @@ def test_a_file_that_is_removed_lets_go(tmp_path: Path) -> None:
     assert hold.fault == ""
     key.unlink()
     assert "key" in hold.fault
+
+
+@pytest.mark.parametrize("fresh_s", [None, 5.0])
+def test_only_a_plain_file_holds_the_car(tmp_path: Path, fresh_s: float | None) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path in (tmp_path, pipe, Path("/dev/null")):
+        hold = HoldFile(path, fresh_s)
+        for i in range(2):
+            if path == tmp_path:
+                (tmp_path / f"other{i}").touch()
+            assert str(path) in hold.fault
 
 
 def test_a_file_has_to_be_touched(tmp_path: Path) -> None:
