@@ -158,7 +158,6 @@ def test_what_cannot_be_taken_over_is_named(write, text, message):
         ("A = PWM_STEERING_THROTTLE = {}\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
         ("PWM_STEERING_THROTTLE = {**A}", "PWM_STEERING_THROTTLE"),
         ("PWM_STEERING_THROTTLE |= {'THROTTLE_STOPPED_PWM': 390}", "PWM_STEERING_THROTTLE"),
-        ("A = PWM_STEERING_THROTTLE = {}\nA['THROTTLE_STOPPED_PWM'] = 390", "PWM_STEERING_THROTTLE"),
         ("A.f_globals['THROTTLE_STOPPED_PWM'] = 390", "f_globals"),
         ("(lambda: 0).__globals__['THROTTLE_STOPPED_PWM'] = 390", "__globals__"),
         ("getattr(A, 'ex' + 'ec')('THROTTLE_STOPPED_PWM = 390')", "getattr"),
