@@ -12,6 +12,7 @@ from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import fitted_width_cm
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
+from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
@@ -46,14 +47,17 @@ class AssembledMap:
     @property
     def near_points(self) -> list[Float[np.ndarray, "_ 2"]]:
         """Edge points of each frame that are near enough to be drawn, [cm], frame map."""
-        points = []
-        for solved in (s.solved for s in self.segments):
-            reach_cm = _DRAWN_HEIGHTS * solved.camera.mounting.height_cm
-            for k in range(len(solved.poses)):
-                seen = solved.scans.points_cm[solved.scans.frame(k)]
-                seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach_cm]
-                points.append(self.factor * map_from_car(seen, solved.poses[k], solved.camera.wheelbase_cm))
-        return points
+        return [self.factor * points for s in self.segments for points in near_points(s.solved)]
+
+
+def near_points(solved: SolvedSegment) -> list[Float[np.ndarray, "_ 2"]]:
+    """Edge points of each frame that are near enough to be drawn, in the scale of the segment's camera."""
+    points, reach_cm = [], _DRAWN_HEIGHTS * solved.camera.mounting.height_cm
+    for k in range(len(solved.poses)):
+        seen = solved.scans.points_cm[solved.scans.frame(k)]
+        seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach_cm]
+        points.append(map_from_car(seen, solved.poses[k], solved.camera.wheelbase_cm))
+    return points
 
 
 def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]) -> AssembledMap:

@@ -12,8 +12,10 @@ from datagen.check import CheckedMap, check_map
 from datagen.labels.label_map import label_map
 from datagen.prepare import MapRequest, prepare
 from datagen.quality.figures import Report, map_edges
-from datagen.quality.page import PAGE_NAME, report_page
+from datagen.quality.layout import PAGE_NAME
+from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
+from datagen.refusal import Attempt, report_refusal
 from datagen.segments import camera_of_drive, fit_lanes, solve_segments
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
@@ -24,7 +26,7 @@ from lanenet.config import dump_settings
 from lanenet.data.files import atomic_folder, check_replaceable, write_text
 from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
 from lanenet.data.tables import write_tum
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, LanenetError, TrackingLostError
 from lanenet.outputs import lock_output
 
 __all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive"]
@@ -46,7 +48,8 @@ def map_drive(
         settings: Settings of all stages.
         out: Map folder to write.
         progress: Called with (done, total).
-        pictures: Draw the map, its frames and the report's page; on a short drive a third of the time.
+        pictures: Draw the map, its frames and the report's page; on a short drive a third of the time. A
+            drive that is refused gets a page as well, see :mod:`datagen.refusal`.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -58,24 +61,34 @@ def map_drive(
     # Before the work: another run may be writing there.
     with lock_output(out):
         check_replaceable(out, "map")
+        attempt = Attempt(request, settings)
         try:
-            return _map_drive(request, settings, out, progress, pictures)
+            return _map_drive(attempt, out, progress, pictures)
         except CalibrationError as error:
-            raise CalibrationError(f"{error}{kept_map(out)}") from error
+            page = _refused(attempt, error, out) if pictures else ""
+            raise CalibrationError(f"{error}{kept_map(out)}{page}") from error
         except TrackingLostError as error:
             where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
-            raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}") from error
+            page = _refused(attempt, error, out) if pictures else ""
+            raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}{page}") from error
 
 
-def _map_drive(
-    request: MapRequest, settings: MapSettings, out: Path, progress: Progress | None, pictures: bool
-) -> Report:
-    prepared = prepare(request, settings)
+def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
+    """Write the report of a refusal, and say where it is: the end of a sentence."""
+    try:
+        return f"; see {report_refusal(attempt, error, out)}"
+    except LanenetError as failed:  # what was refused is worse
+        return f"; its report could not be written ({failed})"
+
+
+def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures: bool) -> Report:
+    request = attempt.request
+    prepared = attempt.prepared = prepare(request, attempt.settings)
     settings = prepared.settings
     solver = SegmentSolver(settings, np.random.default_rng(settings.seed), progress)
-    camera = camera_of_drive(prepared, solver)
+    camera = attempt.camera = camera_of_drive(prepared, solver)
     # Track, close loops, adjust: SegmentSolver.solve, segment by segment.
-    solved = solve_segments(prepared, camera, solver)
+    solved = attempt.solved = solve_segments(prepared, camera, solver)
     joined = join_segments(solved.segments, prepared.drive, settings, solver.rng)
     lanes = fit_lanes(prepared, joined.segments, solved.refused)
     assembled = assemble(prepared, camera.camera, lanes.segments)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.quality.figures import Report
-from datagen.quality.page import PAGE_NAME
+from datagen.quality.layout import PAGE_NAME
 from datagen.quality.pictures import draw_contact_sheet
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json

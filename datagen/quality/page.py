@@ -5,18 +5,15 @@ The plots are PNG images; without Matplotlib they raise ImportError.
 
 from __future__ import annotations
 
-import base64
-import html
 import math
-from collections.abc import Callable, Sequence
 from itertools import pairwise
-from string import Template
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
+from datagen.quality.layout import Row, bullets, jpeg, note, page_of, plot, section, table
 from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
 from datagen.quality.pictures import contact_sheets
 from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
@@ -29,34 +26,6 @@ from lanenet.evaluation.report import new_figure, png_bytes
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 
-#: The report in a map's folder.
-PAGE_NAME = "report.html"
-
-Row = tuple[str, ...]
-
-_PAGE = Template(
-    """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>
-body{font:16px/1.45 system-ui,sans-serif;max-width:60rem;margin:0 auto;padding:0 1rem 3rem;color:#222}
-h1{font-size:1.4rem}h2{font-size:1.15rem;margin-top:2rem;border-bottom:1px solid #ddd}
-img{max-width:100%;height:auto;display:block;margin:.5rem 0}
-.verdict{padding:.6rem 1rem;border-radius:.5rem;color:#fff}
-.verdict strong{font-size:1.5rem;text-transform:uppercase}.verdict p{margin:.3rem 0;font-size:1.1rem}
-.good{background:#2e7d32}.usable{background:#b26a00}.reject{background:#b71c1c}
-.scroll{overflow-x:auto}table{border-collapse:collapse;font-size:.9rem}
-td,th{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}
-td:first-child,th:first-child{text-align:left;white-space:normal}
-p.note{color:#555;font-size:.9rem}
-</style></head><body>
-<h1>$title</h1>
-<div class="verdict $grade"><strong>$grade</strong><p>$sentence</p></div>
-$body
-</body></html>
-"""
-)
 #: Colours of the lines, as in the pictures.
 _COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
 #: Distance bins of the residuals. Chosen: three per label row.
@@ -90,88 +59,46 @@ def report_page(
     held = figures["held_out"]
     chance = held["coverage_by_chance"]
     body = [
-        _section("What the verdict rests on"),
-        _list([*verdict.reasons, *verdict.remarks]),
-        _section("The drive"),
-        _list(figures["notes"]),
-        _section("Held-out frames"),
-        _note(
+        section("What the verdict rests on"),
+        bullets([*verdict.reasons, *verdict.remarks]),
+        section("The drive"),
+        bullets(figures["notes"]),
+        section("Held-out frames"),
+        note(
             "Distance in pixels between the projected borders of the driven lane's two lines and the edges "
             f"in {held['frames']} held-out frames, whose edges were used for their own poses but not for the "
             f"lines. An edge counts if it lies within {held['gate_px_at_160']:g} px (of an image 160 px "
             "wide) and brightens in the same direction. “Found” is the share of the borders in view that met "
             f"an edge. In the middle of the lane it is {_percent(chance)}: by chance, or because of paint."
         ),
-        _table(residual_rows(held, drive.width)),
-        _plot(residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
+        table(residual_rows(held, drive.width)),
+        plot(residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
         *(
-            f"<h3>{title.capitalize()} held-out frames</h3>{_jpeg(sheet)}"
+            f"<h3>{title.capitalize()} held-out frames</h3>{jpeg(sheet)}"
             for title, sheet in contact_sheets(mapped, quality).items()
         ),
-        _section("Labels"),
-        _table(share_rows(figures["labelled"])),
-        _plot(frames_plot, quality, drive, drive_map, drive.width),
-        _section("Map"),
-        _note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
-        _jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
-        _section("Path and loops"),
-        _table(loop_rows(figures["segments_mapped"])),
-        _plot(trajectory_plot, mapped, opened_poses),
-        _section("Camera and scale"),
-        _table(camera_rows(drive_map.camera, figures.get("calibration"))),
-        _table(scale_rows(drive_map.meta)),
-        _section("Steering and speed"),
-        _plot(steering_plot, mapped, fits)
-        or _note("There is no steering command, or it does not explain the path."),
-        _plot(speed_plot, mapped),
+        section("Labels"),
+        table(share_rows(figures["labelled"])),
+        plot(frames_plot, quality, drive, drive_map, drive.width),
+        section("Map"),
+        note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
+        jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
+        section("Path and loops"),
+        table(loop_rows(figures["segments_mapped"])),
+        plot(trajectory_plot, mapped, opened_poses),
+        section("Camera and scale"),
+        table(camera_rows(drive_map.camera, figures.get("calibration"))),
+        table(scale_rows(drive_map.meta)),
+        section("Steering and speed"),
+        plot(steering_plot, mapped, fits)
+        or note("There is no steering command, or it does not explain the path."),
+        plot(speed_plot, mapped),
     ]
-    return _PAGE.substitute(
-        title=html.escape(f"Map of {drive.name}"),
-        grade=verdict.grade,
-        sentence=html.escape(verdict.sentence[:1].upper() + verdict.sentence[1:] + "."),
-        body="\n".join(part for part in body if part),
-    )
+    return page_of(f"Map of {drive.name}", verdict.grade, verdict.sentence, body)
 
 
 def _percent(share: float) -> str:
     return "unknown" if share != share else f"{100.0 * share:.0f} %"
-
-
-def _section(title: str) -> str:
-    return f"<h2>{html.escape(title)}</h2>"
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{html.escape(text)}</p>'
-
-
-def _list(lines: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
-
-
-def _table(rows: list[Row]) -> str:
-    """Lay out rows of text; the first row is the header."""
-    head, *rest = ("".join(f"<T>{html.escape(cell)}</T>" for cell in row) for row in rows)
-    lines = [head.replace("T>", "th>"), *(row.replace("T>", "td>") for row in rest)]
-    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
-
-
-def _plot(draw: Callable[..., bytes | None], *args: Any) -> str:
-    """Inline a plot; nothing without Matplotlib."""
-    try:
-        png = draw(*args)
-    except ImportError:
-        return ""
-    return "" if png is None else _inline(png, "png")
-
-
-def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> str:
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return _inline(data.tobytes(), "jpeg")
-
-
-def _inline(data: bytes, kind: str) -> str:
-    return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(data).decode("ascii")}">'
 
 
 def _number(value: float | None, decimals: int = 2) -> str:

@@ -103,7 +103,7 @@ def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, 
         )
         for k in map(int, chosen)
     ]
-    write_png(path, _tiled(tiles, background=0))
+    write_png(path, tiled(tiles, background=0))
 
 
 def draw_lines(
@@ -183,10 +183,10 @@ def _sheet(
         tiles.append(
             np.vstack([title, cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)])
         )
-    return _tiled(tiles, background=255)
+    return tiled(tiles, background=255)
 
 
-def _tiled(tiles: list[UInt8[np.ndarray, "h w 3"]], background: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def tiled(tiles: list[UInt8[np.ndarray, "h w 3"]], background: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Lay out pictures of one size in rows."""
     empty = [np.full_like(tiles[0], background)] * (-len(tiles) % _COLUMNS)
     tiles = [*tiles, *empty]

@@ -29,6 +29,8 @@ FOLDER_KINDS: dict[str, tuple[str, ...]] = {
         *("map.yaml", "settings.yaml", "camera.yaml", "poses.csv", "trajectory.tum"),
         *("lanes.json", "edges.parquet", "report.json"),
     ),
+    # Of a drive that gave no map; a map replaces it.
+    "refused": ("refused.yaml", "report.html"),
     "checkpoint": ("checkpoint.yaml", "config.yaml", "metrics.json", "weights.safetensors", "model.onnx"),
 }
 
@@ -154,7 +156,7 @@ def check_replaceable(path: Path, kind: str) -> None:
         )
     if not any(path.iterdir()):
         return
-    if not _holds_marker(path, kind):
+    if not _holds_marker(path, kind) and not (kind == "map" and _holds_marker(path, "refused")):
         raise LanenetError(
             f"{path}: the folder is not empty and holds no {kind}.yaml of lanenet, so it is not replaced; "
             "choose another name or remove it"

@@ -190,7 +190,9 @@ def read_map(folder: Path) -> DriveMap:
     """
     restore_output(folder)
     if not (folder / "map.yaml").is_file():
-        raise MapFormatError(f"{folder}: is not a map (no map.yaml in it)")
+        refused = (folder / "refused.yaml").is_file()
+        why = f"its drive was refused, see {folder / 'report.html'}" if refused else "no map.yaml in it"
+        raise MapFormatError(f"{folder}: is not a map ({why})")
     inside = FolderFiles(folder)
     path = inside.file("map.yaml", folder, MapFormatError)
     plain = read_yaml(path, MapFormatError)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 import re
 from pathlib import Path
@@ -20,7 +21,15 @@ from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
-from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
+from lanenet.data.files import check_replaceable
+from lanenet.data.maps.folder import read_map
+from lanenet.errors import (
+    CalibrationError,
+    DriveFormatError,
+    LanenetError,
+    MapFormatError,
+    TrackingLostError,
+)
 from lanenet.perception.edges.canny import EdgeSettings
 
 CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
@@ -42,12 +51,19 @@ def written(folder: Path, frames: list[np.ndarray]) -> Path:
 
 
 def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0) -> str:
-    """Message of a drive that is not mapped; nothing may be left behind."""
+    """Message of a drive that is not mapped; nothing may be left behind but its report."""
     with pytest.raises(TrackingLostError) as caught:
         map_drive(MapRequest(drive, lane_width_cm), SETTINGS, out)
-    assert not out.exists() and not list(out.parent.glob(".*"))
+    assert {path.name for path in out.iterdir()} == {"report.html", "refused.yaml"}
+    assert not list(out.parent.glob(".*"))
     message = str(caught.value)
-    assert str(drive) in message and INSTEAD in message
+    assert str(drive) in message and INSTEAD in message and str(out / "report.html") in message
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert message.split(": ", 1)[1].split(";")[0][1:] in html.unescape(page)
+    # Raw frames, and the same with their edges.
+    assert page.count("data:image/jpeg") >= 2
+    with pytest.raises(MapFormatError, match=r"refused.*report\.html"):
+        read_map(out)
     return message
 
 
@@ -100,6 +116,17 @@ def test_an_older_map_is_kept_and_named_where_the_new_one_is_refused(tmp_path):
     with pytest.raises(TrackingLostError, match=rf"20 frames.*map at {out} is an older one.*verdict: usable"):
         map_drive(MapRequest(drive, 40.0), SETTINGS, out)
     assert "usable" in (out / "map.yaml").read_text()
+    assert {path.name for path in out.iterdir()} == {"map.yaml", "report-refused.html"}
+
+
+def test_the_report_of_a_refusal_makes_room_for_the_next_and_for_a_map(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
+    refusal(written(tmp_path / "drive", frames), tmp_path / "map")
+    assert "19 frames" in refusal(written(tmp_path / "other", frames[1:]), tmp_path / "map")
+    check_replaceable(tmp_path / "map", "map")
+    with pytest.raises(LanenetError, match=r"no drive\.yaml"):
+        check_replaceable(tmp_path / "map", "drive")
 
 
 def test_where_no_map_can_be_written_none_is_made(tmp_path):
@@ -202,4 +229,4 @@ def test_a_lane_width_wrong_by_two_is_found_where_the_camera_is_known(tmp_path, 
         CalibrationError, match=rf"{given_cm:g} cm apart .* (39|40|41) cm apart .*camera's height"
     ):
         map_drive(MapRequest(both_lines, given_cm), SETTINGS, tmp_path / "map")
-    assert not (tmp_path / "map").exists()
+    assert (tmp_path / "map" / "report.html").is_file()

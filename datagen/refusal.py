@@ -1,0 +1,213 @@
+"""The report of a drive that gave no map: what was tried, the frames, and the edges found in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Float, UInt8
+
+from datagen.assemble import near_points
+from datagen.prepare import MapRequest, PreparedDrive
+from datagen.quality.layout import PAGE_NAME, Row, bullets, jpeg, note, page_of, section, table
+from datagen.quality.pictures import tiled
+from datagen.segments import CameraOfDrive, SolvedDrive
+from datagen.settings import MapSettings
+from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
+from datagen.slam.segment import SolvedSegment
+from datagen.slam.view import mapping_range
+from lanenet.data.drives import Drive, open_drive
+from lanenet.data.files import atomic_folder, write_text
+from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
+from lanenet.geometry.camera import Camera
+from lanenet.perception.edges.canny import find_edges
+from lanenet.perception.edges.road import RoadTable
+
+#: The report beside an older map, which a refusal does not replace.
+BESIDE_MAP_NAME = "report-refused.html"
+#: What ``refused.yaml`` says of its folder.
+_FORMAT = "lanenet-refused/1"
+#: Frames that are shown, evenly over the drive; width of one, and of the path from above, [px]. Chosen: two
+#: rows of four on a page.
+_SHOWN, _TILE_PX, _PATH_PX = 8, 320, 900
+#: BGR: edges on the road that are mapped, and those elsewhere.
+_ON_ROAD, _ELSEWHERE = (80, 255, 80), (60, 60, 255)
+
+
+@dataclass
+class Attempt:
+    """How far the mapping of a drive came; each stage notes its result here.
+
+    Attributes:
+        request: What was asked for.
+        settings: Settings of all stages.
+        prepared: The drive with its segments.
+        camera: The camera that was given or found.
+        solved: Segments with their poses.
+    """
+
+    request: MapRequest
+    settings: MapSettings
+    prepared: PreparedDrive | None = None
+    camera: CameraOfDrive | None = None
+    solved: SolvedDrive | None = None
+
+    @property
+    def drive(self) -> Drive:
+        """The frames that were to be mapped; the whole recording if it was refused before."""
+        return open_drive(self.request.drive_path) if self.prepared is None else self.prepared.drive
+
+    @property
+    def known_camera(self) -> Camera | None:
+        """The camera, if there is one for images of this size."""
+        if self.camera is not None:
+            return self.camera.camera
+        return None if self.prepared is None else self.prepared.camera
+
+
+def report_refusal(attempt: Attempt, error: LanenetError, out: Path) -> Path:
+    """Write the report of a drive that gave no map.
+
+    Args:
+        attempt: How far the mapping came.
+        error: Why it ended.
+        out: Where the map was to be; an older map there is kept, and the report is put beside its own.
+
+    Returns:
+        The page.
+
+    Raises:
+        LanenetError: If it cannot be written, or the drive cannot be read.
+    """
+    page = refusal_page(attempt, error)
+    if (out / "map.yaml").is_file():
+        write_text(out / BESIDE_MAP_NAME, page)
+        return out / BESIDE_MAP_NAME
+    with atomic_folder(out, "refused") as folder:
+        write_text(folder / PAGE_NAME, page)
+        said = {"format": _FORMAT, "drive": str(attempt.request.drive_path.resolve()), "reason": str(error)}
+        write_text(folder / "refused.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True))
+    return out / PAGE_NAME
+
+
+def refusal_page(attempt: Attempt, error: LanenetError) -> str:
+    """Return the page: why there is no map, what to do, what was tried, and what the frames show."""
+    drive = attempt.drive
+    reason = str(error).removeprefix(f"{drive.path}: ")
+    sentence = f"{reason}: {DRIVE_INSTEAD}" if isinstance(error, TrackingLostError) else reason
+    raw, edges = _sheets(attempt, drive)
+    camera = "" if attempt.known_camera is None else " Green: on the road that is mapped; red: elsewhere."
+    body = [
+        section("What was tried"),
+        table(tried_rows(attempt, drive)),
+        bullets(_notes(attempt, drive)),
+        section("Frames"),
+        note("Are both lines of the lane in view, sharp and brighter or darker than the floor?"),
+        jpeg(raw),
+        section("Edges"),
+        note(f"What the mapping sees of the same frames: the borders of both lines should be there.{camera}"),
+        jpeg(edges),
+    ]
+    segments = () if attempt.solved is None else attempt.solved.segments
+    if segments:
+        body += [
+            section("Path"),
+            note("Path of the car (white) and edge points (gray) from above, each segment by itself."),
+            *(jpeg(draw_path(segment)) for segment in segments),
+        ]
+    return page_of(f"No map of {drive.name}", "refused", sentence, body)
+
+
+def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
+    """The stages of the mapping, as far as they came, with what each found."""
+    request, lane = attempt.request, f"{attempt.request.lane_width_cm:g} cm"
+    rows: list[Row] = [("stage", "result"), ("given", f"{request.drive_path}, lane width {lane}")]
+    if attempt.prepared is None:
+        return [*rows, ("read the recording", f"{len(drive)} frames"), ("find segments to map", "refused")]
+    segments = attempt.prepared.segments
+    longest = max(part.stop - part.start for part in segments)
+    found = f"{len(drive)} frames in {len(segments)} segment(s), the longest of {longest}"
+    rows.append(("find segments to map", found))
+    if attempt.camera is None:
+        return [*rows, ("find the camera", "refused")]
+    camera, m = attempt.camera.camera, attempt.camera.camera.mounting
+    seen = f"focal length {camera.K[0, 0]:.1f} px, pitch {np.rad2deg(m.pitch_down_rad):.1f} degrees"
+    rows.append(("camera", f"{attempt.camera.how}: {seen}"))
+    if attempt.solved is None:
+        return [*rows, ("track the car", "refused")]
+    for one in attempt.solved.segments:
+        length = f"{one.path_cm[-1] / m.height_cm:.0f} camera heights"
+        at = f"{len(one.poses)} frames, {length} long, {len(one.revisits)} places seen twice"
+        rows.append((f"track frames from {drive.frames[one.rows[0]]} on", at))
+    rows += [
+        (f"track frames from {drive.frames[one.rows[0]]} on", "refused") for one in attempt.solved.refused
+    ]
+    return [*rows, ("find the lane's two lines", "refused")]
+
+
+def _notes(attempt: Attempt, drive: Drive) -> Sequence[str]:
+    """What the stages had to say, a sentence each."""
+    notes = list(drive.problems) if attempt.prepared is None else list(attempt.prepared.notes)
+    if attempt.camera is not None:
+        notes += attempt.camera.notes
+    if attempt.solved is not None:
+        notes += [one.note(drive) for one in attempt.solved.refused]
+    return notes
+
+
+def _sheets(attempt: Attempt, drive: Drive) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    """Draw some frames as they are, and with their edges."""
+    perception = (
+        attempt.settings.perception if attempt.prepared is None else attempt.prepared.settings.perception
+    )
+    keep, camera = np.full((drive.height, drive.width), 255, np.uint8), attempt.known_camera
+    if camera is not None:
+        try:
+            keep = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range)).keep
+        except CalibrationError:  # it sees no road: all edges lie elsewhere
+            keep = np.zeros_like(keep)
+    raw, edges = [], []
+    for k in np.unique(np.linspace(0, len(drive) - 1, _SHOWN).astype(int)).tolist():
+        try:
+            image = drive.image(k)
+            uv = np.rint(find_edges(image, perception.edges).uv_px).astype(np.intp)
+        except DriveFormatError:  # named among the notes
+            image, uv = np.full((drive.height, drive.width, 3), 128, np.uint8), np.empty((0, 2), np.intp)
+        u, v = np.clip(uv, 0, [drive.width - 1, drive.height - 1]).T
+        marked = image // 2
+        marked[v, u] = np.where(keep[v, u, None] > 0, _ON_ROAD, _ELSEWHERE)
+        raw.append(_titled(image, f"frame {drive.frames[k]}"))
+        edges.append(_titled(marked, f"frame {drive.frames[k]}: {len(uv)} edge points"))
+    return tiled(raw, background=255), tiled(edges, background=255)
+
+
+def _titled(image: UInt8[np.ndarray, "h w 3"], title: str) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Bring a frame to the width of a tile, under a title."""
+    size = (_TILE_PX, round(image.shape[0] * _TILE_PX / image.shape[1]))
+    shrinks = image.shape[1] > _TILE_PX
+    big = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
+    head = np.full((22, _TILE_PX, 3), 255, np.uint8)
+    cv2.putText(head, title, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.vstack([head, big])
+
+
+def draw_path(segment: SolvedSegment) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the path of a segment with its edge points, from above; its scale is that of its camera."""
+    cloud = np.concatenate([*near_points(segment), segment.poses[:, :2]])
+    low, extent = cloud.min(axis=0), np.maximum(np.ptp(cloud, axis=0), 1.0)
+    scale = _PATH_PX / float(extent.max())
+    width, height = (extent * scale).astype(int) + 1
+    image = np.full((height, width, 3), 24, np.uint8)
+
+    def pixels(points: Float[np.ndarray, "m 2"]) -> np.ndarray:
+        at = ((points - low) * scale).astype(np.int32)
+        return np.stack([at[:, 0], height - 1 - at[:, 1]], axis=1)
+
+    u, v = pixels(cloud).T
+    image[v, u] = (150, 150, 150)
+    cv2.polylines(image, [pixels(segment.poses[:, :2])], False, (255, 255, 255), 2, cv2.LINE_AA)
+    return image
