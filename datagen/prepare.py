@@ -15,7 +15,7 @@ from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.recording import ImageSource
-from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.static import find_static, spread_frames
@@ -147,7 +147,7 @@ def split_segments(drive: Drive) -> list[slice]:
     segments = [slice(a, b) for a, b in pairwise(starts) if b - a >= MIN_SEGMENT]
     if not segments:
         raise TrackingLostError(
-            f"{drive.path}: {len(drive)} frames, longest segment without a gap "
+            f"{drive.path}: {counted(len(drive), 'frame')}, longest segment without a gap "
             f"{max(b - a for a, b in pairwise(starts))}; mapping needs {MIN_SEGMENT}"
         )
     return segments

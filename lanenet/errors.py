@@ -32,6 +32,11 @@ def did_you_mean(name: str, known: Iterable[str], least: float = 0.6) -> str:
     return f", did you mean {close[0]!r}?" if close else ""
 
 
+def counted(number: int, word: str) -> str:
+    """Return a count of things in words: "1 frame", "2 frames"."""
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
 #: What a terminal takes for commands (all control characters but tab and line feed), marks that turn the
 #: direction of writing, and halves of characters: names that are no UTF-8 have them, and printing fails.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

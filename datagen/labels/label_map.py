@@ -29,7 +29,7 @@ from lanenet.data.maps.mapped_drive import (
     open_mapped_drive,
     points_text,
 )
-from lanenet.errors import MapFormatError, TrackingLostError
+from lanenet.errors import MapFormatError, TrackingLostError, counted
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
@@ -133,7 +133,7 @@ def label_map(
     text = [
         f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",
         points_text(shares),
-        *(f"{count} frames left out: {reason}" for reason, count in left_out.items() if count),
+        *(f"{counted(count, 'frame')} left out: {reason}" for reason, count in left_out.items() if count),
         f"distance of markings from the projected lines: {residual['median']:.2f} cm (median), "
         f"{residual['p95']:.2f} cm (p95)",
     ]

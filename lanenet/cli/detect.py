@@ -16,7 +16,7 @@ from lanenet.cli.shared.options import (
     check_not_source,
     lock_outputs,
 )
-from lanenet.errors import CalibrationError, ConfigError
+from lanenet.errors import CalibrationError, ConfigError, counted
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed, refuse_mask
 
@@ -117,8 +117,8 @@ def detect(
         )
     console.show_problems(report.problems)
     console.say(
-        f"{report.frames} frames, {report.complete} with all six points, {report.steered} with a steering "
-        f"target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
+        f"{counted(report.frames, 'frame')}, {report.complete} with all six points, {report.steered} with a "
+        f"steering target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
     if hint := getattr(chosen, "hint", ""):
         console.say(f"hint: {hint}")

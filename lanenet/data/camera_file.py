@@ -19,6 +19,9 @@ from lanenet.geometry.camera import Camera, CameraModel, Mounting
 #: Bounds of what a file may hold. Chosen: ten metres, since no car is larger; a right angle, beyond which a
 #: camera sees no road ahead and a number is one of degrees; and numbers of lenses whose powers stay finite.
 _MAX_CM, _MAX_RAD, _MAX_PX, _MAX_COEFFICIENT = 1000.0, 0.5 * math.pi, 1e6, 1e4
+#: Lowest camera; chosen: below that, a lens lies on the road. And the least focal length as a share of the
+#: image's side; chosen: half of that of a fisheye whose image circle of 220 degrees fills half of the side.
+_LEAST_HEIGHT_CM, _LEAST_FOCAL = 1.0, 0.06
 #: Pixels along a side; the largest sensors have fewer.
 _MAX_SIDE_PX = 2**14
 
@@ -38,7 +41,7 @@ _ROS_MODELS: dict[str, CameraModel] = {"plumb_bob": "pinhole", "equidistant": "f
 class MountingFile(Settings):
     """The mounting as a camera file holds it; see :class:`lanenet.geometry.camera.Mounting`."""
 
-    height_cm: Length
+    height_cm: Annotated[float, Field(ge=_LEAST_HEIGHT_CM, le=_MAX_CM)]
     pitch_down_rad: Angle = 0.0
     roll_rad: Angle = 0.0
     yaw_rad: Angle = 0.0
@@ -83,8 +86,8 @@ class CameraFile(Settings):
 
     @field_validator("K")
     @classmethod
-    def _check_matrix(cls, K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
-        return _checked_matrix(K)
+    def _check_matrix(cls, K: tuple[Row, Row, Row], info: Any) -> tuple[Row, Row, Row]:
+        return _checked_matrix(K, info.data.get("width"), info.data.get("height"))
 
     @field_validator("D")
     @classmethod
@@ -179,11 +182,12 @@ class RosCameraInfo(Settings):
 
     @field_validator("camera_matrix")
     @classmethod
-    def _check_matrix(cls, matrix: _RosMatrix) -> _RosMatrix:
+    def _check_matrix(cls, matrix: _RosMatrix, info: Any) -> _RosMatrix:
         if (matrix.rows, matrix.cols) != (3, 3):
             raise ValueError(f"expected 3 x 3 numbers, found {matrix.rows} x {matrix.cols}")
         d = matrix.data
-        _checked_matrix(((d[0], d[1], d[2]), (d[3], d[4], d[5]), (d[6], d[7], d[8])))
+        width, height = info.data.get("image_width"), info.data.get("image_height")
+        _checked_matrix(((d[0], d[1], d[2]), (d[3], d[4], d[5]), (d[6], d[7], d[8])), width, height)
         return matrix
 
     @field_validator("distortion_coefficients")
@@ -258,9 +262,16 @@ def _dump(data: dict[str, Any]) -> str:
     return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110))
 
 
-def _checked_matrix(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+def _checked_matrix(K: tuple[Row, Row, Row], width: int | None, height: int | None) -> tuple[Row, Row, Row]:
+    """Check a camera matrix; width and height are None if they were refused themselves."""
     if K[0][0] <= 0.0 or K[1][1] <= 0.0:
         raise ValueError(f"expected positive focal lengths, found {K[0][0]:g} and {K[1][1]:g}")
+    least_px = _LEAST_FOCAL * min(width or 0, height or 0)
+    if min(K[0][0], K[1][1]) < least_px:
+        raise ValueError(
+            f"expected focal lengths of {least_px:g} px or more in an image of {width}x{height}, found "
+            f"{K[0][0]:g} and {K[1][1]:g}"
+        )
     if K[1][0] != 0.0 or K[2] != (0.0, 0.0, 1.0):
         raise ValueError("expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
     return K

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lanenet.data.label_set import LabelSet
+from lanenet.errors import counted
 from lanenet.evaluation.comparison import Comparison
 from lanenet.evaluation.errors import GROUPS
 from lanenet.evaluation.robustness import RobustRow, robust_table
@@ -73,9 +74,10 @@ def _training(meta: ModelMeta, metrics: Mapping[str, Any], training: Sequence[La
     low, high = _widths_cm(meta)
     widths = f"{low} cm" if low == high else f"{low} to {high} cm"
     count = len({labels.meta.camera_hash for labels in training})
+    frames = counted(sum(map(len, training)), "frame")
     return (
-        f"{sum(map(len, training))} frames of {_plural(len(training), 'label set')}, labels from the "
-        f"{sources}; {_plural(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} epochs, the best "
+        f"{frames} of {counted(len(training), 'label set')}, labels from the {sources}; "
+        f"{counted(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} epochs, the best "
         f"one ({metrics['best_epoch']}) chosen by {metrics['val_frames']} frames of other drives or laps "
         f"(RMSE {show_cm(metrics['val_rmse_cm'])} cm).\nThe whole config is `run.yaml`."
     )
@@ -84,13 +86,13 @@ def _training(meta: ModelMeta, metrics: Mapping[str, Any], training: Sequence[La
 def _errors(comparison: Comparison) -> str:
     name, rest = comparison.first, comparison.breakdown
     stats, interval = comparison.tables[name].all, rest.interval_cm[name]
-    frames = sum(source.frames for source in comparison.sources)
+    frames = counted(sum(source.frames for source in comparison.sources), "frame")
     spread = ""
     if interval is not None:
         spread = f" ({show_cm(interval[0])} to {show_cm(interval[1])} over {rest.interval_over})"
     lines = [
-        f"On {frames} frames of {_plural(len(comparison.sources), 'test drive')} held out from the training, "
-        f"against the {comparison.reference}: RMSE {show_cm(stats.rmse_cm)} cm{spread}, median "
+        f"On {frames} of {counted(len(comparison.sources), 'test drive')} held out from the "
+        f"training, against the {comparison.reference}: RMSE {show_cm(stats.rmse_cm)} cm{spread}, median "
         f"{show_cm(stats.median_cm)}, 95 % below {show_cm(stats.p95_cm)}, worst {show_cm(stats.worst_cm)}."
     ]
     sigma, presence = rest.sigma.get(name), rest.presence.get(name)
@@ -148,7 +150,3 @@ def _weak_spots(comparison: Comparison) -> list[str]:
 def _widths_cm(meta: ModelMeta) -> tuple[str, str]:
     low, high = meta.lane_width_range_cm or (meta.lane_width_cm, meta.lane_width_cm)
     return f"{low:.0f}", f"{high:.0f}"
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"

@@ -24,7 +24,7 @@ from jaxtyping import Int
 
 from lanenet.control.controller import LaneController, SpeedSettings, Target, throttle_of
 from lanenet.data.drives.recorder import DriveRecorder
-from lanenet.errors import HardwareError
+from lanenet.errors import HardwareError, counted
 from lanenet.onboard.arming import ArmGate, HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.guard import CommandSink
@@ -318,7 +318,7 @@ class DriveLoop:
         if self._asked:
             self.report.ended = self._asked
         elif max_frames is not None and self.report.frames >= max_frames:
-            self.report.ended = f"{max_frames} frames, as asked"
+            self.report.ended = f"{counted(max_frames, 'frame')}, as asked"
         return bool(self.report.ended)
 
     def _close(self) -> None:
@@ -478,7 +478,7 @@ class DriveReport:
         turns = max(1, self.states.total())
         shares = ", ".join(f"{state} {100.0 * n / turns:.0f} %" for state, n in self.states.most_common())
         lines = [
-            f"{self.frames} frames in {self.seconds:.1f} s ({self.rate_hz:.1f} per second), "
+            f"{counted(self.frames, 'frame')} in {self.seconds:.1f} s ({self.rate_hz:.1f} per second), "
             f"{self.skipped} of the source not read",
         ]
         if len(self.work):
@@ -489,6 +489,6 @@ class DriveReport:
             )
         lines.append(f"states: {shares}")
         if self.recorded or self.unrecorded:
-            lines.append(f"recorded {self.recorded} frames, left out {self.unrecorded}")
+            lines.append(f"recorded {counted(self.recorded, 'frame')}, left out {self.unrecorded}")
         lines.append(f"ended: {self.ended}")
         return lines

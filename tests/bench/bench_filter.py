@@ -31,6 +31,7 @@ from lanenet.perception.edges.road import RoadEdges
 
 HEIGHT_CM, WHEELBASE_CM, STEP_CM, RADIUS_CM = 15.0, 17.0, 3.0, 150.0
 PARTICLES = 200
+LEAST_FRAMES = 600
 BLOCK = 50  # frames of one filter in a row
 
 
@@ -171,6 +172,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10_000)
     args = parser.parse_args()
+    if args.frames < LEAST_FRAMES:
+        parser.error(f"--frames {args.frames}: expected {LEAST_FRAMES} or more; the first 400 are warm-up")
     machine = {
         "cpu": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),

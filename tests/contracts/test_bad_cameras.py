@@ -71,7 +71,9 @@ BAD = [
     own("a focal length of 0", "K", [[100.0, 0, 160], [0, 0.0, 120], [0, 0, 1]], "key 'K'", "and 0"),
     own("two rows", "K", [[100.0, 0, 160], [0, 100.0, 120]], "key 'K"),
     own("a scaled matrix", "K", [[100.0, 0, 160], [0, 100.0, 120], [0, 0, 2]], "key 'K'", "[[fx"),
-    own("on the ground", "mounting.height_cm", 0.0, "key 'mounting.height_cm'", "greater than 0"),
+    own("on the ground", "mounting.height_cm", 0.0, "key 'mounting.height_cm'", "0.0"),
+    own("on its lens", "mounting.height_cm", 0.3, "key 'mounting.height_cm'", "0.3"),
+    own("a focal length in millimetres", "K", [[3.6, 0, 160], [0, 3.6, 120], [0, 0, 1]], "key 'K'", "3.6"),
     own("no height", "mounting.height_cm", None, "key 'mounting.height_cm' is missing"),
     own("a misspelt key", "mounting.pitch_rad", 0.1, "'mounting.pitch_rad'", "'pitch_down_rad'"),
     own("a negative wheelbase", "car.wheelbase_cm", -26.0, "key 'car.wheelbase_cm'", "greater than 0"),
@@ -100,6 +102,7 @@ BAD = [
     ),
     bad("ros: no width", ros("image_width: 640", "image_width: 0"), "info.yaml", "'image_width'"),
     bad("ros: no wheelbase", ros(wheelbase_cm=0.0), "wheelbase_cm"),
+    bad("ros: a focal length in millimetres", ros("500.5", "3.6"), "info.yaml", "'camera_matrix'"),
     bad("ros: below the ground", ros(mounting=Mounting(-1.0)), "height_cm"),
 ]
 

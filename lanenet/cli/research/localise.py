@@ -13,7 +13,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import MappingOption, check_ending, check_not_source, lock_outputs
-from lanenet.errors import CalibrationError, ConfigError, HardwareError
+from lanenet.errors import CalibrationError, ConfigError, HardwareError, counted
 
 if TYPE_CHECKING:
     from datagen.localise.live_filter import LiveFrame
@@ -198,8 +198,9 @@ class CameraFrames:
 def _show(report: LiveReport) -> None:
     localiser = report.localiser
     lines = [
-        f"{report.poses} poses of {report.frames} frames, {report.segments} segment(s); "
-        f"{localiser.unreadable} unreadable, {localiser.standing} standing, {localiser.dropped} left out",
+        f"{counted(report.poses, 'pose')} of {counted(report.frames, 'frame')}, "
+        f"{counted(report.segments, 'segment')}; {localiser.unreadable} unreadable, "
+        f"{localiser.standing} standing, {localiser.dropped} left out",
         "time per frame not measured: all poses were found at once, at the end"
         if math.isnan(report.median_ms)
         else f"{1e3 / report.median_ms:.0f} frames/s: {report.median_ms:.2f} ms per frame (median), "

@@ -33,7 +33,7 @@ from lanenet.data.camera_file import write_camera
 from lanenet.data.drives.folder import FRAMES_FILE, RECORDING_NAME, clear_dead_recordings, image_name
 from lanenet.data.drives.recording import DRIVE_FORMAT, DriveFile, write_drive_file
 from lanenet.data.files import write_text
-from lanenet.errors import DriveFormatError, LanenetError
+from lanenet.errors import DriveFormatError, LanenetError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.outputs import lock_output, remove, sync_path
 
@@ -276,7 +276,8 @@ class DriveRecorder:
 
     def _stop(self, why: str) -> None:
         self.problem = why
-        log.warning("recording stopped after %d frames: %s; driving goes on", self.recorded, why)
+        after = counted(self.recorded, "frame")
+        log.warning("recording stopped after %s: %s; driving goes on", after, why)
 
     def _discard(self) -> None:
         """Remove images without a row, and count the frames that wait."""

@@ -61,6 +61,9 @@ MAX_LINE = 40
 _WRITE_TIMEOUT_S = 0.05
 #: The greeting is repeated this often; lines are lost while an Uno's boot loader runs.
 _AGAIN_S = 0.1
+#: The line's losses are counted over so many commands, and told from this share on. Chosen: three seconds at
+#: 30 commands per second, and far more than single errors.
+_COUNTED, _TOLD_SHARE = 100, 0.1
 #: At most so many reads for the reports that wait; the kernel keeps less than this many times 4096 bytes.
 _READS = 32
 
@@ -135,17 +138,26 @@ def decode(line: bytes) -> Line | None:
 
 
 class LineReader:
-    """Splits a stream of bytes into lines."""
+    """Splits a stream of bytes into lines.
+
+    Attributes:
+        valid: Valid lines so far.
+        dropped: Invalid ones.
+    """
 
     def __init__(self) -> None:
         self._rest = b""
+        self.valid = self.dropped = 0
 
     def feed(self, data: bytes) -> list[Line]:
         """Return the valid lines that end in ``data``; invalid ones are dropped."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         # Noise without a line end must not pile up.
         self._rest = self._rest[-MAX_LINE:]
-        return [line for line in map(decode, lines) if line is not None]
+        good = [line for line in map(decode, lines) if line is not None]
+        self.valid += len(good)
+        self.dropped += len(lines) - len(good)
+        return good
 
 
 class SerialBoardSettings(PulseSettings):
@@ -182,6 +194,9 @@ class SerialBoard:
         #: None while none is due.
         self._sequence = 0
         self._unaccepted_s: float | None = None
+        #: Where the count of losses began: command, refused, valid and dropped lines; whether it was told.
+        self._counts = (0, 0, 0, 0)
+        self._told = False
 
     @property
     def refused_lines(self) -> int:
@@ -246,6 +261,7 @@ class SerialBoard:
             report = self._report
             if self._version is not None and report is not None and report[-3:] == (0, *neutral):
                 self._sequence, self._unaccepted_s, self._restarted = report.sequence, None, False
+                self._counts = (self._sequence, report.refused, self._reader.valid, self._reader.dropped)
                 return
             time.sleep(0.002)
         what = "no answer" if self._version is None else f"neutral pulses {neutral} not accepted"
@@ -269,6 +285,7 @@ class SerialBoard:
                 # First, as a command carries the newest time of the board.
                 self._receive()
                 self._check()
+                self._tell_losses()
                 self._command(round(pulses.steering_us), round(pulses.throttle_us))
             except OSError as error:
                 raise HardwareError(
@@ -292,6 +309,24 @@ class SerialBoard:
                 f"{self._accepted}, and has refused {self.refused_lines} lines as damaged or late; it is in "
                 "neutral; check the cable from the computer to the board"
             )
+
+    def _tell_losses(self) -> None:
+        """Warn of a line that loses much, but not all, once until it is good again."""
+        now = (self._sequence, self.refused_lines, self._reader.valid, self._reader.dropped)
+        sent, refused, valid, dropped = (
+            (after - before) & 0xFFFF for after, before in zip(now, self._counts, strict=True)
+        )
+        if sent < _COUNTED:
+            return
+        self._counts = now
+        much = refused > _TOLD_SHARE * sent or dropped > _TOLD_SHARE * (valid + dropped)
+        if much and not self._told:
+            _log.warning(
+                "%s: the board refused %d of the last %d commands as damaged or late, and %d of its %d lines "
+                "came damaged; check the cable",
+                self._settings.port, refused, sent, dropped, valid + dropped,
+            )  # fmt: skip
+        self._told = much
 
     def _command(self, steering_us: int, throttle_us: int) -> None:
         if self._unaccepted_s is None:

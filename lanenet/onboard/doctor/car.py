@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lanenet.data.camera_file import read_camera
-from lanenet.errors import LanenetError
+from lanenet.errors import LanenetError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
 from lanenet.onboard.cameras import open_source
@@ -59,9 +59,9 @@ def check_car(settings: DriveSettings) -> list[Check]:
     camera = None
     if settings.camera is not None and checks[0].state != "problem":
         camera = read_camera(settings.camera)
-    frames: list[Frame] = []
     rate_hz = getattr(settings.source, "rate_hz", None)
-    checks += check_source(open_source(settings.source), rate_hz, camera, frames)
+    seen, frames = check_source(open_source(settings.source), rate_hz, camera)
+    checks += seen
     found, detector = _detector(settings, camera)
     checks.append(found)
     if camera is not None and detector is not None and _fit(frames, camera):
@@ -72,27 +72,28 @@ def check_car(settings: DriveSettings) -> list[Check]:
 
 
 def check_source(
-    source: FrameSource, rate_hz: float | None, camera: Camera | None, kept: list[Frame] | None = None
-) -> list[Check]:
+    source: FrameSource, rate_hz: float | None, camera: Camera | None
+) -> tuple[list[Check], list[Frame]]:
     """Watch a camera for two seconds.
 
     Args:
         source: Not open yet; it is closed again.
         rate_hz: Requested frames per second; None if none were requested.
         camera: Camera whose size the images must have; None for no check.
-        kept: Takes the frames.
+
+    Returns:
+        The checks, and the frames.
     """
     try:
         source.open()
         frames, arrived_s = _watch(source)
     except LanenetError as error:
-        return [Check("camera", "problem", str(error))]
+        return [Check("camera", "problem", str(error))], []
     finally:
         source.close()
-    if kept is not None:
-        kept += frames
     if len(frames) < 2:
-        return [Check("camera", "problem", f"{len(frames)} frames in {_WATCH_S:g} s, expected a stream")]
+        text = f"{counted(len(frames), 'frame')} in {_WATCH_S:g} s, expected a stream"
+        return [Check("camera", "problem", text)], frames
     height, width = frames[-1].image_bgr.shape[:2]
     checks = [_rate(frames, rate_hz)]
     if camera is not None and (camera.width, camera.height) != (width, height):
@@ -107,7 +108,7 @@ def check_source(
     if not _DARK <= brightness <= _BRIGHT:
         text = f"mean brightness {brightness:.0f} of 255: is the lens covered, the room dark?"
         checks.append(Check("image", "note", text))
-    return checks
+    return checks, frames
 
 
 def check_calibration(
@@ -126,13 +127,14 @@ def check_calibration(
     seen = [image for image in images if detector.detect(image).confidence >= least_confidence]
     off_rad = [pitch for pitch in (comparison.view(image)[0] for image in seen) if np.isfinite(pitch)]
     if not off_rad:
-        text = f"not compared: no lane with two lines in {len(images)} frames; stand the car in its lane"
+        looked = counted(len(images), "frame")
+        text = f"not compared: no lane with two lines in {looked}; stand the car in its lane"
         return Check(name, "note", text)
     median_rad = float(np.median(off_rad))
     text = f"the lines look as if the pitch were {np.rad2deg(abs(median_rad)):.1f} degrees off"
     if abs(median_rad) >= GROSS_RAD:
         return Check(name, "problem", f"{text}: has the camera moved since, is it upside down?")
-    return Check(name, "ok", f"{text}, in {len(off_rad)} views; one place may show some degrees")
+    return Check(name, "ok", f"{text}, in {counted(len(off_rad), 'view')}; one place may show some degrees")
 
 
 def check_temperature(sensor: Path = _THERMAL_ZONE) -> Check:

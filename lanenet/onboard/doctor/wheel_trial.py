@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import yaml
-
+from lanenet.config import parse_yaml
 from lanenet.errors import ConfigError, LanenetError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
@@ -202,15 +201,15 @@ def set_values(text: str, changes: Mapping[str, float], where: str) -> str:
         ConfigError: If the file is not in block style; it has to be changed by hand.
     """
     try:
-        expected = copy.deepcopy(yaml.safe_load(text)) or {}
+        expected = copy.deepcopy(parse_yaml(text, where)) or {}
         lines = text.splitlines()
         for key, value in changes.items():
             path = key.split(".")
             _set_plain(expected, path, value)
             lines = _set_line(lines, path, f"{value:g}")
         changed = "\n".join(lines) + "\n"
-        done = yaml.safe_load(changed) == expected
-    except (yaml.YAMLError, TypeError, AttributeError):
+        done = parse_yaml(changed, where) == expected
+    except (ConfigError, TypeError, AttributeError):
         done = False
     if not done:
         values = ", ".join(f"{key}={value:g}" for key, value in changes.items())
@@ -223,7 +222,7 @@ def _set_plain(data: dict[str, Any], path: list[str], value: float) -> None:
     for parent in parents:
         data = data.setdefault(parent, {})
     # As YAML will read it.
-    data[last] = yaml.safe_load(f"{value:g}")
+    data[last] = parse_yaml(f"{value:g}", last)
 
 
 def _set_line(lines: list[str], path: list[str], value: str) -> list[str]:

@@ -133,7 +133,7 @@ def test_the_command(simulated, tmp_path):
     out = tmp_path / "poses.csv"
     result = invoke(simulated, "--config", config, "--factor", 1.0, "--out", out)
     assert result.exit_code == 0, result.output
-    assert "70 poses of 70 frames, 1 segment(s)" in result.output and "frames/s" in result.output
+    assert "70 poses of 70 frames, 1 segment;" in result.output and "frames/s" in result.output
     assert "gain of the speed 1.000" in result.output and len(rows_of(out)) == 70
     # The map's own settings and camera will do, too.
     assert read_camera(simulated / "camera.yaml").hash == open_drive(simulated).camera.hash

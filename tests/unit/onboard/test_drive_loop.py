@@ -13,7 +13,7 @@ from lanenet.control.steering import SteeringSettings
 from lanenet.errors import HardwareError
 from lanenet.onboard.arming import HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
-from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, LatencyHistogram, Step
+from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, DriveReport, LatencyHistogram, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings, State
 from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import LaneEstimate
@@ -383,3 +383,9 @@ def test_an_error_before_the_first_frame_says_so(caplog: pytest.LogCaptureFixtur
     with pytest.raises(HardwareError, match="no such drive"):
         car.loop.run()
     assert "neutral: HardwareError before the first frame: no such drive" in caplog.text
+
+
+@pytest.mark.parametrize(("frames", "word"), [(0, "frames"), (1, "frame"), (2, "frames")])
+def test_the_report_counts_in_words(frames: int, word: str) -> None:
+    first = DriveReport(frames=frames).lines()[0]
+    assert first.startswith(f"{frames} {word} ")

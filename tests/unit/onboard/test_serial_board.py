@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanenet.errors import HardwareError, MissingExtraError
-from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators import make_actuator, serial_board
 from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.serial_board import (
     COMMAND_S,
@@ -214,6 +214,25 @@ def test_line_that_fails_towards_the_board_is_noticed(board, actuator, monkeypat
     with pytest.raises(HardwareError, match=r"accepted no command for 0\.3\d s.*refused 0 lines"):
         keep_sending(actuator, 2.0, 0.0, 1.0)
     board.wait_for(NEUTRAL)
+
+
+@pytest.mark.parametrize("direction", ["to the board", "to the computer"])
+def test_line_that_loses_every_third_is_told_once(board, actuator, monkeypatch, caplog, direction):
+    monkeypatch.setattr(serial_board, "_COUNTED", 6)
+    port, count = actuator._port, iter(range(10**6))
+
+    def damaged(data: bytes) -> bytes:
+        return data if next(count) % 3 else data.replace(b"*", b"+")
+
+    if direction == "to the board":
+        write = port.write
+        monkeypatch.setattr(port, "write", lambda data: write(damaged(data)))
+    else:
+        feed = actuator._reader.feed
+        lines = lambda data: b"".join(map(damaged, data.splitlines(keepends=True)))  # noqa: E731
+        monkeypatch.setattr(actuator._reader, "feed", lambda data: feed(lines(data)))
+    keep_sending(actuator, 0.6, 0.0, 0.2)
+    assert caplog.text.count("check the cable") == 1 and board.port in caplog.text
 
 
 def test_line_that_fails_towards_the_computer_stops_the_motor(board, actuator, monkeypatch):

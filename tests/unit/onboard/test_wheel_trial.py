@@ -253,6 +253,7 @@ def test_every_shipped_car_can_be_changed(path):
         "actuator: 5\n",
         "- a\n- b\n",
         "a: &x\n  b: [\n",
+        "actuator:\n  kind: serial\n  kind: pca9685\n",
     ],
 )
 def test_another_style_is_left_to_its_owner(text):
