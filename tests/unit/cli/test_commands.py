@@ -94,7 +94,7 @@ def test_bench_writes_json(tmp_path: Path) -> None:
 
 def test_doctor_fails_on_a_bad_camera_file(tmp_path: Path) -> None:
     assert run("doctor").exit_code == 0
-    write_camera(tmp_path / "c.yaml", example_camera().with_mounting(height_cm=0.2), "in metres")
+    write_camera(tmp_path / "c.yaml", example_camera().with_mounting(height_cm=2.0), "in decimetres")
     result = run("doctor", "--camera", tmp_path / "c.yaml")
     assert "problem" in error_of(result)
     assert "centimetres" in result.stdout
