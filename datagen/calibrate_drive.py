@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from datagen.lanes.scale import LaneScale, measure_lane
 from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
+from datagen.segments import fit_height
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.camera.self_calibration import (
@@ -127,7 +128,8 @@ def calibrate_drive(
     Args:
         drive_path: Drive folder, Donkeycar tub or video.
         lane_width_cm: Between the middles of the two lines of the driven lane.
-        camera_height_cm: Height of the lens above the road.
+        camera_height_cm: Height of the lens above the road. Together with the lane width it also determines
+            the focal length where no loop is closed.
         start: Camera to refine; None looks for one.
         settings: Settings of all mapping stages; ``guess`` is what the search tries.
         progress: Called with (stage, done, total).
@@ -158,6 +160,9 @@ def calibrate_drive(
         found = find_camera(drive, start, solver, search)
     except TrackingLostError as error:
         raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
+    if start is None and lane_width_cm is not None and camera_height_cm is not None:
+        found, more = fit_height(found, drive, lane_width_cm / camera_height_cm, settings, solver)
+        notes += more
     if progress is not None:
         progress(_ADJUST, 1, 1)
     notes += check_observable(found, str(drive_path), accept_open_loop)

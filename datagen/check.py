@@ -72,6 +72,11 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
     figures |= quality_figures(quality, drive.width)
     figures["steering_correlation"] = steering_correlation(mapped)
+    request = prepared.request
+    figures["given"] = {
+        "camera_height_cm": request.camera_height_cm,
+        "tape_width_cm": request.tape_width_cm,
+    }
     labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
     notes.append(f"{labelled}; {points_text(quality.point_shares)}")
     evidence = map_evidence(drive_map, camera_figures | figures, drive.deleted[assembled.rows], free_cm)

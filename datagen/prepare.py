@@ -49,6 +49,9 @@ class MapRequest:
         camera_path: Camera file; None takes the drive's own, or calibrates from the drive.
         refine_camera: Adjust a known camera together with the poses; its height stays and sets the scale.
         wheelbase_cm: Distance between the axles; None takes the camera's own, or a nominal one.
+        camera_height_cm: Height of the lens above the road, for a camera that is to be found: together with
+            the lane width it determines the focal length. None if it was not measured.
+        tape_width_cm: Width of the tape, with which the scale is checked. None if it was not measured.
     """
 
     drive_path: Path
@@ -56,6 +59,8 @@ class MapRequest:
     camera_path: Path | None = None
     refine_camera: bool = False
     wheelbase_cm: float | None = None
+    camera_height_cm: float | None = None
+    tape_width_cm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
 
     Raises:
         TrackingLostError: If the car stands still, or no segment is long enough.
-        CalibrationError: If the known camera is for images of another size.
+        CalibrationError: If the known camera is for images of another size, or another height was given.
     """
     recorded = keep_images(open_drive(request.drive_path))
     check_moving(recorded)
@@ -105,6 +110,11 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     settings, hidden = hide_bumper(drive, settings)
     if known is not None:
         check_size(known, drive, request.camera_path)
+        if request.camera_height_cm is not None:
+            raise CalibrationError(
+                f"{request.camera_path or drive.path}: the camera is known, {known.mounting.height_cm:g} cm "
+                f"high, but --camera-height gives {request.camera_height_cm:g} cm: expected one of them"
+            )
     notes += [*found, *nominal, *hidden]
     return PreparedDrive(request, drive, segments, held_out, settings, known, tuple(notes))
 

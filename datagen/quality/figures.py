@@ -206,6 +206,9 @@ def map_evidence(
         else free_cm,
         height_cm=height_cm,
         tape_cm=meta.tape_cm,
+        height_given=bool(figures.get("calibration", {}).get("height_given")),
+        given_height_cm=figures["given"]["camera_height_cm"],
+        given_tape_cm=figures["given"]["tape_width_cm"],
         steering=figures["steering_correlation"],
     )
 

@@ -50,6 +50,9 @@ class MapEvidence:
         contradicted_share: Share of the frames' lines that the images contradict.
         height_cm: Height of the camera that follows from the scale.
         tape_cm: Width of the markings that follows from it.
+        height_given: Whether the focal length was found with a given height of the camera.
+        given_height_cm: That height; None if none was given.
+        given_tape_cm: Width of the tape that the user gave; None if none was given.
         steering: Correlation of the path's curvature with the steering command, both positive to the left;
             None where it is too weak to tell, or nothing was commanded.
     """
@@ -69,6 +72,9 @@ class MapEvidence:
     contradicted_share: float = 0.0
     height_cm: float = float("nan")
     tape_cm: float = float("nan")
+    height_given: bool = False
+    given_height_cm: float | None = None
+    given_tape_cm: float | None = None
     steering: float | None = None
 
 
@@ -108,6 +114,11 @@ class VerdictSettings(Settings):
             Where the lane width sets the scale, a map beyond them is usable, for the lane width may be that
             of the whole road, or in another unit. Chosen: the three recorded drives have 10 to 20 and 2 to 4
             cm; a factor of two is left on either side.
+        height_mismatch: Relative difference between the given height of the camera and the one that follows
+            from the lane width, up to which a map is good. Chosen: two sigmas of a height and a lane that
+            were measured with a ruler.
+        tape_mismatch: The same of the tape's width, whose borders blur. Chosen: less than from one common
+            width to the next (1.9, 2.5, 3.8, 5 cm).
     """
 
     max_sd_px: float = Field(default=0.5, gt=0.0)
@@ -124,6 +135,8 @@ class VerdictSettings(Settings):
     usable: float = Field(default=2.0, gt=1.0)
     height_cm: tuple[float, float] = (5.0, 40.0)
     tape_cm: tuple[float, float] = (0.8, 8.0)
+    height_mismatch: float = Field(default=0.08, gt=0.0)
+    tape_mismatch: float = Field(default=0.25, gt=0.0)
 
 
 @dataclass(frozen=True)
@@ -165,7 +178,11 @@ _Findings = Iterator[Finding]
 
 #: What helps where the camera may be wrong: known, or found from the drive.
 _CHECK_CAMERA = "check that the camera file and the lane width are those of this car and road"
-_DRIVE_AGAIN = "drive two laps of a closed road along the same path, or give a camera file (--camera)"
+_LOOP_OR_CAMERA = (
+    "drive two laps of a closed road along the same path, or give a camera file or an earlier map of the car "
+    "(--camera)"
+)
+_DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 
 
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
@@ -197,13 +214,15 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
     if e.found_lane_cm is not None:
         return
     yield (
-        f"with the given lane width the camera is {e.height_cm:.0f} cm high and the tape {e.tape_cm:.1f} cm "
+        f"with the given lane width the camera is {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm "
         "wide: measure one of them if in doubt"
     )
-    yield (
-        f"the lane width of {e.given_lane_cm:g} cm is the one thing that sets the scale: if it is wrong, "
-        "every length is wrong by the same share, and no check here can show it"
-    )
+    if e.given_height_cm is None and e.given_tape_cm is None:
+        yield (
+            f"the lane width of {e.given_lane_cm:g} cm is the one thing that sets the scale: if it is wrong, "
+            "every length is wrong by the same share, and no check here can show it; --tape-width and "
+            "--camera-height would"
+        )
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:
@@ -344,7 +363,16 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         )
     if e.camera_known:
         return
-    if not e.revisits:
+    if e.height_given and not e.revisits:
+        sigma = e.sigma["focal"]
+        yield Finding(
+            max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
+            "only the camera's height shows what camera this is, for no place was seen twice",
+            _LOOP_OR_CAMERA,
+            f"the focal length is known to {_percent(sigma)} from the camera's height, expected "
+            f"{_percent(s.max_focal_sigma)} at most and a place that is seen twice (max_focal_sigma)",
+        )
+    elif not e.revisits:
         sigma = e.sigma["focal"]
         yield Finding(
             max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
@@ -389,7 +417,20 @@ def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
 
 
 def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
-    """Question a lane width that makes another car of this one; only where it sets the scale."""
+    """Question a lane width that makes another car or road of this one."""
+    for name, value, given, most in (
+        ("height_mismatch", e.height_cm, e.given_height_cm, s.height_mismatch),
+        ("tape_mismatch", e.tape_cm, e.given_tape_cm, s.tape_mismatch),
+    ):
+        what = "camera's height" if name == "height_mismatch" else "tape's width"
+        if given is not None and max(value / given, given / value) > 1.0 + most:
+            yield Finding(
+                "usable",
+                f"the {what} comes out as {value:.1f} cm, not {given:g} cm",
+                f"measure the {what}, and the lane between the middles of its two lines",
+                f"the {what} is {value:.1f} cm on the map, {given:g} cm was given: expected a difference of "
+                f"{_percent(most)} at most ({name})",
+            )
     if e.found_lane_cm is not None:
         return
     for name, value, (least, most) in (

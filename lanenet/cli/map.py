@@ -29,13 +29,22 @@ def map_drive(
         bool, typer.Option("--refine-camera", help="Adjust a known camera to this drive.")
     ] = False,
     wheelbase: WheelbaseOption = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, help="Height of the lens above the road, cm: helps to find a camera that is not known."
+        ),
+    ] = None,
+    tape_width: Annotated[
+        float | None, typer.Option(min=0.1, help="Width of the tape, cm: checks the lane width.")
+    ] = None,
 ) -> None:
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
     from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
-    request = MapRequest(drive, lane_width, camera, refine_camera, wheelbase)
+    request = MapRequest(drive, lane_width, camera, refine_camera, wheelbase, camera_height, tape_width)
     with console.progress_bar("map") as progress:
         report = run(request, settings, out, progress)
     console.show_lines(report.lines)

@@ -109,13 +109,28 @@ class CameraFile(Settings):
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera file.
+    """Read a camera file, or the camera of an earlier map of the same car.
+
+    Args:
+        path: The file, or the map's folder.
 
     Raises:
         CalibrationError: If the file is missing, of an unknown version, or a value is missing, misspelt or
-            impossible; names the file and the key.
+            impossible; names the file and the key. Or if the map was rejected.
     """
-    return _read(CameraFile, path).camera()
+    return _read(CameraFile, _camera_of_map(path) if path.is_dir() else path).camera()
+
+
+def _camera_of_map(folder: Path) -> Path:
+    meta = folder / "map.yaml"
+    if not meta.is_file():
+        raise CalibrationError(f"{folder}: is a folder without map.yaml, expected a camera file or a map")
+    if read_yaml(meta, CalibrationError).get("verdict") == "reject":
+        raise CalibrationError(
+            f"{folder}: this map was rejected, so its camera may be wrong; expected a good or usable map, or "
+            "a camera file"
+        )
+    return folder / "camera.yaml"
 
 
 def write_camera(

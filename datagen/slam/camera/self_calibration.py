@@ -86,6 +86,7 @@ class FoundCamera:
             :attr:`datagen.slam.adjustment.adjust.BundleResult.sigma`, after :func:`honest_sigma`.
         refined: Whether a known camera was the start.
         strain: Distance of principal point and roll from their priors, see :func:`prior_strain`.
+        height_given: Whether the focal length fits a given height, see :func:`datagen.segments.fit_height`.
     """
 
     solved: SolvedSegment
@@ -93,6 +94,7 @@ class FoundCamera:
     sigma: dict[str, float]
     refined: bool
     strain: float
+    height_given: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -114,7 +116,12 @@ class FoundCamera:
     @property
     def figures(self) -> dict[str, Any]:
         """For a map's report."""
-        return {"candidates": [vars(c) for c in self.candidates], "sigma": self.sigma, "closed": self.closed}
+        return {
+            "candidates": [vars(c) for c in self.candidates],
+            "sigma": self.sigma,
+            "closed": self.closed,
+            "height_given": self.height_given,
+        }
 
     @property
     def note(self) -> str:
@@ -125,6 +132,8 @@ class FoundCamera:
             f"{focal * self.sigma['focal']:.1f} px, pitch {np.rad2deg(m.pitch_down_rad):.1f} +- "
             f"{np.rad2deg(self.sigma['pitch']):.1f} degrees"
         )
+        if self.height_given:
+            return f"{found}; the focal length fits the lane width at the camera's height"
         return found if self.closed else f"{found}; no place was seen twice, so the lens is as it started"
 
 
@@ -252,12 +261,13 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
     turned, length = turning_rad(solved.poses), solved.path_cm[-1] / found.camera.mounting.height_cm
     driven = f"{len(solved.poses)} frames, {length:.0f} camera heights long"
     problem = None
-    if turned < MIN_TURNING_RAD:
+    # A given height determines the focal length as a loop does.
+    if turned < MIN_TURNING_RAD and not found.height_given:
         problem = (
             f"too straight: {driven}, its heading stays within {np.rad2deg(turned):.0f} degrees, expected "
             f"{np.rad2deg(MIN_TURNING_RAD):.0f}"
         )
-    elif len(solved.revisits) < MIN_REVISITS:
+    elif len(solved.revisits) < MIN_REVISITS and not found.height_given:
         problem = (
             f"{len(solved.revisits) or 'no'} places were seen twice, expected {MIN_REVISITS}: {driven}, with "
             f"bends of {np.rad2deg(turned):.0f} degrees"

@@ -20,7 +20,9 @@ OverridesArgument = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
 ]
 DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
-CameraOption = Annotated[Path | None, typer.Option("--camera", help="Camera YAML.")]
+CameraOption = Annotated[
+    Path | None, typer.Option("--camera", help="Camera YAML, or an earlier map of the same car.")
+]
 WheelbaseOption = Annotated[
     float | None, typer.Option("--wheelbase", min=0.1, help="Distance between the car's axles, cm.")
 ]

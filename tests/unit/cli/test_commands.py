@@ -183,10 +183,11 @@ def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
     config = tmp_path / "map.yaml"
     config.write_text("frames: 9\n")
     result = run(
-        *("map", "tub", "--lane-width", "38.5", "--camera", "c.yaml", "--config", config, "--out", "m/one")
+        *("map", "tub", "--lane-width", "38.5", "--camera", "c.yaml", "--config", config, "--out", "m/one"),
+        *("--camera-height", "17.5", "--tape-width", "1.9"),
     )
     assert result.exit_code == 0, result.output
-    request = MapRequest(Path("tub"), 38.5, Path("c.yaml"))
+    request = MapRequest(Path("tub"), 38.5, Path("c.yaml"), camera_height_cm=17.5, tape_width_cm=1.9)
     assert asked.calls["map"][:3] == (request, FakeSettings(frames=9), Path("m/one"))
     for text in ("7 frames mapped", "wrote m/one", "lanenet label m/one --out m/one.parquet"):
         assert text in result.stdout

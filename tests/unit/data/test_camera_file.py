@@ -15,6 +15,7 @@ from lanenet.data.camera_file import (
     write_camera,
     write_ros_camera_info,
 )
+from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import CameraModel, Mounting
 
 
@@ -94,3 +95,17 @@ def test_a_ros_file_is_understood(tmp_path: Path) -> None:
     assert (camera.model, camera.width, camera.height, camera.wheelbase_cm) == ("pinhole", 640, 480, 25.0)
     assert (camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]) == (500.5, 320.25, 501.5, 240.75)
     np.testing.assert_array_equal(camera.D, [-0.3, 0.1, 0.001, -0.002, 0.0])
+
+
+@pytest.mark.parametrize("verdict", ["good", "usable", "reject"])
+def test_the_camera_of_an_earlier_map_is_taken_unless_it_was_rejected(tmp_path: Path, verdict: str) -> None:
+    camera = make_camera("fisheye", 4)
+    write_camera(tmp_path / "camera.yaml", camera, "from the drive")
+    with pytest.raises(CalibrationError, match=r"map\.yaml"):
+        read_camera(tmp_path)
+    (tmp_path / "map.yaml").write_text(f"format: lanenet-map/1\nverdict: {verdict}\n")
+    if verdict == "reject":
+        with pytest.raises(CalibrationError, match=f"{tmp_path.name}: .*rejected"):
+            read_camera(tmp_path)
+    else:
+        assert read_camera(tmp_path).hash == camera.hash

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from made_up_drive import made_up_drive
 
+import datagen.segments
 import datagen.slam.camera.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera, straight_frames
-from datagen.lanes.scale import fitted_width_cm, spacing_cm, width_sigma
+from datagen.lanes.scale import LaneScale, fitted_width_cm, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
+from datagen.prepare import MapRequest, keep_images, prepare
+from datagen.segments import fit_height
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult, BundleSettings
 from datagen.slam.camera.coarse import guessed_camera, nudged
@@ -31,7 +34,10 @@ from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
 from lanenet.data.camera_file import write_camera
+from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.maps.line import LaneLine
 from lanenet.errors import CalibrationError
@@ -280,3 +286,56 @@ def test_pictures_show_where_the_car_drives_straight():
     assert 59 <= first <= 79 and 75 <= second <= 80
     (only,) = straight_frames(found(np.zeros(4)).solved.poses, 60.0, 1)
     assert 0 <= only < 4
+
+
+class _Solver(SegmentSolver):
+    """Keeps the camera that it starts from, as a drive without a closed loop does."""
+
+    def solve(self, drive, camera, **_) -> SolvedSegment:
+        return replace(found(np.zeros(len(drive)), 0).solved, camera=camera)
+
+
+@pytest.mark.parametrize("slope", [-0.6, -0.75, -0.9])
+def test_a_given_height_finds_the_focal_length_where_the_lane_has_its_width(monkeypatch, slope):
+    """The lane looks narrower the longer the lens; with 90 px it is 2.5 camera heights wide."""
+
+    def measure(solved, *_):
+        width = 2.5 * (solved.camera.K[0, 0] / 90.0) ** slope
+        return LaneScale(width * solved.camera.mounting.height_cm, 0.02)
+
+    monkeypatch.setattr(datagen.segments, "measure_lane", measure)
+    solver = _Solver(MapSettings(), np.random.default_rng(0))
+    alone = found(np.zeros(70), 0, 0.3)
+    camera, notes = fit_height(alone, made_up_drive(70), 2.5, MapSettings(), solver)
+    assert camera.camera.K[0, 0] == pytest.approx(90.0, rel=0.01) and not notes and camera.height_given
+    # The horizon stays where it is in the images.
+    before, after = (
+        np.tan(one.camera.mounting.pitch_down_rad) * one.camera.K[0, 0] for one in (alone, camera)
+    )
+    assert after == pytest.approx(before)
+    # From height, lane and measurement, by the slope; without them the focal length was a guess.
+    assert camera.sigma["focal"] == pytest.approx(math.hypot(0.03, 0.012, 0.02) / -slope, rel=0.05)
+
+
+def test_a_height_beside_a_known_camera_is_refused(tmp_path):
+    drive, path = write_drive(tmp_path / "d", np.arange(70) * 3.0), tmp_path / "camera.yaml"
+    write_camera(path, replace(CAMERA, width=64, height=48), "made up")
+    with pytest.raises(CalibrationError, match=r"camera\.yaml.* 15 cm .*--camera-height .* 17 cm"):
+        prepare(MapRequest(drive, 40.0, path, camera_height_cm=17.0), MapSettings())
+
+
+@pytest.mark.slow
+def test_with_the_height_the_focal_length_of_an_open_road_comes_out_better(tmp_path):
+    """A lens of 83 px and a search that came out 20 % too long; nothing is seen twice."""
+    camera = {"width": 160, "height": 120, "field_of_view_rad": math.radians(110.0), "height_cm": 22.0}
+    settings = SimulationSettings.model_validate({"seed": 4, "frames": 200, "camera": camera})
+    drive = keep_images(open_drive(simulate_drive(settings, tmp_path / "d")))
+    start = nudged(drive.camera, "focal", math.log(1.2))
+    solver = SegmentSolver(MapSettings(find_bumper=False), np.random.default_rng(0))
+    solved = solver.solve(drive, start, find_camera=True)
+    sigma = honest_sigma(solved.bundle.sigma, False, 0.0, BundleSettings(), 160)
+    alone = FoundCamera(solved, [], sigma, False, 0.0)
+    given, _ = fit_height(alone, drive, drive.lane_width_cm / 22.0, solver.settings, solver)
+    true_px = drive.camera.K[0, 0]
+    off = [abs(one.camera.K[0, 0] / true_px - 1.0) for one in (alone, given)]
+    assert off[0] > 0.15 and off[1] < 2.0 * given.sigma["focal"] < 0.12

@@ -47,7 +47,7 @@ def test_a_good_map_says_what_it_rests_on():
 
 def test_what_sets_the_scale_is_named_with_what_follows_from_it():
     remarks = graded(GOOD, height_cm=17.2, tape_cm=1.9).remarks
-    assert any("17 cm" in remark and "1.9 cm" in remark for remark in remarks)
+    assert any("17.2 cm" in remark and "1.9 cm" in remark for remark in remarks)
     assert any("40 cm" in remark for remark in remarks)
     assert judge(KNOWN, VerdictSettings()).remarks == ()
 
@@ -64,6 +64,30 @@ def test_a_lane_width_that_makes_another_car_of_it_is_questioned(height_cm, tape
         assert bound in found.reasons[0] and len(found.reasons) == 1
         assert all(f"{value} cm" in found.sentence for value in (40, round(height_cm), tape_cm))
     assert graded(KNOWN, height_cm=height_cm, tape_cm=tape_cm).grade == "good"
+
+
+@pytest.mark.parametrize(
+    ("given", "bound"),
+    [
+        ({"given_height_cm": 17.9}, None),
+        ({"given_height_cm": 19.0}, "height_mismatch"),
+        ({"given_tape_cm": 2.2}, None),
+        ({"given_tape_cm": 3.8}, "tape_mismatch"),
+    ],
+)
+def test_a_height_or_a_tape_that_was_measured_checks_the_lane_width(given, bound):
+    found = graded(GOOD, height_cm=17.0, tape_cm=1.9, **given)
+    assert found.grade == ("good" if bound is None else "usable")
+    # The lane width is no longer the one thing that sets the scale.
+    assert len(found.remarks) == 1
+    if bound is not None:
+        assert bound in found.reasons[0] and all(f"{v:g} cm" in found.sentence for v in given.values())
+
+
+@pytest.mark.parametrize(("sigma", "grade"), [(0.04, "usable"), (0.08, "usable"), (0.12, "reject")])
+def test_a_height_stands_in_for_a_loop_but_not_for_a_check(sigma, grade):
+    found = graded(GOOD, **OPEN, height_given=True, sigma={"focal": sigma})
+    assert found.grade == grade and "max_focal_sigma" in found.reasons[0]
 
 
 @pytest.mark.parametrize(("steering", "remarks"), [(None, 0), (0.9, 0), (-0.9, 1)])
