@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.lanes.scale import LaneScale, measure_lane
-from datagen.prepare import check_moving, hide_bumper, keep_images, split_segments
+from datagen.prepare import (
+    check_lens,
+    check_moving,
+    hide_bumper,
+    keep_images,
+    readable_frames,
+    split_segments,
+)
 from datagen.segments import fit_height
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import with_known_scale
@@ -147,7 +154,11 @@ def calibrate_drive(
         raise CalibrationError(
             "images do not show the scale: expected the lane's width or the camera's height, found neither"
         )
-    drive, notes = _moving_part(keep_images(open_drive(drive_path)), start)
+    recorded, unreadable = readable_frames(keep_images(open_drive(drive_path)))
+    if start is None:
+        check_lens(recorded)
+    drive, notes = _moving_part(recorded, start)
+    notes += unreadable
     settings, hidden = hide_bumper(drive, settings)
     notes += hidden
     if start is not None:

@@ -13,12 +13,12 @@ from datagen.quality.measure import held_out_frames
 from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
-from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives import Commands, Drive, open_drive
 from lanenet.data.drives.recording import ImageSource
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
-from lanenet.perception.edges.static import find_static, spread_frames
+from lanenet.perception.edges.static import find_static, lens_circle_px, spread_frames
 
 #: Frames of a segment at least. Chosen: three seconds at 20 frames a second; the steering is fitted to 50.
 MIN_SEGMENT = 60
@@ -36,6 +36,8 @@ _NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
 #: Least median number of edge points in the lower half of a frame. Chosen: one border of one line, 20 px
 #: long.
 _LEAST_EDGES = 20
+#: Share of frames without a readable image above which a drive is not mapped. Chosen: more is no accident.
+_UNREADABLE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -96,11 +98,13 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
 
     Raises:
         TrackingLostError: If the car stands still, or no segment is long enough.
-        CalibrationError: If the known camera is for images of another size, or another height was given.
+        CalibrationError: If the known camera is for images of another size, or another height was given; or
+            if the images are those of a full-circle fisheye, and the camera is not known.
+        DriveFormatError: If the recording cannot be read.
     """
-    recorded = keep_images(open_drive(request.drive_path))
+    recorded, unreadable = readable_frames(keep_images(open_drive(request.drive_path)))
     check_moving(recorded)
-    notes = list(recorded.problems)
+    notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
     drive, found = following_frames(recorded)
     segments = split_segments(drive)
     # Deleted frames get no labels; where the car leaves the road, they show nothing of the lines.
@@ -108,7 +112,9 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     known = read_camera(request.camera_path) if request.camera_path is not None else drive.camera
     settings, known, nominal = with_wheelbase(settings, known, request.wheelbase_cm)
     settings, hidden = hide_bumper(drive, settings)
-    if known is not None:
+    if known is None:
+        check_lens(drive)
+    else:
         check_size(known, drive, request.camera_path)
         if request.camera_height_cm is not None:
             raise CalibrationError(
@@ -145,6 +151,59 @@ class KeptImages:
 def keep_images(drive: Drive) -> Drive:
     """Return the drive with images that are read once, as far as they fit into memory."""
     return replace(drive, images=KeptImages(drive.images))
+
+
+def readable_frames(drive: Drive) -> tuple[Drive, list[str]]:
+    """Leave out frames whose image cannot be read: a power cut leaves empty ones behind.
+
+    Returns:
+        The drive that is left, and a note on what was left out.
+
+    Raises:
+        DriveFormatError: If these are more than a few; says what is wrong with the first.
+    """
+    errors: dict[int, DriveFormatError] = {}
+    for k in range(len(drive)):
+        try:
+            drive.image(k)
+        except DriveFormatError as error:
+            errors[k] = error
+    if not errors:
+        return drive, []
+    first = next(iter(errors.values()))
+    if len(errors) > _UNREADABLE_SHARE * len(drive):
+        raise first
+    kept = np.setdiff1d(np.arange(len(drive)), list(errors))
+    return drive.subset(kept), [f"{len(errors)} images cannot be read and are left out, the first: {first}"]
+
+
+def _throttle_notes(commands: Commands) -> list[str]:
+    """Say what the sign of the throttle is taken for, where it is not the usual one."""
+    if commands.speed_cm_s is not None or commands.throttle is None:
+        return []
+    negative = float(np.mean(commands.throttle < 0.0))
+    if negative <= float(np.mean(commands.throttle > 0.0)):
+        return []
+    return [
+        f"the throttle is negative in {100.0 * negative:.0f} % of the frames: taken as driving forward; a "
+        "drive in reverse gives no good map"
+    ]
+
+
+def check_lens(drive: Drive) -> None:
+    """Refuse a full-circle fisheye where the camera is to be found: its lens is beyond the search.
+
+    Raises:
+        CalibrationError: Names the circle.
+    """
+    frames = np.unique(np.linspace(0, len(drive) - 1, _CHECKED).astype(int)).tolist()
+    radius_px = lens_circle_px(drive.image(k) for k in frames)
+    if radius_px is not None:
+        raise CalibrationError(
+            f"{drive.path}: the images show a circle with a radius of {radius_px:.0f} px in black, as a "
+            "fisheye of about 180 degrees does. Such a lens is not found from a drive: calibrate it with "
+            "photos of a chessboard (lanenet calibrate chessboard) and give it with --camera"
+        )
 
 
 def split_segments(drive: Drive) -> list[slice]:

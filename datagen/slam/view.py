@@ -76,12 +76,18 @@ def view_road(
     """
     limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
     table = RoadTable(camera, limits)
-    found = edges_of_drive(drive, settings.perception.edges, table)
+    found = [on_road(pixels, table) for pixels in edges_of_drive(drive, settings.perception.edges, table)]
     kept = list(found)
     for rows in [np.arange(len(found))] if keys is None else interleaved_rows(keys, len(found)):
         for k, pixels in zip(rows, without_reflections([found[k] for k in rows], camera, table), strict=True):
             kept[k] = pixels
     return RoadView(kept, table.keep, limits)
+
+
+def on_road(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
+    """Drop edges without a place on the road: at the rim of a lens, half a pixel further there is none."""
+    good = np.isfinite(table.lift_points(pixels)).all(axis=1)
+    return pixels if good.all() else EdgePixels(pixels.uv_px[good], pixels.normals[good])
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,15 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def cut_image(folder: Path) -> None:
-    image = folder / "drive" / "images" / "000035.jpg"
+def cut_image(folder: Path, number: int = 35) -> None:
+    image = folder / "drive" / "images" / f"{number:06d}.jpg"
     image.write_bytes(image.read_bytes()[:200])
+
+
+def cut_images(folder: Path) -> None:
+    """More than a drive is mapped without."""
+    for number in range(35, 45):
+        cut_image(folder, number)
 
 
 def nan_in_the_table(folder: Path) -> None:
@@ -80,7 +86,7 @@ BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, 
     "map: no drive": (None, ("map", "@nowhere", *MAP), ("nowhere",)),
     "detect: no drive": (None, ("detect", "@nowhere", *FILTER), ("nowhere",)),
     "map: an empty tub": (empty_tub, ("map", "@tub", *MAP), ("tub", "no ")),
-    "map: a corrupt image": (cut_image, ("map", "@drive", *MAP), ("000035.jpg",)),
+    "map: corrupt images": (cut_images, ("map", "@drive", *MAP), ("000035.jpg",)),
     "detect: a corrupt image": (
         cut_image,
         ("detect", "@drive", *FILTER, "--video", "@o.mp4"),
@@ -149,7 +155,9 @@ def test_a_bad_command_is_refused(folder: Path, what: str) -> None:
     prepare, words, named = BAD[what]
     if prepare is not None:
         prepare(folder)
-    line = refused(folder, *(word.replace("@", f"{folder}/") for word in words))
+    # The report of a drive that was refused.
+    words = tuple(word.replace("@", f"{folder}/") for word in words)
+    line = refused(folder, *words, writes="m" if words[0] == "map" else "")
     for text in named:
         assert text in line, line
 

@@ -30,6 +30,12 @@ _CAR_SHARE = 0.4
 _ENOUGH_FRAMES = 150
 
 
+#: Gray level that no pixel outside the image circle of a lens reaches, in any frame; side of the patches that
+#: are looked at there, and share of the inner half of the image that is brighter. Chosen: above the noise of
+#: black.
+_BLACK, _PATCH_SHARE, _BRIGHT_SHARE = 24, 0.05, 0.95
+
+
 @dataclass(frozen=True, eq=False)
 class StaticPart:
     """What never moves at the bottom of a drive's frames.
@@ -51,6 +57,30 @@ class StaticPart:
 def spread_frames(count: int) -> range:
     """Return which of a drive's ``count`` frames to look at."""
     return range(0, count, max(1, count // _ENOUGH_FRAMES))
+
+
+def lens_circle_px(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> float | None:
+    """Radius of the circle that a full-circle fisheye shows; None if the images are filled to both sides.
+
+    Args:
+        frames: Frames from all over a drive, all of one size.
+    """
+    brightest = None
+    for frame in frames:
+        # Blurred, so that the noise of single pixels does not count.
+        gray = cv2.blur(to_gray(frame), (3, 3))
+        brightest = gray if brightest is None else np.maximum(brightest, gray)
+    if brightest is None:
+        return None
+    height, width = brightest.shape
+    lit, patch = brightest > _BLACK, max(2, round(_PATCH_SHARE * width))
+    top, bottom, middle = slice(0, patch), slice(height - patch, height), (height - patch) // 2
+    left, right = slice(0, patch), slice(width - patch, width)
+    rows = (top, slice(middle, middle + patch), bottom)
+    if any(lit[row, column].any() for row in rows for column in (left, right)):
+        return None
+    inner = lit[height // 4 : -(height // 4), width // 4 : -(width // 4)]
+    return float(np.sqrt(lit.sum() / np.pi)) if inner.mean() > _BRIGHT_SHARE else None
 
 
 def find_static(frames: Iterable[UInt8[np.ndarray, "h w *c"]]) -> StaticPart:

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up_drive import made_up_drive
 
-from datagen.prepare import KeptImages, check_size, hide_bumper, split_segments
+from datagen.prepare import (
+    KeptImages,
+    MapRequest,
+    check_lens,
+    check_size,
+    hide_bumper,
+    prepare,
+    readable_frames,
+    split_segments,
+)
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.settings import GuessSettings
+from datagen.slam.view import mapping_range, on_road
 from lanenet.data.drives import open_drive
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
+from lanenet.perception.edges.pixels import EdgePixels
+from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 
 def test_an_uninterrupted_drive_is_one_segment():
@@ -91,3 +105,70 @@ def test_an_image_that_cannot_be_read_is_not_kept():
         with pytest.raises(DriveFormatError, match="row 9"):
             images.read(9)
     assert source.reads == [9, 9]
+
+
+class _Few:
+    """Images of one gray level, some of which cannot be read."""
+
+    def __init__(self, bad: set[int]) -> None:
+        self.bad = bad
+
+    def read(self, row: int) -> np.ndarray:
+        if row in self.bad:
+            raise DriveFormatError(f"{row}.jpg: the image file is empty")
+        return np.full((120, 160, 3), 90, np.uint8)
+
+
+def test_images_that_a_power_cut_left_empty_are_left_out_without_a_break():
+    drive = replace(made_up_drive(100, [50], first_frame=300), images=_Few({20, 99}))
+    kept, (note,) = readable_frames(drive)
+    assert np.setdiff1d(drive.frames, kept.frames).tolist() == [320, 399] and kept.breaks.sum() == 1
+    assert "2 images" in note and "frame 320" in note and "20.jpg" in note
+    whole = replace(drive, images=_Few(set()))
+    assert readable_frames(whole) == (whole, [])
+    with pytest.raises(DriveFormatError, match=r"frame 300: 0\.jpg"):
+        readable_frames(replace(drive, images=_Few(set(range(11)))))
+
+
+class _Lens:
+    """A textured floor as a fisheye shows it: black outside a circle."""
+
+    def __init__(self, radius_px: float) -> None:
+        v, u = np.mgrid[:120, :160]
+        self.outside = np.hypot(u - 79.5, v - 59.5) > radius_px
+
+    def read(self, row: int) -> np.ndarray:
+        rng = np.random.default_rng(row)
+        image = rng.integers(60, 200, (120, 160, 3), dtype=np.uint8)
+        image[self.outside] = rng.integers(0, 20, (int(self.outside.sum()), 3))
+        return image
+
+
+def test_a_full_circle_fisheye_is_named_and_dark_corners_are_not():
+    with pytest.raises(CalibrationError, match=r"radius of 5[567] px.*--camera"):
+        check_lens(replace(made_up_drive(60), images=_Lens(56.0)))
+    for radius_px in (82.0, 95.0, 200.0):
+        check_lens(replace(made_up_drive(60), images=_Lens(radius_px)))
+    # A dark room with a lamp.
+    check_lens(replace(made_up_drive(60), images=_Lens(20.0)))
+
+
+@pytest.mark.parametrize(("sign", "count"), [(1.0, 0), (-1.0, 1)])
+def test_a_throttle_that_is_negative_forward_is_named(tmp_path, sign, count):
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k in range(70):
+            image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            writer.add(image, 0.05 * k, throttle=sign * 0.3)
+    notes = prepare(MapRequest(tmp_path / "drive", 40.0), MapSettings(find_bumper=False)).notes
+    assert sum("100 %" in note for note in notes) == count
+
+
+def test_edges_at_the_rim_of_a_lens_have_no_place_on_the_road():
+    """Found in the last pixel that sees the road, and moved a little further: there is no road."""
+    camera = guessed_camera(160, 120, 38.0, 30.0, GuessSettings())
+    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
+    uv = np.array([[80.0, 100.0], [80.0, 2.0]])
+    normals = np.array([[0.0, 1.0], [0.0, 1.0]])
+    kept = on_road(EdgePixels(uv, normals), table)
+    np.testing.assert_array_equal(kept.uv_px, uv[:1])

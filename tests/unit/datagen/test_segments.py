@@ -61,6 +61,8 @@ def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monk
     monkeypatch.setattr(prepare, "following_frames", lambda drive: (drive, []))
     monkeypatch.setattr(prepare, "keep_images", lambda drive: drive)
     monkeypatch.setattr(prepare, "check_moving", lambda *_: None)
+    monkeypatch.setattr(prepare, "readable_frames", lambda drive: (drive, []))
+    monkeypatch.setattr(prepare, "check_lens", lambda *_: None)
     monkeypatch.setattr(drive_segments, "check_edges", lambda *_: None)
     monkeypatch.setattr(drive_segments, "find_camera", find)
     monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: _solved(len(part)))
