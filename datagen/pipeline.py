@@ -26,7 +26,7 @@ from lanenet.config import dump_settings
 from lanenet.data.files import atomic_folder, check_replaceable, write_text
 from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
 from lanenet.data.tables import write_tum
-from lanenet.errors import CalibrationError, LanenetError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.outputs import lock_output
 
 __all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive"]
@@ -64,9 +64,9 @@ def map_drive(
         attempt = Attempt(request, settings)
         try:
             return _map_drive(attempt, out, progress, pictures)
-        except CalibrationError as error:
+        except (CalibrationError, DriveFormatError) as error:
             page = _refused(attempt, error, out) if pictures else ""
-            raise CalibrationError(f"{error}{kept_map(out)}{page}") from error
+            raise type(error)(f"{error}{kept_map(out)}{page}") from error
         except TrackingLostError as error:
             where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
             page = _refused(attempt, error, out) if pictures else ""
@@ -77,6 +77,8 @@ def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
     """Write the report of a refusal, and say where it is: the end of a sentence."""
     try:
         return f"; see {report_refusal(attempt, error, out)}"
+    except DriveFormatError:  # there is nothing to show
+        return ""
     except LanenetError as failed:  # what was refused is worse
         return f"; its report could not be written ({failed})"
 

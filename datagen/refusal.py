@@ -127,11 +127,15 @@ def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
     request, lane = attempt.request, f"{attempt.request.lane_width_cm:g} cm"
     rows: list[Row] = [("stage", "result"), ("given", f"{request.drive_path}, lane width {lane}")]
     if attempt.prepared is None:
-        return [*rows, ("read the recording", f"{len(drive)} frames"), ("find segments to map", "refused")]
+        return [
+            *rows,
+            ("read the recording", f"{len(drive)} frames"),
+            ("check it and find its segments", "refused"),
+        ]
     segments = attempt.prepared.segments
     longest = max(part.stop - part.start for part in segments)
     found = f"{len(drive)} frames in {len(segments)} segment(s), the longest of {longest}"
-    rows.append(("find segments to map", found))
+    rows.append(("check it and find its segments", found))
     if attempt.camera is None:
         return [*rows, ("find the camera", "refused")]
     camera, m = attempt.camera.camera, attempt.camera.camera.mounting

@@ -129,6 +129,20 @@ def test_the_report_of_a_refusal_makes_room_for_the_next_and_for_a_map(tmp_path)
         check_replaceable(tmp_path / "map", "drive")
 
 
+def test_a_recording_of_damaged_images_has_a_report_and_none_at_all_has_none(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
+    drive, out = written(tmp_path / "drive", frames), tmp_path / "map"
+    for k in (3, 7, 11):
+        (drive / "images" / f"{k:06d}.jpg").write_bytes(b"")
+    with pytest.raises(DriveFormatError, match=rf"000003\.jpg.*{out / 'report.html'}"):
+        map_drive(MapRequest(drive, 40.0), SETTINGS, out)
+    assert "000003.jpg" in (out / "report.html").read_text(encoding="utf-8")
+    with pytest.raises(DriveFormatError, match="nowhere"):
+        map_drive(MapRequest(tmp_path / "nowhere", 40.0), SETTINGS, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
 def test_where_no_map_can_be_written_none_is_made(tmp_path):
     """Said before the drive is opened."""
     foreign = tmp_path / "notes"
