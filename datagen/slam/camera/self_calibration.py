@@ -261,13 +261,12 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
     turned, length = turning_rad(solved.poses), solved.path_cm[-1] / found.camera.mounting.height_cm
     driven = f"{len(solved.poses)} frames, {length:.0f} camera heights long"
     problem = None
-    # A given height determines the focal length as a loop does.
-    if turned < MIN_TURNING_RAD and not found.height_given:
+    if turned < MIN_TURNING_RAD:
         problem = (
             f"too straight: {driven}, its heading stays within {np.rad2deg(turned):.0f} degrees, expected "
             f"{np.rad2deg(MIN_TURNING_RAD):.0f}"
         )
-    elif len(solved.revisits) < MIN_REVISITS and not found.height_given:
+    elif len(solved.revisits) < MIN_REVISITS:
         problem = (
             f"{len(solved.revisits) or 'no'} places were seen twice, expected {MIN_REVISITS}: {driven}, with "
             f"bends of {np.rad2deg(turned):.0f} degrees"
