@@ -325,6 +325,109 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
+def _compare(state, edges, turns, frames, moved, moved_by, q, view, by, jac):
+    """Compare a point of frame i with an edge of frame j.
+
+    Args:
+        state: See :class:`datagen.slam.adjustment.state.BundleState`.
+        edges: Edges of all frames.
+        turns: Cosines and sines of both headings, of i and then of j.
+        frames: i and j.
+        moved: Road point in frame i.
+        moved_by: Its Jacobian by the camera parameters.
+        q: The edge.
+        view: Of frame j.
+        by: Buffer, see :func:`project_with_jacobian`.
+        jac: Filled: Jacobian of the residual by frame i, frame j and the camera.
+
+    Returns:
+        Distance of the moved point from the edge, along the edge's gradient.
+    """
+    poses = state.poses
+    ci, si, cj, sj = turns
+    i, j = frames
+    a, b = moved[0], moved[1]
+    dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
+    dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
+    forward, left = cj * dx + sj * dy, cj * dy - sj * dx
+    u, v = project_with_jacobian(state.fisheye, state.lens, view, forward, left, by)
+    nu, nv = edges.normals[q, 0], edges.normals[q, 1]
+    g_f, g_l = nu * by[0, 0] + nv * by[1, 0], nu * by[0, 1] + nv * by[1, 1]
+    # By the point in the map, and by the point in frame i.
+    g_x, g_y = g_f * cj - g_l * sj, g_f * sj + g_l * cj
+    g_a, g_b = g_x * ci + g_y * si, g_y * ci - g_x * si
+    jac[0], jac[1] = g_x, g_y
+    jac[2] = g_x * (-si * a - ci * b) + g_y * (ci * a - si * b)
+    jac[5], jac[6] = -g_x, -g_y
+    jac[7] = g_f * left - g_l * forward
+    for c in range(N_CAMERA):
+        direct = nu * by[0, 2 + c] + nv * by[1, 2 + c]
+        through = g_a * moved_by[c, 0] + g_b * moved_by[c, 1]
+        jac[2 * N_FRAME + c] = direct + through
+        if c == _PITCH:
+            jac[3], jac[8] = through, direct
+        elif c == _ROLL:
+            jac[4], jac[9] = through, direct
+    return (u - edges.uv[q, 0]) * nu + (v - edges.uv[q, 1]) * nv
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
+def sum_scores(
+    state,
+    pairs,
+    edges,
+    lifted,
+    lifted_by,
+    links,
+    point_weight,
+    cauchy_px,
+    through_frames,
+    errors_px,
+    groups,
+    sums,
+):
+    """Add up the scores of the camera, J^T w e with the frames eliminated, over groups of links.
+
+    Args:
+        state: See :class:`datagen.slam.adjustment.state.BundleState`.
+        pairs: Pairs of frames, i and j.
+        edges: Edges of all frames.
+        lifted: Road point of each compared pixel.
+        lifted_by: Its Jacobian by the camera parameters.
+        links: Which point meets which edge.
+        point_weight: Inverse variance of each compared pixel.
+        cauchy_px: Scale of the loss, see :func:`accumulate`.
+        through_frames: Change of each frame's numbers with each of the camera's, ``N_FRAME`` rows per frame.
+        errors_px: e of each link; w is that of its residual.
+        groups: Group of each link.
+        sums: Added to, a row per group.
+    """
+    poses, tilt = state.poses, state.tilt
+    starts = np.searchsorted(links.pair, np.arange(pairs.shape[0] + 1))
+    view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
+    jac = np.empty(2 * N_FRAME + N_CAMERA)
+    for k in range(pairs.shape[0]):
+        i, j = pairs[k, 0], pairs[k, 1]
+        set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
+        turns = np.cos(poses[i, 2]), np.sin(poses[i, 2]), np.cos(poses[j, 2]), np.sin(poses[j, 2])
+        for r in range(starts[k], starts[k + 1]):
+            p, sigma = links.point[r], links.sigma[r]
+            e = _compare(state, edges, turns, (i, j), lifted[p], lifted_by[p], links.edge[r], view, by, jac)
+            if not np.isfinite(e):
+                continue
+            s = e / (sigma * cauchy_px)
+            scaled = errors_px[r] * point_weight[p] / ((1.0 + s * s) * sigma * sigma)
+            for c in range(N_CAMERA):
+                total = jac[2 * N_FRAME + c]
+                for m in range(N_FRAME):
+                    total += jac[m] * through_frames[N_FRAME * i + m, c]
+                    total += jac[N_FRAME + m] * through_frames[N_FRAME * j + m, c]
+                sums[groups[r], c] += scaled * total
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
 def accumulate(
     state, pairs, edges, lifted, lifted_by, links, point_weight, cauchy_px, blocks, descents, residual
 ):
@@ -350,7 +453,7 @@ def accumulate(
     Returns:
         Robust cost.
     """
-    poses, tilt, edge_uv, edge_normals = state.poses, state.tilt, edges.uv, edges.normals
+    poses, tilt = state.poses, state.tilt
     starts = np.searchsorted(links.pair, np.arange(pairs.shape[0] + 1))
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
@@ -359,17 +462,10 @@ def accumulate(
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
-        ci, si = np.cos(poses[i, 2]), np.sin(poses[i, 2])
-        cj, sj = np.cos(poses[j, 2]), np.sin(poses[j, 2])
+        turns = np.cos(poses[i, 2]), np.sin(poses[i, 2]), np.cos(poses[j, 2]), np.sin(poses[j, 2])
         for r in range(starts[k], starts[k + 1]):
-            p, q, sigma = links.point[r], links.edge[r], links.sigma[r]
-            a, b = lifted[p, 0], lifted[p, 1]
-            dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
-            dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
-            forward, left = cj * dx + sj * dy, cj * dy - sj * dx
-            u, v = project_with_jacobian(state.fisheye, state.lens, view, forward, left, by)
-            nu, nv = edge_normals[q, 0], edge_normals[q, 1]
-            e = (u - edge_uv[q, 0]) * nu + (v - edge_uv[q, 1]) * nv
+            p, sigma = links.point[r], links.sigma[r]
+            e = _compare(state, edges, turns, (i, j), lifted[p], lifted_by[p], links.edge[r], view, by, jac)
             if not np.isfinite(e):
                 residual[r] = np.nan
                 continue
@@ -377,22 +473,6 @@ def accumulate(
             s = e / (sigma * cauchy_px)
             cost += 0.5 * point_weight[p] * cauchy_px * cauchy_px * np.log1p(s * s)
             w = point_weight[p] / ((1.0 + s * s) * sigma * sigma)
-            g_f, g_l = nu * by[0, 0] + nv * by[1, 0], nu * by[0, 1] + nv * by[1, 1]
-            # By the point in the map, and by the point in frame i.
-            g_x, g_y = g_f * cj - g_l * sj, g_f * sj + g_l * cj
-            g_a, g_b = g_x * ci + g_y * si, g_y * ci - g_x * si
-            jac[0], jac[1] = g_x, g_y
-            jac[2] = g_x * (-si * a - ci * b) + g_y * (ci * a - si * b)
-            jac[5], jac[6] = -g_x, -g_y
-            jac[7] = g_f * left - g_l * forward
-            for c in range(N_CAMERA):
-                direct = nu * by[0, 2 + c] + nv * by[1, 2 + c]
-                through = g_a * lifted_by[p, c, 0] + g_b * lifted_by[p, c, 1]
-                jac[2 * N_FRAME + c] = direct + through
-                if c == _PITCH:
-                    jac[3], jac[8] = through, direct
-                elif c == _ROLL:
-                    jac[4], jac[9] = through, direct
             for row in range(n):
                 wj = w * jac[row]
                 descents[k, row] -= wj * e

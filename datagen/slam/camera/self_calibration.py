@@ -56,9 +56,6 @@ _CLOSE_START = 0.03
 #: Focal lengths of restarts, relative to the first start, where no loop was closed: once with the pitch that
 #: was found, and once longer by about what the search may be off.
 _RESTARTS = (1.0, 1.2)
-#: Factor on the adjustment's own sigmas, measured on simulated drives with known cameras
-#: (docs/calibration.md): edge points of one line share their errors, so that they count for fewer.
-SIGMA_FACTOR = 2.0
 
 
 def refining(settings: BundleSettings) -> BundleSettings:
@@ -232,7 +229,7 @@ def honest_sigma(
     centre = priors.centre_px * width / _REFERENCE_WIDTH
     prior = {"focal": priors.focal, "cx": centre, "cy": centre, "k1": priors.k1}
     return {
-        name: prior[name] if name in _LENS and not closed else SIGMA_FACTOR * max(1.0, strain) * sigma[name]
+        name: prior[name] if name in _LENS and not closed else max(1.0, strain) * sigma[name]
         for name in CAMERA_NAMES
     }
 

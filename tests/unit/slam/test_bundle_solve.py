@@ -58,4 +58,6 @@ def test_a_step_and_the_uncertainty_are_those_of_the_full_system(free, damping):
     damped = full + damping * np.diag(np.diag(full))
     np.testing.assert_allclose(now.step(damping), np.linalg.solve(damped, rhs), rtol=1e-8, atol=1e-10)
     sigma = np.sqrt(np.diag(np.linalg.inv(full))[size:])
-    np.testing.assert_allclose(now.camera_sigma(), sigma, rtol=1e-8)
+    information, follow = now.without_frames()
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(information))), sigma, rtol=1e-8)
+    np.testing.assert_allclose(follow, -np.linalg.solve(frames.toarray(), border), rtol=1e-7, atol=1e-12)
