@@ -16,6 +16,7 @@ from datagen.quality.figures import (
     steering_correlation,
 )
 from datagen.quality.measure import MapQuality, measure_map, quality_figures
+from datagen.quality.places import withheld_figures, withhold_wrong_places
 from datagen.quality.residuals import REFERENCE_WIDTH, contradicted_lines, summarise
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
@@ -67,10 +68,12 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures = map_figures(drive_map, segments, drive.frames, assembled.factor)
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
-    drive_map = replace(drive_map, contradicted=contradicted_lines(mapped))
-    quality = measure_map(replace(mapped, drive_map=drive_map))
+    drive_map, wrong = withhold_wrong_places(mapped)
+    drive_map = replace(drive_map, contradicted=contradicted_lines(replace(mapped, drive_map=drive_map)))
+    mapped = replace(mapped, drive_map=drive_map)
+    quality = replace(measure_map(mapped), wrong=tuple(wrong))
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
-    figures |= quality_figures(quality, drive.width)
+    figures |= quality_figures(quality, drive.width) | {"withheld": withheld_figures(drive_map, wrong)}
     figures["steering_correlation"] = steering_correlation(mapped)
     request = prepared.request
     figures["given"] = {

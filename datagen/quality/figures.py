@@ -190,6 +190,8 @@ def map_evidence(
         labelled_share=figures["labelled"]["share"],
         point_shares=figures["labelled"]["points_in_window"],
         contradicted_share=contradicted_share(drive_map.contradicted, known_lines(drive_map), deleted),
+        withheld=tuple(withheld_text(place) for place in figures["withheld"]["places"]),
+        withheld_share=figures["withheld"]["share"],
         not_labelled=figures["labelled"]["why_not"],
         revisits=revisits,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm
@@ -211,6 +213,13 @@ def map_evidence(
         given_tape_cm=figures["given"]["tape_width_cm"],
         steering=figures["steering_correlation"],
     )
+
+
+def withheld_text(place: dict[str, Any]) -> str:
+    """Say which section of a line is withheld; ``place`` as in the report's figures."""
+    length_cm = place["to_cm"] - place["from_cm"]
+    length = f"{0.01 * length_cm:.1f} m" if length_cm >= 100.0 else f"{length_cm:.0f} cm"
+    return f"{length} of the {place['line']} near frame {place['frames'][0]}"
 
 
 def map_notes(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from datagen.quality.places import WrongPlace
 from datagen.quality.residuals import (
     BANDS_CM,
     GATE_PX,
@@ -56,6 +57,7 @@ class MapQuality:
         status: Per frame of the drive: labelled, or the reason why not.
         points_cm: Six labels per frame of the map.
         in_window: Which points a complete map would label; none for frames that are not to be labelled.
+        wrong: Sections of the lines that are withheld, the longest first.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -64,6 +66,7 @@ class MapQuality:
     status: list[str]
     points_cm: Float[np.ndarray, "n 6"]
     in_window: Bool[np.ndarray, "n 6"]
+    wrong: tuple[WrongPlace, ...] = ()
 
     @property
     def near(self) -> BorderSamples:

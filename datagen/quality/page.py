@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from datagen.quality.layout import Row, bullets, jpeg, note, page_of, plot, section, table
 from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
-from datagen.quality.pictures import contact_sheets
+from datagen.quality.pictures import contact_sheets, withheld_sheet
 from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
 from datagen.quality.verdict import Verdict, VerdictSettings
 from datagen.slam.commands import SteeringFit, commands_of, delayed
@@ -30,6 +30,8 @@ from lanenet.geometry.lane import POINT_NAMES, SIDES
 _COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
 #: Distance bins of the residuals. Chosen: three per label row.
 _BIN_CM = 5.0
+#: Frames that are named for each section that is withheld.
+_FRAMES_NAMED = 6
 
 
 def report_page(
@@ -77,11 +79,15 @@ def report_page(
             f"<h3>{title.capitalize()} held-out frames</h3>{jpeg(sheet)}"
             for title, sheet in contact_sheets(mapped, quality).items()
         ),
+        *withheld_section(mapped, quality, figures["withheld"]["places"]),
         section("Labels"),
         table(share_rows(figures["labelled"])),
         plot(frames_plot, quality, drive, drive_map, drive.width),
         section("Map"),
-        note("Edge points (hue: time), driven path (white), left line (green), right line (magenta)."),
+        note(
+            "Edge points (hue: time), driven path (white), left line (green), right line (magenta); red: "
+            "withheld."
+        ),
         jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
         section("Path and loops"),
         table(loop_rows(figures["segments_mapped"])),
@@ -124,6 +130,27 @@ def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
         coverage = _number(100.0 * figures["coverage"], 0)
         rows.append((name, str(figures["samples"]), coverage, *values))
     return rows
+
+
+def withheld_section(mapped: MappedDrive, quality: MapQuality, places: list[dict[str, Any]]) -> list[str]:
+    """The worst places: sections of the lines that the images contradict, and frames that show them."""
+    sheet = withheld_sheet(mapped, quality.wrong)
+    if sheet is None:
+        return []
+    rows: list[Row] = [("line", "along the path, cm", "border seen, cm to the right", "frames")]
+    for place in places:
+        frames = ", ".join(str(frame) for frame in place["frames"][:_FRAMES_NAMED])
+        span = f"{place['from_cm']:.0f} to {place['to_cm']:.0f}"
+        rows.append((place["line"], span, _number(place["beside_cm"], 0), frames))
+    return [
+        section("Withheld"),
+        note(
+            "Along these sections most frames do not see the line where the map has it, but a border beside "
+            "it, or none. No frame gets labels of a line there."
+        ),
+        table(rows),
+        jpeg(sheet),
+    ]
 
 
 def share_rows(labelled: dict[str, Any]) -> list[Row]:

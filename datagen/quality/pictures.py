@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.quality.measure import MapQuality
+from datagen.quality.places import WrongPlace
 from datagen.quality.residuals import REFERENCE_WIDTH
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.frame_lines import FrameLines
@@ -20,6 +22,7 @@ from lanenet.geometry.lane import ROWS_CM
 
 #: Colours, BGR.
 _LEFT, _RIGHT, _ADJACENT, _POINT = (80, 220, 80), (220, 80, 220), (200, 200, 80), (60, 60, 255)
+_WITHHELD = (40, 40, 255)
 #: Least width of an enlarged frame, and width of a frame on the report's sheets with the height of its title,
 #: [px]. Chosen: four frames side by side fit a page.
 _TILE_WIDTH = 400
@@ -37,6 +40,8 @@ def draw_map(
 ) -> None:
     """Draw edge points (hue: time), driven path (white), lane lines (green left, magenta right) and a scale.
 
+    Sections that the images contradict are red.
+
     Args:
         path: PNG to write.
         drive_map: The map.
@@ -50,9 +55,12 @@ def draw_map(
         for line in lines:
             end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
             colour = _ADJACENT if line.rank else _LEFT if line.side == "left" else _RIGHT
-            lanes.append((line.points(np.arange(s.min(), end, 2.0)), colour))
+            at_cm = np.arange(s.min(), end, 2.0)
+            points, withheld = line.points(at_cm), line.contradicted(at_cm)
+            lanes.append((points, colour, 1))
+            lanes.append((np.where(withheld[:, None], points, np.nan), _WITHHELD, 5))
     # A line of an adjacent lane may lie beyond all edge points that are drawn.
-    known = [points[np.isfinite(points[:, 0])] for points, _ in lanes]
+    known = [points[np.isfinite(points[:, 0])] for points, _, _ in lanes]
     xy = np.concatenate([*clouds, *known, drive_map.poses[:, :2]])
     low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
     scale = size_px / float((high - low).max())
@@ -69,8 +77,8 @@ def draw_map(
     for cloud, colour in zip(clouds, hues[0], strict=True):
         at = pixels(cloud)
         image[at[:, 1], at[:, 0]] = colour
-    for points, colour in lanes:
-        _polyline(image, pixels, points, colour)
+    for points, colour, thickness in lanes:
+        _polyline(image, pixels, points, colour, thickness)
     for driven in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
         _polyline(image, pixels, driven, (255, 255, 255))
     draw_metre(image, scale)
@@ -84,11 +92,13 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
     cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
 
 
-def _polyline(image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour) -> None:  # type: ignore[no-untyped-def]
+def _polyline(  # type: ignore[no-untyped-def]
+    image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour, thickness: int = 1
+) -> None:
     for run in true_runs(np.isfinite(points[:, 0])):
         if len(run) > 1:
             at = pixels(points[run]).astype(np.int32)
-            cv2.polylines(image, [at], False, colour, 1, cv2.LINE_AA)
+            cv2.polylines(image, [at], False, colour, thickness, cv2.LINE_AA)
 
 
 def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"]) -> None:
@@ -107,9 +117,13 @@ def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, 
 
 
 def draw_lines(
-    image: UInt8[np.ndarray, "h w 3"], lines: FrameLines, camera: Camera, text: str
+    image: UInt8[np.ndarray, "h w 3"],
+    lines: FrameLines,
+    camera: Camera,
+    text: str,
+    withheld: FrameLines | None = None,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Enlarge a frame and draw its lane with a text in the corner."""
+    """Enlarge a frame and draw its lane with a text in the corner; what is withheld of it is red."""
     zoom = max(1, round(_TILE_WIDTH / camera.width))
     big = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
 
@@ -117,7 +131,8 @@ def draw_lines(
         # Pixel centres are at integers; enlarging moves them by (zoom - 1) / 2.
         return camera.project_ground(points_cm) * zoom + 0.5 * (zoom - 1)
 
-    for line, colour in ((lines.left_cm, _LEFT), (lines.right_cm, _RIGHT)):
+    drawn = [] if withheld is None else [(withheld.left_cm, _WITHHELD), (withheld.right_cm, _WITHHELD)]
+    for line, colour in [*drawn, (lines.left_cm, _LEFT), (lines.right_cm, _RIGHT)]:
         at = pixels(line)
         # A fisheye projects points far behind the bumper, too; these are not drawn.
         inside = (
@@ -164,6 +179,35 @@ def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> dict[str, UInt8[
     return {title: _sheet(mapped, quality, medians, rows) for title, rows in picks.items()}
 
 
+def withheld_sheet(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> UInt8[np.ndarray, "_ _ 3"] | None:
+    """Draw frames that show the longest sections that are withheld, in red; None where there is none."""
+    if not wrong:
+        return None
+    drive_map = mapped.drive_map
+    as_mapped = replace(
+        drive_map,
+        lines={
+            segment: [replace(line, contradicted_cm=np.empty((0, 2))) for line in lines]
+            for segment, lines in drive_map.lines.items()
+        },
+    )
+    tiles = []
+    for place in wrong[:_TILES]:
+        k = place.frames[0]
+        image, camera = mapped.drive.image(int(mapped.rows[k])), drive_map.camera_at(k)
+        tile = draw_lines(image, lines_at(drive_map, k), camera, "", lines_at(as_mapped, k))
+        tiles.append(_titled(tile, f"frame {drive_map.frames[k]}: {place.name}"))
+    return tiled(tiles, background=255)
+
+
+def _titled(tile: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h2 w2 3"]:
+    height = round(tile.shape[0] * _SHEET_TILE_WIDTH / tile.shape[1])
+    title = np.full((_TITLE_HEIGHT, _SHEET_TILE_WIDTH, 3), 255, np.uint8)
+    cv2.putText(title, text, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    small = cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(np.vstack([title, small]), dtype=np.uint8)
+
+
 def _sheet(
     mapped: MappedDrive, quality: MapQuality, medians: np.ndarray, picks: np.ndarray
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -177,12 +221,7 @@ def _sheet(
         )
         image = mapped.drive.image(int(mapped.rows[k]))
         tile = draw_lines(image, lines_at(drive_map, k), drive_map.camera_at(k), "")
-        height = round(tile.shape[0] * _SHEET_TILE_WIDTH / tile.shape[1])
-        title = np.full((_TITLE_HEIGHT, _SHEET_TILE_WIDTH, 3), 255, np.uint8)
-        cv2.putText(title, text, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-        tiles.append(
-            np.vstack([title, cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)])
-        )
+        tiles.append(_titled(tile, text))
     return tiled(tiles, background=255)
 
 

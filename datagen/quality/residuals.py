@@ -119,7 +119,7 @@ def border_samples(
             # ``across`` points to the right; the left border lies on its negative side.
             place = at + border * marking_cm * across
             uv, gradient = _in_image(place, -np.sign(border) * across, camera)
-            seen = _in_view(uv, gradient, keep)
+            seen = in_view(uv, gradient, keep)
             gate_px = GATE_PX * (camera.width / REFERENCE_WIDTH)
             residual = _nearest(edges.uv_px, edges.normals, uv[seen], gradient[seen], gate_px)
             parts.append(BorderSamples(np.full(int(seen.sum()), SIDES[i] == "right"), at[seen, 1], residual))
@@ -159,9 +159,10 @@ def _in_image(
     return uv, normal
 
 
-def _in_view(
+def in_view(
     uv: Float[np.ndarray, "m 2"], gradient: Float[np.ndarray, "m 2"], keep: UInt8[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "m"]:
+    """Return which points lie in the image where it shows road; those with NaN in either argument do not."""
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(gradient).all(axis=1)
     nearest = np.rint(np.where(finite[:, None], uv, -1.0)).clip(-1, 1e6).astype(np.intp)
     height, width = keep.shape

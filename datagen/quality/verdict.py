@@ -55,6 +55,8 @@ class MapEvidence:
         given_tape_cm: Width of the tape that the user gave; None if none was given.
         steering: Correlation of the path's curvature with the steering command, both positive to the left;
             None where it is too weak to tell, or nothing was commanded.
+        withheld: Sections of the lines that are withheld because the images contradict them, in words.
+        withheld_share: Share of the lines' length in these sections.
     """
 
     lines: dict[str, LineEvidence]
@@ -76,6 +78,8 @@ class MapEvidence:
     given_height_cm: float | None = None
     given_tape_cm: float | None = None
     steering: float | None = None
+    withheld: tuple[str, ...] = ()
+    withheld_share: float = 0.0
 
 
 Grade = Literal["good", "usable", "reject"]
@@ -102,6 +106,8 @@ class VerdictSettings(Settings):
             a map may be right, but the frames do not show it. Chosen: short dashes leave a third.
         max_contradicted: Share of the frames' lines that the images contradict. Derived: half of the frames
             that may have no labels; a map that is wrong in many places is not trusted elsewhere.
+        max_withheld: Share of the lines' length that is withheld because the images contradict it there.
+            Chosen: a bend of a lap; the labels of the rest are as good.
         max_focal_sigma: Relative sigma of the focal length, if it was found from the drive. Chosen.
         max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1 degree.
         max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
@@ -127,6 +133,7 @@ class VerdictSettings(Settings):
     min_labelled: float = Field(default=0.85, gt=0.0, lt=1.0)
     min_coverage: float = Field(default=0.3, gt=0.0, lt=1.0)
     max_contradicted: float = Field(default=0.075, gt=0.0, lt=1.0)
+    max_withheld: float = Field(default=0.15, gt=0.0, lt=1.0)
     max_focal_sigma: float = Field(default=0.05, gt=0.0)
     max_pitch_sigma_rad: float = Field(default=0.02, gt=0.0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)
@@ -187,21 +194,35 @@ _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
-    checks = (_residuals, _labelled, _contradicted, _camera, _lane_width, _scale)
+    checks = (_residuals, _labelled, _contradicted, _withheld, _camera, _lane_width, _scale)
     found = [finding for check in checks for finding in check(evidence, settings)]
     # The worst first.
     found.sort(key=lambda finding: -_ORDER.index(finding.grade))
     remarks = tuple(_remarks(evidence))
+    withheld = _withheld_text(evidence.withheld)
     if found:
         worst = found[0]
         more = f" ({len(found) - 1} more below)" if len(found) > 1 else ""
         sentence = f"{worst.cause}{more}: {worst.remedy}"
-        return Verdict(worst.grade, sentence, tuple(finding.figures for finding in found), remarks)
+        figures = [finding.figures for finding in found]
+        return Verdict(worst.grade, sentence, tuple(figures + [withheld] if withheld else figures), remarks)
     sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
     labelled = f"{_percent(evidence.labelled_share)} of the frames have labels"
     sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is"
-    figures = f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; {labelled}"
-    return Verdict("good", sentence, (figures,), remarks)
+    if withheld:
+        # A map with a wrong section is good only without that section.
+        sentence = f"labels good; {withheld}; elsewhere {sentence}"
+    measured = f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; {labelled}"
+    return Verdict("good", sentence, (measured,), remarks)
+
+
+def _withheld_text(withheld: tuple[str, ...]) -> str:
+    """Name the longest section that is withheld; empty if there is none."""
+    if not withheld:
+        return ""
+    more = len(withheld) - 1
+    rest = f", and {more} more section{'s' if more > 1 else ''}" if more else ""
+    return f"{withheld[0]}{rest} withheld, where the images disagree with the map"
 
 
 def _remarks(e: MapEvidence) -> Iterator[str]:
@@ -349,6 +370,18 @@ def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
             f"look at the worst frames of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
             f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map, "
             f"expected {bound} at most, rejected above {most} (max_contradicted)",
+        )
+
+
+def _withheld(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    grade = _bounded(e.withheld_share, s.max_withheld, s)
+    if grade != "good":
+        yield Finding(
+            grade,
+            "in many places the images disagree with the map",
+            f"look at the withheld places of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
+            f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, "
+            f"{_at_most('max_withheld', s.max_withheld, s)}",
         )
 
 

@@ -96,7 +96,7 @@ def scans_of(
     frames = []
     for k, pixels in enumerate(edges):
         kept = seen_edges(pixels, table)
-        frames.append(table.lift(kept) if tilt_rad is None else _lift_tilted(kept, camera, tilt_rad[k]))
+        frames.append(table.lift(kept) if tilt_rad is None else lift_tilted(kept, camera, tilt_rad[k]))
     return pack_scans(frames, camera.mounting.height_cm)
 
 
@@ -107,7 +107,7 @@ def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
     return EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
 
 
-def _lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
+def lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
     """Lift with the camera as it was tilted in this frame."""
     m = camera.mounting
     tilted = camera.with_mounting(

@@ -27,7 +27,8 @@ from lanenet.outputs import restore_output
 from lanenet.reading import FolderFiles, parsing, read_json
 
 FORMAT = "lanenet-map/1"
-_LANES_FORMAT = "lanenet-lanes/2"
+#: The second format had no sections that the images contradict.
+_LANES_FORMAT, _OLDER_LANES_FORMAT = "lanenet-lanes/3", "lanenet-lanes/2"
 _EDGES_FORMAT = "lanenet-edges/2"
 _REPORT_FORMAT = "lanenet-map-report/1"
 #: The resolved settings of the mapping, in the map's folder.
@@ -170,6 +171,7 @@ def write_map(
             "bare_share": line.unpainted,
             "sigma_s_cm": line.sigma_s_cm,
             "sigma_at_cm": line.sigma_at_cm,
+            "contradicted_cm": line.contradicted_cm,
         }
         for segment, pair in m.lines.items()
         for line in pair
@@ -279,10 +281,12 @@ def kept_map(out: Path) -> str:
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     plain = read_json(path, MapFormatError)
     with parsing(f"{path}: lane lines cannot be read", MapFormatError):
-        if plain["format"] != _LANES_FORMAT:
+        if plain["format"] not in (_LANES_FORMAT, _OLDER_LANES_FORMAT):
             raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {_LANES_FORMAT!r}")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
+            if plain["format"] == _OLDER_LANES_FORMAT:
+                item["contradicted_cm"] = []
             lines.setdefault(int(item["segment"]), []).append(_line(item))
     for segment in sorted(segments):
         found = sorted(line.index for line in lines.get(segment, []))
@@ -313,24 +317,26 @@ def _check_sides(path: Path, segment: int, lines: list[LaneLine]) -> None:
 
 
 def _line(item: dict[str, Any]) -> LaneLine:
-    knots, coefficients, supported, sigma_s, sigma_at = (
+    knots, coefficients, supported, contradicted, sigma_s, sigma_at = (
         np.array(item[f"{name}_cm"], dtype=np.float64)
-        for name in ("knots", "coefficients", "supported", "sigma_s", "sigma_at")
+        for name in ("knots", "coefficients", "supported", "contradicted", "sigma_s", "sigma_at")
     )
     if item["side"] not in ("left", "right"):
         raise ValueError(f"side is {item['side']!r}")
     if knots.ndim != 1 or len(knots) < 8 or coefficients.shape != (len(knots) - 4, 2):
         raise ValueError(f"{len(knots)} knots with coefficients of shape {coefficients.shape}")
-    supported = supported.reshape(-1, 2)
+    supported, contradicted = supported.reshape(-1, 2), contradicted.reshape(-1, 2)
     if not all(
-        (np.abs(values) <= MAX_PLACE).all() for values in (knots, coefficients, supported, sigma_s, sigma_at)
+        (np.abs(values) <= MAX_PLACE).all()
+        for values in (knots, coefficients, supported, contradicted, sigma_s, sigma_at)
     ):
         raise ValueError(f"all numbers must be finite and at most {MAX_PLACE:g}")
     # The three at either end may be equal: there the line begins and ends.
     if not ((np.diff(knots) >= 0.0).all() and (np.diff(knots[3:-3]) > 0.0).all()):
         raise ValueError("knots_cm must increase")
-    if not (supported[:, 1] >= supported[:, 0]).all():
-        raise ValueError("supported_cm must hold sections (from, to)")
+    for name, sections in (("supported_cm", supported), ("contradicted_cm", contradicted)):
+        if not (sections[:, 1] >= sections[:, 0]).all():
+            raise ValueError(f"{name} must hold sections (from, to)")
     rank, period = item["rank"], item["period_cm"]
     if type(rank) is not int or not 0 <= rank <= _MAX_RANK:
         raise ValueError(f"rank is {rank!r}, expected 0 to {_MAX_RANK}")
@@ -363,4 +369,5 @@ def _line(item: dict[str, Any]) -> LaneLine:
         sigma_at_cm=sigma_at,
         marking_cm=marking,
         unpainted=unpainted,
+        contradicted_cm=contradicted,
     )

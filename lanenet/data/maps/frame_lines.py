@@ -78,7 +78,7 @@ def lines_of_frame(
         wheelbase_cm: Distance between the axles.
         lane: Index of the line on the left of the lane, seen in the path's direction; 0 is the driven lane.
         forward: Whether the car drives in the path's direction; if not, left and right swap.
-        max_sigma_cm: A line is masked where its sigma exceeds this.
+        max_sigma_cm: A line is masked where its sigma exceeds this, and where the images contradict it.
     """
     along = np.arange(-_BEHIND_CM, wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
     s = s_cm + (along if forward else -along)
@@ -125,11 +125,11 @@ def _polyline(
     wheelbase_cm: float,
     max_sigma_cm: float,
 ) -> Float[np.ndarray, "m 2"]:
-    """Express a line in the car frame; NaN where it is unsupported or uncertain."""
+    """Express a line in the car frame; NaN where it is unsupported, uncertain or contradicted."""
     if line is None:
         return np.full((len(s_cm), 2), np.nan)
     polyline = car_from_map(line.points(s_cm), pose, wheelbase_cm)
-    polyline[line.sigma_cm(s_cm) > max_sigma_cm] = np.nan
+    polyline[(line.sigma_cm(s_cm) > max_sigma_cm) | line.contradicted(s_cm)] = np.nan
     return polyline
 
 

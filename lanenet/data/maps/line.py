@@ -20,6 +20,10 @@ def _none() -> Float[np.ndarray, "0"]:
     return np.empty(0)
 
 
+def _no_sections() -> Float[np.ndarray, "0 2"]:
+    return np.empty((0, 2))
+
+
 @dataclass(frozen=True)
 class LaneLine:
     """One lane line: cubic B-splines x(s), y(s) over the position s along the path.
@@ -37,6 +41,8 @@ class LaneLine:
         sigma_at_cm: Sigma of the line's position across the path there.
         marking_cm: Measured width of the marking; NaN if unknown.
         unpainted: Share of the line without paint, as near frames see it; NaN if unknown.
+        contradicted_cm: Sections (from, to) of s that the images contradict, see
+            :mod:`datagen.quality.places`; as for support, one across the seam ends beyond the period.
     """
 
     side: Side
@@ -50,6 +56,7 @@ class LaneLine:
     sigma_at_cm: Float[np.ndarray, "u"] = field(default_factory=_none)
     marking_cm: float = float("nan")
     unpainted: float = float("nan")
+    contradicted_cm: Float[np.ndarray, "w 2"] = field(default_factory=_no_sections)
 
     @property
     def index(self) -> int:
@@ -76,8 +83,17 @@ class LaneLine:
 
     def supported(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
         """Return which positions are supported."""
+        return self._within(self.supported_cm, s_cm)
+
+    def contradicted(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+        """Return which positions the images contradict."""
+        return self._within(self.contradicted_cm, s_cm)
+
+    def _within(
+        self, sections_cm: Float[np.ndarray, "g 2"], s_cm: Float[np.ndarray, "m"]
+    ) -> Bool[np.ndarray, "m"]:
         inside = np.zeros(len(s_cm), dtype=bool)
-        for start, end in self.supported_cm:
+        for start, end in sections_cm:
             if self.period_cm is None:
                 inside |= (s_cm >= start) & (s_cm <= end)
             else:
@@ -102,4 +118,5 @@ class LaneLine:
             sigma_s_cm=self.sigma_s_cm * factor,
             sigma_at_cm=self.sigma_at_cm * factor,
             marking_cm=self.marking_cm * factor,
+            contradicted_cm=self.contradicted_cm * factor,
         )

@@ -113,7 +113,7 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
 def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LANES) -> FrameLines:
     """Return the lane of the map's k-th frame, in its direction of travel.
 
-    A line is left out where its sigma exceeds ``max_sigma_lanes`` lane widths.
+    A line is left out where its sigma exceeds ``max_sigma_lanes`` lane widths or the images contradict it.
     """
     segment = int(drive_map.segment[k])
     return lines_of_frame(
@@ -140,7 +140,8 @@ def label_frame(
 
     A frame has no labels if the driver deleted it, if its pose is uncertain (few edges match the map), if the
     car is between two lanes or far beside its own, or if the images contradict both lines. A point is masked
-    if the images contradict its line, if the map does not support it, or if it lies outside the window.
+    if the images contradict its line there or in this frame, if the map does not support it, or if it lies
+    outside the window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED

@@ -101,6 +101,22 @@ def test_closed_lines_and_lines_beside_the_lane_are_read_back(tmp_path):
     )
 
 
+def test_sections_that_images_contradict_are_read_back_and_older_maps_have_none(tmp_path):
+    written = _closed_map()
+    wrong = replace(written.lines[0][1], contradicted_cm=np.array([[280.0, 320.0]]))
+    written = replace(written, lines={0: [written.lines[0][0], wrong, written.lines[0][2]]})
+    write_map(tmp_path, written, {"frame": np.arange(2)}, {}, "given")
+    places = np.array([270.0, 290.0, 10.0, 30.0])
+    assert read_map(tmp_path).lines[0][1].contradicted(places).tolist() == [False, True, True, False]
+    path = tmp_path / "lanes.json"
+    older = json.loads(path.read_text())
+    older["format"] = "lanenet-lanes/2"
+    for line in older["lines"]:
+        del line["contradicted_cm"]
+    path.write_text(json.dumps(older))
+    assert not read_map(tmp_path).lines[0][1].contradicted(places).any()
+
+
 def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "map"

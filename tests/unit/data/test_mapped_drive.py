@@ -183,6 +183,19 @@ def test_a_frame_without_edges_is_uncertain_unless_it_is_the_first(folder):
     assert [reason == UNCERTAIN for reason in reasons] == [False, True, False, True, True]
 
 
+def test_the_rows_that_lie_in_a_contradicted_section_get_no_labels(folder):
+    mapped = open_mapped_drive(folder)
+    lines = mapped.drive_map.lines
+    # The front axle of the 6th frame is at 26 cm.
+    wrong = [replace(lines[0][0], contradicted_cm=np.array([[35.0, 50.0]])), lines[0][1]]
+    withheld = replace(mapped, drive_map=replace(mapped.drive_map, lines={**lines, 0: wrong}))
+    found = label_frame(withheld, 6, BirdseyeWindow())
+    assert not isinstance(found, str)
+    assert np.isfinite(found[1]).tolist()[:3] == [True, False, True]
+    # A complete map would have labelled it.
+    assert points_in_window(withheld.drive_map, 6, BirdseyeWindow())[:3].all()
+
+
 def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folder):
     mapped = open_mapped_drive(folder)
     whole = label_frame(mapped, 6, BirdseyeWindow())

@@ -45,6 +45,15 @@ def test_a_good_map_says_what_it_rests_on():
         assert words in verdict.reasons[0]
 
 
+def test_sections_that_are_withheld_are_said_first():
+    withheld = ("1.2 m of the right line near frame 2704", "30 cm of the left line near frame 9")
+    verdict = graded(GOOD, withheld=withheld, withheld_share=0.05)
+    assert verdict.grade == "good"
+    assert withheld[0] in verdict.sentence and "1 more" in verdict.sentence
+    assert graded(GOOD, withheld=withheld, withheld_share=0.2).grade == "usable"
+    assert graded(GOOD, withheld=withheld, withheld_share=0.9).grade == "reject"
+
+
 def test_what_sets_the_scale_is_named_with_what_follows_from_it():
     remarks = graded(GOOD, height_cm=17.2, tape_cm=1.9).remarks
     assert any("17.2 cm" in remark and "1.9 cm" in remark for remark in remarks)
