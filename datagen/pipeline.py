@@ -9,6 +9,7 @@ import numpy as np
 
 from datagen.assemble import AssembledMap, assemble
 from datagen.check import CheckedMap, check_map
+from datagen.compile_ahead import compile_ahead
 from datagen.labels.label_map import label_map
 from datagen.prepare import MapRequest, prepare
 from datagen.quality.figures import Report, map_edges
@@ -87,6 +88,7 @@ def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures:
     request = attempt.request
     prepared = attempt.prepared = prepare(request, attempt.settings)
     settings = prepared.settings
+    compile_ahead()
     solver = SegmentSolver(settings, np.random.default_rng(settings.seed), progress)
     camera = attempt.camera = camera_of_drive(prepared, solver)
     # Track, close loops, adjust: SegmentSolver.solve, segment by segment.

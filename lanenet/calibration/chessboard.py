@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.processes import in_threads
 from lanenet.reading import read_image
 
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -179,19 +178,13 @@ def find_views(
         except CalibrationError as error:
             return str(error).removeprefix(f"{path}: ")
 
-    # Threads are enough: OpenCV searches without holding Python's lock.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        try:
-            for path, answer in zip(paths, pool.map(find, paths), strict=True):
-                if isinstance(answer, BoardView):
-                    views.append(answer)
-                else:
-                    left_out[str(path)] = answer
-                if progress is not None:
-                    progress(len(views) + len(left_out), len(paths))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    for path, answer in zip(paths, in_threads(find, paths), strict=True):
+        if isinstance(answer, BoardView):
+            views.append(answer)
+        else:
+            left_out[str(path)] = answer
+        if progress is not None:
+            progress(len(views) + len(left_out), len(paths))
     if not any(view.complete for view in views):
         raise CalibrationError(
             f"none of {len(paths)} images shows a whole board with {board.columns}x{board.rows} inner "

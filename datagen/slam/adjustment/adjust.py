@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -42,6 +43,7 @@ from datagen.slam.adjustment.state import (
     Observations,
 )
 from lanenet.geometry.camera import Camera
+from lanenet.processes import in_threads
 
 __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "Observations", "adjust"]
 
@@ -66,6 +68,8 @@ _REFERENCE_WIDTH = 160.0
 #: Commanded steps that are shorter than this share of the typical one count as this long: a car that hardly
 #: moves says little about its gain.
 _LEAST_STEP = 0.1
+#: Parts into which the pairs of frames are cut for threads. Chosen: enough for the cores of a laptop.
+_PARTS = 8
 #: Sigma of the first pose, which only fixes the map: far below anything that is measured.
 _FIXED_SIGMA = 1e-6
 
@@ -258,7 +262,9 @@ class BundleProblem:
         #: Unknowns of the two frames of each pair.
         self.unknowns = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
         self.inner = inner_pixels(camera, observed.keep)
-        self.compared = int(np.diff(point_starts)[self.pairs[:, 0]].sum())
+        #: Comparisons of the pairs before each.
+        self.compared_by = np.concatenate([[0], np.cumsum(np.diff(point_starts)[self.pairs[:, 0]])])
+        self.compared = int(self.compared_by[-1])
         self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         self.weight = np.full(len(index), 1.0 / settings.pixel_sigma**2)
         self._lifted: tuple[BundleState, _Lifted] | None = None
@@ -277,23 +283,30 @@ class BundleProblem:
             return self._lifted[1]
         count = len(self.points.uv)
         lifted = np.empty((count, 2)), np.empty((count, N_CAMERA, 2)), np.empty((count, 2))
-        lift_points(state, self.points, *lifted)
+        parts = _parts(self.frames)
+        list(in_threads(lambda part: lift_points(state, self.points, part, *lifted), parts))
         self._lifted = state, lifted
         return lifted
 
     def associate(self, state: BundleState, gate_px: float) -> Links:
         """Find the nearest edge of every compared point, and weigh the points by how often they have one."""
         lifted, _, half_px = self.lift(state)
-        links = Links(
-            *(np.empty(self.compared, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64))
-        )
-        in_view, matched = (np.zeros(len(self.points.uv), np.int64) for _ in range(2))
-        count = associate(
-            state, self.pairs, self.points, lifted, half_px, self.edges,
-            gate_px * self.scale, self.inner, in_view, matched, links,
-        )  # fmt: skip
+        gate_px *= self.scale
+
+        def links_of(part: tuple[int, int]) -> tuple[Links, Int[np.ndarray, "2 m"]]:
+            most = int(self.compared_by[part[1]] - self.compared_by[part[0]])
+            links = Links(*(np.empty(most, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64)))
+            seen = np.zeros((2, len(self.points.uv)), np.int64)
+            count = associate(
+                state, self.pairs, part, self.points, lifted, half_px, self.edges,
+                gate_px, self.inner, seen, links,
+            )  # fmt: skip
+            return Links(*(column[:count] for column in links)), seen
+
+        found = list(in_threads(links_of, _parts(len(self.pairs))))
+        in_view, matched = sum((seen for _, seen in found[1:]), found[0][1])
         self.weight = point_trust(in_view, matched) / self.settings.pixel_sigma**2
-        return Links(*(column[:count] for column in links))
+        return Links(*(np.concatenate(columns) for columns in zip(*(one for one, _ in found), strict=True)))
 
     def equations(self, state: BundleState, links: Links) -> Equations:
         """Build the normal equations of all residuals and priors."""
@@ -302,10 +315,15 @@ class BundleProblem:
         blocks = np.zeros((len(self.pairs), both + N_CAMERA, both + N_CAMERA))
         descents = np.zeros((len(self.pairs), both + N_CAMERA))
         residual_px = np.empty(len(links.point))
-        cost = accumulate(
-            state, self.pairs, self.edges, lifted, lifted_by, links,
-            self.weight, self.settings.cauchy_px, blocks, descents, residual_px,
-        )  # fmt: skip
+        starts = np.searchsorted(links.pair, np.arange(len(self.pairs) + 1))
+
+        def cost_of(part: tuple[int, int]) -> float:
+            return accumulate(
+                state, self.pairs, part, self.edges, lifted, lifted_by, links, starts,
+                self.weight, self.settings.cauchy_px, blocks, descents, residual_px,
+            )  # fmt: skip
+
+        cost = sum(in_threads(cost_of, _parts(len(self.pairs))))
         prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.joined, self.observed)
         at, free = self.unknowns.ravel(), self.free
         border = [
@@ -377,6 +395,12 @@ class BundleProblem:
         band = (uv[:, 1] / (_BAND_PX * self.scale)).astype(np.int64)
         way = np.arctan2(normals[:, 1], normals[:, 0]) / (2.0 * np.pi / _WAYS)
         return band * _WAYS + np.rint(way).astype(np.int64) % _WAYS
+
+
+def _parts(count: int) -> list[tuple[int, int]]:
+    """Cut a range into parts for threads: always the same ones, since a sum depends on its order."""
+    ends = np.linspace(0, count, _PARTS + 1).astype(int).tolist()
+    return list(pairwise(ends))
 
 
 def sum_blocks(unknowns: Int[np.ndarray, "p k"], blocks: Float[np.ndarray, "p k k"], size: int) -> csc_matrix:

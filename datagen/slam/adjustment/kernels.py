@@ -220,19 +220,20 @@ def project_with_jacobian(fisheye, lens, view, forward, left, by):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def lift_points(state, points, out, out_by, out_half):
+def lift_points(state, points, part, out, out_by, out_half):
     """Lift pixels to the road, with Jacobians.
 
     Args:
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
         points: Pixels of all frames.
+        part: First frame whose pixels are lifted, and one behind the last.
         out: Filled: road point of each pixel (ahead, left).
         out_by: Filled: derivatives by the camera parameters.
         out_half: Filled: road point half a pixel further along the gradient.
     """
     lens, tilt, uv, normals = state.lens, state.tilt, points.uv, points.normals
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
-    for k in range(points.starts.shape[0] - 1):
+    for k in range(part[0], part[1]):
         set_view(state.mount, tilt[k, 0], tilt[k, 1], view)
         for p in range(points.starts[k], points.starts[k + 1]):
             a, b = lift_pixel(state.fisheye, lens, view, uv[p, 0], uv[p, 1])
@@ -250,7 +251,7 @@ def lift_points(state, points, out, out_by, out_half):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, in_view, matched, links):
+def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, inner, seen, links):
     """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
 
     The edges of each frame are sorted by row. Only points that fall into ``inner`` get an edge: beyond the
@@ -260,14 +261,15 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
     Args:
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
         pairs: Pairs of frames, i and j.
+        part: First pair that is looked at, and one behind the last.
         points: Compared pixels.
         lifted: Road point of each, see :func:`lift_points`.
         lifted_half: The same half a pixel further along the gradient.
         edges: Edges of all frames.
         gate_px: Search radius.
         inner: Pixels in which points get an edge.
-        in_view: Counts in how many frames each point fell into ``inner``.
-        matched: Counts in how many of them it met an edge.
+        seen: Counts in how many frames each point fell into ``inner``, and in how many of these it met an
+            edge.
         links: Filled from the front.
 
     Returns:
@@ -277,7 +279,7 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
     view = np.empty(N_VIEW)
     height, width = inner.shape
     count = 0
-    for k in range(pairs.shape[0]):
+    for k in range(part[0], part[1]):
         i, j = pairs[k, 0], pairs[k, 1]
         set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
         ci, si = np.cos(poses[i, 2]), np.sin(poses[i, 2])
@@ -304,11 +306,18 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
                 continue
             if not inner[int(v + 0.5), int(u + 0.5)]:
                 continue
-            in_view[p] += 1
+            seen[0, p] += 1
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
             stop = edges.starts[j + 1]
-            q = edges.starts[j] + np.searchsorted(edge_uv[edges.starts[j] : stop, 1], v - gate_px)
+            # Bisection; NumPy's takes a second to compile.
+            q, behind = edges.starts[j], stop
+            while q < behind:
+                middle = (q + behind) // 2
+                if edge_uv[middle, 1] < v - gate_px:
+                    q = middle + 1
+                else:
+                    behind = middle
             while q < stop and edge_uv[q, 1] <= v + gate_px:
                 du, dv = edge_uv[q, 0] - u, edge_uv[q, 1] - v
                 d = du * du + dv * dv
@@ -316,7 +325,7 @@ def associate(state, pairs, points, lifted, lifted_half, edges, gate_px, inner, 
                     best, chosen = d, q
                 q += 1
             if chosen >= 0:
-                matched[p] += 1
+                seen[1, p] += 1
                 links.point[count], links.edge[count], links.pair[count] = p, chosen, k
                 links.sigma[count] = np.sqrt(0.5 * (1.0 + stretch * stretch))
                 count += 1
@@ -429,8 +438,9 @@ def sum_scores(
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def accumulate(
-    state, pairs, edges, lifted, lifted_by, links, point_weight, cauchy_px, blocks, descents, residual
-):
+    state, pairs, part, edges, lifted, lifted_by, links, starts, point_weight, cauchy_px,
+    blocks, descents, residual
+):  # fmt: skip
     """Add up the normal equations of all point-to-line residuals, a block per pair of frames.
 
     The residual e of a link is the distance of the moved point from its edge, along the edge's gradient, with
@@ -440,10 +450,12 @@ def accumulate(
     Args:
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
         pairs: Pairs of frames, i and j.
+        part: First pair whose links are added up, and one behind the last.
         edges: Edges of all frames.
         lifted: Road point of each compared pixel.
         lifted_by: Its Jacobian by the camera parameters.
         links: Which point meets which edge.
+        starts: First link of each pair, and one behind the last.
         point_weight: Inverse variance of each compared pixel.
         cauchy_px: Scale c of the loss.
         blocks: Filled: J^T W J of each pair.
@@ -454,12 +466,11 @@ def accumulate(
         Robust cost.
     """
     poses, tilt = state.poses, state.tilt
-    starts = np.searchsorted(links.pair, np.arange(pairs.shape[0] + 1))
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
     n = jac.shape[0]
     cost = 0.0
-    for k in range(pairs.shape[0]):
+    for k in range(part[0], part[1]):
         i, j = pairs[k, 0], pairs[k, 1]
         set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
         turns = np.cos(poses[i, 2]), np.sin(poses[i, 2]), np.cos(poses[j, 2]), np.sin(poses[j, 2])

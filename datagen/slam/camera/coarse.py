@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +27,7 @@ from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RoadTable
+from lanenet.processes import in_threads
 
 #: Step lengths to try with each camera, relative to that of the best camera so far, and those among them that
 #: may be the best; the others are what it is compared with. Chosen: half to twice, in steps of a tenth.
@@ -98,9 +100,10 @@ def coarse_camera(
     total = len(grid) + 9
     # The given grid, then half its steps around the best.
     for last in (False, True):
-        for camera in grid:
-            if camera not in tried:
-                tried[camera] = search.try_camera(*camera, step)
+        new = [camera for camera in grid if camera not in tried]
+        rated = in_threads(partial(search.try_camera, step_heights=step), new)
+        for camera, candidate in zip(new, rated, strict=True):
+            tried[camera] = candidate
             if progress is not None:
                 progress(min(len(tried), total), total)
         best = max(tried.values(), key=lambda candidate: candidate.fit)
@@ -135,8 +138,9 @@ class _Search:
         edges = [seen_edges(pixels, table) for pixels in self.edges]
         return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(self.seed))
 
-    def try_camera(self, focal_px: float, pitch_deg: float, step_heights: float) -> Candidate:
+    def try_camera(self, focal_and_pitch: tuple[float, float], step_heights: float) -> Candidate:
         """Rate a camera by how clear the motion is with it, around a step length."""
+        focal_px, pitch_deg = focal_and_pitch
         images = self.images(focal_px, pitch_deg)
         steps = step_heights * _AROUND
         _, fits = best_step(images, self.relative, steps, _PAIRS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import NamedTuple, no_type_check
 
@@ -28,6 +29,12 @@ _TURN_SIGMAS = 1.2
 #: Share of an image's points that must stay in view for their match to count. Chosen: few points fit
 #: anywhere.
 _LEAST_SEEN = 0.5
+#: Entries per pixel in the table of gains, and the longest distance from an edge in it: within ``REACH`` of
+#: the edge's pixel in either direction, and half a pixel on either side. Chosen: between entries, a line is
+#: 2e-5 off.
+_PER_PX, _FARTHEST_PX = 256.0, 1.5 * (REACH + 1.0)
+#: Type of an index: unsigned, so that numba need not check for indices from the end.
+U = np.uint32
 #: Image width up to which an edge's place is known to the same fraction of a pixel; beyond, blur grows with
 #: it.
 _FINE_WIDTH = 320
@@ -82,14 +89,14 @@ class Image(NamedTuple):
         points: Points ahead and left of the rear axle, camera heights.
         sector: Sector of each.
         uv: Edge pixels.
-        normals: Their unit gradients.
+        lines: The line along each edge: unit gradient n and n . uv.
         edge_sector: Direction of each in sectors, as a real number.
     """
 
     points: Float[np.ndarray, "m 2"]
     sector: Int[np.ndarray, "m"]
     uv: Float[np.ndarray, "e 2"]
-    normals: Float[np.ndarray, "e 2"]
+    lines: Float[np.ndarray, "e 3"]
     edge_sector: Float[np.ndarray, "e"]
 
 
@@ -105,6 +112,14 @@ class RoadGrid(NamedTuple):
     pixel_of: Float[np.ndarray, "a l 2"]
     origin: Float[np.ndarray, "2"]
     cell: float
+
+
+class _EdgeIndex(threading.local):
+    """See :func:`index_edges`; each thread compares frames of its own."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        self.nearest, self.distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
+        self.frame: int | None = None
 
 
 class ImagePairs:
@@ -134,10 +149,9 @@ class ImagePairs:
         pixel_of = camera.project_ground(car_cm.reshape(-1, 2)).reshape(car_cm.shape)
         self._grid = RoadGrid(pixel_of, np.array([ahead[0], left[0]]), _CELL_HEIGHTS)
         self.height_cm = camera.mounting.height_cm
-        self._images = [self._image(pixels, rng) for pixels in edges]
-        shape = (SECTORS, camera.height, camera.width)
-        self._nearest, self._distance = np.empty(shape, np.int32), np.empty(shape, np.float32)
-        self._indexed: int | None = None
+        self._images = self._drawn(edges, rng)
+        self._gain_at = gains(self._sigma_px, settings.gain)
+        self._index = _EdgeIndex((SECTORS, camera.height, camera.width))
 
     def __len__(self) -> int:
         return len(self._images)
@@ -153,14 +167,17 @@ class ImagePairs:
         """Difference of two turns that the images can just tell apart."""
         return float(_TURN_SIGMAS * self._sigma_px / self._camera.K[0, 0])
 
-    def _image(self, pixels: EdgePixels, rng: np.random.Generator) -> Image:
-        """Draw equal numbers of points of every direction on the road.
+    def _drawn(self, edges: Sequence[EdgePixels], rng: np.random.Generator) -> list[Image]:
+        """Draw equal numbers of points of every direction on the road from each frame.
 
         Source:
             Rusinkiewicz and Levoy 2001, "Efficient variants of the ICP algorithm", section 3.1 (normal-space
             sampling): lines along the road are most of the edges and say nothing about the distance along it.
         """
-        uv, normals = pixels.uv_px.astype(np.float64), pixels.normals.astype(np.float64)
+        # All frames at once: a call costs as much as hundreds of points.
+        uv = np.concatenate([np.empty((0, 2)), *(pixels.uv_px for pixels in edges)])
+        normals = np.concatenate([np.empty((0, 2)), *(pixels.normals for pixels in edges)])
+        lines = np.column_stack([normals, np.sum(uv * normals, axis=1)])
         sector = np.arctan2(normals[:, 1], normals[:, 0]) * (SECTORS / (2.0 * np.pi)) % SECTORS
         along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
         road, beside = self._camera.intersect_ground(np.concatenate([uv, uv + 0.5 * along])).reshape(2, -1, 2)
@@ -169,21 +186,26 @@ class ImagePairs:
         angle = np.arctan2(tangent[good, 1], tangent[good, 0])
         direction = np.full(len(uv), -1)
         direction[good] = np.rint(angle * (_DIRECTIONS / np.pi)).astype(np.int64) % _DIRECTIONS
+        points = np.stack([road[:, 1] + self._camera.wheelbase_cm, -road[:, 0]], axis=1) / self.height_cm
+        whole_sector = np.rint(sector).astype(np.int64) % SECTORS
         each = self.settings.points // _DIRECTIONS
-        drawn = []
-        for number in range(_DIRECTIONS):
-            candidates = np.flatnonzero(direction == number)
-            drawn.append(rng.choice(candidates, min(each, len(candidates)), replace=False))
-        chosen = np.concatenate(drawn)
-        forward_cm = road[chosen, 1] + self._camera.wheelbase_cm
-        points = np.stack([forward_cm, -road[chosen, 0]], axis=1) / self.height_cm
-        return Image(points, np.rint(sector[chosen]).astype(np.int64) % SECTORS, uv, normals, sector)
+        images, start = [], 0
+        for pixels in edges:
+            frame = slice(start, start + len(pixels.uv_px))
+            start = frame.stop
+            drawn = []
+            for number in range(_DIRECTIONS):
+                candidates = np.flatnonzero(direction[frame] == number)
+                drawn.append(rng.choice(candidates, min(each, len(candidates)), replace=False))
+            chosen = frame.start + np.concatenate(drawn)
+            images.append(Image(points[chosen], whole_sector[chosen], uv[frame], lines[frame], sector[frame]))
+        return images
 
     def fit(
         self,
         k: int,
         steps: Float[np.ndarray, "w"],
-        turns_rad: Float[np.ndarray, "t"],
+        turns_rad: Float[np.ndarray, "t"] | Float[np.ndarray, "w t"],
         relative: Float[np.ndarray, "n"],
         lags: Sequence[int] | None = None,
         typical_turns_rad: Float[np.ndarray, "n"] | None = None,
@@ -193,7 +215,7 @@ class ImagePairs:
         Args:
             k: Frame.
             steps: Typical step lengths to try.
-            turns_rad: Turns of frame k.
+            turns_rad: Turns of frame k, the same for every step or others; NaN for none, with a fit of 0.
             relative: Step length of each frame relative to the typical one.
             lags: Frames between the images of a pair; None for those of the settings.
             typical_turns_rad: About the turn of each frame, for the differences between frame k and the
@@ -203,11 +225,12 @@ class ImagePairs:
             Log likelihood up to a constant, not tempered.
         """
         s, later = self.settings, self._images[k]
-        out, seen_fit, unseen = (np.zeros((len(steps), len(turns_rad))) for _ in range(3))
-        # The search for the typical step asks for one frame repeatedly, with other turns for every step.
-        if self._indexed != k:
-            index_edges(later.uv, later.edge_sector, self._nearest, self._distance)
-            self._indexed = k
+        tried_rad = np.array(np.broadcast_to(turns_rad, (len(steps), turns_rad.shape[-1])))
+        out, seen_fit, unseen = (np.zeros(tried_rad.shape) for _ in range(3))
+        index = self._index
+        if index.frame != k:
+            index_edges(later.uv, later.edge_sector, index.nearest, index.distance)
+            index.frame = k
         for lag in s.lags if lags is None else lags:
             if lag > k:
                 continue
@@ -216,16 +239,15 @@ class ImagePairs:
             if typical_turns_rad is not None:
                 turned = float(np.sum(typical_turns_rad[k - lag + 1 : k + 1] - typical_turns_rad[k]))
             distances = relative[k - lag + 1 : k + 1].sum() * steps
-            turns = lag * turns_rad + turned
+            turns = lag * tried_rad + turned
             fit_of_motions(
                 earlier,
                 later,
-                self._nearest,
+                index.nearest,
                 self._grid,
                 distances,
                 turns,
-                self._sigma_px,
-                s.gain,
+                self._gain_at,
                 seen_fit,
                 unseen,
             )
@@ -243,7 +265,22 @@ def turns_up_to(most_rad: float, step_rad: float) -> Float[np.ndarray, "t"]:
     return step_rad * np.arange(-half, half + 1)
 
 
-@njit(cache=True, error_model="numpy")
+def gains(sigma_px: float, gain: float) -> Float[np.ndarray, "g 2"]:
+    """Tabulate the log likelihood ratio of a point on and off an edge, by its distance from the edge.
+
+    Args:
+        sigma_px: Standard deviation of an edge's place across itself.
+        gain: How much likelier a place is on an edge than off it.
+
+    Returns:
+        The value at every ``1 / _PER_PX`` pixels, and by how much the next one exceeds it.
+    """
+    off_px = np.arange(int(_FARTHEST_PX * _PER_PX) + 2) / _PER_PX
+    values = np.log1p(gain * np.exp(-0.5 * (off_px / sigma_px) ** 2))
+    return np.column_stack([values[:-1], np.diff(values)])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def index_edges(uv, sector, nearest, distance):
     """Find for each pixel and sector the nearest edge around it.
@@ -269,9 +306,9 @@ def index_edges(uv, sector, nearest, distance):
                         nearest[s, v, u] = q
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def fit_of_motions(earlier, later, nearest, grid, distances, turns, sigma_px, gain, out, unseen):
+def fit_of_motions(earlier, later, nearest, grid, distances, turns, gain_at, out, unseen):
     """Add up how well each motion carries the points of one frame onto the edges of a later one.
 
     Args:
@@ -280,40 +317,46 @@ def fit_of_motions(earlier, later, nearest, grid, distances, turns, sigma_px, ga
         nearest: See :func:`index_edges`, of the later frame.
         grid: Pixels of road points.
         distances: Distances of the rear axle to try.
-        turns: Turns to try, positive left.
-        sigma_px: Standard deviation of an edge's place across itself.
-        gain: How much likelier a place is on an edge than off it.
+        turns: Turns to try with each of them, positive left; NaN for none.
+        gain_at: Gain of a point at each distance from its edge, see :func:`gains`.
         out: Filled: sums over the points that stay in view, a row per distance and a column per turn.
         unseen: Filled: of the same shape, number of points that leave the view.
     """
-    points, sector, uv, normals = earlier.points, earlier.sector, later.uv, later.normals
-    pixel_of, origin, cell = grid.pixel_of, grid.origin, grid.cell
-    height, width = nearest.shape[1:]
-    rows, columns = pixel_of.shape[:2]
+    points, sector, lines = earlier.points, earlier.sector, later.lines
+    pixel_of, per_cell = grid.pixel_of, 1.0 / grid.cell
+    last_u, last_v = nearest.shape[2] - 1.0, nearest.shape[1] - 1.0
+    last_row, last_column = pixel_of.shape[0] - 1.0, pixel_of.shape[1] - 1.0
+    x0, y0 = grid.origin[0] * per_cell, grid.origin[1] * per_cell
+    one = U(1)
     for a in range(distances.shape[0]):
-        for b in range(turns.shape[0]):
-            c, s = np.cos(turns[b]), np.sin(turns[b])
-            dx, dy = distances[a] * np.cos(0.5 * turns[b]), distances[a] * np.sin(0.5 * turns[b])
+        for b in range(turns.shape[1]):
+            turn = turns[a, b]
+            if np.isnan(turn):
+                continue
+            c, s = np.cos(turn) * per_cell, np.sin(turn) * per_cell
+            dx, dy = distances[a] * np.cos(0.5 * turn), distances[a] * np.sin(0.5 * turn)
+            from_x, from_y = c * dx + s * dy + x0, c * dy - s * dx + y0
             total, lost = 0.0, 0
             for p in range(points.shape[0]):
-                x, y = points[p, 0] - dx, points[p, 1] - dy
-                gx, gy = (c * x + s * y - origin[0]) / cell, (c * y - s * x - origin[1]) / cell
-                ix, iy = int(np.floor(gx)), int(np.floor(gy))
-                if not (0 <= ix < rows - 1 and 0 <= iy < columns - 1):
+                x, y = points[p, 0], points[p, 1]
+                gx, gy = c * x + s * y - from_x, c * y - s * x - from_y
+                if not (0.0 <= gx < last_row and 0.0 <= gy < last_column):
                     lost += 1
                     continue
-                tx, ty = gx - ix, gy - iy
-                w00, w01 = (1.0 - tx) * (1.0 - ty), (1.0 - tx) * ty
-                w10, w11 = tx * (1.0 - ty), tx * ty
-                p00, p01 = pixel_of[ix, iy], pixel_of[ix, iy + 1]
-                p10, p11 = pixel_of[ix + 1, iy], pixel_of[ix + 1, iy + 1]
-                u = w00 * p00[0] + w01 * p01[0] + w10 * p10[0] + w11 * p11[0]
-                v = w00 * p00[1] + w01 * p01[1] + w10 * p10[1] + w11 * p11[1]
-                if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+                ix, iy = np.int32(gx), np.int32(gy)
+                tx, ty, i, j = gx - ix, gy - iy, U(ix), U(iy)
+                u = pixel_of[i, j, 0] + ty * (pixel_of[i, j + one, 0] - pixel_of[i, j, 0])
+                v = pixel_of[i, j, 1] + ty * (pixel_of[i, j + one, 1] - pixel_of[i, j, 1])
+                i += one
+                far_u = pixel_of[i, j, 0] + ty * (pixel_of[i, j + one, 0] - pixel_of[i, j, 0])
+                far_v = pixel_of[i, j, 1] + ty * (pixel_of[i, j + one, 1] - pixel_of[i, j, 1])
+                u, v = u + tx * (far_u - u), v + tx * (far_v - v)
+                if not (0.0 <= u <= last_u and 0.0 <= v <= last_v):
                     lost += 1
                     continue
-                q = nearest[sector[p], int(v + 0.5), int(u + 0.5)]
+                q = nearest[U(sector[p]), U(np.int32(v + 0.5)), U(np.int32(u + 0.5))]
                 if q >= 0:
-                    e = (u - uv[q, 0]) * normals[q, 0] + (v - uv[q, 1]) * normals[q, 1]
-                    total += np.log1p(gain * np.exp(-0.5 * (e / sigma_px) ** 2))
+                    off = _PER_PX * abs(u * lines[U(q), 0] + v * lines[U(q), 1] - lines[U(q), 2])
+                    entry = np.int32(off)
+                    total += gain_at[U(entry), 0] + (off - entry) * gain_at[U(entry), 1]
             out[a, b], unseen[a, b] = total, lost

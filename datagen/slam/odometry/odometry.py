@@ -10,6 +10,7 @@ corners or stains. What one pair of images leaves open, its neighbours settle (s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Float16, Float32
@@ -17,6 +18,7 @@ from jaxtyping import Float, Float16, Float32
 from datagen.slam.odometry.image_pairs import ImagePairs, turns_up_to
 from datagen.slam.odometry.motion_grid import MotionGrid, SeenTurns, follow_motion, seen_turns
 from datagen.slam.odometry.scans import Progress
+from lanenet.processes import in_threads
 
 #: Steps that are tried where no speed was recorded, in camera heights per frame: from a crawl up to a fast
 #: car at 10 Hz. The factor of 1.1 between them is less than the width of a peak of the fit.
@@ -129,11 +131,15 @@ def best_step(
     s, n = images.settings, len(images)
     first = min(max(s.lags), n - 1)
     frames = np.unique(np.linspace(first, n - 1, min(most_frames, n - first)).astype(np.int64))
-    fit = np.zeros(len(steps))
-    for k in frames:
-        for i, step in enumerate(steps):
-            turns = _turns_of(images, step * relative[k])
-            fit[i] += images.fit(int(k), steps[i : i + 1], turns, relative).max() / len(frames)
+
+    def fits_of(k: int) -> Float[np.ndarray, "w"]:
+        turns = [_turns_of(images, step * relative[k]) for step in steps]
+        tried = np.full((len(steps), max(map(len, turns))), np.nan)
+        for row, own in zip(tried, turns, strict=True):
+            row[: len(own)] = own
+        return images.fit(k, steps, tried, relative).max(axis=1)
+
+    fit = sum(in_threads(fits_of, frames.tolist()), np.zeros(len(steps))) / len(frames)
     above = prominence(fit, steps)
     log_ratio = float(np.log(steps[1] / steps[0]))
     best = int(np.argmax(above))
@@ -212,8 +218,16 @@ class Evidence:
         turns: Float[np.ndarray, "n"] | None = None
         rounds = [lags for lags in (s.lags[:1], s.lags[1:]) if lags]
         for number, lags in enumerate(rounds):
-            for k in range(1, n):
-                fits[k] += images.fit(k, self.grid.steps, self.grid.turns_rad, self.relative, lags, turns)
+            fit_of = partial(
+                images.fit,
+                steps=self.grid.steps,
+                turns_rad=self.grid.turns_rad,
+                relative=self.relative,
+                lags=lags,
+                typical_turns_rad=turns,
+            )
+            for k, found in enumerate(in_threads(fit_of, range(1, n)), start=1):
+                fits[k] += found
                 done, rest = divmod(number * n + k + 1, len(rounds))
                 if progress is not None and not rest:
                     progress(done, n)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,10 +131,9 @@ class RoadTable:
         if not useful.any():
             raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
         across = np.linalg.norm(du, axis=-1)
-        with warnings.catch_warnings():
-            # A row without a useful pixel has no median: NaN.
-            warnings.simplefilter("ignore", RuntimeWarning)
-            per_row = np.nanmedian(np.where(useful, across, np.nan), axis=1)
+        # A row without a useful pixel has no median.
+        per_row, seen = np.full(self.height, np.nan), useful.any(axis=1)
+        per_row[seen] = np.nanmedian(np.where(useful[seen], across[seen], np.nan), axis=1)
         self.scale = PixelScale(across, per_row)
 
     def lift(self, edges: EdgePixels) -> RoadEdges:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import signal
+import threading
 
+import cv2
 import pytest
 
+from lanenet import processes
 from lanenet.errors import LanenetError
-from lanenet.processes import run_jobs
+from lanenet.processes import in_threads, run_jobs
 
 HUGE = 2**60  # bytes
 
@@ -39,3 +44,32 @@ def test_a_process_that_is_killed_names_its_drives():
     with pytest.raises(LanenetError, match=r"train_00 \(seed 0\) or train_01 \(seed 1\): .*killed") as found:
         run_jobs(os._exit, jobs, 2)
     assert "train_03" not in str(found.value) and "data.workers" in str(found.value)
+
+
+def threads_used() -> int:
+    """Number of threads in which two jobs run that wait for each other for a while."""
+    together = threading.Barrier(2)
+
+    def wait(_: int) -> int:
+        with contextlib.suppress(threading.BrokenBarrierError):
+            together.wait(0.1)
+        return threading.get_ident()
+
+    return len(set(in_threads(wait, range(2))))
+
+
+def test_threads_give_results_in_the_order_of_the_jobs(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert list(in_threads(math.factorial, (9, 3, 7))) == [362880, 6, 5040]
+    assert threads_used() == 2
+    with pytest.raises(ValueError, match="factorial"):
+        list(in_threads(math.factorial, [3, -1]))
+
+
+def test_a_worker_process_has_one_thread(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(processes, "_ONE_THREAD", threading.Event())
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(cv2, "setNumThreads", lambda _: None)
+    processes.prepare_process()
+    assert threads_used() == 1

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import threading
+
 import numpy as np
 import pytest
 from pixel_road import camera_numbers, drifted, fisheye, mirrored, pinhole, pixels
@@ -50,6 +53,17 @@ def test_drifted_poses_come_back(model, seed, way, turn_rad):
     assert found.robust_sd_px < 0.05
     assert np.abs(found.tilt).max() < 1e-3
     assert found.pairs == sum(70 - lag for lag in SMALL.lags)
+
+
+def test_the_number_of_cores_changes_nothing(monkeypatch):
+    camera, road = fisheye(), tape_road(20)
+    observed, start = Observations(pixels(road, camera)), BundleEstimate.level(road.poses, camera)
+    found, short = {}, SMALL.model_copy(update={"gates_px": (3.0, 2.0), "iterations": 2})
+    for cores in (1, 3):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        found[cores] = adjust(observed, start, short, _rng())
+    assert threading.active_count() == 1 and found[1].camera.hash == found[3].camera.hash
+    np.testing.assert_array_equal(found[1].poses, found[3].poses)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from pixel_road import fisheye, mirrored, pinhole, pixels
@@ -89,6 +91,25 @@ def test_frames_are_compared_alike_whatever_was_compared_before(edges):
         again = [pictures.fit(k, steps[i : i + 1], turns, np.ones(60))[0] for i in range(3)]
         np.testing.assert_array_equal(again, together[k])
     assert not np.array_equal(together[8], together[30])
+
+
+def test_the_number_of_cores_changes_nothing(edges, monkeypatch):
+    found = {}
+    for cores in (1, 3):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        evidence = _evidence(_pictures(edges[:10]), np.ones(10), False)
+        found[cores] = np.column_stack([evidence.motion().steps_cm, evidence.motion().turns_rad])
+    np.testing.assert_array_equal(found[1], found[3])
+
+
+def test_steps_with_turns_of_their_own_fit_as_they_do_alone(edges):
+    pictures, steps = _pictures(edges), STEP * np.array([0.8, 1.25])
+    turns = turns_up_to(0.05, pictures.turn_step_rad)
+    own = np.stack([np.append(turns[1:], np.nan), turns])
+    fit = pictures.fit(30, steps, own, np.ones(60))
+    np.testing.assert_array_equal(fit[0, :-1], pictures.fit(30, steps[:1], turns[1:], np.ones(60))[0])
+    np.testing.assert_array_equal(fit[1], pictures.fit(30, steps[1:], turns, np.ones(60))[0])
+    assert fit[0, -1] == 0.0 < fit[0, :-1].max()
 
 
 def test_steps_put_together_give_poses():
