@@ -150,10 +150,13 @@ def fit_height(
         if abs(change) < _SAME_FOCAL or len(points) > rounds:
             break
         found = _with_focal(found, drive, change, focal_sigma, solver)
-    # Pitch and focal length are found together: the horizon stays where it is in the image.
-    by_focal = 0.5 * float(np.sin(2.0 * camera.mounting.pitch_down_rad)) * focal_sigma
-    sigma = {**found.sigma, "pitch": float(np.hypot(found.sigma["pitch"], by_focal))}
-    sigma["focal"] = min(focal_sigma, sigma["focal"]) if found.closed else focal_sigma
+    if found.closed:
+        sigma = {**found.sigma, "focal": min(focal_sigma, found.sigma["focal"])}
+    else:
+        # Pitch and focal length are found together: the horizon stays where it is in the image.
+        by_focal = 0.5 * float(np.sin(2.0 * camera.mounting.pitch_down_rad)) * focal_sigma
+        pitch_sigma = float(np.hypot(found.sigma["pitch"], by_focal))
+        sigma = {**found.sigma, "focal": focal_sigma, "pitch": pitch_sigma}
     return replace(found, sigma=sigma, height_given=True), ()
 
 

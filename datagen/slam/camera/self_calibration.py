@@ -129,9 +129,11 @@ class FoundCamera:
             f"{focal * self.sigma['focal']:.1f} px, pitch {np.rad2deg(m.pitch_down_rad):.1f} +- "
             f"{np.rad2deg(self.sigma['pitch']):.1f} degrees"
         )
+        if self.closed:
+            return found
         if self.height_given:
             return f"{found}; the focal length fits the lane width at the camera's height"
-        return found if self.closed else f"{found}; no place was seen twice, so the lens is as it started"
+        return f"{found}; no place was seen twice, so the lens is as it started"
 
 
 def find_camera(

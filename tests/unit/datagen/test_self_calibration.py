@@ -317,6 +317,14 @@ def test_a_given_height_finds_the_focal_length_where_the_lane_has_its_width(monk
     assert camera.sigma["focal"] == pytest.approx(math.hypot(by_width, 1.7 * 0.03), rel=0.05)
 
 
+def test_a_height_that_agrees_with_a_closed_loop_leaves_its_camera_alone(monkeypatch):
+    monkeypatch.setattr(datagen.segments, "measure_lane", lambda *_: LaneScale(2.5 * 15.0, 0.02))
+    closed = found(np.zeros(70), 8, 0.01)
+    solver = _Solver(MapSettings(), np.random.default_rng(0))
+    given, _ = fit_height(closed, made_up_drive(70), 2.51, MapSettings(), solver)
+    assert given.camera is closed.camera and given.sigma == closed.sigma and given.note == closed.note
+
+
 def test_a_height_beside_a_known_camera_is_refused(tmp_path):
     drive, path = write_drive(tmp_path / "d", np.arange(70) * 3.0), tmp_path / "camera.yaml"
     write_camera(path, replace(CAMERA, width=64, height=48), "made up")
