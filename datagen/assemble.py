@@ -69,7 +69,8 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         mapped: Segments in its scale.
     """
     request, segments = prepared.request, list(mapped)
-    lane_cm = float(np.median([fitted_width_cm(s.lines, s.lane, s.s_frames_cm) for s in segments]))
+    longest = max(segments, key=lambda s: len(s.rows))
+    lane_cm = fitted_width_cm(longest.lines, longest.lane, longest.s_frames_cm)
     factor = 1.0
     if prepared.camera is None:
         factor = request.lane_width_cm / lane_cm
@@ -83,7 +84,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         mapped_lane_cm=factor * lane_cm,
         tape_cm=factor * float(np.median(markings_cm)),
         scale_from="lane width" if prepared.camera is None else "camera",
-        laps=max(int(s.solved.laps.max()) for s in segments),
+        laps=max(int(s.laps.max()) for s in segments),
     )
     numbers = [np.full(len(s.rows), i) for i, s in enumerate(segments)]
     drive_map = DriveMap(
@@ -92,7 +93,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         frames=drive.frames[rows],
         t_s=drive.t_s[rows],
         poses=_in_order(segments, [s.solved.poses for s in segments]) * _pose_scale(factor),
-        lap=_in_order(segments, [s.solved.laps for s in segments]),
+        lap=_in_order(segments, [s.laps for s in segments]),
         segment=_in_order(segments, numbers),
         s_cm=_in_order(segments, [s.s_frames_cm for s in segments]) * factor,
         match=_in_order(segments, [s.solved.trajectory.match for s in segments]),

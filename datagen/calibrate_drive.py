@@ -10,15 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.lanes.scale import LaneScale, measure_lane
-from datagen.prepare import (
-    check_lens,
-    check_moving,
-    hide_bumper,
-    keep_images,
-    readable_frames,
-    split_segments,
-)
-from datagen.segments import fit_height
+from datagen.prepare import check_lens, check_moving, hide_bumper, keep_images, readable_frames
+from datagen.segments import fit_height, segments_of
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.camera.self_calibration import (
@@ -220,7 +213,7 @@ def _track_progress(progress: StageProgress | None) -> Progress | None:
 
 
 def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str]]:
-    """Longest segment of the frames in which the car moves, and notes on what was left out."""
+    """Frames in which the car drives forward, and notes on what was left out."""
     notes = list(recorded.problems)
     if start is not None and (start.width, start.height) != (recorded.width, recorded.height):
         raise CalibrationError(
@@ -233,15 +226,9 @@ def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str
         moving, found = following_frames(recorded)
         notes += found
         _check_count(recorded, len(moving), f"of {len(recorded)} frames show a car that moves")
-        segments = split_segments(moving)
     except TrackingLostError as error:
         raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
-    longest = max(segments, key=lambda s: s.stop - s.start)
-    drive = moving.subset(longest)
-    if len(drive) < len(moving):
-        _check_count(recorded, len(drive), "frames without a gap")
-        notes.append(f"the longest segment is used, {len(drive)} of {len(moving)} frames")
-    return drive, notes
+    return moving, notes
 
 
 def _check_count(drive: Drive, count: int, what: str) -> None:
@@ -251,7 +238,7 @@ def _check_count(drive: Drive, count: int, what: str) -> None:
 
 def _lane_of(found: FoundCamera, settings: MapSettings, where: Path, needed: bool) -> LaneScale | None:
     try:
-        return measure_lane(found.solved, found.sigma, settings.trace, settings.fit)
+        return measure_lane(segments_of(found.solved)[0], found.sigma, settings.trace, settings.fit)
     except TrackingLostError as error:
         if needed:
             raise CalibrationError(

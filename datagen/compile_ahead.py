@@ -45,7 +45,7 @@ def _made_up_drive() -> None:
     normals = np.tile([1.0, 0.0], (len(points), 1))
     scans = pack_scans([RoadEdges(points, normals)] * _FRAMES, height_cm)
     odometry = Odometry(steps, turns)
-    motion = motion_about(odometry, settings.motion, height_cm)
+    motion = motion_about(odometry, settings.motion, height_cm, np.ones(_FRAMES))
     run_filter(scans, motion, settings.filter, height_cm, camera.wheelbase_cm, rng)
     edges = EdgePixels(camera.project_ground(points).astype(np.float32), normals.astype(np.float32))
     start = BundleEstimate.level(odometry.poses, camera)

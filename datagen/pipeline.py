@@ -17,10 +17,9 @@ from datagen.quality.layout import PAGE_NAME
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.refusal import Attempt, report_refusal
-from datagen.segments import camera_of_drive, fit_lanes, solve_segments
+from datagen.segments import camera_of_drive, fit_lanes, solve_drive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
-from datagen.slam.join import join_segments
 from datagen.slam.odometry.scans import Progress
 from datagen.slam.segment import SegmentSolver
 from lanenet.config import dump_settings
@@ -91,17 +90,16 @@ def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures:
     compile_ahead()
     solver = SegmentSolver(settings, np.random.default_rng(settings.seed), progress)
     camera = attempt.camera = camera_of_drive(prepared, solver)
-    # Track, close loops, adjust: SegmentSolver.solve, segment by segment.
-    solved = attempt.solved = solve_segments(prepared, camera, solver)
-    joined = join_segments(solved.segments, prepared.drive, settings, solver.rng)
-    lanes = fit_lanes(prepared, joined.segments, solved.refused)
+    # Track, close loops, adjust: SegmentSolver.solve.
+    solved = attempt.solved = solve_drive(prepared, camera, solver)
+    lanes = fit_lanes(prepared, solved.segments, solved.refused)
     assembled = assemble(prepared, camera.camera, lanes.segments)
     checked = check_map(prepared, assembled, camera.figures)
-    notes = [*prepared.notes, *camera.notes, *joined.notes, *lanes.notes, *checked.notes]
+    notes = [*prepared.notes, *camera.notes, *lanes.notes, *checked.notes]
     figures = {
         "drive": str(request.drive_path),
         "frames": len(prepared.drive),
-        "segments": len(prepared.segments),
+        "segments": len(solved.segments),
         **camera.figures,
         **checked.figures,
         "notes": notes,

@@ -1,9 +1,8 @@
-"""First stage of mapping: from a recording to the segments that can be tracked, or a refusal."""
+"""First stage of mapping: from a recording to the frames that can be tracked, or a refusal."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,9 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.static import find_static, lens_circle_px, spread_frames
 
-#: Frames of a segment at least. Chosen: three seconds at 20 frames a second; the steering is fitted to 50.
-MIN_SEGMENT = 60
+#: Frames of a drive at least, and of what hangs together of it. Chosen: three seconds at 20 frames a second;
+#: the steering is fitted to 50.
+LEAST_FRAMES = 60
 #: Memory for the images of a drive; the rest is read again. About 1100 frames of 320 x 240 px.
 _MOST_BYTES = 250_000_000
 #: Frames looked at, evenly over the drive. Chosen: enough for a median, and quick.
@@ -72,7 +72,6 @@ class PreparedDrive:
     Attributes:
         request: What was asked for.
         drive: The frames in which the car drives forward.
-        segments: Its segments, as positions in it.
         held_out: Frames whose edge points are held out from the lines.
         settings: Settings, with the drive's wheelbase and without the rows in which the car sees itself.
         camera: The camera, where it is known.
@@ -81,7 +80,6 @@ class PreparedDrive:
 
     request: MapRequest
     drive: Drive
-    segments: list[slice]
     held_out: Bool[np.ndarray, "n"]
     settings: MapSettings
     camera: Camera | None
@@ -97,7 +95,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     """Open a recording, and keep the frames in which the car drives forward.
 
     Raises:
-        TrackingLostError: If the car stands still, or no segment is long enough.
+        TrackingLostError: If the car stands still, or there are too few frames of a car that drives.
         CalibrationError: If the known camera is for images of another size, or another height was given; or
             if the images are those of a full-circle fisheye, and the camera is not known.
         DriveFormatError: If the recording cannot be read.
@@ -106,7 +104,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     check_moving(recorded)
     notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
     drive, found = following_frames(recorded)
-    segments = split_segments(drive)
+    check_count(drive)
     # Deleted frames get no labels; where the car leaves the road, they show nothing of the lines.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
     known = read_camera(request.camera_path) if request.camera_path is not None else drive.camera
@@ -122,7 +120,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
                 f"high, but --camera-height gives {request.camera_height_cm:g} cm: expected one of them"
             )
     notes += [*found, *nominal, *hidden]
-    return PreparedDrive(request, drive, segments, held_out, settings, known, tuple(notes))
+    return PreparedDrive(request, drive, held_out, settings, known, tuple(notes))
 
 
 class KeptImages:
@@ -206,20 +204,16 @@ def check_lens(drive: Drive) -> None:
         )
 
 
-def split_segments(drive: Drive) -> list[slice]:
-    """Cut a drive where the recording is interrupted; segments too short to map are left out.
+def check_count(drive: Drive) -> None:
+    """Refuse a drive with too few frames to map.
 
     Raises:
-        TrackingLostError: If no segment is long enough.
+        TrackingLostError: Names the number of frames.
     """
-    starts = [0, *(int(k) for k in np.flatnonzero(drive.breaks) if k > 0), len(drive)]
-    segments = [slice(a, b) for a, b in pairwise(starts) if b - a >= MIN_SEGMENT]
-    if not segments:
+    if len(drive) < LEAST_FRAMES:
         raise TrackingLostError(
-            f"{drive.path}: {counted(len(drive), 'frame')}, longest segment without a gap "
-            f"{max(b - a for a, b in pairwise(starts))}; mapping needs {MIN_SEGMENT}"
+            f"{drive.path}: {counted(len(drive), 'frame')} of a car that drives, mapping needs {LEAST_FRAMES}"
         )
-    return segments
 
 
 def hide_bumper(drive: Drive, settings: MapSettings) -> tuple[MapSettings, tuple[str, ...]]:

@@ -18,6 +18,7 @@ from datagen.quality.pictures import tiled
 from datagen.segments import CameraOfDrive, SolvedDrive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
+from datagen.slam.commands import commands_of
 from datagen.slam.segment import SolvedSegment
 from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive, open_drive
@@ -45,7 +46,7 @@ class Attempt:
     Attributes:
         request: What was asked for.
         settings: Settings of all stages.
-        prepared: The drive with its segments.
+        prepared: The drive without what cannot be mapped.
         camera: The camera that was given or found.
         solved: Segments with their poses.
     """
@@ -127,15 +128,10 @@ def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
     request, lane = attempt.request, f"{attempt.request.lane_width_cm:g} cm"
     rows: list[Row] = [("stage", "result"), ("given", f"{request.drive_path}, lane width {lane}")]
     if attempt.prepared is None:
-        return [
-            *rows,
-            ("read the recording", f"{len(drive)} frames"),
-            ("check it and find its segments", "refused"),
-        ]
-    segments = attempt.prepared.segments
-    longest = max(part.stop - part.start for part in segments)
-    found = f"{len(drive)} frames in {len(segments)} segment(s), the longest of {longest}"
-    rows.append(("check it and find its segments", found))
+        return [*rows, ("read the recording", f"{len(drive)} frames"), ("check it", "refused")]
+    sizes = np.bincount(commands_of(drive, attempt.settings.guess.wheelbase_cm).part)
+    found = f"{len(drive)} frames in {len(sizes)} part(s) between long gaps, the longest of {sizes.max()}"
+    rows.append(("check it", found))
     if attempt.camera is None:
         return [*rows, ("find the camera", "refused")]
     camera, m = attempt.camera.camera, attempt.camera.camera.mounting

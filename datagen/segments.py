@@ -1,6 +1,7 @@
-"""Stages over the segments of a drive: the camera from one of them, then poses and lanes of each.
+"""Stages over a drive: its camera and poses, then the lanes of each of its segments.
 
-A segment that cannot be mapped does not spoil the others.
+A segment is what hangs together of a drive: it has a map frame of its own. One that cannot be mapped does not
+spoil the others.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ import numpy as np
 from jaxtyping import Int
 
 from datagen.lanes.find import MappedSegment, check_lane, find_lane
-from datagen.lanes.scale import measure_lane
-from datagen.prepare import PreparedDrive, check_edges
+from datagen.lanes.scale import fitted_width_cm, measure_lane
+from datagen.prepare import LEAST_FRAMES, PreparedDrive, check_edges
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import nudged
 from datagen.slam.camera.self_calibration import FoundCamera, find_camera, honest_sigma
-from datagen.slam.join import frames_text
+from datagen.slam.loops.parts import connected
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.data.segments import equal_runs
+from lanenet.errors import CalibrationError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 
 #: Sigmas of a height and a lane width that were measured with a ruler, relative. Chosen: half a centimetre of
@@ -47,14 +49,14 @@ class CameraOfDrive:
     Attributes:
         camera: In centimetres where it was known, else of nominal height.
         how: How it was found, for the files.
-        solved: Segments that were solved on the way, by their place among the segments.
+        solved: The drive, where it was solved on the way.
         figures: For the report.
         notes: A sentence each.
     """
 
     camera: Camera
     how: str = "given"
-    solved: dict[int, SolvedSegment] = field(default_factory=dict)
+    solved: SolvedSegment | None = None
     figures: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -93,16 +95,14 @@ class LanesOfDrive:
 
 
 def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfDrive:
-    """Take the known camera, or find it on the longest segment; refine it there if that was asked for.
+    """Take the known camera, or find it in the drive; refine it there if that was asked for.
 
     Raises:
-        TrackingLostError: If that segment shows too few edges of the road.
+        TrackingLostError: If the drive shows too few edges of the road.
     """
-    segments = prepared.segments
     if prepared.camera is not None and not prepared.request.refine_camera:
         return CameraOfDrive(prepared.camera)
-    longest = max(range(len(segments)), key=lambda i: segments[i].stop - segments[i].start)
-    drive = prepared.drive.subset(segments[longest])
+    drive = prepared.drive
     check_edges(drive, prepared.settings.perception.edges)
     found = find_camera(drive, prepared.camera, solver, solver.progress)
     notes: tuple[str, ...] = ()
@@ -110,7 +110,7 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
     if height_cm is not None:
         found, notes = fit_height(found, drive, width_cm / height_cm, prepared.settings, solver)
     figures = {"calibration": found.figures}
-    return CameraOfDrive(found.camera, found.how, {longest: found.solved}, figures, (found.note, *notes))
+    return CameraOfDrive(found.camera, found.how, found.solved, figures, (found.note, *notes))
 
 
 def fit_height(
@@ -123,10 +123,10 @@ def fit_height(
 
     Args:
         found: The camera that the images show.
-        drive: Its segment of the drive.
+        drive: The drive.
         lane_heights: Lane width over camera height.
         settings: How lanes are found.
-        solver: Solves the segment.
+        solver: Solves the drive.
 
     Returns:
         The camera, and a note if the lane that it needs was not found.
@@ -135,7 +135,7 @@ def fit_height(
     slope = _WIDTH_BY_FOCAL
     while True:
         try:
-            lane = measure_lane(found.solved, {}, settings.trace, settings.fit)
+            lane = measure_lane(segments_of(found.solved)[0], {}, settings.trace, settings.fit)
         except TrackingLostError as error:
             return found, (f"the camera's height was not used: {error}",)
         camera = found.camera
@@ -163,14 +163,14 @@ def fit_height(
 def _with_focal(
     found: FoundCamera, drive: Drive, change: float, focal_sigma: float, solver: SegmentSolver
 ) -> FoundCamera:
-    """Solve a segment again with another focal length, and the horizon where it is in the images.
+    """Solve a drive again with another focal length, and the horizon where it is in the images.
 
     Args:
         found: The camera before.
-        drive: The segment.
+        drive: The drive.
         change: Of the focal length, a logarithm.
         focal_sigma: How closely it is known, relative.
-        solver: Solves the segment.
+        solver: Solves the drive.
     """
     pitch = float(np.arctan(np.tan(found.camera.mounting.pitch_down_rad) * np.exp(-change)))
     camera = nudged(found.camera, "focal", change).with_mounting(pitch_down_rad=pitch)
@@ -181,24 +181,41 @@ def _with_focal(
     return replace(found, solved=solved, sigma=sigma)
 
 
-def solve_segments(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentSolver) -> SolvedDrive:
-    """Track each segment, close its loops and adjust it."""
-    found, refused = [], []
-    for i, segment in enumerate(prepared.segments):
-        rows = np.arange(segment.start, segment.stop)
-        try:
-            one = camera.solved.get(i) or solver.solve(prepared.drive.subset(segment), camera.camera)
-        except (TrackingLostError, CalibrationError) as error:
-            refused.append(Refused(rows, error))
-        else:
-            found.append(replace(one, rows=rows))
-    return SolvedDrive(tuple(found), tuple(refused))
+def segments_of(solved: SolvedSegment) -> list[SolvedSegment]:
+    """Return what hangs together of a solved drive, the longest first."""
+    group = connected(solved.part, solved.revisits)
+    by_size = np.argsort(-np.bincount(group), kind="stable")
+    return [solved.only(np.flatnonzero(group == number)) for number in by_size]
+
+
+def solve_drive(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentSolver) -> SolvedDrive:
+    """Track the drive, close its loops and adjust it; what hangs together of it becomes a segment.
+
+    Raises:
+        TrackingLostError: If the road shows too few edges, or no segment is long enough.
+    """
+    drive = prepared.drive
+    found = segments_of(camera.solved or solver.solve(drive, camera.camera))
+    if len(found[0].rows) < LEAST_FRAMES:
+        raise TrackingLostError(
+            f"{drive.path}: {len(drive)} frames in {len(found)} parts that show no place of each other, the "
+            f"longest of {len(found[0].rows)} frames; mapping needs {LEAST_FRAMES}"
+        )
+    refused = [
+        Refused(
+            one.rows, TrackingLostError(f"{counted(len(one.rows), 'frame')} that show no place of others")
+        )
+        for one in found
+        if len(one.rows) < LEAST_FRAMES
+    ]
+    kept = sorted((one for one in found if len(one.rows) >= LEAST_FRAMES), key=lambda one: int(one.rows[0]))
+    return SolvedDrive(tuple(kept), tuple(refused))
 
 
 def fit_lanes(
     prepared: PreparedDrive, segments: Sequence[SolvedSegment], refused: Sequence[Refused]
 ) -> LanesOfDrive:
-    """Find the lane of each segment.
+    """Find the lane of each segment, the longest first: unless it is known, its width is that of the others.
 
     Args:
         prepared: The drive.
@@ -211,8 +228,9 @@ def fit_lanes(
     """
     drive, settings, held_out = prepared.drive, prepared.settings, prepared.held_out
     mapped, left_out = [], list(refused)
-    for segment in segments:
-        rows, lane_cm = segment.rows, prepared.known_lane_cm
+    lane_cm = prepared.known_lane_cm
+    for segment in sorted(segments, key=lambda one: -len(one.rows)):
+        rows = segment.rows
         try:
             one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit)
             check_lane(one, drive)
@@ -220,6 +238,15 @@ def fit_lanes(
             left_out.append(Refused(rows, error))
         else:
             mapped.append(one)
+            # A road keeps its width; the longest segment shows it best.
+            lane_cm = lane_cm or fitted_width_cm(one.lines, one.lane, one.s_frames_cm)
     if not mapped:
         raise max(left_out, key=lambda one: len(one.rows)).reason
+    mapped.sort(key=lambda one: int(one.rows[0]))
     return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in left_out))
+
+
+def frames_text(drive: Drive, rows: Int[np.ndarray, "n"]) -> str:
+    """Name rows of a drive by the frame numbers of their first and last ones, run by run."""
+    runs = [rows[run] for run in equal_runs(rows - np.arange(len(rows)))]
+    return "frames " + ", ".join(f"{drive.frames[run[0]]}-{drive.frames[run[-1]]}" for run in runs)

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.markings import TraceSettings
-from datagen.lanes.path import lap_path, without_frames
+from datagen.lanes.path import Path, shared_path, without_frames
 from datagen.lanes.profile import without_crossings
-from datagen.lanes.scale import STEP_HEIGHTS, edges_of_segment
+from datagen.lanes.scale import AHEAD_HEIGHTS, STEP_HEIGHTS, edges_of_segment
 from datagen.lanes.trace import (
     LEAST_SEEN,
     MAYBE_LINE,
@@ -42,6 +42,7 @@ class MappedSegment:
     Attributes:
         solved: Poses and scans.
         s_frames_cm: Position of each frame along the driven path.
+        laps: Lap of each frame, from 0.
         lane: The traced lane.
         lines: Its two lines, then those of adjacent lanes.
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
@@ -49,6 +50,7 @@ class MappedSegment:
 
     solved: SolvedSegment
     s_frames_cm: Float[np.ndarray, "n"]
+    laps: Int[np.ndarray, "n"]
     lane: TracedLane
     lines: list[LaneLine]
     free_lane_cm: float | None = None
@@ -80,10 +82,11 @@ def find_lane(
         CalibrationError: If two do, but at another distance than the lane width.
     """
     height = segment.camera.mounting.height_cm
-    revisits = [(revisit.earlier, revisit.later) for revisit in segment.uninterrupted_revisits]
-    lap = lap_path(segment.poses, revisits, STEP_HEIGHTS * height, height)
+    revisits = [(revisit.earlier, revisit.later) for revisit in segment.revisits_within_parts]
+    step_cm, ahead_cm = STEP_HEIGHTS * height, AHEAD_HEIGHTS * height
+    shared = shared_path(segment.poses, segment.part, revisits, step_cm, ahead_cm, height)
     scans, side_cm = without_frames(segment.scans, held_out), trace.side_heights * height
-    path, edges = edges_of_segment(segment, scans, lap, _OWN_LANE_REACH * (lane_width_cm or 0.0))
+    path, edges = edges_of_segment(segment, scans, shared, _OWN_LANE_REACH * (lane_width_cm or 0.0))
     edges = without_crossings(path, edges, height, side_cm)
     free_cm = None
     if lane_width_cm is None:
@@ -95,7 +98,17 @@ def find_lane(
     adjacent = without_crossings(path, adjacent, height, side_cm)
     lane = trace_adjacent(path, adjacent, lane, height, trace)
     lines = fit_lines(path, edges, lane, height, fit, adjacent)
-    return MappedSegment(segment, path.s_frames_cm, lane, lines, free_cm)
+    return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, free_cm)
+
+
+def _laps(segment: SolvedSegment, path: Path) -> Int[np.ndarray, "n"]:
+    """Number the laps from 0; where no part of the drive holds a whole one, by the way along the path."""
+    if path.period_cm is None or segment.revisits_within_parts:
+        return segment.laps
+    # The car may roll back by less than a quarter of a lap; what it did in a long gap is unknown.
+    back = 0.25 * path.period_cm
+    gone = np.mod(np.diff(path.s_frames_cm, prepend=path.s_frames_cm[0]) + back, path.period_cm) - back
+    return np.floor(np.maximum(np.cumsum(gone), 0.0) / path.period_cm).astype(np.int64)
 
 
 def check_lane(segment: MappedSegment, drive: Drive) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
+from datagen.lanes.lap import stitched_road, with_long_steps_filled
 from datagen.slam.odometry.scans import Scans
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.frames import wrap_angle
@@ -121,29 +122,50 @@ def left_of(direction: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
     return np.stack([-unit[:, 1], unit[:, 0]], axis=1)
 
 
-def lap_path(
-    poses: Float[np.ndarray, "n 3"], revisits: list[tuple[int, int]], step_cm: float, camera_height_cm: float
+def shared_path(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    revisits: list[tuple[int, int]],
+    step_cm: float,
+    ahead_cm: float,
+    camera_height_cm: float,
 ) -> Path | None:
-    """Close one lap of a drive and find the position of every frame on it.
+    """Find the path that all visits share, one lap as a rule, and the position of every frame on it.
 
-    The lap is the section between the two visits of one place that are closest together; the remaining gap is
-    distributed over the lap.
+    The lap is the section between the two visits of one place that are closest together. Where no part of the
+    drive holds a whole one, it is put together from several, or an open road is. What a lap misses of itself
+    is distributed over it.
 
     Args:
         poses: Rear-axle poses after closing loops, frame map.
-        revisits: Pairs of frames, earlier and later, that show the same place in the same direction.
+        part: Part of the drive that each frame belongs to.
+        revisits: Pairs of frames, earlier and later, that show the same place in the same direction, both in
+            one part.
         step_cm: Approximate distance between samples.
+        ahead_cm: Length to add at the end of an open road.
         camera_height_cm: Sets the scale of bounds.
 
     Returns:
-        The closed path; None if the drive does not repeat one lap: it has no revisit, or too many frames lie
-        elsewhere.
+        The path, closed where it is a lap; None if the visits share none: the drive is in one part without a
+        revisit, or too many frames lie elsewhere.
     """
     ends = _ends_of_lap(poses, revisits)
-    if ends is None:
+    if ends is not None:
+        road, closed = poses[ends[0] : ends[1] + 1], True
+    elif part[-1] > part[0]:
+        road, closed = stitched_road(poses, part, camera_height_cm)
+    else:
         return None
-    first, last = ends
-    xy = poses[first : last + 1, :2]
+    road = with_long_steps_filled(road, camera_height_cm)
+    path = _closed_path(road[:, :2], step_cm) if closed else path_of_poses(road, step_cm, ahead_cm)
+    s, d, forward = positions_on_path(path, poses, part)
+    if np.mean(np.abs(d) > _OFF_HEIGHTS * camera_height_cm) > _MAX_OFF:
+        return None
+    return replace(path, s_frames_cm=s, d_frames_cm=d, forward=forward)
+
+
+def _closed_path(xy: Float[np.ndarray, "k 2"], step_cm: float) -> Path:
+    """Close a lap, smooth it and sample it evenly."""
     along = path_lengths(xy)
     xy = xy - (along / along[-1])[:, None] * (xy[-1] - xy[0])
     xy = _even(xy, step_cm)
@@ -153,23 +175,19 @@ def lap_path(
         xy = gaussian_filter1d(xy, _SMOOTH_CM / spacing, axis=0, mode="wrap")
         xy = _even(np.concatenate([xy, xy[:1]]), step_cm)
     step = float(np.linalg.norm(np.diff(xy, axis=0, append=xy[:1]), axis=1).mean())
-    path = Path(step, xy, left_of(np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)), np.empty(0), closed=True)
-    s, d, forward = positions_on_lap(path, poses)
-    if np.mean(np.abs(d) > _OFF_HEIGHTS * camera_height_cm) > _MAX_OFF:
-        return None
-    return replace(path, s_frames_cm=s, d_frames_cm=d, forward=forward)
+    return Path(step, xy, left_of(np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)), np.empty(0), closed=True)
 
 
-def positions_on_lap(
-    path: Path, poses: Float[np.ndarray, "n 3"]
+def positions_on_path(
+    path: Path, poses: Float[np.ndarray, "n 3"], part: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Find each pose's position along a closed path, its offset to the left, and whether it drives forward.
+    """Find each pose's position along a path, its offset to the left, and whether it drives forward.
 
-    Where roads cross or lie side by side, heading and the position of the frame before decide.
+    Where roads cross or lie side by side, heading and the position of the frame before in its part decide.
     """
-    n, m = len(poses), len(path.xy_cm)
-    period = m * path.step_cm
-    s_all = path.s_cm
+    n, s_all = len(poses), path.s_cm
+    # On an open path no position comes again.
+    period = path.period_cm or 4.0 * len(path.xy_cm) * path.step_cm
     road = np.arctan2(-path.left[:, 0], path.left[:, 1])
     s, d, forward = np.empty(n), np.empty(n), np.ones(n, dtype=bool)
     moved = np.concatenate([[0.0], np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)])
@@ -185,10 +203,12 @@ def positions_on_lap(
         cost = cost + np.where(np.abs(cosine) < _MIN_COSINE, 1e6, 0.0)
         i = int(np.argmin(cost))
         along = float(apart[i] @ [path.left[i, 1], -path.left[i, 0]])
-        s[k] = np.mod(s_all[i] + np.clip(along, -path.step_cm, path.step_cm), period)
+        s[k] = s_all[i] + np.clip(along, -path.step_cm, path.step_cm)
+        s[k] = np.mod(s[k], period) if path.closed else max(s[k], 0.0)
         d[k] = float(apart[i] @ path.left[i])
         forward[k] = bool(cosine[i] > 0.0)
-        if k + 1 < n:
+        expected = None
+        if k + 1 < n and part[k + 1] == part[k]:
             expected = s[k] + (moved[k + 1] if forward[k] else -moved[k + 1])
     return s, d, forward
 

@@ -25,7 +25,7 @@ from lanenet.geometry.lane import SIDES
 #: to which the edges of a frame count, in camera heights. The study of three recorded drives found lines
 #: beyond 3.5 heights wrong; the extension covers what the last frame sees. Chosen: a step of 1.8 cm at 15 cm,
 #: a dash is longer.
-STEP_HEIGHTS, _AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
+STEP_HEIGHTS, AHEAD_HEIGHTS, _REACH_HEIGHTS = 0.12, 5.0, 3.5
 #: Length of lane that counts as one measurement of its width, in camera heights. Chosen: what one frame
 #: shows.
 _ALIKE_HEIGHTS = 3.0
@@ -73,7 +73,7 @@ def edges_of_segment(
     """
     height = solved.camera.mounting.height_cm
     if path is None:
-        path = path_of_poses(solved.poses, STEP_HEIGHTS * height, _AHEAD_HEIGHTS * height)
+        path = path_of_poses(solved.poses, STEP_HEIGHTS * height, AHEAD_HEIGHTS * height)
     reach_cm = max(_REACH_HEIGHTS * height, least_reach_cm)
     return path, edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach_cm)
 

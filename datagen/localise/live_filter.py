@@ -25,7 +25,7 @@ from datagen.slam.odometry.stillness import StandstillDetector, shrink_image
 from datagen.slam.view import mapping_range
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
-from lanenet.data.drives.recording import COMMAND_NAMES, MAX_PAUSE_S, Commands
+from lanenet.data.drives.recording import COMMAND_NAMES, Commands
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import check_frame, find_edges
@@ -34,6 +34,9 @@ from lanenet.perception.edges.road import RoadEdges, RoadTable
 
 #: Frames that are needed to find the typical step: as many as the odometry compares.
 LEAST_START = 60
+#: After a longer pause a new segment begins: a car at 1 m/s has lost its last frame from sight, and what
+#: follows cannot be put beside it while driving.
+_MAX_PAUSE_S = 1.0
 #: Time steps whose median is the typical one: five seconds at 20 Hz.
 _TIMES = 100
 #: Walk per frame of the distance factor about a recorded speed, whose gain is nearly 1; in camera heights,
@@ -184,7 +187,7 @@ class LiveLocaliser:
         self._waiting: list[_Observed] = []
         #: Times of the last frame that was taken, of the last with an image, and of the last that the filter
         #: saw.
-        self._t_s = self._t_image_s = self._t_filtered_s = -np.inf
+        self._t_s = self._t_image_s = self._t_driven_s = -np.inf
         self._begin()
 
     @property
@@ -207,7 +210,7 @@ class LiveLocaliser:
         if frame.t_s <= self._t_s:
             raise DriveFormatError(f"frame {frame.frame}: time {frame.t_s:g} s after {self._t_s:g} s")
         first, poses = not np.isfinite(self._t_s), list[LivePose]()
-        paused = self._t_image_s < frame.t_s - MAX_PAUSE_S
+        paused = self._t_image_s < frame.t_s - _MAX_PAUSE_S
         if not first and (frame.starts or (paused and frame.image is not None)):
             poses = self.finish()
             self.segment += bool(self._filter is not None)
@@ -224,6 +227,8 @@ class LiveLocaliser:
         stands = self._standstill.stands(shrink_image(frame.image))
         if stands and (self._filter is not None or self._waiting):
             self.standing += 1
+            # Time in which the car stands is not driven.
+            self._t_driven_s = frame.t_s
             return poses if self._last is None else [*poses, self._stay(frame)]
         return [*poses, *self._follow(self._observed(frame))]
 
@@ -256,7 +261,7 @@ class LiveLocaliser:
         self._history: deque[Survivors] = deque(maxlen=self.start.frames)
         self._distances_cm: deque[float] = deque(maxlen=self.start.frames)
         self._turns: deque[float] = deque(maxlen=self.start.frames)
-        self._t_filtered_s = -np.inf
+        self._t_driven_s = -np.inf
 
     def _check_size(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         height, width = check_frame(image).shape[:2]
@@ -276,11 +281,11 @@ class LiveLocaliser:
             )
             road = self._table.lift(pixels)
         commands = self._commanded(frame)
-        self._t_filtered_s = frame.t_s
+        self._t_driven_s = frame.t_s
         return _Observed(frame.frame, frame.t_s, pixels, pack_scans([road], self.height_cm).scan(0), commands)
 
     def _commanded(self, frame: LiveFrame) -> CommandedMotion:
-        """What was commanded since the last frame that the filter saw."""
+        """What was commanded since the last frame that the filter saw, or that showed a standing car."""
         rows = {}
         for name in COMMAND_NAMES:
             values = getattr(frame.commands, name)
@@ -289,12 +294,12 @@ class LiveLocaliser:
             if np.isfinite(values[0]):
                 self._held[name] = float(values[0])
             rows[name] = np.full(2, self._held.get(name, 0.0))
-        before_s = self._t_filtered_s if np.isfinite(self._t_filtered_s) else frame.t_s
+        before_s = self._t_driven_s if np.isfinite(self._t_driven_s) else frame.t_s
         typical_s = float(np.median(self._intervals_s)) if self._intervals_s else 1.0
         times = np.array([before_s, frame.t_s])
         both = commanded_motion(Commands(**rows), times, typical_s, self.camera.wheelbase_cm)
         turn = None if both.turn is None else both.turn[1:]
-        return replace(both, distance_cm=both.distance_cm[1:], turn=turn)
+        return replace(both, distance_cm=both.distance_cm[1:], turn=turn, periods=both.periods[1:])
 
     def _follow(self, observed: _Observed) -> list[LivePose]:
         if self.factor is not None:
@@ -350,7 +355,9 @@ class LiveLocaliser:
         final = np.bincount(particles.survivor_of, particles.weights)
         states = smooth_lineages(list(self._history), final)
         n = len(states)
-        commands = CommandedMotion(np.array(self._distances_cm)[-n:], speed_known, np.array(self._turns)[-n:])
+        commands = CommandedMotion.without_gaps(
+            np.array(self._distances_cm)[-n:], speed_known, np.array(self._turns)[-n:]
+        )
         self.steering = fit_steering(states[:, :3], commands, self.height_cm)
         self._history.clear()
         if self.steering is not None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from datagen.slam.commands import CommandedMotion
 from lanenet.data.segments import equal_runs, true_runs
@@ -26,14 +26,17 @@ _SLOW_HEIGHTS, _KEY_HEIGHTS = 0.075, 0.15
 _BESIDE, _LEAST_SLOW = 10, 60
 
 
-def choose_keyframes(steps_heights: Float[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
+def choose_keyframes(
+    steps_heights: Float[np.ndarray, "n"], part: Int[np.ndarray, "n"]
+) -> Int[np.ndarray, "k"]:
     """Choose the frames by which a drive is tracked: all of them where the car is not slow.
 
     Args:
         steps_heights: Rough step length of each frame, in camera heights.
+        part: Part of the drive that each frame belongs to.
 
     Returns:
-        Frames in ascending order, the first and the last among them.
+        Frames in ascending order, the first and the last of each part among them.
     """
     n = len(steps_heights)
     so_far = np.concatenate([[0.0], np.cumsum(steps_heights)])
@@ -49,7 +52,8 @@ def choose_keyframes(steps_heights: Float[np.ndarray, "n"]) -> Int[np.ndarray, "
             # The frame nearest to the wanted distance; the first one has none before it.
             kept[k] = k == 0 or distance + 0.5 * steps_heights[k] >= _KEY_HEIGHTS
             distance = 0.0 if kept[k] else distance
-    kept[[0, -1]] = True
+    kept |= np.diff(part, prepend=part[0] - 1) > 0
+    kept |= np.diff(part, append=part[-1] + 1) > 0
     return np.flatnonzero(kept)
 
 
@@ -65,22 +69,21 @@ def interleaved_rows(keys: Int[np.ndarray, "k"], n: int) -> list[Int[np.ndarray,
 
 
 def keyframe_pairs(
-    keys: Int[np.ndarray, "k"], lags: Sequence[int], breaks: Bool[np.ndarray, "n"] | None = None
+    keys: Int[np.ndarray, "k"], lags: Sequence[int], part: Int[np.ndarray, "n"]
 ) -> list[tuple[int, int]]:
     """Pairs of frames that are so many keyframes apart, for the adjustment of all frames together.
 
     Consecutive frames of a slow car hardly show how far apart they are: what holds the keyframes on each
-    other holds the whole map in shape. A segment of which every frame is a keyframe needs no pairs of its
+    other holds the whole map in shape. A part of which every frame is a keyframe needs no pairs of its
     own.
 
     Args:
-        keys: The keyframes, the first and the last frame of each segment among them.
+        keys: The keyframes, the first and the last frame of each part among them.
         lags: How many keyframes apart.
-        breaks: Frames that do not follow the one before them; None for one segment.
+        part: Part of the drive that each frame belongs to.
     """
-    segment = np.zeros(keys[-1] + 1, np.int64) if breaks is None else np.cumsum(breaks)
     pairs = []
-    for run in equal_runs(segment):
+    for run in equal_runs(part):
         own = keys[(keys >= run[0]) & (keys <= run[-1])]
         if len(own) < len(run):
             pairs += [(int(a), int(b)) for lag in lags for a, b in zip(own, own[lag:], strict=False)]
@@ -94,7 +97,9 @@ def commands_between(commands: CommandedMotion, keys: Int[np.ndarray, "k"]) -> C
     turn = commands.turn
     if turn is not None:
         turn = np.add.reduceat(turn, starts) / np.diff(starts, append=keys[-1] + 1)
-    return replace(commands, distance_cm=distance, turn=turn)
+    # Time counts in steps between keyframes. The first frame of a part follows the last of the one before.
+    periods = np.add.reduceat(commands.periods, starts) / np.diff(starts, append=keys[-1] + 1)
+    return replace(commands, distance_cm=distance, turn=turn, periods=periods)
 
 
 def poses_between(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from datagen.slam.adjustment.adjust import Observations
 from datagen.slam.commands import CommandedMotion
@@ -56,11 +56,11 @@ class RoadView:
         """Move the edges to the road, with the camera tilted in each frame beyond its mounting."""
         return scans_of(self.edges, camera, self.limits, tilt_rad)
 
-    def observed(
-        self, commands: CommandedMotion, breaks: Bool[np.ndarray, "n"] | None = None
-    ) -> Observations:
-        """For the bundle adjustment: the edges, with what was commanded and where the drive breaks."""
-        return Observations(self.edges, self.keep, commands.relative_steps, commands.speed_known, breaks)
+    def observed(self, commands: CommandedMotion) -> Observations:
+        """For the bundle adjustment: the edges, with what was commanded and how long each step took."""
+        return Observations(
+            self.edges, self.keep, commands.relative_steps, commands.speed_known, commands.periods
+        )
 
 
 def view_road(
@@ -137,6 +137,6 @@ def view_segment(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
             f"road; mapping needs {_LEAST_POINTS}"
         )
-    images = ImagePairs(road.edges, camera, settings.odometry, rng)
+    images = ImagePairs(road.edges, camera, settings.odometry, rng, commands.periods)
     typical = typical_step(images, commands.distance_cm, commands.speed_known)
     return SegmentView(drive, camera, commands, road, scans, images, typical)

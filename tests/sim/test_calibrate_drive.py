@@ -51,7 +51,7 @@ def test_two_laps_give_the_camera_from_a_coarse_start(tmp_path, seed, focal_px, 
     width_cm = simulation.track.lane_width_cm
     result = calibrate_drive(tmp_path / "drive", width_cm, None, None, settings)
     check_near(result.camera, truth)
-    assert result.closed and result.lane_cm == pytest.approx(width_cm)
+    assert result.revisits and result.lane_cm == pytest.approx(width_cm)
     focal_error = abs(result.camera.K[0, 0] - truth.K[0, 0])
     assert focal_error < 3.0 * result.sigma["focal_px"] < 0.15 * truth.K[0, 0]
     path = tmp_path / "camera.yaml"

@@ -46,8 +46,7 @@ SIMULATION = SimulationSettings.model_validate(
 #: What a mapping computes before it writes; the same for every run.
 STAGES = (
     "camera_of_drive",
-    "solve_segments",
-    "join_segments",
+    "solve_drive",
     "fit_lanes",
     "assemble",
     "check_map",

@@ -42,6 +42,7 @@ from datagen.slam.adjustment.state import (
     BundleState,
     Observations,
 )
+from datagen.slam.commands import MOST_BRIDGED
 from lanenet.geometry.camera import Camera
 from lanenet.processes import in_threads
 
@@ -256,16 +257,14 @@ class BundleProblem:
         self.points = Pixels(point_starts, uv[index], normals[index])
         by_row = np.lexsort((uv[:, 1], np.repeat(np.arange(self.frames), counts)))
         self.edges = Pixels(starts, uv[by_row], normals[by_row])
-        breaks = observed.breaks
-        segment = np.zeros(self.frames, int) if breaks is None else np.cumsum(breaks)
-        self.pairs = _pairs(settings.lags, segment, loops, rng)
+        periods = np.ones(self.frames) if observed.periods is None else observed.periods
+        self.pairs = _pairs(settings.lags, np.cumsum(periods > MOST_BRIDGED), loops, rng)
         #: Unknowns of the two frames of each pair.
         self.unknowns = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
         self.inner = inner_pixels(camera, observed.keep)
         #: Comparisons of the pairs before each.
         self.compared_by = np.concatenate([[0], np.cumsum(np.diff(point_starts)[self.pairs[:, 0]])])
         self.compared = int(self.compared_by[-1])
-        self.joined = np.flatnonzero(segment[1:] == segment[:-1])
         self.weight = np.full(len(index), 1.0 / settings.pixel_sigma**2)
         self._lifted: tuple[BundleState, _Lifted] | None = None
         s, centre = settings, settings.centre_px * self.scale
@@ -324,7 +323,7 @@ class BundleProblem:
             )  # fmt: skip
 
         cost = sum(in_threads(cost_of, _parts(len(self.pairs))))
-        prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.joined, self.observed)
+        prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.observed)
         at, free = self.unknowns.ravel(), self.free
         border = [
             np.bincount(at, blocks[:, :both, both + k].ravel(), minlength=count) for k in np.flatnonzero(free)
@@ -411,21 +410,23 @@ def sum_blocks(unknowns: Int[np.ndarray, "p k"], blocks: Float[np.ndarray, "p k 
 
 
 def frame_priors(
-    state: BundleState, settings: BundleSettings, joined: Int[np.ndarray, "m"], observed: Observations
+    state: BundleState, settings: BundleSettings, observed: Observations
 ) -> tuple[float, csc_matrix, Float[np.ndarray, "u"]]:
     """What is assumed of the frames: they are nearly level, and the car rolls on arcs that change slowly.
 
     Args:
         state: Where to linearise.
         settings: Sigmas.
-        joined: Frames that are followed by the next one.
         observed: What was commanded.
 
     Returns:
         Cost, H and -g of the priors by the frames' numbers.
     """
     s, n = settings, len(state.poses)
-    i, j = joined, joined + 1
+    periods = np.ones(n) if observed.periods is None else observed.periods
+    # Nothing is assumed across a long gap.
+    j = np.flatnonzero(periods[1:] <= MOST_BRIDGED) + 1
+    i = j - 1
     own = N_FRAME * np.arange(n)[:, None]
     step_at = np.concatenate(
         [N_FRAME * i[:, None] + np.arange(3), N_FRAME * j[:, None] + np.arange(3)], axis=1
@@ -452,13 +453,22 @@ def frame_priors(
     per = np.where(commanded > 0.0, 1.0 / np.maximum(commanded, _LEAST_STEP), 0.0)
     per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
     speed_by = np.concatenate([per_b[:, None] * along_by[b], -per_a[:, None] * along_by[a]], axis=1)
+    # Over a gap the turn spreads over its time, and all is less sure.
+    time = periods[j]
+    longer = np.maximum(time[a], time[b])
+    rate = (1.0 / time)[:, None]
     # Each prior: residual, sigma, and the unknowns that it depends on with the Jacobian by them.
     priors = [
         (state.tilt[:, 0], s.frame_pitch, own + 3, np.ones((n, 1))),
         (state.tilt[:, 1], s.frame_roll, own + 4, np.ones((n, 1))),
-        (across, s.slip, step_at, across_by),
-        (per_b * along[b] - per_a * along[a], s.speed_change, both_at, speed_by),
-        (turn[b] - turn[a], s.turn_change, both_at, np.concatenate([turn_by[b], -turn_by[a]], axis=1)),
+        (across, s.slip * time**1.5, step_at, across_by),
+        (per_b * along[b] - per_a * along[a], s.speed_change * longer, both_at, speed_by),
+        (
+            turn[b] / time[b] - turn[a] / time[a],
+            s.turn_change * np.sqrt(longer),
+            both_at,
+            np.concatenate([rate[b] * turn_by[b], -rate[a] * turn_by[a]], axis=1),
+        ),
         (np.zeros(3), _FIXED_SIGMA, np.arange(3)[:, None], np.ones((3, 1))),
     ]
     known = np.flatnonzero(commanded >= _LEAST_STEP) if observed.speed_recorded else np.zeros(0, np.int64)
@@ -471,7 +481,7 @@ def frame_priors(
         )
     e = np.concatenate([residual / sigma for residual, sigma, _, _ in priors])
     counts = np.concatenate([np.full(len(columns), columns.shape[1]) for _, _, columns, _ in priors])
-    values = np.concatenate([(by / sigma).ravel() for _, sigma, _, by in priors])
+    values = np.concatenate([(by.T / sigma).T.ravel() for _, sigma, _, by in priors])
     columns = np.concatenate([at.ravel() for _, _, at, _ in priors])
     jacobian = coo_matrix(
         (values, (np.repeat(np.arange(len(e)), counts), columns)), shape=(len(e), N_FRAME * n)

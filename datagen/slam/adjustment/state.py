@@ -88,14 +88,15 @@ class Observations:
         keep: Pixels in which edges were looked for; None for all.
         relative_steps: Commanded step length to each frame, 1 where it is typical; None for equal steps.
         speed_recorded: Whether these come from a recorded speed.
-        breaks: Frames that do not follow the one before them; None for one segment.
+        periods: Time from the frame before to each frame, in typical time steps (see
+            :class:`datagen.slam.commands.CommandedMotion`); None for a drive without gaps.
     """
 
     edges: Sequence[EdgePixels]
     keep: UInt8[np.ndarray, "h w"] | None = None
     relative_steps: Float[np.ndarray, "n"] | None = None
     speed_recorded: bool = False
-    breaks: Bool[np.ndarray, "n"] | None = None
+    periods: Float[np.ndarray, "n"] | None = None
 
 
 @dataclass(frozen=True)

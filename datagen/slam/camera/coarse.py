@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
+from datagen.slam.commands import commands_of
 from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
 from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence
 from datagen.slam.odometry.scans import Progress, seen_edges
@@ -121,6 +122,7 @@ class _Search:
         count = min(guess.frames, len(drive))
         start = max(0, (len(drive) - count) // 3)
         self.edges = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
+        self.periods = commands_of(drive.subset(slice(start, start + count)), guess.wheelbase_cm).periods
         self.size = drive.width, drive.height
         self.scale = drive.width / _REFERENCE_WIDTH
         self.limits, self.guess, self.seed = perception.range, guess, seed
@@ -136,7 +138,8 @@ class _Search:
         camera = self.camera(focal_px, pitch_deg)
         table = RoadTable(camera, mapping_range(camera.mounting.height_cm, self.limits))
         edges = [seen_edges(pixels, table) for pixels in self.edges]
-        return ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(self.seed))
+        rng = np.random.default_rng(self.seed)
+        return ImagePairs(edges, camera, OdometrySettings(), rng, self.periods)
 
     def try_camera(self, focal_and_pitch: tuple[float, float], step_heights: float) -> Candidate:
         """Rate a camera by how clear the motion is with it, around a step length."""

@@ -28,6 +28,8 @@ class MotionModel:
         offset_decay: Share of the offset that is forgotten per frame.
         curvature_noise_per_cm: Standard deviation of the curvature per frame.
         max_curvature_per_cm: Bound of the total curvature, so that the heading cannot spin.
+        wider: Factor on the noise of each frame's distance and curvature: over a gap both are less sure.
+            None for a drive without gaps.
     """
 
     distance_cm: Float[np.ndarray, "n"]
@@ -40,6 +42,7 @@ class MotionModel:
     offset_decay: float
     curvature_noise_per_cm: float
     max_curvature_per_cm: float
+    wider: Float[np.ndarray, "n"] | None = None
 
     @property
     def numbers(self) -> Float[np.ndarray, "8"]:
@@ -68,6 +71,8 @@ class MotionModel:
     def predict(self, states: Float[np.ndarray, "p 5"], k: int, rng: np.random.Generator) -> None:
         """Move particles in place from frame k - 1 to frame k."""
         noise = rng.standard_normal((4, len(states)))
+        if self.wider is not None:
+            noise[2:] *= self.wider[k]
         advance(states, noise, self.distance_cm[k], self.curvature_per_cm[k], self.numbers)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
@@ -19,8 +19,6 @@ from lanenet.geometry.poses import compose, path_lengths, relative_pose
 #: Gauss-Newton steps at most, and the step, in camera heights and rad, at which they end. Chosen: four or
 #: five are usual.
 _ITERATIONS, _CONVERGED = 12, 1e-4
-#: Weight of the motion across a break, which is unknown; not zero, so that the system stays determined.
-_ACROSS_BREAK = 1e-4
 #: Weight that holds the first heading; far above all others.
 _HOLD = 1e3
 #: Sigmas of a turn between neighbours and of a revisit's heading when the headings are solved alone, [rad].
@@ -67,7 +65,7 @@ def close_loops(
     poses: Float[np.ndarray, "n 3"],
     revisits: list[Revisit],
     camera_height_cm: float,
-    breaks: Bool[np.ndarray, "n"] | None = None,
+    periods: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "r 3"]]:
     """Bend a trajectory so that revisits meet.
 
@@ -79,7 +77,8 @@ def close_loops(
         poses: Open-loop trajectory, heading unwrapped.
         revisits: Verified revisits.
         camera_height_cm: Sets the scale of the tolerances.
-        breaks: Frames that do not follow the one before them.
+        periods: Time from the frame before to each frame, in typical time steps; None for a drive without
+            gaps.
 
     Returns:
         The closed trajectory, and each revisit's residual (ahead, left, heading) in it.
@@ -87,8 +86,8 @@ def close_loops(
     if not revisits:
         return poses, np.empty((0, 3))
     odometry = relative_pose(poses[:-1], poses[1:])
-    # How far the motion to each frame is known: 1 where the drive was recorded.
-    trust = np.ones(len(odometry)) if breaks is None else np.where(breaks[1:], _ACROSS_BREAK, 1.0)
+    # The longer a step took, the less is known of it.
+    trust = np.ones(len(odometry)) if periods is None else 1.0 / periods[1:]
     constraints = _constraints(odometry, trust, revisits, camera_height_cm)
     closed = _integrate(poses[0], odometry, _solve_headings(poses[:, 2], revisits, trust))
     for robust in (False, True):
@@ -123,22 +122,19 @@ def inlier_revisits(
     return [revisit for revisit, kept in zip(revisits, inlier, strict=True) if kept]
 
 
-def loop_pairs(
-    revisits: list[Revisit], count: int, breaks: Bool[np.ndarray, "n"] | None = None
-) -> list[tuple[int, int]]:
-    """Pairs of frames around each revisit that show the same place, not across a break of the drive.
+def loop_pairs(revisits: list[Revisit], part: Int[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """Pairs of frames around each revisit that show the same place, not across a long gap of the drive.
 
     Args:
         revisits: The revisits.
-        count: Number of frames.
-        breaks: Frames that do not follow the one before them; None for one segment.
+        part: Part of the drive that each frame belongs to.
     """
-    segment = np.zeros(count, np.int64) if breaks is None else np.cumsum(breaks)
+    count = len(part)
     pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _AROUND_REVISIT]
     return [
         (a, b)
         for r, a, b in pairs
-        if a >= 0 and b < count and segment[a] == segment[r.earlier] and segment[b] == segment[r.later]
+        if a >= 0 and b < count and part[a] == part[r.earlier] and part[b] == part[r.later]
     ]
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from pydantic import Field
 
+from datagen.slam.commands import MOST_BRIDGED
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.pixels import EdgePixels
@@ -131,6 +132,7 @@ class ImagePairs:
         camera: Camera,
         settings: OdometrySettings,
         rng: np.random.Generator,
+        periods: Float[np.ndarray, "n"] | None = None,
     ) -> None:
         """Draw the points that are compared.
 
@@ -139,7 +141,10 @@ class ImagePairs:
             camera: The camera.
             settings: How images are compared.
             rng: Draws the points.
+            periods: Time from the frame before to each frame, in typical time steps; None for a drive without
+                gaps.
         """
+        self.periods = np.ones(len(edges)) if periods is None else periods
         self.settings, self._camera = settings, camera
         self._sigma_px = settings.sigma_px * max(1.0, camera.width / _FINE_WIDTH)
         ahead = np.arange(0.0, _REACH_HEIGHTS, _CELL_HEIGHTS)
@@ -212,14 +217,17 @@ class ImagePairs:
     ) -> Float[np.ndarray, "w t"]:
         """Compare frame k with those before it, for every step and turn.
 
+        Frames beyond what images bridge are not compared.
+
         Args:
             k: Frame.
             steps: Typical step lengths to try.
-            turns_rad: Turns of frame k, the same for every step or others; NaN for none, with a fit of 0.
+            turns_rad: Turns in a typical time step before frame k, the same for every step or others; NaN for
+                none, with a fit of 0.
             relative: Step length of each frame relative to the typical one.
             lags: Frames between the images of a pair; None for those of the settings.
-            typical_turns_rad: About the turn of each frame, for the differences between frame k and the
-                frames before it. None where all turns are alike.
+            typical_turns_rad: About the turn in a typical time step before each frame, for the differences
+                between frame k and the frames before it. None where all turns are alike.
 
         Returns:
             Log likelihood up to a constant, not tempered.
@@ -234,12 +242,16 @@ class ImagePairs:
         for lag in s.lags if lags is None else lags:
             if lag > k:
                 continue
+            between = slice(k - lag + 1, k + 1)
+            time = self.periods[between]
+            if time.sum() > MOST_BRIDGED:
+                continue
             earlier = self._images[k - lag]
             turned = 0.0
             if typical_turns_rad is not None:
-                turned = float(np.sum(typical_turns_rad[k - lag + 1 : k + 1] - typical_turns_rad[k]))
-            distances = relative[k - lag + 1 : k + 1].sum() * steps
-            turns = lag * tried_rad + turned
+                turned = float(np.sum(time * (typical_turns_rad[between] - typical_turns_rad[k])))
+            distances = relative[between].sum() * steps
+            turns = time.sum() * tried_rad + turned
             fit_of_motions(
                 earlier,
                 later,

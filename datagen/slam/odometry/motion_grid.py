@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from datagen.slam.commands import LONGEST_STEP
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import to_gray
@@ -69,7 +70,8 @@ class MotionGrid:
         spread: Standard deviation of the step about it, as a logarithm.
         keep: Share of the deviation that stays until the next frame.
         jump: Probability that the step changes to any other.
-        turns_rad: Turns of the grid, evenly spaced.
+        turns_rad: Turns of the grid in a typical time step, evenly spaced.
+        turn_walk_rad: Standard deviation of the change of turn from one typical time step to the next.
     """
 
     typical: float
@@ -77,6 +79,7 @@ class MotionGrid:
     keep: float
     jump: float
     turns_rad: Float[np.ndarray, "t"]
+    turn_walk_rad: float
 
     @property
     def log_factors(self) -> Float[np.ndarray, "w"]:
@@ -115,10 +118,10 @@ class MotionGrid:
         changes: Float[np.ndarray, "w w"] = (1.0 - self.jump) * np.linalg.matrix_power(chain, times) + jumps
         return changes
 
-    def turn_changes(self, walk_rad: float) -> Float[np.ndarray, "t t"]:
+    def turn_changes(self) -> Float[np.ndarray, "t t"]:
         """Probability of each turn (columns) after each other (rows)."""
         apart = self.turns_rad[:, None] - self.turns_rad[None, :]
-        changes = np.zeros_like(apart)
+        changes, walk_rad = np.zeros_like(apart), self.turn_walk_rad
         for share, sigma in ((1.0 - _QUICK_SHARE, walk_rad), (_QUICK_SHARE, _QUICK_FACTOR * walk_rad)):
             part = np.exp(-0.5 * (apart / sigma) ** 2)
             changes += share * part / part.sum(axis=1, keepdims=True)
@@ -129,10 +132,10 @@ def follow_motion(
     grid: MotionGrid,
     log_likelihood: Float[np.ndarray, "n w t"],
     relative: Float[np.ndarray, "n"],
-    turn_walk_rad: float,
     curvature: Float[np.ndarray, "n"],
     curvature_sigma: float,
     seen: SeenTurns | None = None,
+    periods: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Find each frame's step and turn, given all frames.
 
@@ -140,37 +143,43 @@ def follow_motion(
         grid: States.
         log_likelihood: Log likelihood of each state given the images, at most 0.
         relative: Step length of each frame relative to the typical one.
-        turn_walk_rad: Standard deviation of the change of turn from frame to frame.
         curvature: Predicted curvature.
         curvature_sigma: Standard deviation of the prediction.
         seen: Turns as seen in the distance, if any.
+        periods: Time from the frame before to each frame, in typical time steps; None for a drive without
+            gaps. Over a gap the state changes as often as in as many frames.
 
     Returns:
-        Typical steps and turns: the mean over the states around the likeliest one.
+        Typical steps, and turns in a typical time step: the mean over the states around the likeliest one.
 
     Source:
         Rabiner 1989, "A tutorial on hidden Markov models", eq. 19-27 (forward and backward, scaled).
     """
     n = len(log_likelihood)
-    by_step, by_turn = grid.step_changes(), grid.turn_changes(turn_walk_rad)
+    time = np.ones(n) if periods is None else np.minimum(periods, LONGEST_STEP)
+    whole = np.rint(time).astype(int).tolist()
+    by_step, by_turn = (
+        {m: np.linalg.matrix_power(once, m) for m in set(whole)}
+        for once in (grid.step_changes(), grid.turn_changes())
+    )
     steps, turns_rad = grid.steps, grid.turns_rad
 
     def likelihood(k: int) -> Float[np.ndarray, "w t"]:
         likely: Float[np.ndarray, "w t"] = np.exp(log_likelihood[k].astype(np.float64))
         # One sigma for all steps: a prediction of the turn says nothing about the step.
-        sigma = max(curvature_sigma * grid.typical * relative[k], 0.5 * turn_walk_rad)
-        miss = (turns_rad[None, :] - curvature[k] * (steps[:, None] * relative[k])) / sigma
+        sigma = max(curvature_sigma * grid.typical * relative[k], 0.5 * grid.turn_walk_rad)
+        miss = (time[k] * turns_rad[None, :] - curvature[k] * (steps[:, None] * relative[k])) / sigma
         likely = likely * (np.exp(-0.5 * miss**2) + _STEERING_FLOOR) ** _STEERING_TEMPER
         if seen is not None and np.isfinite(seen.turns_rad[k]):
-            off = (turns_rad - seen.turns_rad[k]) / (_SEEN_WIDER * seen.sigma_rad)
+            off = (time[k] * turns_rad - seen.turns_rad[k]) / (_SEEN_WIDER * seen.sigma_rad)
             likely = likely * (np.exp(-0.5 * off**2) + _SEEN_FLOOR)
         return likely
 
     forward = np.empty(log_likelihood.shape, np.float32)
     # At the first frame the car may be in any motion.
     state = np.repeat(np.exp(-0.5 * (grid.log_factors / grid.spread) ** 2)[:, None], grid.shape[1], axis=1)
-    for k in range(n):
-        state = (by_step.T @ state @ by_turn if k else state) * likelihood(k)
+    for k, m in enumerate(whole):
+        state = (by_step[m].T @ state @ by_turn[m] if k else state) * likelihood(k)
         state /= state.sum()
         forward[k] = state
     step, turn = np.empty(n), np.empty(n)
@@ -185,7 +194,7 @@ def follow_motion(
         near = both[rows, columns] / both[rows, columns].sum()
         step[k] = grid.typical * np.exp(near.sum(axis=1) @ grid.log_factors[rows])
         turn[k] = near.sum(axis=0) @ turns_rad[columns]
-        later = by_step @ (later * likelihood(k)) @ by_turn.T
+        later = by_step[whole[k]] @ (later * likelihood(k)) @ by_turn[whole[k]].T
         later /= later.sum()
     return step, turn
 

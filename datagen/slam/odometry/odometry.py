@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Float16, Float32
 
+from datagen.slam.commands import LONGEST_STEP, MOST_BRIDGED
 from datagen.slam.odometry.image_pairs import ImagePairs, turns_up_to
 from datagen.slam.odometry.motion_grid import MotionGrid, SeenTurns, follow_motion, seen_turns
 from datagen.slam.odometry.scans import Progress
@@ -34,12 +35,18 @@ _LONGEST_STEP_HEIGHTS = _GRID_MARGIN * STEPS_HEIGHTS[-1]
 #: Frames from which the typical step is found. Chosen: time grows in proportion,
 #: the error of the mean falls with the root.
 _SAMPLED_FRAMES = 60
+#: Frames without a gap before them that are enough to find it. Chosen: a fifth of them.
+_LEAST_SAMPLED = 12
 #: The prominence of a step is measured against steps that are shorter and longer by this factor: what does
 #: not move on the road, such as mirrored lamps, fits slow motion of any size.
 _BESIDE = 1.5
 #: A step far from the recorded speed is believed instead of it where its prominence is this many times as
 #: large. Chosen: a wrong unit shows by more.
 _CLEARLY = 2.0
+#: Over a gap the step is looked for again by up to this share to either side, in so many steps, with this
+#: sigma, all as logarithms; and the gain on its likelihood, which no neighbour adds to. Chosen: a few cells
+#: of the grid, and as strong as the pairs of a frame without gaps.
+_REFINED, _REFINED_STEPS, _REFINED_SIGMA, _REFINED_GAIN = 0.17, 13, 0.1, 4.0
 #: Least commanded step relative to the typical one: a car that is commanded to stand may still roll.
 LEAST_STEP = 0.1
 
@@ -130,7 +137,14 @@ def best_step(
     """
     s, n = images.settings, len(images)
     first = min(max(s.lags), n - 1)
-    frames = np.unique(np.linspace(first, n - 1, min(most_frames, n - first)).astype(np.int64))
+    # Steps over a gap say little of the typical one; a drive of gaps alone has no others.
+    gaps = np.convolve(images.periods > 1.0, np.ones(first + 1))[:n]
+    frames = np.flatnonzero(gaps[first:] == 0) + first
+    if len(frames) < min(_LEAST_SAMPLED, n - first):
+        frames = np.arange(first, n)
+    frames = frames[
+        np.unique(np.linspace(0, len(frames) - 1, min(most_frames, len(frames))).astype(np.int64))
+    ]
 
     def fits_of(k: int) -> Float[np.ndarray, "w"]:
         turns = [_turns_of(images, step * relative[k]) for step in steps]
@@ -182,6 +196,11 @@ def _likelihood(fits: Float32[np.ndarray, "n w t"], temper: float) -> Float16[np
     return result
 
 
+def _turns_per_cell(periods: float) -> int:
+    """Into how many turns each cell of the grid is divided over a gap; an odd number, so that it is one."""
+    return 2 * int(np.ceil(0.5 * (min(periods, MOST_BRIDGED) - 1.0))) + 1
+
+
 class Evidence:
     """How likely each motion of each frame is, given the images.
 
@@ -205,27 +224,22 @@ class Evidence:
             far_rad: Turn of each frame as the distance shows it (:mod:`datagen.slam.odometry.motion_grid`).
         """
         s, n = images.settings, len(images)
-        self.settings, self.height_cm, self.relative = s, images.height_cm, typical.relative
+        self.settings, self.images, self.relative = s, images, typical.relative
+        self.time = np.minimum(images.periods, LONGEST_STEP)
         self.seen: SeenTurns | None = None
         spread, keep = s.unknown_spread, s.unknown_keep
         if typical.speed_known:
             spread, keep = s.known_spread, s.known_keep
         step = typical.step_heights
-        self.grid = MotionGrid(step, spread, keep, s.jump, _turns_of(images, _GRID_MARGIN * step))
+        turns_rad = _turns_of(images, _GRID_MARGIN * step)
+        self.grid = MotionGrid(step, spread, keep, s.jump, turns_rad, s.turn_walk_rad)
         fits: Float32[np.ndarray, "n w t"] = np.zeros((n, *self.grid.shape), np.float32)
         # Neighbours first: where a car slides, or is caught, the turn changes from frame to frame, and images
         # that are further apart fit no constant turn.
-        turns: Float[np.ndarray, "n"] | None = None
+        rates: Float[np.ndarray, "n"] | None = None
         rounds = [lags for lags in (s.lags[:1], s.lags[1:]) if lags]
         for number, lags in enumerate(rounds):
-            fit_of = partial(
-                images.fit,
-                steps=self.grid.steps,
-                turns_rad=self.grid.turns_rad,
-                relative=self.relative,
-                lags=lags,
-                typical_turns_rad=turns,
-            )
+            fit_of = partial(self._fit, lags=lags, rates=rates)
             for k, found in enumerate(in_threads(fit_of, range(1, n)), start=1):
                 fits[k] += found
                 done, rest = divmod(number * n + k + 1, len(rounds))
@@ -239,7 +253,18 @@ class Evidence:
                     self.seen = seen_turns(far_rad, turns)
                 if self.seen is not None:
                     turns = self.motion().turns_rad
+                rates = turns / self.time
         self.log_likelihood = _likelihood(fits, s.temper)
+
+    def _fit(
+        self, k: int, lags: tuple[int, ...], rates: Float[np.ndarray, "n"] | None
+    ) -> Float[np.ndarray, "w t"]:
+        """Compare a frame with those before it; over a gap, several turns in a cell of the grid are tried."""
+        turns, count = self.grid.turns_rad, _turns_per_cell(self.time[k])
+        within = (turns[1] - turns[0]) / count * (np.arange(count) - count // 2)
+        tried = (turns[:, None] + within).ravel()
+        found = self.images.fit(k, self.grid.steps, tried, self.relative, lags, rates)
+        return found.reshape(*self.grid.shape, count).max(axis=2)
 
     def motion(self, curvature_per_cm: Float[np.ndarray, "n"] | None = None) -> Odometry:
         """Find the likeliest motion.
@@ -247,15 +272,29 @@ class Evidence:
         Args:
             curvature_per_cm: What the steering predicts, positive left; None where it predicts nothing.
         """
-        s = self.settings
+        s, height_cm = self.settings, self.images.height_cm
         if curvature_per_cm is None:
             # Where nothing is seen the car goes straight on.
             curvature, sigma = np.zeros(len(self.relative)), s.max_curvature_heights
         else:
-            curvature, sigma = curvature_per_cm * self.height_cm, s.steering_heights
-        steps, turns = follow_motion(
-            self.grid, self.log_likelihood, self.relative, s.turn_walk_rad, curvature, sigma, self.seen
+            curvature, sigma = curvature_per_cm * height_cm, s.steering_heights
+        steps, rates = follow_motion(
+            self.grid, self.log_likelihood, self.relative, curvature, sigma, self.seen, self.time
         )
-        steps_cm = steps * self.relative * self.height_cm
+        for k in np.flatnonzero((self.time > 1.0) & (self.time <= MOST_BRIDGED)).tolist():
+            steps[k], rates[k] = self._refined(k, steps[k], rates[k])
+        turns = rates * self.time
+        steps_cm = steps * self.relative * height_cm
         steps_cm[0] = turns[0] = 0.0
         return Odometry(steps_cm, turns)
+
+    def _refined(self, k: int, step: float, rate: float) -> tuple[float, float]:
+        """Find step and turn over a gap more finely than on the grid, whose cells suit a single frame."""
+        turns, count = self.grid.turns_rad, _turns_per_cell(self.time[k])
+        rates = rate + (turns[1] - turns[0]) / count * np.arange(-2 * count, 2 * count + 1)
+        by = np.linspace(-_REFINED, _REFINED, _REFINED_STEPS)
+        fit = self.settings.temper * self.images.fit(k, step * np.exp(by), rates, self.relative)
+        fit -= 0.5 * ((by / _REFINED_SIGMA) ** 2)[:, None]
+        likely = np.exp(_REFINED_GAIN * (fit - fit.max()))
+        likely /= likely.sum()
+        return step * float(np.exp(likely.sum(axis=1) @ by)), float(likely.sum(axis=0) @ rates)

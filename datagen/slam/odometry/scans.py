@@ -67,6 +67,13 @@ class Scans:
         rows = self.frame(k)
         return Scan(self.points_cm[rows], self.normals[rows], self.weights[rows])
 
+    def only(self, frames: Int[np.ndarray, "k"]) -> Scans:
+        """Return the scans of some frames, in that order."""
+        chosen = [np.arange(self.starts[k], self.starts[k + 1]) for k in frames]
+        rows = np.concatenate(chosen) if len(chosen) else np.zeros(0, np.int64)
+        starts = np.concatenate([[0], np.cumsum([len(one) for one in chosen])]).astype(np.int64)
+        return Scans(self.points_cm[rows], self.normals[rows], self.weights[rows], starts)
+
     @property
     def frame_of_point(self) -> Int[np.ndarray, "m"]:
         """Frame index of every point."""

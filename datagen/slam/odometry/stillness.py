@@ -19,7 +19,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from datagen.slam.commands import GAP_PERIODS
 from lanenet.data.drives import Commands, Drive
+from lanenet.data.segments import true_runs
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import to_gray
@@ -67,6 +69,9 @@ _FACING = 0.6
 #: Frames by which a frame without the edge reduces its count. A place beside a row of dashes sees a dash,
 #: then a gap, and must not reach the count. Chosen.
 _MISSED = 2
+#: Frames in a row that show the same while the car drives on: an image that was written again. Chosen: more
+#: are a stop.
+_MOST_REPEATS = 2
 #: Cells of the road, in camera heights, in which the continuation of an edge is looked for, and directions
 #: told apart; size of this grid in cells: 9 camera heights ahead, 6 to either side.
 _CELL_HEIGHTS, _SECTORS = 0.05, 8
@@ -91,6 +96,14 @@ def following_frames(drive: Drive) -> tuple[Drive, list[str]]:
     notes: list[str] = []
     small = small_images(drive)
     standing, elsewhere = standing_frames(small), put_elsewhere(small)
+    step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
+    # Across a gap of the recording another image is no surprise.
+    elsewhere &= step_s < GAP_PERIODS * np.median(step_s[1:])
+    stood = np.zeros(len(drive), dtype=bool)
+    for run in true_runs(standing):
+        # A recorder that writes an image twice has missed one of a car that drives on.
+        stood[run] = len(run) > _MOST_REPEATS
+    drive = replace(drive, standing_s=np.cumsum(np.where(stood, step_s, 0.0)))
     if elsewhere.any():
         where = ", ".join(str(number) for number in drive.frames[elsewhere][:5])
         notes.append(f"{elsewhere.sum()} breaks in the images, the first before frame {where}")

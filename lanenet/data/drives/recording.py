@@ -26,8 +26,8 @@ from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.reading import FolderFiles, read_image
 
-#: A longer pause is a break: a car at 1 m/s would have lost its last frame from sight.
-MAX_PAUSE_S = 1.0
+#: A longer pause is a break: even a slow car has left the road that its last frame showed.
+MAX_PAUSE_S = 2.0
 
 COMMAND_NAMES: tuple[str, ...] = ("speed_cm_s", "throttle", "steering_rad", "angle", "yaw_rate_rad_s")
 DRIVE_FILE = "drive.yaml"
@@ -83,8 +83,8 @@ class Drive:
         times_trusted: False if ``t_s`` is the frame number times a guessed period.
         commands: Commanded values; NaN in rows that lack one.
         deleted: True where the driver flagged the frame as unfit for learning.
-        breaks: True where a frame does not continue the one before it: frame numbers were skipped, another
-            session began, or time jumped. False for the first.
+        breaks: True where a frame does not continue the one before it: another session began, or more than
+            ``MAX_PAUSE_S`` passed. False for the first. A shorter gap in the times is no break.
         camera: The camera; None if the drive does not name one.
         lane_width_cm: Distance between the middles of the lane's lines; None if unknown.
         problems: What was wrong with the recording, a sentence each.
@@ -94,6 +94,7 @@ class Drive:
         rows: Row of each frame in ``images``.
         max_steering_rad: Steering angle at Donkeycar's angle -1; None if unknown.
         notes: Free text of the driver.
+        standing_s: How long the car stood until each frame, in frames that were left out; None for never.
     """
 
     name: str
@@ -113,9 +114,15 @@ class Drive:
     rows: Int[np.ndarray, "n"] = field(repr=False)
     max_steering_rad: float | None = None
     notes: str = ""
+    standing_s: Float[np.ndarray, "n"] | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def driven_s(self) -> Float[np.ndarray, "n"]:
+        """Time of each frame on a clock that stops while the car stands."""
+        return self.t_s if self.standing_s is None else self.t_s - self.standing_s
 
     def image(self, i: int) -> UInt8[np.ndarray, "h w 3"]:
         """Read the image of frame ``frames[i]``, BGR.
@@ -161,6 +168,7 @@ class Drive:
             deleted=self.deleted[rows],
             breaks=breaks,
             rows=self.rows[rows],
+            standing_s=None if self.standing_s is None else self.standing_s[rows],
         )
 
 
@@ -240,7 +248,7 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
             f"{path}: images of {width}x{height} px, but its camera file is for "
             f"{camera.width}x{camera.height} px"
         )
-    breaks = _find_breaks(r.frames, r.t_s, r.times_trusted)
+    breaks = np.diff(r.t_s, prepend=r.t_s[:1]) > MAX_PAUSE_S
     return Drive(
         name=path.resolve().name if path.is_dir() else path.stem,
         path=path,
@@ -363,19 +371,3 @@ def _image_size(images: ImageSource, rows: Int[np.ndarray, "n"], where: Path) ->
             continue
         return int(width), int(height)
     raise DriveFormatError(f"{where}: none of the {len(rows)} frames has a readable image ({reason})")
-
-
-def _find_breaks(
-    frames: Int[np.ndarray, "n"], t_s: Float[np.ndarray, "n"], times_trusted: bool
-) -> Bool[np.ndarray, "n"]:
-    """Return True at each frame after a gap in the numbers, or after a pause if times can be trusted.
-
-    A gap is more than the median step of the numbers: a drive may number every second frame.
-    """
-    breaks = np.zeros(len(frames), dtype=bool)
-    if len(frames) > 1:
-        steps = np.diff(frames)
-        breaks[1:] = steps > max(1.0, float(np.median(steps)))
-        if times_trusted:
-            breaks[1:] |= np.diff(t_s) > MAX_PAUSE_S
-    return breaks

@@ -47,10 +47,10 @@ def test_drawing_on_a_frame_does_not_change_it(tmp_path: Path) -> None:
 
 def test_the_csv_beside_it_gives_times_and_commands(tmp_path: Path) -> None:
     write_video(tmp_path / "lap.avi")
-    (tmp_path / "lap.csv").write_text("frame,t_s,angle\n4,0.5,-0.1\n6,0.6,0.2\n38,2.2,0\n")
+    (tmp_path / "lap.csv").write_text("frame,t_s,angle\n4,0.5,-0.1\n6,0.6,0.2\n38,2.7,0\n")
     drive = open_drive(tmp_path / "lap.avi")
     assert drive.frames.tolist() == [4, 6, 38]
-    assert drive.t_s.tolist() == [0.5, 0.6, 2.2]
+    assert drive.t_s.tolist() == [0.5, 0.6, 2.7]
     assert drive.commands.angle is not None
     assert drive.commands.angle.tolist() == [-0.1, 0.2, 0.0]
     assert [number_of(drive.image(i)) for i in range(3)] == [4, 6, 38]

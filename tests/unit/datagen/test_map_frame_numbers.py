@@ -45,11 +45,11 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
         poses=poses,
         steering=None,
         revisits=[],
-        drift_rad_per_cm=None,
         bundle=BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(1), 0.0, 1),
+        part=np.zeros(n, np.int64),
     )
     lane = TracedLane(zeros, zeros, zeros, 30.0, 2.0)
-    return MappedSegment(solved, zeros, lane, [])
+    return MappedSegment(solved, zeros, np.zeros(n, np.int64), lane, [])
 
 
 def test_edges_name_the_drives_own_frames():

@@ -12,12 +12,12 @@ from made_up_drive import made_up_drive
 from datagen.prepare import (
     KeptImages,
     MapRequest,
+    check_count,
     check_lens,
     check_size,
     hide_bumper,
     prepare,
     readable_frames,
-    split_segments,
 )
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import guessed_camera
@@ -30,24 +30,10 @@ from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 
-def test_an_uninterrupted_drive_is_one_segment():
-    assert split_segments(made_up_drive(200, [])) == [slice(0, 200)]
-    assert split_segments(made_up_drive(60, [])) == [slice(0, 60)]
-
-
-def test_a_drive_is_cut_at_its_breaks_and_short_segments_are_left_out():
-    assert split_segments(made_up_drive(400, [100, 130, 300])) == [
-        slice(0, 100),
-        slice(130, 300),
-        slice(300, 400),
-    ]
-
-
-def test_a_drive_of_scraps_cannot_be_mapped():
-    with pytest.raises(TrackingLostError, match=r"120 frames.* 50.*60"):
-        split_segments(made_up_drive(120, [50, 90]))
+def test_a_drive_of_a_few_frames_cannot_be_mapped():
+    check_count(made_up_drive(60, [20, 40]))
     with pytest.raises(TrackingLostError, match="59 frames"):
-        split_segments(made_up_drive(59, []))
+        check_count(made_up_drive(59, []))
 
 
 def test_a_camera_of_another_size_is_refused():

@@ -2,37 +2,32 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_up_drive import made_up_drive
 
-from datagen import pipeline, prepare
+from datagen import prepare
 from datagen import segments as drive_segments
 from datagen.lanes.find import MappedSegment
 from datagen.lanes.trace import TracedLane
-from datagen.segments import LanesOfDrive
+from datagen.segments import LanesOfDrive, SolvedDrive
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleResult
 from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.filter.dp_slam import Trajectory
+from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Drive
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.errors import CalibrationError, TrackingLostError
-from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 SETTINGS = MapSettings(find_bumper=False)
-
-
-class _StopError(Exception):
-    """Ends a run once what it hands on has been seen."""
 
 
 def _solved(n: int) -> SolvedSegment:
@@ -40,38 +35,69 @@ def _solved(n: int) -> SolvedSegment:
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
     bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), 1.0, 10)
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
-    return SolvedSegment(np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, [], None, bundle)
+    return SolvedSegment(
+        np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, [], bundle, np.zeros(n, np.int64)
+    )
 
 
-@pytest.mark.parametrize("at", [70, 130])
-def test_each_segment_keeps_its_own_poses_where_the_longest_gave_the_camera(monkeypatch, at):
-    drive = made_up_drive(200, [at], first_frame=1000)
-    longest = _solved(130)
-    seen: list[SolvedSegment] = []
+def _prepared(drive: Drive) -> prepare.PreparedDrive:
+    return prepare.PreparedDrive(
+        request=prepare.MapRequest(drive.path, 40.0),
+        drive=drive,
+        held_out=np.zeros(len(drive), dtype=bool),
+        settings=SETTINGS,
+        camera=CAMERA,
+        notes=(),
+    )
 
-    def join(found: tuple[SolvedSegment, ...], *_: object) -> None:
-        seen.extend(found)
-        raise _StopError
 
-    def find(part: Drive, *_: object, **__: object) -> SimpleNamespace:
-        assert len(part) == 130
-        return SimpleNamespace(solved=longest, camera=CAMERA, how="found", figures={}, note="found")
+def _in_parts(drive: Drive, revisits: list[Revisit]) -> SolvedSegment:
+    return replace(_solved(len(drive)), part=np.cumsum(drive.breaks), revisits=revisits)
 
-    monkeypatch.setattr(prepare, "open_drive", lambda path: drive)
-    monkeypatch.setattr(prepare, "following_frames", lambda drive: (drive, []))
-    monkeypatch.setattr(prepare, "keep_images", lambda drive: drive)
-    monkeypatch.setattr(prepare, "check_moving", lambda *_: None)
-    monkeypatch.setattr(prepare, "readable_frames", lambda drive: (drive, []))
-    monkeypatch.setattr(prepare, "check_lens", lambda *_: None)
-    monkeypatch.setattr(drive_segments, "check_edges", lambda *_: None)
-    monkeypatch.setattr(drive_segments, "find_camera", find)
-    monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: _solved(len(part)))
-    monkeypatch.setattr(pipeline, "join_segments", join)
-    with pytest.raises(_StopError):
-        pipeline.map_drive(pipeline.MapRequest(Path("made-up"), 40.0), SETTINGS, Path("nowhere"))
-    assert [(int(s.rows[0]), int(s.rows[-1])) for s in seen] == [(0, at - 1), (at, 199)]
-    assert [len(s.poses) for s in seen] == [at, 200 - at]
-    assert next(s for s in seen if len(s.rows) == 130).poses is longest.poses
+
+def _solve(monkeypatch: pytest.MonkeyPatch, drive: Drive, revisits: list[Revisit]) -> SolvedDrive:
+    monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: _in_parts(part, revisits))
+    prepared, solver = _prepared(drive), SegmentSolver(SETTINGS, np.random.default_rng(0))
+    return drive_segments.solve_drive(prepared, drive_segments.camera_of_drive(prepared, solver), solver)
+
+
+def test_parts_that_show_the_same_places_are_one_segment(monkeypatch):
+    drive = made_up_drive(300, [70, 100, 200], first_frame=1000)
+    # The second part, of thirty frames, lies on the road of the fourth; the others on none.
+    solved = _solve(monkeypatch, drive, [Revisit(80, 250, np.zeros(3), 0.8)])
+    rows = [np.r_[0:70], np.r_[70:100, 200:300], np.r_[100:200]]
+    for segment, expected in zip(solved.segments, rows, strict=True):
+        np.testing.assert_array_equal(segment.rows, expected)
+        np.testing.assert_array_equal(segment.poses[:, 0], 3.0 * expected)
+    (visit,) = solved.segments[1].revisits
+    assert (visit.earlier, visit.later) == (10, 80)
+    assert not solved.refused
+
+
+def test_a_short_part_on_no_known_road_is_left_out_and_said(monkeypatch):
+    solved = _solve(monkeypatch, made_up_drive(200, [70, 100], first_frame=1000), [])
+    assert [(int(s.rows[0]), int(s.rows[-1])) for s in solved.segments] == [(0, 69), (100, 199)]
+    (left_out,) = solved.refused
+    assert left_out.note(made_up_drive(200, first_frame=1000)).startswith(
+        "frames 1070-1099 left out: 30 frames"
+    )
+
+
+def test_a_drive_of_scraps_cannot_be_mapped(monkeypatch):
+    with pytest.raises(TrackingLostError, match=r"120 frames in 3 parts.* 50 frames.* 60"):
+        _solve(monkeypatch, made_up_drive(120, [50, 90]), [])
+
+
+def test_a_drive_that_was_solved_for_its_camera_is_not_solved_again(monkeypatch):
+    def solve(*_: object) -> None:
+        raise AssertionError
+
+    drive = made_up_drive(100)
+    monkeypatch.setattr(SegmentSolver, "solve", solve)
+    solver = SegmentSolver(SETTINGS, np.random.default_rng(0))
+    camera = drive_segments.CameraOfDrive(CAMERA, solved=_solved(100))
+    (segment,) = drive_segments.solve_drive(_prepared(drive), camera, solver).segments
+    np.testing.assert_array_equal(segment.poses, camera.solved.poses)
 
 
 def _line(side: Side, until_cm: float) -> LaneLine:
@@ -82,17 +108,11 @@ def _line(side: Side, until_cm: float) -> LaneLine:
 def _map(
     monkeypatch: pytest.MonkeyPatch,
     drive: Drive,
-    no_edges: tuple[int, ...] = (),
     no_lane: tuple[int, ...] = (),
     one_line: tuple[int, ...] = (),
     other_lane: tuple[int, ...] = (),
 ) -> LanesOfDrive:
-    """Map a drive whose segments of some lengths show no edges, no lane, one line only, or another lane."""
-
-    def solve(self: SegmentSolver, part: Drive, camera: Camera) -> SolvedSegment:
-        if len(part) in no_edges:
-            raise TrackingLostError(f"{part.path}: {len(part)} frames, 3 edge points per frame")
-        return _solved(len(part))
+    """Map a drive whose segments of some lengths show no lane, one line only, or another lane."""
 
     def find_lane(segment: SolvedSegment, *_: object) -> MappedSegment:
         n = len(segment.rows)
@@ -103,29 +123,16 @@ def _map(
         lane = TracedLane(np.zeros(2), np.zeros(2), np.zeros(2), 40.0, 2.0)
         # The right line ends early where there is one line only.
         lines = [_line("left", 3.0 * n), _line("right", 0.3 * n if n in one_line else 3.0 * n)]
-        return MappedSegment(segment, 3.0 * np.arange(n), lane, lines)
+        return MappedSegment(segment, 3.0 * np.arange(n), np.zeros(n, np.int64), lane, lines)
 
-    monkeypatch.setattr(SegmentSolver, "solve", solve)
     monkeypatch.setattr(drive_segments, "find_lane", find_lane)
-    prepared = prepare.PreparedDrive(
-        request=prepare.MapRequest(drive.path, 40.0),
-        drive=drive,
-        segments=prepare.split_segments(drive),
-        held_out=np.zeros(len(drive), dtype=bool),
-        settings=SETTINGS,
-        camera=CAMERA,
-        notes=(),
-    )
-    solver = SegmentSolver(SETTINGS, np.random.default_rng(0))
-    camera = drive_segments.camera_of_drive(prepared, solver)
-    solved = drive_segments.solve_segments(prepared, camera, solver)
-    return drive_segments.fit_lanes(prepared, solved.segments, solved.refused)
+    solved = _solve(monkeypatch, drive, [])
+    return drive_segments.fit_lanes(_prepared(drive), solved.segments, solved.refused)
 
 
 @pytest.mark.parametrize(
     ("bad", "why"),
     [
-        ({"no_edges": (70,)}, "70 frames, 3 edge points per frame"),
         ({"no_lane": (70,)}, "no pair of lines in 70 frames"),
         ({"one_line": (70,)}, "one line only bounds the driven lane"),
         ({"other_lane": (70,)}, "a lane of 30 cm in 70 frames, expected 40 cm"),
@@ -139,12 +146,11 @@ def test_a_segment_that_cannot_be_mapped_is_left_out_and_said(monkeypatch, bad, 
 
 
 def test_the_longest_segment_says_why_nothing_could_be_mapped(monkeypatch):
+    drive = made_up_drive(200, [70], first_frame=1000)
     with pytest.raises(TrackingLostError, match="no pair of lines in 130 frames"):
-        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(70,), no_lane=(130,))
-    with pytest.raises(TrackingLostError, match="130 frames, 3 edge points"):
-        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(130,), no_lane=(70,))
+        _map(monkeypatch, drive, no_lane=(130,), other_lane=(70,))
     with pytest.raises(CalibrationError, match="a lane of 30 cm in 130 frames"):
-        _map(monkeypatch, made_up_drive(200, [70], first_frame=1000), no_edges=(70,), other_lane=(130,))
+        _map(monkeypatch, drive, no_lane=(70,), other_lane=(130,))
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):

@@ -57,7 +57,7 @@ def found(heading: np.ndarray, revisits: int = 8, focal_sigma: float = 0.02) -> 
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
     places = [REVISIT] * revisits
     solved = SolvedSegment(
-        np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, places, None, bundle
+        np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, places, bundle, np.zeros(n, np.int64)
     )
     return FoundCamera(solved, [], {**SIGMA, "focal": focal_sigma}, False, 0.5)
 
@@ -319,9 +319,9 @@ def test_a_given_height_finds_the_focal_length_where_the_lane_has_its_width(monk
 
 def test_a_height_that_agrees_with_a_closed_loop_leaves_its_camera_alone(monkeypatch):
     monkeypatch.setattr(datagen.segments, "measure_lane", lambda *_: LaneScale(2.5 * 15.0, 0.02))
-    closed = found(np.zeros(70), 8, 0.01)
+    closed = found(np.zeros(300), 8, 0.01)
     solver = _Solver(MapSettings(), np.random.default_rng(0))
-    given, _ = fit_height(closed, made_up_drive(70), 2.51, MapSettings(), solver)
+    given, _ = fit_height(closed, made_up_drive(300), 2.51, MapSettings(), solver)
     assert given.camera is closed.camera and given.sigma == closed.sigma and given.note == closed.note
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lane_edges import arc_path
 
 from datagen.lanes.offset import CubicBasis, adapted_breaks
-from datagen.lanes.path import edges_along_path, lap_path, positions_on_lap
+from datagen.lanes.path import edges_along_path, positions_on_path, shared_path
 from datagen.slam.odometry.scans import pack_scans
 from lanenet.data.maps.frame_lines import assign_lanes
 from lanenet.data.maps.line import LaneLine, Side
@@ -39,10 +39,14 @@ def _laps(laps: float, wander_cm: float = 4.0, seed: int = 0) -> tuple[np.ndarra
     return poses, [(k, k + per_lap) for k in range(0, len(poses) - per_lap, 25)]
 
 
+def _one_part(poses: np.ndarray) -> np.ndarray:
+    return np.zeros(len(poses), np.int64)
+
+
 @pytest.mark.parametrize("laps", [1.3, 2.6])
 def test_a_lap_closes_and_every_frame_has_its_place(laps):
     poses, pairs = _laps(laps)
-    path = lap_path(poses, pairs, 1.8, HEIGHT_CM)
+    path = shared_path(poses, _one_part(poses), pairs, 1.8, 75.0, HEIGHT_CM)
     assert path is not None and path.closed and path.period_cm is not None
     steps = np.linalg.norm(np.diff(path.xy_cm, axis=0, append=path.xy_cm[:1]), axis=1)
     np.testing.assert_allclose(steps, path.step_cm, rtol=0.03)
@@ -65,7 +69,7 @@ def test_frames_of_the_other_direction_are_told():
     poses, pairs = _laps(2.0)
     back = poses[::-1][:200] + [0.0, 0.0, np.pi]
     both = np.concatenate([poses, back])
-    path = lap_path(both, pairs, 1.8, HEIGHT_CM)
+    path = shared_path(both, _one_part(both), pairs, 1.8, 75.0, HEIGHT_CM)
     assert path is not None and path.forward is not None
     assert path.forward[: len(poses)].all() and not path.forward[len(poses) :].any()
     np.testing.assert_allclose(
@@ -78,7 +82,9 @@ def test_roads_that_cross_are_told_apart_by_heading():
     x, y = 200.0 * np.sin(phase), 100.0 * np.sin(2.0 * phase)
     heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
     poses = np.column_stack([x, y, heading])
-    path = lap_path(poses, [(k, k + 400) for k in range(5, 195, 20)], 1.8, HEIGHT_CM)
+    path = shared_path(
+        poses, _one_part(poses), [(k, k + 400) for k in range(5, 195, 20)], 1.8, 75.0, HEIGHT_CM
+    )
     assert path is not None and path.period_cm is not None
     steps = np.mod(np.diff(path.s_frames_cm) + 100.0, path.period_cm) - 100.0
     assert steps.min() > 0.0 and steps.max() < 6.0
@@ -86,11 +92,11 @@ def test_roads_that_cross_are_told_apart_by_heading():
 
 def test_without_revisits_or_on_another_road_there_is_no_lap():
     poses, pairs = _laps(2.0)
-    assert lap_path(poses, [], 1.8, HEIGHT_CM) is None
+    assert shared_path(poses, _one_part(poses), [], 1.8, 75.0, HEIGHT_CM) is None
     away = np.concatenate(
         [poses, np.column_stack([np.linspace(200.0, 900.0, 300), np.full((300, 2), 500.0)])]
     )
-    assert lap_path(away, pairs, 1.8, HEIGHT_CM) is None
+    assert shared_path(away, _one_part(away), pairs, 1.8, 75.0, HEIGHT_CM) is None
 
 
 @settings(max_examples=15, deadline=None)
@@ -100,7 +106,10 @@ def test_moving_the_map_moves_the_lap(x, y, turn):
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.array([[c, -s], [s, c]])
     moved = np.column_stack([poses[:, :2] @ rotation.T + [x, y], poses[:, 2] + turn])
-    here, there = lap_path(poses, pairs, 1.8, HEIGHT_CM), lap_path(moved, pairs, 1.8, HEIGHT_CM)
+    here, there = (
+        shared_path(poses, _one_part(poses), pairs, 1.8, 75.0, HEIGHT_CM),
+        shared_path(moved, _one_part(moved), pairs, 1.8, 75.0, HEIGHT_CM),
+    )
     assert here is not None and there is not None
     np.testing.assert_allclose(there.xy_cm, here.xy_cm @ rotation.T + [x, y], atol=1e-6)
     np.testing.assert_allclose(there.s_frames_cm, here.s_frames_cm, atol=1e-5)
@@ -109,12 +118,12 @@ def test_moving_the_map_moves_the_lap(x, y, turn):
 @pytest.mark.parametrize("forward", [True, False])
 def test_edges_of_all_laps_and_directions_lie_on_one_another(forward):
     poses, pairs = _laps(2.2)
-    path = lap_path(poses, pairs, 1.8, HEIGHT_CM)
+    path = shared_path(poses, _one_part(poses), pairs, 1.8, 75.0, HEIGHT_CM)
     assert path is not None and path.period_cm is not None
     rng = np.random.default_rng(1)
     truth, scans = [], []
     turned = poses if forward else poses + [0.0, 0.0, np.pi]
-    s_frames, _, found = positions_on_lap(path, turned)
+    s_frames, _, found = positions_on_path(path, turned, _one_part(turned))
     assert (found == forward).all()
     placed = type(path)(path.step_cm, path.xy_cm, path.left, s_frames, None, found, closed=True)
     for pose in turned:

@@ -22,6 +22,7 @@ from datagen.slam.adjustment.adjust import (
     point_trust,
 )
 from datagen.slam.adjustment.state import BundleState
+from datagen.slam.commands import BREAK_PERIODS
 from lanenet.geometry.poses import path_lengths
 
 #: The pixels are exact, so that they may weigh more, and be looked for nearer, than those of a real picture.
@@ -87,9 +88,7 @@ def test_nods_of_each_frame_come_back(seed):
 def test_a_break_is_not_bridged(seed):
     camera, road = fisheye(), tape_road(80)
     edges = pixels(road, camera)
-    breaks = np.zeros(80, dtype=bool)
-    breaks[40] = True
-    observed = Observations(edges, breaks=breaks)
+    observed = Observations(edges, periods=np.where(np.arange(80) == 40, BREAK_PERIODS, 1.0))
     problem = BundleProblem(observed, camera, SMALL, _rng(seed))
     first = problem.pairs.min(axis=1)
     assert not ((first < 40) & (problem.pairs.max(axis=1) >= 40)).any()
@@ -219,7 +218,7 @@ def _prior(poses: np.ndarray, expected: np.ndarray, recorded: bool) -> tuple[flo
     """Cost of what is believed of the frames, and its downhill slope by their numbers."""
     state = BundleState.at(BundleEstimate.level(poses, fisheye()))
     observed = Observations([], relative_steps=expected, speed_recorded=recorded)
-    cost, _, downhill = frame_priors(state, BundleSettings(), np.arange(len(poses) - 1), observed)
+    cost, _, downhill = frame_priors(state, BundleSettings(), observed)
     return cost, downhill
 
 

@@ -222,7 +222,7 @@ def _motion(frames: int, speed_known: bool) -> MotionModel:
 class _StartingElsewhere(MotionModel):
     """The same motion, from another pose."""
 
-    pose: tuple[float, float, float]
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def start(self, particles: int, rng: np.random.Generator) -> np.ndarray:
         states = super().start(particles, rng)

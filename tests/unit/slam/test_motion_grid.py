@@ -23,7 +23,7 @@ WALK_RAD = 0.008
 
 
 def _grid(spread: float = 0.2, keep: float = 0.95, jump: float = 0.0) -> MotionGrid:
-    return MotionGrid(0.15, spread, keep, jump, TURNS)
+    return MotionGrid(0.15, spread, keep, jump, TURNS, WALK_RAD)
 
 
 def _seen(grid: MotionGrid, steps: np.ndarray, turns: np.ndarray, sharp: float = 8.0) -> np.ndarray:
@@ -46,7 +46,7 @@ def test_changes_are_probabilities_with_the_drift_and_variance_asked_for(spread,
     changes = grid.step_changes()
     assert (changes >= 0.0).all()
     np.testing.assert_allclose(changes.sum(axis=1), 1.0)
-    np.testing.assert_allclose(grid.turn_changes(WALK_RAD).sum(axis=1), 1.0)
+    np.testing.assert_allclose(grid.turn_changes().sum(axis=1), 1.0)
     if jump == 0.0:
         x = grid.log_factors
         middle = np.abs(x) < 0.1
@@ -59,7 +59,7 @@ def test_a_sure_motion_is_found_between_the_states():
     grid, n = _grid(), 60
     steps = 0.15 * np.exp(0.25 * np.sin(np.arange(n) / 12.0))
     turns = 0.05 * np.sin(np.arange(n) / 15.0)
-    found, turned = follow_motion(grid, _seen(grid, steps, turns), np.ones(n), WALK_RAD, np.zeros(n), 0.6)
+    found, turned = follow_motion(grid, _seen(grid, steps, turns), np.ones(n), np.zeros(n), 0.6)
     np.testing.assert_allclose(found, steps, rtol=0.03)
     np.testing.assert_allclose(turned, turns, atol=0.003)
 
@@ -69,16 +69,14 @@ def test_frames_that_show_nothing_are_bridged_from_both_sides():
     steps, turns = np.full(n, 0.18), np.full(n, 0.03)
     seen = _seen(grid, steps, turns)
     seen[20:35] = 0.0
-    found, turned = follow_motion(grid, seen, np.ones(n), WALK_RAD, np.zeros(n), 0.6)
+    found, turned = follow_motion(grid, seen, np.ones(n), np.zeros(n), 0.6)
     np.testing.assert_allclose(found[20:35], 0.18, rtol=0.08)
     np.testing.assert_allclose(turned[20:35], 0.03, atol=0.005)
 
 
 def test_with_nothing_to_see_the_car_does_as_it_usually_does():
     grid, n = _grid(), 30
-    found, turned = follow_motion(
-        grid, np.zeros((n, *grid.shape), np.float32), np.ones(n), WALK_RAD, np.zeros(n), 0.3
-    )
+    found, turned = follow_motion(grid, np.zeros((n, *grid.shape), np.float32), np.ones(n), np.zeros(n), 0.3)
     np.testing.assert_allclose(found, 0.15, rtol=0.03)
     np.testing.assert_allclose(turned, 0.0, atol=0.003)
 
@@ -90,12 +88,12 @@ def test_the_steering_settles_what_the_pictures_leave_open():
     seen = np.repeat(-4.0 * off[None] ** 2, n, axis=0).astype(np.float32)
     relative = np.ones(n)
     predicted = np.full(n, curvature)
-    found, turned = follow_motion(grid, seen, relative, WALK_RAD, predicted, 0.03)
+    found, turned = follow_motion(grid, seen, relative, predicted, 0.03)
     np.testing.assert_allclose(turned / found, curvature, rtol=0.1)
     # Without pictures the steering alone tells the turn, in proportion to the commanded way.
     relative[20:] = 1.5
     blind = np.zeros((n, *grid.shape), np.float32)
-    found, turned = follow_motion(grid, blind, relative, WALK_RAD, predicted, 0.03)
+    found, turned = follow_motion(grid, blind, relative, predicted, 0.03)
     assert turned[8] == pytest.approx(curvature * 0.15, rel=0.15)
     assert turned[32] == pytest.approx(1.5 * curvature * 0.15, rel=0.15)
 
@@ -105,7 +103,7 @@ def test_one_wrong_frame_does_not_carry_the_motion_away():
     steps, turns = np.full(n, 0.15), np.zeros(n)
     seen = _seen(grid, steps, turns, sharp=0.1)
     seen[20] = _seen(grid, np.full(1, 0.19), np.full(1, 0.05), sharp=0.1)[0]
-    found, turned = follow_motion(grid, seen, np.ones(n), WALK_RAD, np.zeros(n), 0.6)
+    found, turned = follow_motion(grid, seen, np.ones(n), np.zeros(n), 0.6)
     assert found[20] == pytest.approx(0.15, rel=0.06)
     assert abs(turned[20]) < 0.015
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from datagen.slam.commands import BREAK_PERIODS
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, revisit_residuals
 from datagen.slam.loops.revisits import Revisit
 from lanenet.geometry.poses import relative_pose
@@ -133,9 +134,9 @@ def test_motion_across_a_break_is_not_believed():
     c, s = np.cos(0.8), np.sin(0.8)
     moved[150:, :2] = moved[150:, :2] @ np.array([[c, s], [-s, c]]) + [40.0, -25.0]
     moved[150:, 2] += 0.8
-    breaks = np.arange(len(true)) == 150
+    periods = np.where(np.arange(len(true)) == 150, BREAK_PERIODS, 1.0)
     revisits = _revisits(true, range(0, LAP, 5))
-    closed, residuals = close_loops(moved, revisits, HEIGHT_CM, breaks)
+    closed, residuals = close_loops(moved, revisits, HEIGHT_CM, periods)
     assert np.abs(residuals[:, :2]).max() < 0.5
     assert np.linalg.norm(closed[:, :2] - true[:, :2], axis=1).max() < 3.0
     # Taken for motion, the jump would bend the road.

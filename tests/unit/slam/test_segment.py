@@ -143,7 +143,7 @@ def test_pictures_without_edges_cannot_be_mapped():
 
 def test_pairs_around_a_revisit_stay_within_the_drive():
     revisits = [Revisit(4, 60, np.zeros(3), 0.8), Revisit(30, 95, np.zeros(3), 0.8)]
-    pairs = loop_pairs(revisits, 100)
+    pairs = loop_pairs(revisits, np.zeros(100, np.int64))
     assert pairs == [(4 + d, 60 + d) for d in range(-4, 13, 4)] + [(30 + d, 95 + d) for d in range(-12, 5, 4)]
 
 

@@ -91,7 +91,7 @@ def test_revisits_that_the_map_of_keyframes_contradicts_hold_no_frames(monkeypat
     bundle = BundleResult(on_keys, np.zeros((len(keys), 2)), _camera(), {}, np.zeros(1), 1.0, 1)
     solved = SolvedSegment(
         keys, _camera(), pack_scans([], 15.0), Trajectory(on_keys, still, still, still), on_keys, on_keys,
-        None, [true, false], None, bundle,
+        None, [true, false], bundle, np.zeros(len(keys), np.int64),
     )  # fmt: skip
     drive = made_up_drive([np.zeros((120, 160, 3), np.uint8)] * 301)
     held: list[tuple[int, int]] = []
@@ -106,4 +106,4 @@ def test_revisits_that_the_map_of_keyframes_contradicts_hold_no_frames(monkeypat
         solver.place_between(solved, keys, np.full(301, 0.05), drive, commands_of(drive, 17.0))
     assert {(15 + d, 15 + lap + d) for d in range(-12, 13, 4)} <= set(held)
     assert not {(30 + d, 30 + 3 * lap // 2 + d) for d in range(-12, 13, 4)} & set(held)
-    assert set(keyframe_pairs(keys, SMALL.bundle.lags)) <= set(held)
+    assert set(keyframe_pairs(keys, SMALL.bundle.lags, np.zeros(keys[-1] + 1, np.int64))) <= set(held)

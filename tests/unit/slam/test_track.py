@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,9 +74,17 @@ def test_donkeycar_full_left_turns_left():
     np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0])
 
 
-def test_a_long_pause_counts_as_one_step():
-    commands = commands_of(_drive([0.0, 0.05, 0.1, 0.15, 3.0, 3.05], angle=[0.0] * 6), 17.0)
-    np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0, 1.0, 1.0, 1.0], rtol=1e-9)
+def test_a_step_over_a_gap_is_as_long_as_its_time():
+    times_s = [0.0, 0.05, 0.1, 0.15, 0.35, 0.4, 3.4]
+    drive = _drive(times_s, angle=[0.0] * 7)
+    commands = commands_of(drive, 17.0)
+    # In a long gap the car may have stopped.
+    np.testing.assert_allclose(commands.distance_cm, [0.0, 1.0, 1.0, 1.0, 4.0, 1.0, 20.0], rtol=1e-9)
+    np.testing.assert_allclose(commands.periods, [1.0, 1.0, 1.0, 1.0, 4.0, 1.0, 60.0], rtol=1e-9)
+    np.testing.assert_array_equal(commands.part, [0, 0, 0, 0, 0, 0, 1])
+    # Time in which it stood, in frames that were left out, is not driven.
+    stood = replace(drive, standing_s=np.array([0.0] * 6 + [2.95]))
+    np.testing.assert_allclose(commands_of(stood, 17.0).distance_cm[-1], 1.0, rtol=1e-9)
 
 
 def test_yaw_rate_over_speed_is_curvature():
@@ -116,7 +125,7 @@ def _answer(
     heading = np.cumsum(curvature * STEP_CM) + np.cumsum(noise_rad * rng.normal(size=n))
     middle = heading - 0.5 * curvature * STEP_CM
     xy = np.cumsum(STEP_CM * np.column_stack([np.cos(middle), np.sin(middle)]), axis=0)
-    return np.column_stack([xy, heading]), CommandedMotion(np.full(n, STEP_CM), True, turn)
+    return np.column_stack([xy, heading]), CommandedMotion.without_gaps(np.full(n, STEP_CM), True, turn)
 
 
 @pytest.mark.parametrize("lag", [0, 4, 10])
@@ -152,14 +161,19 @@ def test_no_fit_without_a_command_that_explains_the_path():
     n = len(poses)
 
     def fit_of(turn: np.ndarray | None) -> object:
-        return fit_steering(poses, CommandedMotion(commands.distance_cm, True, turn), HEIGHT_CM)
+        return fit_steering(poses, CommandedMotion.without_gaps(commands.distance_cm, True, turn), HEIGHT_CM)
 
     assert fit_of(None) is None
     assert fit_of(np.full(n, 0.3)) is None
     assert fit_of(rng.normal(size=n)) is None
     # Too short a drive to tell.
     assert commands.turn is not None
-    assert fit_steering(poses[:40], CommandedMotion(np.ones(40), True, commands.turn[:40]), HEIGHT_CM) is None
+    assert (
+        fit_steering(
+            poses[:40], CommandedMotion.without_gaps(np.ones(40), True, commands.turn[:40]), HEIGHT_CM
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize("speed_known", [True, False])
@@ -169,7 +183,7 @@ def test_tracking_finds_the_answer_of_the_steering_and_uses_it(speed_known):
     curvature = np.diff(road.poses[:, 2], prepend=0.0) / STEP_CM
     # The command comes two frames before the wheels answer, as an angle of about +-0.7.
     turn = np.concatenate([curvature[2:], curvature[-1:], curvature[-1:]]) / 0.02
-    commands = CommandedMotion(np.full(n, STEP_CM if speed_known else 1.0), speed_known, turn)
+    commands = CommandedMotion.without_gaps(np.full(n, STEP_CM if speed_known else 1.0), speed_known, turn)
     calls: list[tuple[int, int]] = []
     camera = fisheye()
     edges = pixels(road, camera)
@@ -196,7 +210,7 @@ def test_the_filter_moves_as_the_odometry_says():
     settings = MotionSettings(
         factor_walk=1e-9, distance_noise=1e-9, curvature_noise_heights=1e-9, offset_walk_heights=1e-9
     )
-    motion = motion_about(odometry, settings, HEIGHT_CM)
+    motion = motion_about(odometry, settings, HEIGHT_CM, np.ones(3))
     rng = np.random.default_rng(0)
     states = motion.start(20, rng)
     for k in (1, 2):
@@ -205,6 +219,8 @@ def test_the_filter_moves_as_the_odometry_says():
 
 
 def test_steps_are_relative_to_the_typical_one():
-    commands = CommandedMotion(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
+    commands = CommandedMotion.without_gaps(np.array([0.0, 2.0, 2.0, 4.0, 0.0]), True, None)
     np.testing.assert_allclose(commands.relative_steps, [0.0, 1.0, 1.0, 2.0, 0.0])
-    np.testing.assert_array_equal(CommandedMotion(np.zeros(3), True, None).relative_steps, np.zeros(3))
+    np.testing.assert_array_equal(
+        CommandedMotion.without_gaps(np.zeros(3), True, None).relative_steps, np.zeros(3)
+    )

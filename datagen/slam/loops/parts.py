@@ -1,0 +1,113 @@
+"""Parts of a drive between long gaps: which revisits place one on another, and which hang together.
+
+A drive is recorded in parts: the driver paused, lifted the car and put it elsewhere, or let it roll so far
+that no image bridges the gap. Nothing is known of the motion from one part to the next. Where one shows
+places of another, each revisit between them places it there; those that agree carry it over. What hangs
+together this way is one map; what does not has a map of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datagen.slam.loops.consistency import AGREE_HEIGHTS, AGREE_RAD, AGREE_SHARE, count_places
+from datagen.slam.loops.revisits import Revisit
+from lanenet.geometry.frames import wrap_angle
+from lanenet.geometry.poses import compose, moved_rigidly, path_lengths, relative_pose
+
+#: Separate places at which revisits must agree to place one part on another. Chosen: one place may look like
+#: another one by chance; that a second one at the right distance from it does, too, is rare.
+_LEAST_PLACES = 2
+
+
+def placing_revisits(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    revisits: Sequence[Revisit],
+    camera_height_cm: float,
+) -> list[Revisit]:
+    """Choose the revisits that place parts on each other, as many as agree, and no part twice.
+
+    Args:
+        poses: Poses, each part in shape, in any place.
+        part: Part of the drive that each frame belongs to.
+        revisits: Candidates.
+        camera_height_cm: Sets the scale.
+
+    Returns:
+        For each pair of parts that are joined the largest set of revisits that agree, with their whole turns;
+        the largest sets first. Sets that would join parts twice are left out: other evidence decides on them.
+    """
+    between: dict[tuple[int, int], list[Revisit]] = {}
+    for r in revisits:
+        if part[r.earlier] != part[r.later]:
+            pair = sorted((int(part[r.earlier]), int(part[r.later])))
+            between.setdefault((pair[0], pair[1]), []).append(r)
+    path = path_lengths(poses)
+    sets = []
+    for (_, moved), found in between.items():
+        agreeing = _largest_agreeing(poses, part, moved, found, camera_height_cm)
+        at = [r.later if part[r.later] == moved else r.earlier for r in agreeing]
+        if count_places(path[at], camera_height_cm) >= _LEAST_PLACES:
+            sets.append(agreeing)
+    chosen: list[Revisit] = []
+    group = {int(number): int(number) for number in np.unique(part)}
+    for agreeing in sorted(sets, key=len, reverse=True):
+        a, b = (group[int(part[k])] for k in (agreeing[0].earlier, agreeing[0].later))
+        if a != b:
+            chosen += agreeing
+            group = {number: a if own == b else own for number, own in group.items()}
+    return [replace(r, turns=whole_turns(poses, r)) for r in chosen]
+
+
+def whole_turns(poses: Float[np.ndarray, "n 3"], revisit: Revisit) -> int:
+    """Count the whole turns to the left between the visits of a place, with unwrapped headings."""
+    turned = poses[revisit.later, 2] - poses[revisit.earlier, 2] - revisit.relative[2]
+    return round(float(turned) / (2.0 * np.pi))
+
+
+def connected(part: Int[np.ndarray, "n"], revisits: Sequence[Revisit]) -> Int[np.ndarray, "n"]:
+    """Number the groups of parts that revisits join, frame by frame, in the order of their first frames."""
+    group = part.copy()
+    for r in revisits:
+        group[group == group[r.later]] = group[r.earlier]
+    _, first, number = np.unique(group, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[number])
+
+
+def _largest_agreeing(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    moved: int,
+    revisits: list[Revisit],
+    height_cm: float,
+) -> list[Revisit]:
+    """Find the largest set of revisits between two parts that agree with one of them.
+
+    Args:
+        poses: Poses.
+        part: Part of each frame.
+        moved: The part that they move onto the other one.
+        revisits: Revisits between the two.
+        height_cm: Height of the camera, which sets the scale.
+    """
+    inside, target = [], []
+    for r in revisits:
+        later = part[r.later] == moved
+        inside.append(r.later if later else r.earlier)
+        back = relative_pose(r.relative, np.zeros(3))
+        target.append(compose(poses[r.earlier], r.relative) if later else compose(poses[r.later], back))
+    own, to = poses[inside], np.array(target)
+    best = np.zeros(0, np.intp)
+    for one, place in zip(own, to, strict=True):
+        off = moved_rigidly(own, one, place) - to
+        apart = np.hypot(*(own - one)[:, :2].T)
+        near = np.hypot(off[:, 0], off[:, 1]) < AGREE_HEIGHTS * height_cm + AGREE_SHARE * apart
+        agreeing = np.flatnonzero(near & (np.abs(wrap_angle(off[:, 2])) < AGREE_RAD))
+        if len(agreeing) > len(best):
+            best = agreeing
+    return [revisits[k] for k in best]
