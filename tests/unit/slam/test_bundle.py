@@ -60,10 +60,11 @@ def test_the_number_of_cores_changes_nothing(monkeypatch):
     camera, road = fisheye(), tape_road(20)
     observed, start = Observations(pixels(road, camera)), BundleEstimate.level(road.poses, camera)
     found, short = {}, SMALL.model_copy(update={"gates_px": (3.0, 2.0), "iterations": 2})
+    running = threading.active_count()
     for cores in (1, 3):
         monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
         found[cores] = adjust(observed, start, short, _rng())
-    assert threading.active_count() == 1 and found[1].camera.hash == found[3].camera.hash
+    assert threading.active_count() <= running and found[1].camera.hash == found[3].camera.hash
     np.testing.assert_array_equal(found[1].poses, found[3].poses)
 
 
