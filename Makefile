@@ -27,7 +27,7 @@ help:
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
-	@echo "make traps        maps of sixty simulated drives that are hard to map; goes on where it stopped"
+	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
@@ -60,6 +60,7 @@ chain: $(VENV)/.stamp-dev
 # Most of an hour on one core; TRAPS adds arguments, such as --drives 0:20 --processes 2.
 traps: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps
 
 golden: $(VENV)/.stamp-dev
 	$(PYTEST) tests/golden
