@@ -69,7 +69,8 @@ _SHORTEST, _JOINED = 5, 20
 #: Longest section without paint: in lane widths, or relative to the usual gap of a line that has at least so
 #: many. Chosen: interruptions shorter than the lane is wide are bridged well.
 _BARE_LANES, _BARE_GAPS, _MIN_GAPS = 2.5, 1.5, 4
-#: Offset of the borders beyond which the ends of a section belong to it, and how far that may go, in places.
+#: Offset of the borders beyond which the ends of a section belong to it, as do places where the line is not
+#: met, and how far that may go, in places.
 _END_CM, _END_PLACES = 0.7, 15
 
 
@@ -295,22 +296,21 @@ def wrong_places(
     votes = np.maximum(looked.sum(axis=0), 1)
     wrong = against.sum(axis=0) >= np.maximum(_PASSES * votes, 1)
     empty = (against | bare).sum(axis=0) >= np.maximum(_PASSES * votes, 1)
-    found = [run for run in _joined(wrong, ~met_places(evidence, closed), closed) if len(run) >= _SHORTEST]
+    confirmed = met_places(evidence, closed)
+    found = [run for run in _joined(wrong, ~confirmed, closed) if len(run) >= _SHORTEST]
     if other_met is not None and len(other_met) == len(empty):
         empty &= ~other_met
     found += _too_long(empty, lane_cm, closed)
     mean_off = evidence.off_cm.sum(axis=0) / np.maximum(evidence.near.sum(axis=0), 1)
     taken = np.zeros(len(wrong), dtype=bool)
     for run in found:
-        taken[_with_ends(run, np.abs(mean_off) > _END_CM, closed)] = True
+        # A line leaves its marking by degrees: what lies far beside a short section is something else.
+        if abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM:
+            continue
+        taken[_with_ends(run, (np.abs(mean_off) > _END_CM) | ~confirmed, closed)] = True
     low = _first_cm(line)
     places = []
     for run in true_runs(taken, closed):
-        distances = beside[:, run].sum(axis=(0, 1))
-        beside_cm = float(int(distances.argmax()) - _HALF_BINS) * _BIN_CM if distances.any() else float("nan")
-        # A line leaves its marking by degrees: what lies far beside a short section is something else.
-        if abs(beside_cm) > len(run) * _PLACE_CM:
-            continue
         start = low + float(run[0]) * _PLACE_CM
         frames = evidence.frame[:, run].max(axis=1)
         places.append(
@@ -318,11 +318,17 @@ def wrong_places(
                 segment,
                 line.index,
                 (start, start + len(run) * _PLACE_CM),
-                beside_cm,
+                _distance_cm(beside[:, run]),
                 tuple(sorted({int(k) for k in frames if k >= 0})),
             )
         )
     return places
+
+
+def _distance_cm(beside: Float[np.ndarray, "v r b"]) -> float:
+    """Distance at which most borders lie beside a run of places; NaN without one."""
+    counts = beside.sum(axis=(0, 1))
+    return float(int(counts.argmax()) - _HALF_BINS) * _BIN_CM if counts.any() else float("nan")
 
 
 def met_places(evidence: PlaceEvidence, closed: bool) -> Bool[np.ndarray, "p"]:
@@ -354,7 +360,7 @@ def _too_long(empty: Bool[np.ndarray, "p"], lane_cm: float, closed: bool) -> lis
 
 
 def _with_ends(run: Int[np.ndarray, "r"], off: Bool[np.ndarray, "p"], closed: bool) -> Int[np.ndarray, "_"]:
-    """Extend a run over the places at its ends where the line is off, and by one more."""
+    """Extend a run over the places at its ends where the line is off or not met, and by one more."""
     n = len(off)
     first, last = int(run[0]), int(run[0]) + len(run) - 1
     for step in (-1, 1):
