@@ -90,6 +90,14 @@ def is_regular(path: Path) -> bool:
         return False
 
 
+def is_folder(path: Path) -> bool:
+    """Tell whether there is a folder; False for a name that none can have."""
+    try:
+        return stat.S_ISDIR(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def open_regular(path: Path, error: type[LanenetError], most: int) -> Iterator[BinaryIO]:
     """Open a file for reading, if it is one.

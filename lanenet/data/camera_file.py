@@ -15,6 +15,7 @@ from lanenet.config import Settings, SettingsT, check_settings, read_yaml
 from lanenet.data.files import write_text
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
+from lanenet.reading import is_folder, is_regular
 
 #: Bounds of what a file may hold. Chosen: ten metres, since no car is larger; a right angle, beyond which a
 #: camera sees no road ahead and a number is one of degrees; and numbers of lenses whose powers stay finite.
@@ -118,12 +119,12 @@ def read_camera(path: Path) -> Camera:
         CalibrationError: If the file is missing, of an unknown version, or a value is missing, misspelt or
             impossible; names the file and the key. Or if the map was rejected.
     """
-    return _read(CameraFile, _camera_of_map(path) if path.is_dir() else path).camera()
+    return _read(CameraFile, _camera_of_map(path) if is_folder(path) else path).camera()
 
 
 def _camera_of_map(folder: Path) -> Path:
     meta = folder / "map.yaml"
-    if not meta.is_file():
+    if not is_regular(meta):
         raise CalibrationError(f"{folder}: is a folder without map.yaml, expected a camera file or a map")
     if read_yaml(meta, CalibrationError).get("verdict") == "reject":
         raise CalibrationError(

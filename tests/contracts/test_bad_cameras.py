@@ -88,6 +88,7 @@ BAD = [
     own("a width in a text", "width", "320", "key 'width'", "'320'"),
     bad("three coefficients", write_three, "camera.yaml", "key 'D'", "4 or 5", "found 3"),
     bad("no file", lambda folder: read_camera(folder / "camera.yaml"), "camera.yaml", "no such file"),
+    bad("a name that no file can have", lambda folder: read_camera(folder / ("x" * 5000)), "xxx"),
     bad("ros: another model", ros("plumb_bob", "rational_polynomial"), "info.yaml", "'distortion_model'"),
     bad(
         "ros: coefficients of another model",

@@ -30,7 +30,7 @@ from lanenet.errors import LanenetError
 out, rng = Path(sys.argv[1]), np.random.default_rng(int(sys.argv[3]))
 waits_s = rng.uniform(0.0, 0.03, (8, 3))
 
-def mapping(request, settings, out, *_):
+def mapping(attempt, out, *_):
     time.sleep(waits_s[k, 1])
     with atomic_folder(out, "map", check_map_files) as folder:
         write_text(folder / "settings.yaml", "seed: 0\\n")
