@@ -65,6 +65,31 @@ def test_a_lap_closes_and_every_frame_has_its_place(laps):
     assert np.abs(gone).max() < 3.0
 
 
+def test_a_lap_is_put_together_from_parts_that_hold_none():
+    poses, _ = _laps(2.6)
+    # Two thirds of a lap, and as much of the next one from its middle on.
+    rows = np.r_[0:170, 390:620]
+    part = np.repeat([0, 1], [170, 230])
+    path = shared_path(poses[rows], part, [], 1.8, 75.0, HEIGHT_CM)
+    assert path is not None and path.period_cm is not None and path.d_frames_cm is not None
+    whole = shared_path(poses, _one_part(poses), _laps(2.6)[1], 1.8, 75.0, HEIGHT_CM)
+    assert whole is not None and path.period_cm == pytest.approx(whole.period_cm, rel=0.03)
+    assert np.abs(path.d_frames_cm).max() < 9.0
+
+
+def test_an_open_road_is_put_together_from_parts_that_overlap():
+    x = np.arange(0.0, 600.0, 3.0)
+    poses = np.column_stack([x, 20.0 * np.sin(x / 90.0), np.arctan(20.0 / 90.0 * np.cos(x / 90.0))])
+    # The car was put back, and drove on from the middle of what it knew.
+    rows = np.r_[0:120, 80:200]
+    path = shared_path(poses[rows], np.repeat([0, 1], 120), [], 1.8, 75.0, HEIGHT_CM)
+    assert path is not None and not path.closed and path.d_frames_cm is not None
+    assert np.abs(path.d_frames_cm).max() < 3.0
+    # Both visits of a place are at the same position along it.
+    np.testing.assert_allclose(path.s_frames_cm[120:160], path.s_frames_cm[80:120], atol=1.0)
+    assert path.s_frames_cm.max() == pytest.approx(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum(), rel=0.02)
+
+
 def test_frames_of_the_other_direction_are_told():
     poses, pairs = _laps(2.0)
     back = poses[::-1][:200] + [0.0, 0.0, np.pi]
