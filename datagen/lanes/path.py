@@ -11,6 +11,7 @@ from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.lap import stitched_road, with_long_steps_filled
+from datagen.slam.loops.consistency import of_one_lap
 from datagen.slam.odometry.scans import Scans
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.frames import wrap_angle
@@ -220,8 +221,7 @@ def _ends_of_lap(poses: Float[np.ndarray, "n 3"], revisits: list[tuple[int, int]
     path = path_lengths(poses)
     pairs = np.array(revisits)
     gaps = path[pairs[:, 1]] - path[pairs[:, 0]]
-    # Later visits may skip laps; the shortest distances are those of one lap.
-    pairs = pairs[gaps < 1.4 * np.percentile(gaps, 10)]
+    pairs = pairs[of_one_lap(gaps)]
     step = poses[pairs[:, 1]] - poses[pairs[:, 0]]
     turn = np.abs(wrap_angle(step[:, 2]))
     apart = np.linalg.norm(step[:, :2], axis=1) * (1.0 + turn)

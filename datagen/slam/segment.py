@@ -22,7 +22,12 @@ from datagen.slam.keyframes import (
     poses_between,
     values_between,
 )
-from datagen.slam.loops.consistency import consistent_revisits, with_supported, without_contradicted
+from datagen.slam.loops.consistency import (
+    consistent_revisits,
+    of_one_lap,
+    with_supported,
+    without_contradicted,
+)
 from datagen.slam.loops.parts import connected, placing_revisits, whole_turns
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
 from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_revisits, thumbnails
@@ -51,8 +56,6 @@ _DRIFT_RAD, _GAP_RAD = (0.3, 0.8), 0.05
 #: Times that loops are closed again with the revisits that the closed poses confirm. Chosen: two or three
 #: rounds are usual.
 _MOST_GROWTH = 6
-#: Gaps between two visits up to so many times the shortest tenth of them are those of one lap.
-_ONE_LAP = 1.4
 
 
 @dataclass(frozen=True)
@@ -138,12 +141,7 @@ def heading_drift(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> t
     between = np.array([path[r.later] - path[r.earlier] for r in revisits])
     missed = [heading[r.later] - heading[r.earlier] - r.relative[2] - 2.0 * np.pi * r.turns for r in revisits]
     rate = float(np.median(missed / between))
-    return rate, rate * _lap_cm(between)
-
-
-def _lap_cm(between_cm: Float[np.ndarray, "r"]) -> float:
-    """Length of a lap from the paths between visits: later visits may skip laps."""
-    return float(np.median(between_cm[between_cm < _ONE_LAP * np.percentile(between_cm, 10)]))
+    return rate, rate * float(np.median(between[of_one_lap(between)]))
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:
@@ -151,7 +149,8 @@ def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[
     if not revisits:
         return np.zeros(len(path_cm), dtype=np.int64)
     between_cm = np.array([path_cm[r.later] - path_cm[r.earlier] for r in revisits])
-    return (path_cm // _lap_cm(between_cm)).astype(np.int64)
+    lap_cm = float(np.median(between_cm[of_one_lap(between_cm)]))
+    return (path_cm // lap_cm).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from lanenet.geometry.frames import wrap_angle
@@ -31,8 +31,9 @@ from lanenet.geometry.poses import compose, path_lengths, relative_pose
 #: Heading per lap, [rad], up to which the drift of an open loop is small. With yaw and lever arm of the
 #: camera fitted, ``garage_tape`` drifted by 0.14 and ``usi_mat`` by 0.65.
 _SMALL_DRIFT_RAD = 0.6
-#: The gaps between visits that are one lap: those up to this factor times the shortest tenth.
-_ONE_LAP = 1.5
+#: Gaps between two visits up to so many times the shortest tenth of them are those of one lap. Chosen: below
+#: two, with room for places at the ends of the tenth.
+_ONE_LAP = 1.4
 #: What two revisits may miss of each other: in camera heights, as a share of the path between them, over
 #: which the open loop drifts, and in heading, [rad]. Chosen: less than a lane, and than the drift of a bad
 #: open loop.
@@ -73,8 +74,7 @@ def consistent_revisits(
     earlier, later = (np.array([getattr(r, name) for r in revisits]) for name in ("earlier", "later"))
     between = path[later] - path[earlier]
     missed = poses[later, 2] - poses[earlier, 2] - np.array([r.relative[2] for r in revisits])
-    # Later visits may skip laps: the shortest gaps are those of one lap.
-    lap = float(np.median(between[between < _ONE_LAP * np.percentile(between, 10)]))
+    lap = float(np.median(between[of_one_lap(between)]))
     limit = settings.max_drift_rad / lap
     # Changes of the drift add up over the laps.
     tolerance = settings.drift_tolerance_rad * np.sqrt(np.maximum(between / lap, 1.0))
@@ -187,6 +187,11 @@ def without_contradicted(
             break
         del kept[int(sums.argmin())]
     return [revisits[k] for k in kept]
+
+
+def of_one_lap(between_cm: Float[np.ndarray, "r"]) -> Bool[np.ndarray, "r"]:
+    """Which paths between two visits of a place are one lap long: later visits may skip laps."""
+    return between_cm <= _ONE_LAP * np.percentile(between_cm, 10)
 
 
 def count_places(along_cm: Float[np.ndarray, "r"], camera_height_cm: float) -> int:
