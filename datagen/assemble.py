@@ -85,6 +85,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         tape_cm=factor * float(np.median(markings_cm)),
         scale_from="lane width" if prepared.camera is None else "camera",
         laps=max(int(s.laps.max()) for s in segments),
+        markings="dark" if longest.dark else "light",
     )
     numbers = [np.full(len(s.rows), i) for i, s in enumerate(segments)]
     drive_map = DriveMap(

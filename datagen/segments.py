@@ -215,7 +215,9 @@ def solve_drive(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentS
 def fit_lanes(
     prepared: PreparedDrive, segments: Sequence[SolvedSegment], refused: Sequence[Refused]
 ) -> LanesOfDrive:
-    """Find the lane of each segment, the longest first: unless it is known, its width is that of the others.
+    """Find the lane of each segment, the longest first.
+
+    The markings of the others are of its kind, and unless it is known, the lane has its width.
 
     Args:
         prepared: The drive.
@@ -228,17 +230,18 @@ def fit_lanes(
     """
     drive, settings, held_out = prepared.drive, prepared.settings, prepared.held_out
     mapped, left_out = [], list(refused)
-    lane_cm = prepared.known_lane_cm
+    lane_cm, dark = prepared.known_lane_cm, None
     for segment in sorted(segments, key=lambda one: -len(one.rows)):
         rows = segment.rows
         try:
-            one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit)
+            one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit, dark)
             check_lane(one, drive)
         except (TrackingLostError, CalibrationError) as error:
             left_out.append(Refused(rows, error))
         else:
             mapped.append(one)
-            # A road keeps its width; the longest segment shows it best.
+            # A road keeps its width and its markings; the longest segment shows them best.
+            dark = one.dark
             lane_cm = lane_cm or fitted_width_cm(one.lines, one.lane, one.s_frames_cm)
     if not mapped:
         raise max(left_out, key=lambda one: len(one.rows)).reason

@@ -16,6 +16,7 @@ from datagen.lanes.trace import (
     LEAST_SEEN,
     MAYBE_LINE,
     TracedLane,
+    has_dark_markings,
     trace_adjacent,
     trace_known_lane,
     trace_lane,
@@ -45,6 +46,7 @@ class MappedSegment:
         laps: Lap of each frame, from 0.
         lane: The traced lane.
         lines: Its two lines, then those of adjacent lanes.
+        dark: Whether the markings are darker than the floor.
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
     """
 
@@ -53,6 +55,7 @@ class MappedSegment:
     laps: Int[np.ndarray, "n"]
     lane: TracedLane
     lines: list[LaneLine]
+    dark: bool = False
     free_lane_cm: float | None = None
 
     @property
@@ -67,6 +70,7 @@ def find_lane(
     held_out: Bool[np.ndarray, "n"],
     trace: TraceSettings,
     fit: FitSettings,
+    dark: bool | None = None,
 ) -> MappedSegment:
     """Find a segment's lane lines, in the scale of its camera.
 
@@ -76,6 +80,7 @@ def find_lane(
         held_out: Frames of the segment that are held out from the lines.
         trace: How lane lines are traced.
         fit: How cubics are fitted to them.
+        dark: Whether the markings are darker than the floor; None if unknown.
 
     Raises:
         TrackingLostError: If no two lines run along the drive.
@@ -88,6 +93,9 @@ def find_lane(
     scans, side_cm = without_frames(segment.scans, held_out), trace.side_heights * height
     path, edges = edges_of_segment(segment, scans, shared, _OWN_LANE_REACH * (lane_width_cm or 0.0))
     edges = without_crossings(path, edges, height, side_cm)
+    if dark is None:
+        dark = has_dark_markings(path, edges, height, trace)
+    edges = edges.towards_dark() if dark else edges
     free_cm = None
     if lane_width_cm is None:
         lane = trace_lane(path, edges, height, None, trace)
@@ -95,10 +103,10 @@ def find_lane(
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, trace)
     # Also where the car drives near the line between the lanes.
     _, adjacent = edges_of_segment(segment, scans, path, _NEXT_LANE_REACH * lane.lane_cm)
-    adjacent = without_crossings(path, adjacent, height, side_cm)
+    adjacent = without_crossings(path, adjacent.towards_dark() if dark else adjacent, height, side_cm)
     lane = trace_adjacent(path, adjacent, lane, height, trace)
     lines = fit_lines(path, edges, lane, height, fit, adjacent)
-    return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, free_cm)
+    return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)
 
 
 def _laps(segment: SolvedSegment, path: Path) -> Int[np.ndarray, "n"]:

@@ -222,9 +222,30 @@ def find_tape_width(
     """Find the width at which left and right edges pair up best, over the driven section."""
     low, high = (t * camera_height_cm for t in settings.tape_heights)
     widths = np.arange(low, high, 0.5 * profile.cell_cm)
-    # The six best pairings at each position: two or three lines, each some cells wide.
-    scores = [np.sort(profile.tapes(w)[:driven], axis=1)[:, -6:].mean() for w in widths]
+    scores = [_best_pairs(profile, w, driven).mean() for w in widths]
     return float(widths[int(np.argmax(gaussian_filter1d(np.array(scores), 1.0)))])
+
+
+def darker_than_floor(
+    profile: EdgeProfile, driven: int, camera_height_cm: float, settings: TraceSettings
+) -> bool:
+    """Whether the markings along most of the driven section are darker than the floor.
+
+    The two borders of a marking lie its width apart and brighten towards each other; those of a dark one
+    brighten away from each other. What lies between two markings is wider.
+    """
+    pairs = []
+    for one in (profile, profile.towards_dark()):
+        width_cm = find_tape_width(one, driven, camera_height_cm, settings)
+        # Densities saturate: after many laps, the scatter of a border counts nearly as much as the border.
+        pairs.append(_best_pairs(one.unsaturated(), width_cm, driven))
+    light, dark = pairs
+    return int((dark > light).sum()) > int((light > dark).sum())
+
+
+def _best_pairs(profile: EdgeProfile, width_cm: float, driven: int) -> Samples:
+    """Mean of the six best pairs of borders at each position: two or three lines, each some cells wide."""
+    return np.asarray(np.sort(profile.tapes(width_cm)[:driven], axis=1)[:, -6:].mean(axis=1))
 
 
 def find_lane_width(markings: Markings, driven: int, camera_height_cm: float) -> float:

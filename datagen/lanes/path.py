@@ -249,7 +249,8 @@ class PathEdges:
     Attributes:
         s_cm: Position along the path.
         d_cm: Offset to the left.
-        side: Component to the left of the edge's unit normal, which points to the brighter side.
+        side: Component to the left of the edge's unit normal, which points to the brighter side; see
+            :meth:`towards_dark`.
         along: Component of the normal along the path.
         weight: Weight of the point.
         distance_cm: Distance from the front axle at which it was seen.
@@ -267,6 +268,10 @@ class PathEdges:
     def select(self, rows: Bool[np.ndarray, "m"]) -> PathEdges:
         """Return some of the points."""
         return PathEdges(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    def towards_dark(self) -> PathEdges:
+        """Return the points with normals to the darker side: dark markings look like bright ones."""
+        return replace(self, side=-self.side, along=-self.along)
 
 
 def edges_along_path(

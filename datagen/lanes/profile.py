@@ -6,7 +6,7 @@ none, or on one side only, where it is double or runs beside a crossing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -57,6 +57,14 @@ class EdgeProfile:
             shifted(self.left, 0.5 * width_cm / self.cell_cm)
             * shifted(self.right, -0.5 * width_cm / self.cell_cm)
         )
+
+    def towards_dark(self) -> EdgeProfile:
+        """Return the profile of the same edges with normals to the darker side."""
+        return replace(self, left=self.right, right=self.left)
+
+    def unsaturated(self) -> EdgeProfile:
+        """Return the profile with numbers of edges in place of their densities."""
+        return replace(self, left=_edges_of(self.left), right=_edges_of(self.right))
 
 
 def edge_profile(

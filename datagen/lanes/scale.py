@@ -13,7 +13,7 @@ from jaxtyping import Float
 from datagen.lanes.fit import FitSettings, fit_lines
 from datagen.lanes.markings import TraceSettings
 from datagen.lanes.path import Path, PathEdges, edges_along_path, path_of_poses
-from datagen.lanes.trace import TracedLane, trace_lane
+from datagen.lanes.trace import TracedLane, has_dark_markings, trace_lane
 from datagen.slam.camera.coarse import nudged
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.segment import SolvedSegment
@@ -95,6 +95,7 @@ def measure_lane(
     """
     height = solved.camera.mounting.height_cm
     path, edges = edges_of_segment(solved, solved.scans)
+    edges = edges.towards_dark() if has_dark_markings(path, edges, height, trace) else edges
     lane = trace_lane(path, edges, height, None, trace)
     lines = fit_lines(path, edges, lane, height, fit)
     width_cm = fitted_width_cm(lines, lane, path.s_frames_cm)

@@ -13,7 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.lanes.markings import Markings, TraceSettings, find_lane_width, find_tape_width
+from datagen.lanes.markings import (
+    Markings,
+    TraceSettings,
+    darker_than_floor,
+    find_lane_width,
+    find_tape_width,
+)
 from datagen.lanes.path import Path, PathEdges, Samples
 from datagen.lanes.profile import EdgeProfile, edge_profile, long_runs
 from lanenet.data.maps.line import Side
@@ -60,6 +66,12 @@ class TracedLane:
     adjacent_cm: dict[tuple[Side, int], Samples] = field(default_factory=dict)
 
 
+def has_dark_markings(path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings) -> bool:
+    """Whether the markings along the path are darker than the floor; arguments as for :func:`trace_lane`."""
+    profile = _profile_along(path, edges, camera_height_cm, settings)
+    return darker_than_floor(profile, _driven_samples(path), camera_height_cm, settings)
+
+
 def trace_lane(
     path: Path,
     edges: PathEdges,
@@ -71,7 +83,7 @@ def trace_lane(
 
     Args:
         path: The driven path.
-        edges: Edge points in its coordinates.
+        edges: Edge points in its coordinates, with normals into the markings.
         camera_height_cm: Sets the scale of cells and bounds.
         lane_width_cm: Distance between the lines; None if it is to be found.
         settings: Cell sizes and bounds.
@@ -80,9 +92,7 @@ def trace_lane(
         TrackingLostError: If no pair of lines runs along the path.
     """
     profile = _profile_along(path, edges, camera_height_cm, settings)
-    driven = len(path.xy_cm)
-    if not path.closed:
-        driven = round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
+    driven = _driven_samples(path)
     tape = find_tape_width(profile, driven, camera_height_cm, settings)
     markings = Markings(path, profile, tape, settings)
     if lane_width_cm is None:
@@ -232,6 +242,11 @@ def _driven_cm(path: Path) -> Float[np.ndarray, "n"]:
     if path.period_cm is not None:
         step = np.mod(step + 0.5 * path.period_cm, path.period_cm) - 0.5 * path.period_cm
     return np.abs(step)
+
+
+def _driven_samples(path: Path) -> int:
+    """Number of path samples that the car has driven over."""
+    return len(path.xy_cm) if path.closed else round(float(path.s_frames_cm[-1]) / path.step_cm) + 1
 
 
 def _profile_along(

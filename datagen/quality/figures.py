@@ -241,7 +241,7 @@ def map_notes(
     notes = [
         f"{len(drive_map.frames)} of {frames} frames mapped, {path / 100.0:.1f} m of road, "
         f"{revisits} revisits" + ("" if revisits else ": no place was seen twice, so no loop was closed"),
-        f"{lane} {meta.mapped_lane_cm:.1f} cm, marking {meta.tape_cm:.1f} cm, "
+        f"{lane} {meta.mapped_lane_cm:.1f} cm, {meta.markings} marking {meta.tape_cm:.1f} cm, "
         f"scale from the {meta.scale_from}",
     ]
     if camera_known and free_cm is None and abs(meta.mapped_lane_cm / meta.lane_width_cm - 1.0) > 0.08:

@@ -460,7 +460,7 @@ def _borders_beside(points, normals, at, right, met_cm, width_cm, most_cm):
 
     Args:
         points: Edge points, frame car.
-        normals: Their unit normals, towards the brighter side.
+        normals: Their unit normals, into the marking.
         at: The places.
         right: Unit vectors to the right of the line there.
         met_cm: Largest distance at which a border is met.

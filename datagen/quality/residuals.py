@@ -1,8 +1,9 @@
 """Residuals: distance in pixels between the projected borders of the lane lines and the edges of a frame.
 
 On a textured floor there is always some edge close by. So an edge counts only if it brightens towards the
-marking, as the border does. Two coverages put the residuals into perspective: the share of the border in view
-that met an edge, and the same share for a line shifted off its marking.
+marking, as the border does; on a map of dark markings, if it darkens towards it. Two coverages put the
+residuals into perspective: the share of the border in view that met an edge, and the same share for a line
+shifted off its marking.
 
 A map that is wrong in one place has good figures as a whole. At that place, the frames contradict it: the
 borders of its lines meet no edge, or edges beside them. Such frames get no labels, and neither do frames
@@ -238,12 +239,14 @@ def summarise(samples: BorderSamples) -> ResidualFigures:
 def frame_edges(
     mapped: MappedDrive, rows: Int[np.ndarray, "m"]
 ) -> Iterator[tuple[int, EdgePixels, UInt8[np.ndarray, "h w"]]]:
-    """Yield frames of a map with their edges, and the mask of the pixels that show road."""
+    """Yield frames of a map with their edges, normals into the markings, and the mask of road pixels."""
     camera, perception = mapped.drive_map.camera, mapped.perception
+    dark = mapped.drive_map.meta.markings == "dark"
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
     for k in rows.tolist():
         image = mapped.drive.image(int(mapped.rows[k]))
-        yield k, find_edges(image, perception.edges, table.keep, table.scale), table.keep
+        edges = find_edges(image, perception.edges, table.keep, table.scale)
+        yield k, edges.towards_dark() if dark else edges, table.keep
 
 
 def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:

@@ -58,6 +58,7 @@ class MapMeta(Settings):
         tape_cm: Width of the markings on this map.
         scale_from: What sets the scale: the camera's height or the lane width.
         laps: Whole laps between revisits; 0 without a revisit.
+        markings: Whether the markings are lighter or darker than the floor.
         verdict: How far the map can be trusted; None until it has been judged.
     """
 
@@ -68,6 +69,7 @@ class MapMeta(Settings):
     tape_cm: float = Field(ge=0.0, le=MAX_PLACE)
     scale_from: str
     laps: int = Field(ge=0)
+    markings: Literal["light", "dark"] = "light"
     verdict: Literal["good", "usable", "reject"] | None = None
 
     @property

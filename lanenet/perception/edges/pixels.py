@@ -24,6 +24,10 @@ class EdgePixels:
     uv_px: Float[np.ndarray, "n 2"]
     normals: Float[np.ndarray, "n 2"]
 
+    def towards_dark(self) -> EdgePixels:
+        """Return the points with normals to the darker side: dark markings look like bright ones."""
+        return EdgePixels(self.uv_px, -self.normals)
+
 
 def gradients(
     gray: UInt8[np.ndarray, "h w"], blur_px: int

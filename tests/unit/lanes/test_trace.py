@@ -9,7 +9,7 @@ import pytest
 
 from datagen.lanes.path import Path, PathEdges
 from datagen.lanes.profile import EdgeProfile, edge_profile
-from datagen.lanes.trace import TracedLane, TraceSettings, _without_bulges, trace_lane
+from datagen.lanes.trace import TracedLane, TraceSettings, _without_bulges, has_dark_markings, trace_lane
 from lanenet.errors import TrackingLostError
 
 HEIGHT_CM = 15.0
@@ -176,6 +176,23 @@ def test_a_half_is_on_the_side_on_which_the_car_drives_there_and_back(backward, 
     parts = [_tape(rng, middle + side, everywhere) for side in (30.0, -30.0)]
     edges = _edges(*parts, _tape(rng, middle, _dashed(path, 22.0)))
     assert trace_lane(path, edges, HEIGHT_CM, None, SETTINGS).lane_cm == pytest.approx(lane_cm, abs=1.0)
+
+
+@pytest.mark.parametrize("tape_cm", [1.5, 7.5])
+def test_markings_are_light_or_dark_whatever_their_width(tape_cm):
+    """On a mottled floor, after many laps; the left line is dashed."""
+    rng = np.random.default_rng(2)
+    path = _path()
+    centre, everywhere = _wandering(path), np.ones(len(path.s_cm), dtype=bool)
+    lines = [(0.5, _dashed(path)), (-0.5, everywhere)]
+    light = _edges(
+        *[_tape(rng, centre + k * LANE_CM, seen, tape_cm) for k, seen in lines for _ in range(5)],
+        _clutter(rng, 1500),
+    )
+    assert not has_dark_markings(path, light, HEIGHT_CM, SETTINGS)
+    dark = light.towards_dark()
+    np.testing.assert_array_equal((dark.side, dark.along), (-light.side, -light.along))
+    assert has_dark_markings(path, dark, HEIGHT_CM, SETTINGS)
 
 
 def test_left_and_right_are_mirror_images():

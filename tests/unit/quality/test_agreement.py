@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -98,8 +100,27 @@ WRONG = (np.arange(N) >= 30) & (np.arange(N) < 45)
 NEAR = (np.arange(N) >= 22) & (np.arange(N) < 53)
 
 
+def _darkened(mapped: MappedDrive, markings: Literal["light", "dark"]) -> MappedDrive:
+    """The same tapes, dark on a light floor, on a map that says what they are."""
+    drive, drive_map = mapped.drive, mapped.drive_map
+    images = [255 - drive.image(k) for k in range(N)]
+    meta = drive_map.meta.model_copy(update={"markings": markings})
+    return replace(
+        mapped,
+        drive=replace(drive, images=_Pictures(images)),
+        drive_map=replace(drive_map, meta=meta),
+    )
+
+
 def test_frames_that_agree_are_left_alone():
     assert not contradicted_lines(_mapped(np.where(WRONG, 0.15, 0.0))).any()
+
+
+def test_dark_lines_are_where_the_image_darkens_towards_them():
+    right = _mapped(np.where(WRONG, 2.5, 0.0))
+    found = contradicted_lines(_darkened(right, "dark"))
+    np.testing.assert_array_equal(found, contradicted_lines(right))
+    assert contradicted_lines(_darkened(right, "light")).mean() > 0.8
 
 
 @pytest.mark.parametrize("aside_cm", [2.5, -2.5, 7.0])
