@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -141,6 +142,17 @@ def test_a_bright_tape_raises_the_threshold_for_soft_edges() -> None:
     assert has_soft(both, CANNY)
     assert not has_soft(both, DIRECTIONAL)
     assert has_soft(both, EdgeSettings(contrast_share=0.0))
+
+
+def test_a_dim_frame_lowers_the_threshold_but_noise_is_no_edge() -> None:
+    # A step of 45 gray levels, as soft as if out of focus.
+    step, _, _ = blurred_step(0.0, 0.0, dark=60.0, bright=105.0)
+    soft = cv2.GaussianBlur(step, (0, 0), 1.5)
+    assert len(find_edges(soft, EdgeSettings(contrast_share=0.0)).uv_px) == 0
+    assert len(find_edges(soft, DIRECTIONAL).uv_px) > 0.8 * soft.shape[0]
+    for sigma in (2.0, 4.0, 6.0, 8.0):
+        noise = np.random.default_rng(0).normal(70.0, sigma, (240, 320))
+        assert len(find_edges(np.rint(noise).astype(np.uint8), DIRECTIONAL).uv_px) < 10
 
 
 def test_keep_drops_pixels_and_changes_no_other() -> None:
