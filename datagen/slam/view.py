@@ -15,6 +15,7 @@ from datagen.slam.odometry.odometry import TypicalStep, typical_step
 from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
 from datagen.slam.odometry.stillness import without_reflections
 from datagen.slam.settings import SlamSettings
+from datagen.slam.stripes import true_borders
 from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
@@ -68,6 +69,8 @@ def view_road(
 ) -> RoadView:
     """Find the edges of the road in every frame, without those of lamps that are mirrored in it.
 
+    Borders of narrow lines are put where they are, see :mod:`datagen.slam.stripes`.
+
     Args:
         drive: The drive.
         camera: Its camera.
@@ -81,7 +84,7 @@ def view_road(
     for rows in [np.arange(len(found))] if keys is None else interleaved_rows(keys, len(found)):
         for k, pixels in zip(rows, without_reflections([found[k] for k in rows], camera, table), strict=True):
             kept[k] = pixels
-    return RoadView(kept, table.keep, limits)
+    return RoadView([on_road(p, table) for p in true_borders(kept, table)], table.keep, limits)
 
 
 def on_road(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
