@@ -51,6 +51,8 @@ __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "
 #: Share of the diagonal that is added to it. A bend of the whole drive hardly changes any one frame's
 #: residuals: with 1e-4, an error that all turns have in common was still there after all rounds.
 _DAMPING = 1e-8
+#: The same where no step is taken. Chosen: far above rounding, far below what any frame is known by.
+_AFLOAT = 1e-9
 #: Relative fall of the cost at which a round ends early. Chosen: it only saves
 #: steps that change little.
 _CONVERGED = 1e-5
@@ -210,7 +212,9 @@ class Equations:
 
     def without_frames(self) -> tuple[Float[np.ndarray, "f f"], Float[np.ndarray, "u f"]]:
         """Return H of the camera with the frames eliminated, and how the frames follow the camera."""
-        follow = -_factorised(self.frames).solve(self.border)
+        # A part of the drive that nothing joins to the others may lie anywhere.
+        frames = (self.frames + _AFLOAT * diags(self.frames.diagonal())).tocsc()
+        follow = -_factorised(frames).solve(self.border)
         return self.camera + self.border.T @ follow, follow
 
 

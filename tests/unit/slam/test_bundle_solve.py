@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import block_diag, csc_matrix
 
 from datagen.slam.adjustment.adjust import Equations, sum_blocks
 from datagen.slam.adjustment.kernels import N_FRAME
@@ -61,3 +62,17 @@ def test_a_step_and_the_uncertainty_are_those_of_the_full_system(free, damping):
     information, follow = now.without_frames()
     np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(information))), sigma, rtol=1e-8)
     np.testing.assert_allclose(follow, -np.linalg.solve(frames.toarray(), border), rtol=1e-7, atol=1e-12)
+
+
+def test_frames_that_nothing_joins_to_the_others_leave_the_camera_as_sure_as_it_was():
+    """What joins them to each other says nothing of where they lie: their block is singular."""
+    each = csc_matrix(np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(N_FRAME)))
+    held = csc_matrix(2.0 * np.eye(N_FRAME))
+    alone = np.zeros((2 * N_FRAME, 1))
+    border = np.concatenate([alone, np.full((N_FRAME, 1), 0.5)])
+    afloat = Equations(
+        1.0, block_diag([each, held]).tocsc(), border, np.array([[5.0]]), np.zeros(16), np.zeros(0)
+    )
+    information, follow = afloat.without_frames()
+    np.testing.assert_allclose(information, [[5.0 - N_FRAME * 0.5**2 / 2.0]], rtol=1e-6)
+    assert not follow[: 2 * N_FRAME].any()
