@@ -147,15 +147,21 @@ class Camera:
         v = (pixels_px[:, 1] - self.K[1, 2]) / self.K[1, 1]
         u = (pixels_px[:, 0] - self.K[0, 2] - self.K[0, 1] * v) / self.K[0, 0]
         if self.model == "fisheye":
-            radius = np.hypot(u, v)
+            radius = np.sqrt(u * u + v * v)
             theta = invert_fisheye(radius, self.D, self.max_angle_rad)
+            rays = np.empty((len(u), 3))
             with np.errstate(divide="ignore", invalid="ignore"):
-                sine = np.where(radius > 1e-12, np.sin(theta) / radius, 1.0)
-            rays = np.stack([u * sine, v * sine, np.cos(theta)], axis=1)
-        else:
-            flat = invert_pinhole(np.stack([u, v], axis=1), self.D)
-            rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+                # What is left of the radius is an error along it.
+                error = np.abs(fisheye_radius(theta, self.D) - radius) * max(self.K[0, 0], self.K[1, 1])
+                theta[~(error <= _MAX_RESIDUAL_PX)] = np.nan
+                sine = np.where(radius <= 1e-12, 1.0, np.sin(theta) / radius)
+            np.multiply(u, sine, out=rays[:, 0])
+            np.multiply(v, sine, out=rays[:, 1])
+            np.cos(theta, out=rays[:, 2])
+            return rays
+        flat = invert_pinhole(np.stack([u, v], axis=1), self.D)
+        rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
             back = self.project_rays(np.nan_to_num(rays, nan=0.0))
             error = np.linalg.norm(back - pixels_px, axis=1)
@@ -212,6 +218,8 @@ class Camera:
 _NEWTON_STEPS = 30
 #: Newton's method squares its error: after a step as short as this there is nothing left to gain.
 _LAST_STEP_RAD = 1e-12
+#: Steps without a bracket, and the last one at most. Chosen: three reach 1e-12 on lenses up to 170 degrees.
+_FREE_STEPS, _SMALL_STEP_RAD = 3, 1e-6
 
 
 def fisheye_radius(angle_rad: Float[np.ndarray, "*n"], D: Float[np.ndarray, "_"]) -> Float[np.ndarray, "*n"]:
@@ -236,12 +244,33 @@ def invert_fisheye(
 ) -> Float[np.ndarray, "*n"]:
     """Return the angle from the optical axis, [rad], that has a radius; NaN where none up to the largest has.
 
-    The radius grows up to there, so that Newton's method, kept in a bracket, converges.
+    The radius grows up to there, so that Newton's method, kept in a bracket, converges. Most lenses are so
+    close to the start that it converges without one, in a few steps.
     """
+    most = fisheye_radius(np.array([max_angle_rad]), D)
+    seen = radius <= most
+    aimed = np.minimum(radius, most)
+    angle_rad = aimed * (1.0 - D[0] * aimed * aimed)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for _ in range(_FREE_STEPS):
+            step = (fisheye_radius(angle_rad, D) - aimed) / fisheye_slope(angle_rad, D)
+            angle_rad -= step
+        # The error after a step is about its square.
+        good = (np.abs(step) <= _SMALL_STEP_RAD) & (angle_rad >= 0.0) & (angle_rad <= max_angle_rad)
+    angle_rad[~seen] = np.nan
+    rest = np.flatnonzero(seen & ~good)
+    if rest.size:
+        angle_rad.reshape(-1)[rest] = _bracketed(radius.reshape(-1)[rest], D, max_angle_rad)
+    return angle_rad
+
+
+def _bracketed(
+    radius: Float[np.ndarray, "n"], D: Float[np.ndarray, "_"], max_angle_rad: float
+) -> Float[np.ndarray, "n"]:
+    """Return the angle that has each radius, by Newton's method in a bracket."""
     low = np.zeros_like(radius)
     high = np.full_like(radius, max_angle_rad)
     angle_rad = np.clip(radius, 0.0, max_angle_rad)
-    seen = radius <= fisheye_radius(np.array([max_angle_rad]), D)
     for _ in range(_NEWTON_STEPS):
         error = fisheye_radius(angle_rad, D) - radius
         low = np.where(error < 0.0, angle_rad, low)
@@ -251,9 +280,9 @@ def invert_fisheye(
             step = angle_rad - error / slope
         inside = (step >= low) & (step <= high)
         before, angle_rad = angle_rad, np.where(inside, step, 0.5 * (low + high))
-        if np.max(np.abs(angle_rad - before), where=seen, initial=0.0) <= _LAST_STEP_RAD:
+        if np.max(np.abs(angle_rad - before), initial=0.0) <= _LAST_STEP_RAD:
             break
-    return np.where(seen, angle_rad, np.nan)
+    return np.asarray(angle_rad)
 
 
 def _coefficients(D: Float[np.ndarray, "_"]) -> tuple[float, float, float, float, float]:

@@ -16,14 +16,17 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_matrix, csc_matrix, diags
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import splu
 
 from datagen.slam.adjustment.kernels import (
     N_CAMERA,
@@ -73,6 +76,8 @@ _REFERENCE_WIDTH = 160.0
 _LEAST_STEP = 0.1
 #: Parts into which the pairs of frames are cut for threads. Chosen: enough for the cores of a laptop.
 _PARTS = 8
+#: Numbers of a band of the equations up to which it is solved as one: 400 MB.
+_MOST_BAND = 50_000_000
 #: Sigma of the first pose, which only fixes the map: far below anything that is measured.
 _FIXED_SIGMA = 1e-6
 
@@ -141,12 +146,16 @@ def adjust(
     """
     problem = BundleProblem(observed, start.camera, settings, rng, free, loops, prior_camera)
     state = BundleState.at(start)
-    for gate_px in settings.gates_px:
+    for round_number, gate_px in enumerate(settings.gates_px, start=1):
         links = problem.associate(state, gate_px)
         damping = _DAMPING
         now = problem.equations(state, links)
-        for _ in range(settings.iterations):
+        for left in reversed(range(settings.iterations)):
             trial = state.moved(now.step(damping), problem.free)
+            if not left and round_number < len(settings.gates_px):
+                # The next round meets other edges, and has other equations.
+                state = trial if problem.cost(trial, links) < now.cost else state
+                break
             new = problem.equations(trial, links)
             if new.cost < now.cost:
                 converged = now.cost - new.cost < _CONVERGED * now.cost
@@ -202,7 +211,7 @@ class Equations:
         """
         count = len(self.border)
         frames = (self.frames + damping * diags(self.frames.diagonal())).tocsc()
-        reduced = _factorised(frames).solve(np.column_stack([self.descent[:count], self.border]))
+        reduced = _Factorised(frames).solve(np.column_stack([self.descent[:count], self.border]))
         if not self.border.shape[1]:
             return np.asarray(reduced[:, 0])
         camera = self.camera + damping * np.diag(np.diag(self.camera))
@@ -214,13 +223,50 @@ class Equations:
         """Return H of the camera with the frames eliminated, and how the frames follow the camera."""
         # A part of the drive that nothing joins to the others may lie anywhere.
         frames = (self.frames + _AFLOAT * diags(self.frames.diagonal())).tocsc()
-        follow = -_factorised(frames).solve(self.border)
+        follow = -_Factorised(frames).solve(self.border)
         return self.camera + self.border.T @ follow, follow
 
 
-def _factorised(matrix: csc_matrix) -> SuperLU:
-    """Factorise a positive definite matrix: no pivoting, and an order that suits symmetry."""
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+class _Factorised:
+    """A symmetric positive definite matrix, ready for solving.
+
+    Neighbouring frames and neighbouring laps make it a band, once the unknowns are in a suitable order. The
+    band takes a fifth of the time of a sparse factorisation, but more memory.
+
+    Source:
+        Cuthill and McKee 1969, "Reducing the bandwidth of sparse symmetric matrices".
+    """
+
+    def __init__(self, matrix: csc_matrix) -> None:
+        size = matrix.shape[0]
+        self._order = reverse_cuthill_mckee(matrix, symmetric_mode=True)
+        place = np.empty(size, np.int64)
+        place[self._order] = np.arange(size)
+        column = np.repeat(place, np.diff(matrix.indptr))
+        below = place[matrix.indices] - column
+        width = int(below.max(initial=0)) + 1
+        self._band: Float[np.ndarray, "b v"] | None = None
+        if width * size <= _MOST_BAND:
+            lower = below >= 0
+            band = np.zeros(width * size)
+            band[column[lower] * width + below[lower]] = matrix.data[lower]
+            # Singular but for rounding, where a part of the drive hangs together with no other.
+            with suppress(LinAlgError):
+                self._band = cholesky_banded(
+                    band.reshape(size, width).T, overwrite_ab=True, lower=True, check_finite=False
+                )
+        if self._band is None:
+            # No pivoting, and an order that suits symmetry.
+            options = {"SymmetricMode": True}
+            self._sparse = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+
+    def solve(self, right: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "v k"]:
+        """Solve for some right-hand sides."""
+        if self._band is None:
+            return np.asarray(self._sparse.solve(right))
+        found = np.empty_like(right)
+        found[self._order] = cho_solve_banded((self._band, True), right[self._order], check_finite=False)
+        return found
 
 
 class BundleProblem:
@@ -313,28 +359,16 @@ class BundleProblem:
 
     def equations(self, state: BundleState, links: Links) -> Equations:
         """Build the normal equations of all residuals and priors."""
-        lifted, lifted_by, _ = self.lift(state)
-        both, count = 2 * N_FRAME, N_FRAME * self.frames
-        blocks = np.zeros((len(self.pairs), both + N_CAMERA, both + N_CAMERA))
-        descents = np.zeros((len(self.pairs), both + N_CAMERA))
-        residual_px = np.empty(len(links.point))
-        starts = np.searchsorted(links.pair, np.arange(len(self.pairs) + 1))
-
-        def cost_of(part: tuple[int, int]) -> float:
-            return accumulate(
-                state, self.pairs, part, self.edges, lifted, lifted_by, links, starts,
-                self.weight, self.settings.cauchy_px, blocks, descents, residual_px,
-            )  # fmt: skip
-
-        cost = sum(in_threads(cost_of, _parts(len(self.pairs))))
+        free, both, count = self.free, 2 * N_FRAME, N_FRAME * self.frames
+        size, pairs = both + int(free.sum()), len(self.pairs)
+        blocks, descents = np.zeros((pairs, size, size)), np.zeros((pairs, size))
+        cost, residual_px = self._add_up(state, links, blocks, descents)
         prior_cost, prior, prior_descent = frame_priors(state, self.settings, self.observed)
-        at, free = self.unknowns.ravel(), self.free
-        border = [
-            np.bincount(at, blocks[:, :both, both + k].ravel(), minlength=count) for k in np.flatnonzero(free)
-        ]
+        at = self.unknowns.ravel()
+        border = [np.bincount(at, blocks[:, :both, k].ravel(), minlength=count) for k in range(both, size)]
         off = (state.camera_minus(self.prior_camera) / self.camera_sigmas)[free]
-        camera = blocks[:, both:, both:].sum(axis=0)[np.ix_(free, free)]
-        camera_descent = descents[:, both:].sum(axis=0)[free] - off / self.camera_sigmas[free]
+        camera = blocks[:, both:, both:].sum(axis=0)
+        camera_descent = descents[:, both:].sum(axis=0) - off / self.camera_sigmas[free]
         frames_descent = np.bincount(at, descents[:, :both].ravel(), minlength=count) + prior_descent
         return Equations(
             cost=cost + prior_cost + 0.5 * float(off @ off),
@@ -344,6 +378,34 @@ class BundleProblem:
             descent=np.concatenate([frames_descent, camera_descent]),
             residual_px=residual_px,
         )
+
+    def cost(self, state: BundleState, links: Links) -> float:
+        """Return the cost of all residuals and priors, in a third of the time of the equations."""
+        size = 2 * N_FRAME + int(self.free.sum())
+        cost, _ = self._add_up(state, links, np.empty((0, size, size)), np.empty((0, size)))
+        prior_cost, _, _ = frame_priors(state, self.settings, self.observed)
+        off = (state.camera_minus(self.prior_camera) / self.camera_sigmas)[self.free]
+        return cost + prior_cost + 0.5 * float(off @ off)
+
+    def _add_up(
+        self,
+        state: BundleState,
+        links: Links,
+        blocks: Float[np.ndarray, "p u u"],
+        descents: Float[np.ndarray, "p u"],
+    ) -> tuple[float, Float[np.ndarray, "r"]]:
+        """Fill the blocks of all pairs, see :func:`accumulate`; return cost and residuals of the links."""
+        lifted, lifted_by, _ = self.lift(state)
+        residual_px = np.empty(len(links.point))
+        starts, free = self._starts(links), np.flatnonzero(self.free)
+
+        def cost_of(part: tuple[int, int]) -> float:
+            return accumulate(
+                state, self.pairs, part, self.edges, lifted, lifted_by, links, starts,
+                self.weight, self.settings.cauchy_px, free, blocks, descents, residual_px,
+            )  # fmt: skip
+
+        return sum(in_threads(cost_of, _parts(len(self.pairs)))), residual_px
 
     def camera_sigma(self, state: BundleState, links: Links, now: Equations) -> Float[np.ndarray, "f"]:
         """Return the sigmas of the camera's free numbers, with all other unknowns free too.
@@ -370,11 +432,12 @@ class BundleProblem:
         through = np.zeros((len(follow), N_CAMERA))
         through[:, free] = follow
         lifted, lifted_by, _ = self.lift(state)
+        starts = self._starts(links)
 
         def scores(errors_px: Float[np.ndarray, "r"], groups: Int[np.ndarray, "r"], count: int) -> np.ndarray:
             sums = np.zeros((count, N_CAMERA))
             sum_scores(
-                state, self.pairs, self.edges, lifted, lifted_by, links,
+                state, self.pairs, self.edges, lifted, lifted_by, links, starts,
                 self.weight, self.settings.cauchy_px, through, errors_px, groups, sums,
             )  # fmt: skip
             return sums[:, free]
@@ -391,6 +454,10 @@ class BundleProblem:
         spread = by_road.T @ by_road + by_image.T @ by_image + np.diag(self.camera_sigmas[free] ** -2.0)
         inverse = np.linalg.inv(information)
         return np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0))
+
+    def _starts(self, links: Links) -> Int[np.ndarray, "p1"]:
+        """First link of each pair, and one behind the last."""
+        return np.searchsorted(links.pair, np.arange(len(self.pairs) + 1))
 
     def _image_groups(self, pixels: Pixels, chosen: Int[np.ndarray, "r"]) -> Int[np.ndarray, "r"]:
         """Group edges that lie in one band of the image and face the same way."""

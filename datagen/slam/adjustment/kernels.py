@@ -389,6 +389,7 @@ def sum_scores(
     lifted,
     lifted_by,
     links,
+    starts,
     point_weight,
     cauchy_px,
     through_frames,
@@ -405,6 +406,7 @@ def sum_scores(
         lifted: Road point of each compared pixel.
         lifted_by: Its Jacobian by the camera parameters.
         links: Which point meets which edge.
+        starts: First link of each pair, and one behind the last.
         point_weight: Inverse variance of each compared pixel.
         cauchy_px: Scale of the loss, see :func:`accumulate`.
         through_frames: Change of each frame's numbers with each of the camera's, ``N_FRAME`` rows per frame.
@@ -413,7 +415,6 @@ def sum_scores(
         sums: Added to, a row per group.
     """
     poses, tilt = state.poses, state.tilt
-    starts = np.searchsorted(links.pair, np.arange(pairs.shape[0] + 1))
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
     for k in range(pairs.shape[0]):
@@ -438,14 +439,14 @@ def sum_scores(
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def accumulate(
-    state, pairs, part, edges, lifted, lifted_by, links, starts, point_weight, cauchy_px,
+    state, pairs, part, edges, lifted, lifted_by, links, starts, point_weight, cauchy_px, free,
     blocks, descents, residual
 ):  # fmt: skip
     """Add up the normal equations of all point-to-line residuals, a block per pair of frames.
 
     The residual e of a link is the distance of the moved point from its edge, along the edge's gradient, with
     the Cauchy loss: weight w = 1 / (1 + (e / (sigma c))^2). The unknowns of a block are frame i (x, y,
-    heading, pitch, roll), frame j, and the camera.
+    heading, pitch, roll), frame j, and the camera's free numbers.
 
     Args:
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
@@ -458,7 +459,8 @@ def accumulate(
         starts: First link of each pair, and one behind the last.
         point_weight: Inverse variance of each compared pixel.
         cauchy_px: Scale c of the loss.
-        blocks: Filled: J^T W J of each pair.
+        free: Which of the camera's numbers are free, by index.
+        blocks: Filled: J^T W J of each pair; with a length of 0, only cost and residuals are found.
         descents: Filled: -J^T W e of each pair.
         residual: Filled: e of each link; NaN where the point is behind the camera.
 
@@ -468,7 +470,7 @@ def accumulate(
     poses, tilt = state.poses, state.tilt
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
-    n = jac.shape[0]
+    both, n, only_cost = 2 * N_FRAME, 2 * N_FRAME + free.shape[0], blocks.shape[0] == 0
     cost = 0.0
     for k in range(part[0], part[1]):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -483,12 +485,19 @@ def accumulate(
             residual[r] = e
             s = e / (sigma * cauchy_px)
             cost += 0.5 * point_weight[p] * cauchy_px * cauchy_px * np.log1p(s * s)
+            if only_cost:
+                continue
             w = point_weight[p] / ((1.0 + s * s) * sigma * sigma)
+            for c in range(free.shape[0]):
+                # In ascending order, so that none is overwritten before it is read.
+                jac[both + c] = jac[both + free[c]]
             for row in range(n):
                 wj = w * jac[row]
                 descents[k, row] -= wj * e
                 for column in range(row + 1):
                     blocks[k, row, column] += wj * jac[column]
+        if only_cost:
+            continue
         for row in range(n):
             for column in range(row):
                 blocks[k, column, row] = blocks[k, row, column]

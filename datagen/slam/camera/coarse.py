@@ -20,13 +20,14 @@ from jaxtyping import Float
 
 from datagen.slam.commands import commands_of
 from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
-from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence
+from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence, sampled_frames
 from datagen.slam.odometry.scans import Progress, seen_edges
 from datagen.slam.settings import GuessSettings
 from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.canny import find_edges
+from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import PerceptionSettings, RoadTable
 from lanenet.processes import in_threads
 
@@ -96,7 +97,7 @@ def coarse_camera(
     grid = [(focal, pitch) for focal in focals for pitch in pitches]
     # Every second camera of the grid, like the black squares of a chessboard.
     spread = [(f, p) for i, f in enumerate(focals) for j, p in enumerate(pitches) if (i + j) % 2 == 0]
-    step = clearest_step((search.images(*camera) for camera in spread), search.relative)
+    step = clearest_step((search.images(*camera, _FIRST_PAIRS) for camera in spread), search.relative)
     tried: dict[tuple[float, float], Candidate] = {}
     total = len(grid) + 9
     # The given grid, then half its steps around the best.
@@ -121,8 +122,13 @@ class _Search:
     def __init__(self, drive: Drive, perception: PerceptionSettings, guess: GuessSettings, seed: int) -> None:
         count = min(guess.frames, len(drive))
         start = max(0, (len(drive) - count) // 3)
-        self.edges = [find_edges(drive.image(k), perception.edges) for k in range(start, start + count)]
         self.periods = commands_of(drive.subset(slice(start, start + count)), guess.wheelbase_cm).periods
+        #: Frames that are compared, by the number of pairs.
+        self.compared = {most: self._compared(most) for most in (_FIRST_PAIRS, _PAIRS)}
+        self.edges = {
+            k: find_edges(drive.image(start + k), perception.edges)
+            for k in sorted(set().union(*self.compared.values()))
+        }
         self.size = drive.width, drive.height
         self.scale = drive.width / _REFERENCE_WIDTH
         self.limits, self.guess, self.seed = perception.range, guess, seed
@@ -133,18 +139,33 @@ class _Search:
     def camera(self, focal_px: float, pitch_deg: float) -> Camera:
         return guessed_camera(*self.size, focal_px, pitch_deg, self.guess)
 
-    def images(self, focal_px: float, pitch_deg: float) -> ImagePairs:
-        """The edges that see the road with a camera; the same points are drawn for every camera."""
+    def _compared(self, most: int) -> set[int]:
+        """Frames that :func:`best_step` compares, and those before them that it compares them with."""
+        lags = OdometrySettings().lags
+        frames = sampled_frames(self.periods, lags, most)
+        return {int(k) - lag for k in frames for lag in (0, *lags) if lag <= k}
+
+    def images(self, focal_px: float, pitch_deg: float, most: int) -> ImagePairs:
+        """The edges that see the road with a camera; the same points are drawn for every camera.
+
+        Args:
+            focal_px: Focal length.
+            pitch_deg: Downward pitch.
+            most: Frames that will be compared with those before them; the others stay empty.
+        """
         camera = self.camera(focal_px, pitch_deg)
         table = RoadTable(camera, mapping_range(camera.mounting.height_cm, self.limits))
-        edges = [seen_edges(pixels, table) for pixels in self.edges]
+        compared, none = self.compared[most], EdgePixels(np.empty((0, 2)), np.empty((0, 2)))
+        edges = [
+            seen_edges(self.edges[k], table) if k in compared else none for k in range(len(self.periods))
+        ]
         rng = np.random.default_rng(self.seed)
         return ImagePairs(edges, camera, OdometrySettings(), rng, self.periods)
 
     def try_camera(self, focal_and_pitch: tuple[float, float], step_heights: float) -> Candidate:
         """Rate a camera by how clear the motion is with it, around a step length."""
         focal_px, pitch_deg = focal_and_pitch
-        images = self.images(focal_px, pitch_deg)
+        images = self.images(focal_px, pitch_deg, _PAIRS)
         steps = step_heights * _AROUND
         _, fits = best_step(images, self.relative, steps, _PAIRS)
         # The fit itself decides nothing: with too much pitch, standing still fits better than the true motion

@@ -16,6 +16,8 @@ frame's row leaves the tree.
 The entries of a cell are stored in pages, each of which is contiguous, and the loops over points are
 outermost: following entries one by one through memory would take longer than all the arithmetic.
 
+The loops spell out what NumPy would do with whole arrays: that takes numba three times as long to compile.
+
 Source:
     Eliazar and Parr 2003 and 2004 (see :mod:`datagen.slam.filter.dp_slam`).
 """
@@ -304,7 +306,8 @@ def grow(tree, row, frame, states, chosen):
         if before[p + 1] > before[p]:
             span[row, count, 0] = before[p]
             span[row, count, 1] = before[p + 1]
-            tree.pose[row, count] = states[p, :3]
+            for c in range(3):
+                tree.pose[row, count, c] = states[p, c]
             count += 1
     tree.nodes[row] = count
     tree.frame[row] = frame
@@ -404,11 +407,15 @@ def write(shared, row, start):
     following, used, free = pages.following, pages.used, pages.free
     entered, vector = pages.node.reshape(-1), pages.vector.reshape((-1, 2))
     nodes, mask = tree.nodes[row], state.shape[0] - 1
-    wx, wy = np.ones(2), np.ones(2)
+    wx, wy = np.empty(2), np.empty(2)
+    wx[0] = wx[1] = wy[0] = wy[1] = 1.0
     reach, half = (1, 0.0) if plain else (2, 0.5)
-    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
+    cosines, sines = np.empty(nodes), np.empty(nodes)
+    for node in range(nodes):
+        cosines[node], sines[node] = np.cos(pose[row, node, 2]), np.sin(pose[row, node, 2])
     # Neighbouring points share cells: the last entry of a node in each of a few cells takes both.
-    recent = np.full((nodes, _RECENT * _RECENT, 3), _NOWHERE, np.int32)
+    recent = np.empty((nodes, _RECENT * _RECENT, 3), np.int32)
+    _forget(recent)
     for i in range(start, tree.size[row]):
         if free[1] < reach * reach * nodes:
             return i
@@ -437,7 +444,7 @@ def write(shared, row, start):
                         # The cell is taken over by another patch of road; what it held is dropped.
                         if state[a, b, PAGE] >= 0:
                             _free(pages, state[a, b, PAGE])
-                            recent[:] = _NOWHERE
+                            _forget(recent)
                         state[a, b, PAGE], state[a, b, STAMP] = -1, -1
                         root[a, b, 0], root[a, b, 1] = 0.0, 0.0
                         state[a, b, OWNER_X], state[a, b, OWNER_Y] = ix, iy
@@ -465,6 +472,15 @@ def write(shared, row, start):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
+def _forget(recent):
+    """Forget the cells of all nodes."""
+    for node in range(recent.shape[0]):
+        for slot in range(recent.shape[1]):
+            recent[node, slot, 0] = recent[node, slot, 1] = _NOWHERE
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
 def collapse(shared, row):
     """Collapse a row of the tree: its entries move into the roots or are dropped.
 
@@ -484,15 +500,18 @@ def collapse(shared, row):
     particles, nodes, mask = span.shape[1], tree.nodes[row], state.shape[0] - 1
     reach, half = (1, 0.0) if plain else (2, 0.5)
     forced, mean = True, np.zeros(3)
+    cosines, sines = np.empty(nodes), np.empty(nodes)
     for node in range(nodes):
         size = span[row, node, 1] - span[row, node, 0]
         forced &= size < particles
-        mean += size / particles * pose[row, node]
+        for c in range(3):
+            mean[c] += size / particles * pose[row, node, c]
+        cosines[node], sines[node] = np.cos(pose[row, node, 2]), np.sin(pose[row, node, 2])
     if forced:
-        span[row, :nodes] = 0
+        for node in range(nodes):
+            span[row, node, 0] = span[row, node, 1] = 0
         tree.version[0] += 1
     version = tree.version[0]
-    cosines, sines = np.cos(pose[row, :nodes, 2]), np.sin(pose[row, :nodes, 2])
     for i in range(tree.size[row]):
         right, forward = points[row, i, 0], points[row, i, 1] + wheelbase
         for node in range(nodes):
@@ -506,7 +525,8 @@ def collapse(shared, row):
                         prune(tree, cells, pages, a, b, shared.memory_frames)
     if forced:
         # No entry of single lineages is left; one node that everybody descends from takes their place.
-        pose[row, 0] = mean
+        for c in range(3):
+            pose[row, 0, c] = mean[c]
         span[row, 0, 1] = particles
         tree.nodes[row] = 1
         tree.version[0] += 1
@@ -540,7 +560,9 @@ def score(shared, poses, points, frame):
     fade_of = np.empty(window)
     for row in range(window):
         fade_of[row] = tree.fades[window + min(frame - tree.frame[row], window)]
-    cosines, sines = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    cosines, sines = np.empty(particles), np.empty(particles)
+    for p in range(particles):
+        cosines[p], sines[p] = np.cos(poses[p, 2]), np.sin(poses[p, 2])
     values = np.empty((particles // _FEW + 1, particles + 1, 2))
     asked, rows = np.zeros(_BOX, np.int64), np.empty(_BOX, np.int64)
     ix, iy = np.empty(particles, np.int64), np.empty(particles, np.int64)
@@ -551,11 +573,15 @@ def score(shared, poses, points, frame):
         for p in range(particles):
             ix[p] = int(np.floor((poses[p, 0] + forward * cosines[p] + right * sines[p]) / cell_cm))
             iy[p] = int(np.floor((poses[p, 1] + forward * sines[p] - right * cosines[p]) / cell_cm))
-        low_x, low_y = ix.min(), iy.min()
-        wide, high = ix.max() - low_x + 1, iy.max() - low_y + 1
+        low_x, low_y, high_x, high_y = ix[0], iy[0], ix[0], iy[0]
+        for p in range(1, particles):
+            low_x, low_y = min(low_x, ix[p]), min(low_y, iy[p])
+            high_x, high_y = max(high_x, ix[p]), max(high_y, iy[p])
+        wide, high = high_x - low_x + 1, high_y - low_y + 1
         boxed, filled = wide * high <= _BOX, 0
         if boxed:
-            asked[: wide * high] = 0
+            for box in range(wide * high):
+                asked[box] = 0
             for p in range(particles):
                 asked[(iy[p] - low_y) * wide + ix[p] - low_x] += 1
         for p in range(particles):
@@ -577,7 +603,8 @@ def score(shared, poses, points, frame):
                     page = state[a, b, PAGE]
                 if boxed and asked[box] > _FEW:
                     held = values[filled]
-                    held[:, :] = 0.0
+                    for q in range(particles + 1):
+                        held[q, 0] = held[q, 1] = 0.0
                     while page >= 0:
                         for at in range(page * PAGE_SIZE, page * PAGE_SIZE + used[page]):
                             e = U(at)

@@ -135,7 +135,10 @@ def widen_steps(before, states, every, factor):
         # A step is a chord in the direction of the middle heading, see advance().
         dx, dy = states[p, X] - before[p, X], states[p, Y] - before[p, Y]
         steps[p] = dx * np.cos(middle) + dy * np.sin(middle)
-    mean_turn, mean_step = turns.mean(), steps.mean()
+    mean_turn, mean_step = 0.0, 0.0
+    for p in range(particles):
+        mean_turn, mean_step = mean_turn + turns[p], mean_step + steps[p]
+    mean_turn, mean_step = mean_turn / particles, mean_step / particles
     for p in range(0, particles, every):
         turn = mean_turn + factor * (turns[p] - mean_turn)
         step = mean_step + factor * (steps[p] - mean_step)

@@ -163,9 +163,9 @@ class ImagePairs:
 
     @property
     def points_per_frame(self) -> float:
-        """Mean number of points in the comparison of a frame with those before it."""
-        drawn = sum(len(image.points) for image in self._images)
-        return max(len(self.settings.lags) * drawn / max(len(self), 1), 1.0)
+        """Mean number of points in the comparison of a frame with those before it, where there are any."""
+        drawn = [len(image.points) for image in self._images if len(image.points)]
+        return max(len(self.settings.lags) * sum(drawn) / max(len(drawn), 1), 1.0)
 
     @property
     def turn_step_rad(self) -> float:
@@ -339,21 +339,30 @@ def fit_of_motions(earlier, later, nearest, grid, distances, turns, gain_at, out
     last_u, last_v = nearest.shape[2] - 1.0, nearest.shape[1] - 1.0
     last_row, last_column = pixel_of.shape[0] - 1.0, pixel_of.shape[1] - 1.0
     x0, y0 = grid.origin[0] * per_cell, grid.origin[1] * per_cell
-    one = U(1)
+    one, count = U(1), turns.shape[1]
+    #: By turn: its column, cosine and sine, where the car comes from, the sum so far, and points out of view.
+    tried, columns = np.empty((6, count)), np.empty(count, np.int64)
+    cosines, sines, from_x, from_y, totals, lost = tried[0], tried[1], tried[2], tried[3], tried[4], tried[5]
     for a in range(distances.shape[0]):
-        for b in range(turns.shape[1]):
+        there = 0
+        for b in range(count):
             turn = turns[a, b]
             if np.isnan(turn):
                 continue
             c, s = np.cos(turn) * per_cell, np.sin(turn) * per_cell
             dx, dy = distances[a] * np.cos(0.5 * turn), distances[a] * np.sin(0.5 * turn)
-            from_x, from_y = c * dx + s * dy + x0, c * dy - s * dx + y0
-            total, lost = 0.0, 0
-            for p in range(points.shape[0]):
-                x, y = points[p, 0], points[p, 1]
-                gx, gy = c * x + s * y - from_x, c * y - s * x - from_y
+            from_x[there], from_y[there] = c * dx + s * dy + x0, c * dy - s * dx + y0
+            cosines[there], sines[there], columns[there] = c, s, b
+            totals[there] = lost[there] = 0.0
+            there += 1
+        # Point by point: with the next turn, it is near to where it was, and so is what is looked up.
+        for p in range(points.shape[0]):
+            x, y, facing = points[p, 0], points[p, 1], U(sector[p])
+            for b in range(there):
+                c, s = cosines[b], sines[b]
+                gx, gy = c * x + s * y - from_x[b], c * y - s * x - from_y[b]
                 if not (0.0 <= gx < last_row and 0.0 <= gy < last_column):
-                    lost += 1
+                    lost[b] += 1.0
                     continue
                 ix, iy = np.int32(gx), np.int32(gy)
                 tx, ty, i, j = gx - ix, gy - iy, U(ix), U(iy)
@@ -364,11 +373,12 @@ def fit_of_motions(earlier, later, nearest, grid, distances, turns, gain_at, out
                 far_v = pixel_of[i, j, 1] + ty * (pixel_of[i, j + one, 1] - pixel_of[i, j, 1])
                 u, v = u + tx * (far_u - u), v + tx * (far_v - v)
                 if not (0.0 <= u <= last_u and 0.0 <= v <= last_v):
-                    lost += 1
+                    lost[b] += 1.0
                     continue
-                q = nearest[U(sector[p]), U(np.int32(v + 0.5)), U(np.int32(u + 0.5))]
+                q = nearest[facing, U(np.int32(v + 0.5)), U(np.int32(u + 0.5))]
                 if q >= 0:
                     off = _PER_PX * abs(u * lines[U(q), 0] + v * lines[U(q), 1] - lines[U(q), 2])
                     entry = np.int32(off)
-                    total += gain_at[U(entry), 0] + (off - entry) * gain_at[U(entry), 1]
-            out[a, b], unseen[a, b] = total, lost
+                    totals[b] += gain_at[U(entry), 0] + (off - entry) * gain_at[U(entry), 1]
+        for b in range(there):
+            out[a, columns[b]], unseen[a, columns[b]] = totals[b], lost[b]

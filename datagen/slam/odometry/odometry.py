@@ -9,11 +9,12 @@ corners or stains. What one pair of images leaves open, its neighbours settle (s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Float16, Float32
+from jaxtyping import Float, Float16, Float32, Int
 
 from datagen.slam.commands import LONGEST_STEP, MOST_BRIDGED
 from datagen.slam.odometry.image_pairs import ImagePairs, turns_up_to
@@ -135,16 +136,7 @@ def best_step(
     Returns:
         The step, interpolated between those that were tried by a parabola, and the mean fit of each of them.
     """
-    s, n = images.settings, len(images)
-    first = min(max(s.lags), n - 1)
-    # Steps over a gap say little of the typical one; a drive of gaps alone has no others.
-    gaps = np.convolve(images.periods > 1.0, np.ones(first + 1))[:n]
-    frames = np.flatnonzero(gaps[first:] == 0) + first
-    if len(frames) < min(_LEAST_SAMPLED, n - first):
-        frames = np.arange(first, n)
-    frames = frames[
-        np.unique(np.linspace(0, len(frames) - 1, min(most_frames, len(frames))).astype(np.int64))
-    ]
+    frames = sampled_frames(images.periods, images.settings.lags, most_frames)
 
     def fits_of(k: int) -> Float[np.ndarray, "w"]:
         turns = [_turns_of(images, step * relative[k]) for step in steps]
@@ -163,6 +155,27 @@ def best_step(
         bend = left - 2.0 * middle + right
         shift = float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
     return float(steps[best] * np.exp(shift * log_ratio)), fit
+
+
+def sampled_frames(
+    periods: Float[np.ndarray, "n"], lags: Sequence[int], most_frames: int
+) -> Int[np.ndarray, "m"]:
+    """Choose frames from all over a drive that are compared with those before them.
+
+    Args:
+        periods: Time from the frame before to each frame, in typical time steps.
+        lags: Frames between the images of a pair.
+        most_frames: How many frames to choose, at most.
+    """
+    n = len(periods)
+    first = min(max(lags), n - 1)
+    # Steps over a gap say little of the typical one; a drive of gaps alone has no others.
+    gaps = np.convolve(periods > 1.0, np.ones(first + 1))[:n]
+    frames = np.flatnonzero(gaps[first:] == 0) + first
+    if len(frames) < min(_LEAST_SAMPLED, n - first):
+        frames = np.arange(first, n)
+    spread = np.linspace(0, len(frames) - 1, min(most_frames, len(frames)))
+    return frames[np.unique(spread.astype(np.int64))]
 
 
 def prominence(fit: Float[np.ndarray, "w"], steps: Float[np.ndarray, "w"]) -> Float[np.ndarray, "w"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -77,9 +78,13 @@ class LaneLine:
     def everywhere(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
         """Evaluate the line or a derivative, also where it is not supported."""
         low, high = self.knots_cm[3], self.knots_cm[-4]
-        spline = BSpline(self.knots_cm, self.coefficients_cm, 3)
         s = np.clip(s_cm, low, high) if self.period_cm is None else low + np.mod(s_cm - low, self.period_cm)
-        return np.array(spline(s, nu=derivative))
+        return np.array(self._spline(s, nu=derivative))
+
+    @cached_property
+    def _spline(self) -> BSpline:
+        """To be evaluated: making it takes longer than evaluating it for a frame."""
+        return BSpline(self.knots_cm, self.coefficients_cm, 3)
 
     def supported(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
         """Return which positions are supported."""
