@@ -212,7 +212,7 @@ def gather_evidence(mapped: MappedDrive) -> dict[tuple[int, int], PlaceEvidence]
     for k, edges, keep in frame_edges(mapped, _spread_frames(drive_map)):
         segment, lane = int(drive_map.segment[k]), int(drive_map.lanes.lane[k])
         tilted = drive_map.camera_at(k)
-        road = lift_tilted(edges, camera, drive_map.tilt_rad[k])
+        (road,) = lift_tilted([edges], camera, drive_map.tilt_rad[[k]])
         near = road.points_cm[:, 1] < _REACH_CM + _BESIDE_CM
         road = RoadEdges(road.points_cm[near], road.normals[near])
         for line in drive_map.lines[segment]:

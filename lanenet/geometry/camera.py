@@ -183,7 +183,10 @@ class Camera:
         Returns:
             Road points, [cm], frame car. NaN where the ray misses the road or the lens does not see.
         """
-        rays_car = self.unproject(pixels_px) @ self.mounting.camera_from_car
+        return self.meet_ground(self.unproject(pixels_px) @ self.mounting.camera_from_car)
+
+    def meet_ground(self, rays_car: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Meet viewing rays, directions in the car frame, with the road plane; NaN where they miss it."""
         position = self.mounting.position_car_cm
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where(rays_car[:, 2] < -1e-9, -position[2] / rays_car[:, 2], np.nan)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -23,6 +24,8 @@ _SECTORS = 4
 #: Distance at which a point weighs one half, camera heights. Chosen: lines that were seen only beyond 3.5
 #: camera heights were wrong on ``donkey_circuit``.
 _HALF_WEIGHT_HEIGHTS = 4.0
+#: Frames whose edges are lifted at once. Chosen: more only takes more memory.
+_LIFTED_AT_ONCE = 64
 
 
 class Scan(NamedTuple):
@@ -100,10 +103,13 @@ def scans_of(
         tilt_rad: Pitch and roll of each frame beyond the mounting's; None for level.
     """
     table = RoadTable(camera, range_settings)
-    frames = []
-    for k, pixels in enumerate(edges):
-        kept = seen_edges(pixels, table)
-        frames.append(table.lift(kept) if tilt_rad is None else lift_tilted(kept, camera, tilt_rad[k]))
+    kept = [seen_edges(pixels, table) for pixels in edges]
+    if tilt_rad is None:
+        frames = [table.lift(pixels) for pixels in kept]
+    else:
+        blocks = range(0, len(kept), _LIFTED_AT_ONCE)
+        parts = (slice(first, first + _LIFTED_AT_ONCE) for first in blocks)
+        frames = [road for part in parts for road in lift_tilted(kept[part], camera, tilt_rad[part])]
     return pack_scans(frames, camera.mounting.height_cm)
 
 
@@ -114,23 +120,34 @@ def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
     return EdgePixels(pixels.uv_px[seen], pixels.normals[seen])
 
 
-def lift_tilted(pixels: EdgePixels, camera: Camera, tilt_rad: Float[np.ndarray, "2"]) -> RoadEdges:
-    """Lift with the camera as it was tilted in this frame."""
+def lift_tilted(
+    frames: Sequence[EdgePixels], camera: Camera, tilt_rad: Float[np.ndarray, "n 2"]
+) -> list[RoadEdges]:
+    """Lift the edges of some frames with the camera as it was tilted in each."""
     m = camera.mounting
-    tilted = camera.with_mounting(
-        pitch_down_rad=m.pitch_down_rad + float(tilt_rad[0]), roll_rad=m.roll_rad + float(tilt_rad[1])
-    )
-    n = len(pixels.uv_px)
-    along = np.stack([-pixels.normals[:, 1], pixels.normals[:, 0]], axis=1)
-    ends = np.concatenate([pixels.uv_px, pixels.uv_px + 0.5 * along, pixels.uv_px + 0.5 * pixels.normals])
-    road = tilted.intersect_ground(ends).reshape(3, n, 2)
+    counts = [len(pixels.uv_px) for pixels in frames]
+    starts = np.cumsum([0, *counts])
+    uv = np.concatenate([pixels.uv_px for pixels in frames])
+    normals = np.concatenate([pixels.normals for pixels in frames])
+    along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+    # The rays of all frames at once, for a call costs as much as hundreds of them; then frame by frame.
+    rays = camera.unproject(np.concatenate([uv, uv + 0.5 * along, uv + 0.5 * normals])).reshape(3, -1, 3)
+    for frame, (pitch_rad, roll_rad) in enumerate(tilt_rad.tolist()):
+        tilted = replace(
+            m, pitch_down_rad=m.pitch_down_rad + pitch_rad, roll_rad=m.roll_rad + roll_rad
+        ).camera_from_car
+        own = slice(starts[frame], starts[frame + 1])
+        rays[:, own] = rays[:, own] @ tilted
+    road = camera.meet_ground(rays.reshape(-1, 3)).reshape(3, -1, 2)
     tangent, towards = road[1] - road[0], road[2] - road[0]
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     # The normal that points to the brighter side.
-    normal *= np.where(np.sum(normal * towards, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    good = np.isfinite(road[0]).all(axis=1) & np.isfinite(normal).all(axis=1)
-    return RoadEdges(road[0][good], normal[good])
+    across *= np.where(np.sum(across * towards, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    good = np.isfinite(road[0]).all(axis=1) & np.isfinite(across).all(axis=1)
+    ends = np.concatenate([[0], np.cumsum(good)])[starts]
+    points, across = road[0][good], across[good]
+    return [RoadEdges(points[a:b], across[a:b]) for a, b in pairwise(ends.tolist())]
 
 
 def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
