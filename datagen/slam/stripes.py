@@ -25,6 +25,7 @@ from scipy.optimize import least_squares
 
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadTable
+from lanenet.processes import in_threads
 
 #: Borders up to so far apart are looked at, [px]. Chosen: about ten standard deviations of the blur, so that
 #: many are too wide to be widened by it.
@@ -41,6 +42,8 @@ _ALIKE = 0.4
 #: Pairs of borders from which the width is found, at least and at most; share of the pairs that must be like
 #: it. Chosen: below, the width is a guess.
 _LEAST_PAIRS, _MOST_PAIRS, _LEAST_ALIKE = 200, 4000, 0.5
+#: Frames whose edges are looked at in one call. Chosen: more only takes more memory.
+_FRAMES_AT_ONCE = 64
 #: Standard deviation of blur and edge detector before it is measured, [px]: of the Gauss kernel and Sobel's,
 #: 0.95, and a little lens. And the scatter of apparent widths, [px], on simulated drives.
 _BLUR_PX, _SCATTER_PX = 1.2, 0.25
@@ -56,7 +59,8 @@ def true_borders(frames: Sequence[EdgePixels], table: RoadTable) -> list[EdgePix
         frames: Edge pixels per frame.
         table: The road of the camera that took them.
     """
-    pairs = [_partnered(pixels, table) for pixels in frames]
+    blocks = range(0, len(frames), _FRAMES_AT_ONCE)
+    pairs = in_threads(lambda first: _partnered(frames[first : first + _FRAMES_AT_ONCE], table), blocks)
     apart_px, per_cm, inwards = np.concatenate([np.empty((0, 3)), *pairs]).T
     side = 1.0 if np.sum(inwards > 0.0) >= np.sum(inwards < 0.0) else -1.0
     chosen = (inwards == side) & np.isfinite(per_cm)
@@ -71,31 +75,34 @@ def true_borders(frames: Sequence[EdgePixels], table: RoadTable) -> list[EdgePix
             return list(frames)
         narrow = alike & (width_px < 2.0 * _NARROW * blur_px)
     shift_px = np.where(narrow, 0.5 * side * (apart_px - width_px), 0.0)
-    ends = np.cumsum([0] + [len(pair) for pair in pairs])
+    ends = np.cumsum([0] + [len(pixels.uv_px) for pixels in frames])
     return [
         replace(pixels, uv_px=pixels.uv_px + shift_px[first:last, None] * pixels.normals)
         for pixels, first, last in zip(frames, ends[:-1], ends[1:], strict=True)
     ]
 
 
-def _partnered(pixels: EdgePixels, table: RoadTable) -> Float[np.ndarray, "n 3"]:
-    """Find the stripe that each edge bounds.
+def _partnered(frames: Sequence[EdgePixels], table: RoadTable) -> Float[np.ndarray, "n 3"]:
+    """Find the stripe that each edge of some frames bounds.
 
     Returns:
         Per edge: apparent width, [px]; pixels per cm across it; 1 if the other border lies towards the
         brighter side, -1 if towards the darker one, 0 if there is none.
     """
-    found = np.full((len(pixels.uv_px), 3), np.nan)
+    uv = np.concatenate([pixels.uv_px for pixels in frames])
+    normals = np.concatenate([pixels.normals for pixels in frames])
+    found = np.full((len(uv), 3), np.nan)
     found[:, 2] = 0.0
-    order = np.argsort(pixels.uv_px[:, 1], kind="stable")
+    counts = [len(pixels.uv_px) for pixels in frames]
+    order = np.lexsort((uv[:, 1], np.repeat(np.arange(len(frames)), counts)))
     partner = np.full(len(order), -1)
-    _find_partners(pixels.uv_px[order], pixels.normals[order], partner)
+    _find_partners(uv[order], normals[order], np.cumsum([0, *counts]), partner)
     own = order[partner >= 0]
     other = order[partner[partner >= 0]]
-    across = pixels.normals[own] - pixels.normals[other]
+    across = normals[own] - normals[other]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    apart = np.sum((pixels.uv_px[other] - pixels.uv_px[own]) * across, axis=1)
-    road = table.lift(pixels)
+    apart = np.sum((uv[other] - uv[own]) * across, axis=1)
+    road = table.lift(EdgePixels(uv, normals))
     across_cm = road.normals[own] - road.normals[other]
     across_cm /= np.maximum(np.linalg.norm(across_cm, axis=1, keepdims=True), 1e-9)
     wide_cm = np.abs(np.sum((road.points_cm[other] - road.points_cm[own]) * across_cm, axis=1))
@@ -105,28 +112,35 @@ def _partnered(pixels: EdgePixels, table: RoadTable) -> Float[np.ndarray, "n 3"]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def _find_partners(uv, normals, partner):
+def _find_partners(uv, normals, starts, partner):
     """Fill in the other border of the stripe that each edge bounds: the nearest across it that faces back.
 
     Args:
-        uv: Edges, sorted by row.
+        uv: Edges of all frames, those of each sorted by row.
         normals: Their unit gradients.
+        starts: First edge of each frame, and one behind the last.
         partner: Filled where there is one.
     """
-    first = 0
+    nearest = np.empty(len(uv))
     for p in range(len(uv)):
-        while uv[first, 1] < uv[p, 1] - _MOST_APART_PX:
-            first += 1
-        best = _MOST_APART_PX * _MOST_APART_PX
-        q = first
-        while q < len(uv) and uv[q, 1] <= uv[p, 1] + _MOST_APART_PX:
-            du, dv = uv[q, 0] - uv[p, 0], uv[q, 1] - uv[p, 1]
-            d = du * du + dv * dv
-            cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
-            beside = abs(dv * normals[p, 0] - du * normals[p, 1])
-            if d < best and cosine < _OPPOSITE and beside < _BESIDE_PX:
-                best, partner[p] = d, q
-            q += 1
+        nearest[p] = _MOST_APART_PX * _MOST_APART_PX
+    for frame in range(len(starts) - 1):
+        for p in range(starts[frame], starts[frame + 1]):
+            u, v, nu, nv = uv[p, 0], uv[p, 1], normals[p, 0], normals[p, 1]
+            # Each pair of edges once, for both.
+            for q in range(p + 1, starts[frame + 1]):
+                du, dv = uv[q, 0] - u, uv[q, 1] - v
+                if dv > _MOST_APART_PX:
+                    break
+                d = du * du + dv * dv
+                if d >= nearest[p] and d >= nearest[q]:
+                    continue
+                if nu * normals[q, 0] + nv * normals[q, 1] >= _OPPOSITE:
+                    continue
+                if d < nearest[p] and abs(dv * nu - du * nv) < _BESIDE_PX:
+                    nearest[p], partner[p] = d, q
+                if d < nearest[q] and abs(dv * normals[q, 0] - du * normals[q, 1]) < _BESIDE_PX:
+                    nearest[q], partner[q] = d, p
 
 
 @cache
