@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.lanes.find import MappedSegment
-from datagen.lanes.scale import fitted_width_cm
+from datagen.lanes.scale import LaneWidth, fitted_width
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.segment import SolvedSegment
@@ -30,12 +30,14 @@ class AssembledMap:
         segments: Its segments, in the scale of the camera that they were solved with.
         rows: Its frames, as positions in the drive.
         factor: Turns the segments' lengths into centimetres.
+        lane: Width of the driven lane, [cm].
     """
 
     drive_map: DriveMap
     segments: list[MappedSegment]
     rows: Int[np.ndarray, "n"]
     factor: float
+    lane: LaneWidth
 
     @property
     def open_poses(self) -> Float[np.ndarray, "n 3"]:
@@ -70,10 +72,10 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
     """
     request, segments = prepared.request, list(mapped)
     longest = max(segments, key=lambda s: len(s.rows))
-    lane_cm = fitted_width_cm(longest.lines, longest.lane, longest.s_frames_cm)
+    lane = fitted_width(longest.lines, longest.lane, longest.s_frames_cm)
     factor = 1.0
     if prepared.camera is None:
-        factor = request.lane_width_cm / lane_cm
+        factor = request.lane_width_cm / lane.width_cm
         camera = with_known_scale(camera, factor, prepared.settings.guess.wheelbase_cm)
     drive, rows = prepared.drive, np.sort(np.concatenate([s.rows for s in segments]))
     markings_cm = [line.marking_cm for s in segments for line in s.lines[:2]]
@@ -81,7 +83,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         format=FORMAT,
         drive=str(request.drive_path),
         lane_width_cm=request.lane_width_cm,
-        mapped_lane_cm=factor * lane_cm,
+        mapped_lane_cm=factor * lane.width_cm,
         tape_cm=factor * float(np.median(markings_cm)),
         scale_from="lane width" if prepared.camera is None else "camera",
         laps=max(int(s.laps.max()) for s in segments),
@@ -104,7 +106,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         # Found by the check.
         contradicted=np.zeros((len(rows), 2), dtype=bool),
     )
-    return AssembledMap(drive_map, segments, rows, factor)
+    return AssembledMap(drive_map, segments, rows, factor, lane.scaled(factor))
 
 
 def _pose_scale(factor: float) -> Float[np.ndarray, "3"]:

@@ -74,6 +74,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     quality = replace(measure_map(mapped), wrong=tuple(wrong))
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
     figures |= quality_figures(quality, drive.width) | {"withheld": withheld_figures(drive_map, wrong)}
+    figures["lane_width"] = asdict(assembled.lane)
     figures["steering_correlation"] = steering_correlation(mapped)
     request = prepared.request
     figures["given"] = {

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from datagen.lanes.find import MappedSegment, check_lane, find_lane
-from datagen.lanes.scale import fitted_width_cm, measure_lane
+from datagen.lanes.scale import fitted_width, measure_lane
 from datagen.prepare import LEAST_FRAMES, PreparedDrive, check_edges
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import nudged
@@ -242,7 +242,7 @@ def fit_lanes(
             mapped.append(one)
             # A road keeps its width and its markings; the longest segment shows them best.
             dark = one.dark
-            lane_cm = lane_cm or fitted_width_cm(one.lines, one.lane, one.s_frames_cm)
+            lane_cm = lane_cm or fitted_width(one.lines, one.lane, one.s_frames_cm).width_cm
     if not mapped:
         raise max(left_out, key=lambda one: len(one.rows)).reason
     mapped.sort(key=lambda one: int(one.rows[0]))

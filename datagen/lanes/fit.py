@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from datagen.lanes.offset import (
     Borders,
@@ -32,6 +32,11 @@ _OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
 #: Reach along the path in which the point opposite is looked for, in distances between the lines. Derived: at
 #: an angle a between line and path it lies sin(a) distances ahead; the rest is margin.
 _OPPOSITE_REACH = 1.2
+#: Distances of two lines that may be those of a lane, in lane widths: it narrows, or is wider in bends.
+_APART = (0.65, 1.5)
+#: Factor between the lengths over which it is measured how much a lane's width changes. Chosen: fine enough
+#: for what is interpolated between them.
+_LONGER = 1.4
 
 
 class FitSettings(Settings):
@@ -149,7 +154,7 @@ class _Fitter:
         known_cm: Samples,
         other: FittedOffset,
         sign: float,
-        apart: tuple[Samples, float],
+        apart: tuple[Samples, Samples],
         tape_cm: float,
     ) -> FittedOffset:
         """Fit a line that runs to the left (sign 1) or to the right (-1) of a fitted one."""
@@ -160,18 +165,20 @@ class _Fitter:
         start = np.where(np.isfinite(known_cm), known_cm, guess)
         return self._fit(start, guess, guess, sigma, tape_cm)
 
-    def apart(self, inner_cm: Samples, outer_cm: Samples, known: SampleMask) -> tuple[Samples, float]:
-        """Distance of two lines, smoothed and interpolated in gaps, and its variation."""
+    def apart(self, inner_cm: Samples, outer_cm: Samples, known: SampleMask) -> tuple[Samples, Samples]:
+        """Distance of two lines, smoothed and interpolated in gaps, and the sigma of that."""
         path, lane_cm = self.path, self.lane_cm
         least = self.settings.guide_lanes * lane_cm
         inner, outer = self._smoothed(inner_cm), self._smoothed(outer_cm)
         found = distance_across(path, inner, outer, known)
-        good = known & (np.abs(found - lane_cm) < 0.35 * lane_cm)
+        good = known & (found > _APART[0] * lane_cm) & (found < _APART[1] * lane_cm)
         if not good.any():
-            return np.full(len(found), lane_cm), self.settings.loose_lanes * lane_cm
+            loose = self.settings.loose_lanes * lane_cm
+            return np.full(len(found), lane_cm), np.full(len(found), loose)
         filled = np.interp(path.s_cm, path.s_cm[good], found[good], period=path.period_cm)
         varies = 1.4826 * float(np.median(np.abs(found[good] - np.median(found[good]))))
-        return _smoothed(path, filled, 0.5 * lane_cm), max(varies, least)
+        sigma = np.maximum(interpolation_error(path, np.where(good, found, np.nan)), max(varies, least))
+        return _smoothed(path, filled, 0.5 * lane_cm), sigma
 
     def line(self, side: Side, rank: int, offset: FittedOffset, guided: SampleMask) -> LaneLine:
         """Turn an offset into a line on the map; ``guided`` is where a parallel line is seen."""
@@ -270,6 +277,34 @@ def distance_across(path: Path, from_cm: Samples, to_cm: Samples, known: SampleM
     nearest = np.argmin(distance, axis=1)
     each = np.arange(len(rows))
     return np.where(known[rows[each, nearest]], distance[each, nearest], np.nan)
+
+
+def interpolation_error(path: Path, values: Samples) -> Samples:
+    """RMS error of values that are interpolated in gaps, by how far the nearest known one is.
+
+    It is measured where they are known: by how much a value differs from the mean of those that far before
+    and after it. A lane that widens in bends is not interpolated across one.
+
+    Args:
+        path: The path.
+        values: One at each sample; NaN where it is unknown.
+
+    Returns:
+        0 where it is known.
+    """
+    m, known = len(values), np.isfinite(values)
+    lead = m if path.closed else 0
+    away = distance_transform_edt(~np.pad(known, lead, mode="wrap"))[lead : lead + m]
+    reaches, errors, reach = [0], [0.0], 2
+    while reach < min(_LONGER * away.max() + 1.0, 0.25 * m):
+        index = np.arange(m) if path.closed else np.arange(reach, m - reach)
+        bend = values[index] - 0.5 * (values[(index - reach) % m] + values[(index + reach) % m])
+        if not np.isfinite(bend).any():
+            break
+        reaches.append(reach)
+        errors.append(max(errors[-1], float(np.sqrt(np.nanmean(bend**2)))))
+        reach = int(np.ceil(_LONGER * reach))
+    return np.interp(away, reaches, errors)
 
 
 def _change(path: Path, values: Float[np.ndarray, "m *d"]) -> Float[np.ndarray, "m *d"]:

@@ -43,6 +43,16 @@ _VISITS = (0.1, 1.0)
 #: Shortest piece of paint that counts, in lane widths. Chosen: 3 to 4 cm, shorter than any
 #: dash.
 _SPECK = 0.1
+#: How far a line is followed away from its place in a lane of constant width, in lane widths: the lane is up
+#: to half as wide again in a bend, and one line may take all of that.
+_WIDENS = 0.5
+#: Steepest course of a line away from that place, and the length over which it is measured, in lane widths.
+#: Derived: a lane that is half as wide again after its own width, and margin; a track that jumps to another
+#: strip is steeper.
+_STEEPEST, _STEEP_OVER = 0.6, 0.25
+#: Least share of such a section along which the line is seen, and its shortest length, in lane widths.
+#: Chosen: a tape that goes on, not dashes that may be something else.
+_GOES_ON, _SHORTEST_SECTION = 0.75, 0.5
 
 
 @dataclass(frozen=True)
@@ -100,8 +110,8 @@ def trace_lane(
     lane, centre = markings.best_lane(lane_width_cm)
     band = settings.width_share * lane
     left, right = (
-        _without_bulges(path, markings.seen(markings.follow(centre + share * lane, band)), centre, lane)
-        for share in (0.5, -0.5)
+        _followed_on(markings, _without_bulges(path, markings.seen(found), centre, lane), centre, lane)
+        for found in (markings.follow(centre + share * lane, band) for share in (0.5, -0.5))
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
         raise TrackingLostError(
@@ -278,3 +288,41 @@ def _without_bulges(path: Path, line_cm: Samples, centre_cm: Samples, lane_cm: f
         if off[run].max() > _BULGE:
             kept[run] = np.nan
     return kept
+
+
+def _followed_on(markings: Markings, line_cm: Samples, centre_cm: Samples, lane_cm: float) -> Samples:
+    """Follow a line also where the lane widens or narrows by more than lines usually vary.
+
+    A section is added only where the tape goes on from where the line was seen before, or after it.
+    """
+    path, m = markings.path, len(line_cm)
+    known = np.isfinite(line_cm)
+    if known.all() or not known.any():
+        return line_cm
+    aside = np.interp(path.s_cm, path.s_cm[known], (line_cm - centre_cm)[known], period=path.period_cm)
+    guess = np.where(known, line_cm, centre_cm + aside)
+    found = markings.follow(guess, _WIDENS * lane_cm)
+    seen = np.isfinite(markings.seen(found)) & (known | _gentle(path, found - centre_cm, lane_cm))
+    # Where the line is known, the track has to be on it.
+    seen &= ~known | (np.abs(found - guess) < 0.5 * markings.tape_cm)
+    followed = line_cm.copy()
+    for run in true_runs(~known, path.closed):
+        if len(run) * path.step_cm < _SHORTEST_SECTION * lane_cm or seen[run].mean() < _GOES_ON:
+            continue
+        ends = np.array([run[0] - 1, run[-1] + 1])
+        ends = ends % m if path.closed else ends[(ends >= 0) & (ends < m)]
+        if seen[ends].all():
+            followed[run] = np.where(seen[run], found[run], np.nan)
+    return followed
+
+
+def _gentle(path: Path, aside_cm: Samples, lane_cm: float) -> Bool[np.ndarray, "m"]:
+    """Return where a track approaches or leaves the lane's centre no faster than lanes change their width."""
+    reach = max(1, round(0.5 * _STEEP_OVER * lane_cm / path.step_cm))
+    index = np.arange(len(aside_cm))
+    before, after = index - reach, index + reach
+    if path.closed:
+        before, after = before % len(index), after % len(index)
+    else:
+        before, after = np.maximum(before, 0), np.minimum(after, len(index) - 1)
+    return np.abs(aside_cm[after] - aside_cm[before]) <= _STEEPEST * 2 * reach * path.step_cm

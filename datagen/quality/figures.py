@@ -200,6 +200,8 @@ def map_evidence(
         camera_known=known,
         sigma={} if known else figures["calibration"]["sigma"],
         given_lane_cm=meta.lane_width_cm,
+        bend_lane_cm=figures["lane_width"]["bend_cm"],
+        open_lane_cm=figures["lane_width"]["open_cm"],
         # If the free search found nothing better, the traced lane.
         found_lane_cm=None
         if meta.scale_from == "lane width"

@@ -47,6 +47,8 @@ class MapEvidence:
             [rad]).
         given_lane_cm: Lane width that the user gave.
         found_lane_cm: Lane width that the camera measures; None if the lane sets the scale.
+        bend_lane_cm: Width of the lane in bends, if it is another one there; else None.
+        open_lane_cm: Narrowest and widest tenth of a lane of many widths that has no straight; else None.
         contradicted_share: Share of the frames' lines that the images contradict.
         height_cm: Height of the camera that follows from the scale.
         tape_cm: Width of the markings that follows from it.
@@ -71,6 +73,8 @@ class MapEvidence:
     sigma: dict[str, float]
     given_lane_cm: float
     found_lane_cm: float | None
+    bend_lane_cm: float | None = None
+    open_lane_cm: tuple[float, float] | None = None
     contradicted_share: float = 0.0
     height_cm: float = float("nan")
     tape_cm: float = float("nan")
@@ -231,6 +235,12 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
         yield (
             f"the car turns right where it was steered left (correlation {e.steering:.2f}): the sign of the "
             "steering is reversed, or the images are mirrored; the map follows the images"
+        )
+    if e.bend_lane_cm is not None:
+        width_cm = e.given_lane_cm if e.found_lane_cm is None else e.found_lane_cm
+        yield (
+            f"the lane is {width_cm:.1f} cm wide on straights and {e.bend_lane_cm:.1f} cm in bends; the lane "
+            "width to give is that of the straights"
         )
     if e.found_lane_cm is not None:
         return
@@ -466,6 +476,16 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
             )
     if e.found_lane_cm is not None:
         return
+    if e.open_lane_cm is not None:
+        low, high = e.open_lane_cm
+        yield Finding(
+            "usable",
+            f"the lane is {low:.0f} to {high:.0f} cm wide and has no straight, so it is open which width is "
+            f"{e.given_lane_cm:g} cm",
+            "give a camera file (--camera), or drive a road that has a straight",
+            f"the narrowest tenth of the lane is {low:.1f} cm wide, the widest {high:.1f} cm, and no "
+            "straight is as long as the lane is wide (open_cm)",
+        )
     for name, value, (least, most) in (
         ("height_cm", e.height_cm, s.height_cm),
         ("tape_cm", e.tape_cm, s.tape_cm),

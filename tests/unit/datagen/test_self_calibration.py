@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_drive import made_up_drive
+from scipy.interpolate import make_lsq_spline
 
 import datagen.segments
 import datagen.slam.camera.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera, straight_frames
-from datagen.lanes.scale import LaneScale, fitted_width_cm, spacing_cm, width_sigma
+from datagen.lanes.scale import LaneScale, fitted_width, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
 from datagen.prepare import MapRequest, keep_images, prepare
 from datagen.segments import fit_height
@@ -256,10 +257,40 @@ def test_the_lane_is_measured_where_both_lines_are_seen():
     lane = TracedLane(at, at, at, 39.0, 2.0)
     apart = spacing_cm([left, right, beside], at)
     # 100 to 150 cm and 300 to 400 cm.
-    np.testing.assert_allclose(apart, np.full(15, 40.5))
-    assert fitted_width_cm([left, right, beside], lane, at) == pytest.approx(40.5)
+    np.testing.assert_allclose(apart[np.isfinite(apart)], np.full(15, 40.5))
+    assert fitted_width([left, right, beside], lane, at).width_cm == pytest.approx(40.5)
     unseen = straight_line("right", 20.2, [])
-    assert fitted_width_cm([left, unseen], lane, at) == 39.0
+    assert fitted_width([left, unseen], lane, at).width_cm == 39.0
+
+
+def lane_through_bends(straight_cm: float, widening: float) -> list[LaneLine]:
+    """Lines of a road that bends by 1 rad, over 100 cm, after every straight; the lane widens there."""
+    s = np.arange(0.0, 1200.0, 2.0)
+    bends = (np.mod(s, straight_cm + 100.0) >= straight_cm).astype(np.float64)
+    heading = np.cumsum(2.0 * bends) / 100.0
+    middle = np.cumsum(2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    half_cm = 20.0 * (1.0 + widening * np.convolve(bends, np.full(11, 1.0 / 11.0), "same"))
+    knots = np.concatenate([np.full(3, s[0]), np.linspace(s[0], s[-1], 60), np.full(3, s[-1])])
+    lines = []
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        points = middle + sign * half_cm[:, None] * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+        spline = make_lsq_spline(s, points, knots)
+        lines.append(LaneLine(side, knots, spline.c, np.array([[s[0], s[-1]]]), 0.1))
+    return lines
+
+
+def test_the_width_that_people_give_is_that_of_the_straights():
+    at = np.arange(0.0, 1198.0, 2.0)
+    lane = TracedLane(at, at, at, 39.0, 2.0)
+    widens = fitted_width(lane_through_bends(100.0, 0.3), lane, at)
+    assert widens.width_cm == pytest.approx(40.0, rel=0.01)
+    assert widens.bend_cm == pytest.approx(52.0, rel=0.02)
+    same = fitted_width(lane_through_bends(100.0, 0.0), lane, at)
+    assert same.width_cm == pytest.approx(40.0, rel=0.01)
+    assert same.bend_cm is None and same.open_cm is None
+    # Without a straight it is open.
+    winding = fitted_width(lane_through_bends(16.0, 0.5), lane, at)
+    assert winding.open_cm is not None and winding.open_cm[1] > 1.2 * winding.open_cm[0]
 
 
 def test_the_width_of_the_lane_depends_on_the_camera_as_the_geometry_says():

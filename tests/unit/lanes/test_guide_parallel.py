@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lane_edges import arc_path, ring_path
 
-from datagen.lanes.fit import distance_across, parallel_offset
+from datagen.lanes.fit import distance_across, interpolation_error, parallel_offset
 from datagen.lanes.path import Path
 
 APART_CM = 60.0
@@ -74,3 +74,16 @@ def test_the_distance_is_known_where_the_other_line_is():
     assert (np.isfinite(found) == expected)[inner & ~near_end].all()
     good = inner & np.isfinite(found)
     np.testing.assert_allclose(found[good], 40.0 / np.hypot(1.0, slope), atol=0.05)
+
+
+def test_what_varies_along_the_road_is_not_known_in_a_long_gap():
+    path = arc_path(None)
+    width = 40.0 + 10.0 * np.sin(2.0 * np.pi * path.s_cm / 160.0)
+    gap = np.abs(path.s_cm - 250.0) < 30.0
+    error = interpolation_error(path, np.where(gap, np.nan, width))
+    assert error[~gap].max() == 0.0
+    assert error[gap].max() > 3.0
+    # Where the nearest known width is a few centimetres away, it is nearly that.
+    assert error[gap][1] < 0.5
+    level = interpolation_error(path, np.where(gap, np.nan, 40.0))
+    np.testing.assert_allclose(level, 0.0)

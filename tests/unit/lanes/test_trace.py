@@ -359,3 +359,35 @@ def test_dashes_stay_also_beside_a_strip_and_where_the_lane_becomes_wider():
     bay = np.where((s > 60) & (s < 160), -24.0, -18.0)
     for alone in (np.full(n, np.nan), np.where(s < 15, -18.0, np.nan), bay):
         np.testing.assert_array_equal(_without_bulges(path, alone, np.zeros(n), LANE_CM), alone)
+
+
+def _wider(over_cm: float, by_lanes: float) -> np.ndarray:
+    """Share of a lane by which it is wider in the middle of the path, and as wide as ever at its ends."""
+    away = np.abs(_path().s_cm - 200.0) / over_cm
+    return np.asarray(by_lanes * np.cos(0.5 * np.pi * np.clip(away, 0.0, 1.0)) ** 2)
+
+
+@pytest.mark.parametrize("by_lanes", [0.25, 0.45])
+def test_a_line_is_followed_where_it_moves_away_from_the_other(by_lanes):
+    rng, path = np.random.default_rng(3), _path()
+    everywhere = np.ones(len(path.s_cm), dtype=bool)
+    left = np.full(len(path.s_cm), 0.5 * LANE_CM)
+    right = -0.5 * LANE_CM - _wider(90.0, by_lanes) * LANE_CM
+    edges = _edges(_tape(rng, left, everywhere), _tape(rng, right, everywhere))
+    lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    inner = (path.s_cm > 20.0) & (path.s_cm < 380.0)
+    assert np.isfinite(lane.right_cm[inner]).mean() > 0.95
+    assert np.nanmax(np.abs(lane.right_cm - right)) < 2.0 * CELL_CM
+
+
+def test_a_strip_beside_a_gap_is_not_the_line():
+    rng, path = np.random.default_rng(4), _path()
+    left = np.full(len(path.s_cm), 0.5 * LANE_CM)
+    gap = np.abs(path.s_cm - 200.0) < 40.0
+    edges = _edges(
+        _tape(rng, left, gap | ~gap),
+        _tape(rng, -left, ~gap),
+        _tape(rng, -left - 0.3 * LANE_CM, gap),
+    )
+    lane = trace_lane(path, edges, HEIGHT_CM, LANE_CM, SETTINGS)
+    assert not np.isfinite(lane.right_cm[np.abs(path.s_cm - 200.0) < 30.0]).any()

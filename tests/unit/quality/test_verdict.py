@@ -189,3 +189,12 @@ def test_pictures_that_disagree_with_the_map_count(share, grade):
     found = judge(replace(GOOD, contradicted_share=share), VerdictSettings())
     assert found.grade == grade
     assert any("disagree" in reason for reason in found.reasons) == (grade != "good")
+
+
+def test_a_lane_that_widens_in_bends_is_named_and_one_of_many_widths_has_no_scale():
+    remarks = graded(GOOD, bend_lane_cm=49.3).remarks
+    assert any("40.0 cm" in remark and "49.3 cm" in remark for remark in remarks)
+    verdict = graded(GOOD, open_lane_cm=(31.0, 44.2))
+    assert verdict.grade == "usable" and "44.2 cm" in verdict.reasons[0]
+    # A known camera sets the scale.
+    assert graded(KNOWN, open_lane_cm=(31.0, 44.2)).grade == "good"
