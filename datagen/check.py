@@ -68,12 +68,11 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures = map_figures(drive_map, segments, drive.frames, assembled.factor)
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
-    drive_map, wrong = withhold_wrong_places(mapped)
-    drive_map = replace(drive_map, contradicted=contradicted_lines(replace(mapped, drive_map=drive_map)))
-    mapped = replace(mapped, drive_map=drive_map)
-    quality = replace(measure_map(mapped), wrong=tuple(wrong))
+    mapped, quality = compare_with_frames(mapped)
+    drive_map = mapped.drive_map
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
-    figures |= quality_figures(quality, drive.width) | {"withheld": withheld_figures(drive_map, wrong)}
+    figures |= quality_figures(quality, drive.width)
+    figures["withheld"] = withheld_figures(drive_map, list(quality.wrong))
     figures["lane_width"] = asdict(assembled.lane)
     figures["steering_correlation"] = steering_correlation(mapped)
     request = prepared.request
@@ -88,6 +87,14 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     meta = drive_map.meta.model_copy(update={"verdict": verdict.grade})
     mapped = replace(mapped, drive_map=replace(drive_map, meta=meta))
     return CheckedMap(mapped, quality, verdict, figures | {"verdict": asdict(verdict)}, tuple(notes))
+
+
+def compare_with_frames(mapped: MappedDrive) -> tuple[MappedDrive, MapQuality]:
+    """Mark what the images of a map contradict, and measure the rest in its held-out frames."""
+    drive_map, wrong = withhold_wrong_places(mapped)
+    drive_map = replace(drive_map, contradicted=contradicted_lines(replace(mapped, drive_map=drive_map)))
+    mapped = replace(mapped, drive_map=drive_map)
+    return mapped, replace(measure_map(mapped), wrong=tuple(wrong))
 
 
 def check_lines_seen(

@@ -214,6 +214,7 @@ def map_evidence(
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
         steering=figures["steering_correlation"],
+        segments=len(figures["segments_mapped"]),
     )
 
 

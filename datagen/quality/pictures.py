@@ -29,6 +29,8 @@ _TILE_WIDTH = 400
 _SHEET_TILE_WIDTH, _TITLE_HEIGHT = 320, 22
 #: Frames in a row of a sheet, and frames on a sheet.
 _COLUMNS, _TILES = 4, 8
+#: Distance between segments on the picture of a map, relative to their size. Chosen.
+_BETWEEN = 0.08
 
 
 def draw_map(
@@ -40,12 +42,13 @@ def draw_map(
 ) -> None:
     """Draw edge points (hue: time), driven path (white), lane lines (green left, magenta right) and a scale.
 
-    Sections that the images contradict are red.
+    Sections that the images contradict are red. Segments are drawn side by side: where they lie relative to
+    each other is not known.
 
     Args:
         path: PNG to write.
         drive_map: The map.
-        clouds: Edge points of each frame, frame map.
+        clouds: Edge points of each frame, frame map; those of the first segment come first.
         starts: Frames that do not continue the frame before them; no path is drawn between the two.
         size_px: Longer side of the picture.
     """
@@ -57,11 +60,17 @@ def draw_map(
             colour = _ADJACENT if line.rank else _LEFT if line.side == "left" else _RIGHT
             at_cm = np.arange(s.min(), end, 2.0)
             points, withheld = line.points(at_cm), line.contradicted(at_cm)
-            lanes.append((points, colour, 1))
-            lanes.append((np.where(withheld[:, None], points, np.nan), _WITHHELD, 5))
+            lanes.append((segment, points, colour, 1))
+            lanes.append((segment, np.where(withheld[:, None], points, np.nan), _WITHHELD, 5))
+    of_cloud = np.sort(drive_map.segment, kind="stable")
     # A line of an adjacent lane may lie beyond all edge points that are drawn.
-    known = [points[np.isfinite(points[:, 0])] for points, _, _ in lanes]
-    xy = np.concatenate([*clouds, *known, drive_map.poses[:, :2]])
+    known = [(segment, points[np.isfinite(points[:, 0])]) for segment, points, _, _ in lanes]
+    known += [*zip(of_cloud.tolist(), clouds, strict=True)]
+    known += [*zip(drive_map.segment.tolist(), drive_map.poses[:, None, :2], strict=True)]
+    moved = _side_by_side(known)
+    clouds = [cloud + moved[segment] for segment, cloud in zip(of_cloud.tolist(), clouds, strict=True)]
+    driven_cm = drive_map.poses[:, :2] + np.array([moved[segment] for segment in drive_map.segment.tolist()])
+    xy = np.concatenate([points + moved[segment] for segment, points in known])
     low, high = xy.min(axis=0) - 20.0, xy.max(axis=0) + 20.0
     scale = size_px / float((high - low).max())
     width, height = ((high - low) * scale).astype(int) + 1
@@ -77,12 +86,26 @@ def draw_map(
     for cloud, colour in zip(clouds, hues[0], strict=True):
         at = pixels(cloud)
         image[at[:, 1], at[:, 0]] = colour
-    for points, colour, thickness in lanes:
-        _polyline(image, pixels, points, colour, thickness)
-    for driven in np.split(drive_map.poses[:, :2], np.flatnonzero(starts[1:]) + 1):
+    for segment, points, colour, thickness in lanes:
+        _polyline(image, pixels, points + moved[segment], colour, thickness)
+    for driven in np.split(driven_cm, np.flatnonzero(starts[1:]) + 1):
         _polyline(image, pixels, driven, (255, 255, 255))
     draw_metre(image, scale)
     write_png(path, image)
+
+
+def _side_by_side(
+    parts: list[tuple[int, Float[np.ndarray, "_ 2"]]],
+) -> dict[int, Float[np.ndarray, "2"]]:
+    """Find how far each segment is moved to the right, so that none lies on another; the first one stays."""
+    moved: dict[int, Float[np.ndarray, "2"]] = {}
+    free_cm: float | None = None
+    for segment in sorted({number for number, _ in parts}):
+        own = np.concatenate([points for number, points in parts if number == segment])
+        low, high = own.min(axis=0), own.max(axis=0)
+        moved[segment] = np.zeros(2) if free_cm is None else np.array([free_cm - low[0], 0.0])
+        free_cm = float(high[0] + moved[segment][0] + max(20.0, _BETWEEN * (high - low).max()))
+    return moved
 
 
 def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:

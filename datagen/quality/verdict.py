@@ -59,6 +59,7 @@ class MapEvidence:
             None where it is too weak to tell, or nothing was commanded.
         withheld: Sections of the lines that are withheld because the images contradict them, in words.
         withheld_share: Share of the lines' length in these sections.
+        segments: Number of segments of the map.
     """
 
     lines: dict[str, LineEvidence]
@@ -84,6 +85,7 @@ class MapEvidence:
     steering: float | None = None
     withheld: tuple[str, ...] = ()
     withheld_share: float = 0.0
+    segments: int = 1
 
 
 Grade = Literal["good", "usable", "reject"]
@@ -202,20 +204,24 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     found = [finding for check in checks for finding in check(evidence, settings)]
     # The worst first.
     found.sort(key=lambda finding: -_ORDER.index(finding.grade))
-    remarks = tuple(_remarks(evidence))
+    remarks, opened = tuple(_remarks(evidence)), _open_text(evidence)
     withheld = _withheld_text(evidence.withheld)
     if found:
         worst = found[0]
         more = f" ({len(found) - 1} more below)" if len(found) > 1 else ""
         sentence = f"{worst.cause}{more}: {worst.remedy}"
         figures = [finding.figures for finding in found]
-        return Verdict(worst.grade, sentence, tuple(figures + [withheld] if withheld else figures), remarks)
+        figures += [text for text in (withheld, opened) if text]
+        return Verdict(worst.grade, sentence, tuple(figures), remarks)
     sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
     labelled = f"{_percent(evidence.labelled_share)} of the frames have labels"
     sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is"
     if withheld:
         # A map with a wrong section is good only without that section.
         sentence = f"labels good; {withheld}; elsewhere {sentence}"
+    if opened:
+        # The next metre is known, the way back to where the drive began is not.
+        sentence = f"labels good, but {opened}; {sentence.removeprefix('labels good; ')}"
     measured = f"residuals on held-out frames: robust sd {sds}, {evidence.p95_px:.2f} px as p95; {labelled}"
     return Verdict("good", sentence, (measured,), remarks)
 
@@ -227,6 +233,22 @@ def _withheld_text(withheld: tuple[str, ...]) -> str:
     more = len(withheld) - 1
     rest = f", and {more} more section{'s' if more > 1 else ''}" if more else ""
     return f"{withheld[0]}{rest} withheld, where the images disagree with the map"
+
+
+def _open_text(e: MapEvidence) -> str:
+    """Say that the map is open, and what would close it; empty if it is closed."""
+    if e.segments > 1:
+        return (
+            f"the map stays open: its {e.segments} segments show no place of each other, so where they lie "
+            "relative to each other is not known; a drive over the road between them would join them"
+        )
+    # Without a known camera this is a finding of its own.
+    if e.camera_known and not e.revisits:
+        return (
+            "the map stays open: no place was seen twice, so distant parts of it may lie askew; a second lap "
+            "along the same path would close it"
+        )
+    return ""
 
 
 def _remarks(e: MapEvidence) -> Iterator[str]:

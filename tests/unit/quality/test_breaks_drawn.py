@@ -97,7 +97,8 @@ def test_a_run_starts_at_a_break_and_after_one_that_was_left_out(mapped):
 
 
 def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
-    draw_map(tmp_path / "map.png", mapped.drive_map, [np.empty((0, 2))], mapped.starts, size_px=400)
+    clouds = [np.empty((0, 2))] * len(ROWS)
+    draw_map(tmp_path / "map.png", mapped.drive_map, clouds, mapped.starts, size_px=400)
     image = cv2.imread(str(tmp_path / "map.png"))
     # Left of the metre of scale in the corner there is nothing else that is white.
     white = (image > 200).all(axis=2)[: image.shape[0] - 60]
@@ -106,6 +107,11 @@ def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
     expected = image.shape[0] - 1 - scale * (20.0 + np.array([200.0, 600.0]))
     assert np.min(np.abs(rows[:, None] - expected), axis=1).max() <= 2.0
     assert {int(np.abs(expected - row).argmin()) for row in rows} == {0, 1}
+    # The run between them is a segment of its own, and nothing lies above or below it.
+    first, second = (
+        np.flatnonzero(white[np.rint(row).astype(int) - 2 :][:5].any(axis=0)) for row in expected
+    )
+    assert first.min() > second.max()
 
 
 def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):

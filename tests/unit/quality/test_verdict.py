@@ -198,3 +198,15 @@ def test_a_lane_that_widens_in_bends_is_named_and_one_of_many_widths_has_no_scal
     assert verdict.grade == "usable" and "44.2 cm" in verdict.reasons[0]
     # A known camera sets the scale.
     assert graded(KNOWN, open_lane_cm=(31.0, 44.2)).grade == "good"
+
+
+def test_labels_of_an_open_map_are_good_and_it_says_what_would_close_it():
+    verdict = graded(KNOWN, **OPEN)
+    assert verdict.grade == "good"
+    assert verdict.sentence.startswith("labels good, but the map stays open") and "lap" in verdict.sentence
+    apart = graded(GOOD, segments=3)
+    assert apart.grade == "good" and "its 3 segments" in apart.sentence
+    # What is worse comes first, and the map is still open.
+    worse = graded(KNOWN, labelled_share=0.8, **OPEN)
+    assert worse.grade == "usable" and any("stays open" in reason for reason in worse.reasons)
+    assert "open" not in graded(KNOWN).sentence
