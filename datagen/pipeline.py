@@ -92,7 +92,7 @@ def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures:
     camera = attempt.camera = camera_of_drive(prepared, solver)
     # Track, close loops, adjust: SegmentSolver.solve.
     solved = attempt.solved = solve_drive(prepared, camera, solver)
-    lanes = fit_lanes(prepared, solved.segments, solved.refused)
+    lanes = fit_lanes(prepared, solved.segments, solved.refused, camera.doubt)
     assembled = assemble(prepared, camera.camera, lanes.segments)
     checked = check_map(prepared, assembled, camera.figures)
     notes = [*prepared.notes, *camera.notes, *lanes.notes, *checked.notes]

@@ -18,7 +18,7 @@ from datagen.lanes.scale import fitted_width, measure_lane
 from datagen.prepare import LEAST_FRAMES, PreparedDrive, check_edges
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import nudged
-from datagen.slam.camera.self_calibration import FoundCamera, find_camera, honest_sigma
+from datagen.slam.camera.self_calibration import MAX_STRAIN, FoundCamera, find_camera, honest_sigma
 from datagen.slam.loops.parts import connected
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive
@@ -52,6 +52,7 @@ class CameraOfDrive:
         solved: The drive, where it was solved on the way.
         figures: For the report.
         notes: A sentence each.
+        doubt: Why a camera that was found is unlikely to be right; "" where nothing speaks against it.
     """
 
     camera: Camera
@@ -59,6 +60,7 @@ class CameraOfDrive:
     solved: SolvedSegment | None = None
     figures: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,14 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
     if height_cm is not None:
         found, notes = fit_height(found, drive, width_cm / height_cm, prepared.settings, solver)
     figures = {"calibration": found.figures}
-    return CameraOfDrive(found.camera, found.how, found.solved, figures, (found.note, *notes))
+    doubt = ""
+    if found.strain > MAX_STRAIN:
+        doubt = (
+            "the drive does not show the camera: the one that fits best has its principal point or roll "
+            f"{found.strain:.1f} standard deviations from those of ordinary cameras; calibrate it with "
+            "photos of a chessboard (lanenet calibrate chessboard) and give it with --camera"
+        )
+    return CameraOfDrive(found.camera, found.how, found.solved, figures, (found.note, *notes), doubt)
 
 
 def fit_height(
@@ -213,7 +222,10 @@ def solve_drive(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentS
 
 
 def fit_lanes(
-    prepared: PreparedDrive, segments: Sequence[SolvedSegment], refused: Sequence[Refused]
+    prepared: PreparedDrive,
+    segments: Sequence[SolvedSegment],
+    refused: Sequence[Refused],
+    doubt: str = "",
 ) -> LanesOfDrive:
     """Find the lane of each segment, the longest first.
 
@@ -223,10 +235,12 @@ def fit_lanes(
         prepared: The drive.
         segments: Segments with their poses.
         refused: Those that could not be tracked.
+        doubt: See :class:`CameraOfDrive`.
 
     Raises:
         TrackingLostError: If no segment can be mapped; says why the longest one cannot.
-        CalibrationError: The same, where the longest one shows a lane of another width.
+        CalibrationError: The same, where the longest one shows a lane of another width, or where the camera
+            is in doubt.
     """
     drive, settings, held_out = prepared.drive, prepared.settings, prepared.held_out
     mapped, left_out = [], list(refused)
@@ -244,7 +258,11 @@ def fit_lanes(
             dark = one.dark
             lane_cm = lane_cm or fitted_width(one.lines, one.lane, one.s_frames_cm).width_cm
     if not mapped:
-        raise max(left_out, key=lambda one: len(one.rows)).reason
+        reason = max(left_out, key=lambda one: len(one.rows)).reason
+        if doubt:
+            why = str(reason).removeprefix(f"{drive.path}: ")
+            raise CalibrationError(f"{drive.path}: {doubt}. With the one that was found: {why}") from reason
+        raise reason
     mapped.sort(key=lambda one: int(one.rows[0]))
     return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in left_out))
 

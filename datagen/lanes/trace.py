@@ -75,6 +75,11 @@ class TracedLane:
     tape_cm: float
     adjacent_cm: dict[tuple[Side, int], Samples] = field(default_factory=dict)
 
+    @property
+    def seen(self) -> tuple[float, float]:
+        """Share of the path along which the left and the right line were seen."""
+        return float(np.isfinite(self.left_cm).mean()), float(np.isfinite(self.right_cm).mean())
+
 
 def has_dark_markings(path: Path, edges: PathEdges, camera_height_cm: float, settings: TraceSettings) -> bool:
     """Whether the markings along the path are darker than the floor; arguments as for :func:`trace_lane`."""
@@ -148,8 +153,8 @@ def trace_known_lane(
     if (
         free is not None
         # Clutter along the path makes pairs of any width.
-        and min(_seen(free)) >= MAYBE_LINE
-        and (lane is None or min(_seen(lane)) < LEAST_SEEN)
+        and min(free.seen) >= MAYBE_LINE
+        and (lane is None or min(lane.seen) < LEAST_SEEN)
     ):
         raise other_lane(lane_width_cm, free.lane_cm)
     if lane is None:
@@ -173,15 +178,10 @@ def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
     less than that of the free lane, or the car keeps to the centre of the free lane and not to that of the
     given one, as on a road of two lanes whose whole width was given.
     """
-    if min(_seen(lane)) < _WEAKER * min(_seen(free)):
+    if min(lane.seen) < _WEAKER * min(free.seen):
         return True
     aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
-    return min(_seen(free)) >= LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
-
-
-def _seen(lane: TracedLane) -> tuple[float, float]:
-    """Share of the path along which the left and the right line were seen."""
-    return float(np.isfinite(lane.left_cm).mean()), float(np.isfinite(lane.right_cm).mean())
+    return min(free.seen) >= LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
 
 
 def trace_adjacent(

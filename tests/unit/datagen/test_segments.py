@@ -10,7 +10,7 @@ from made_up_drive import made_up_drive
 
 from datagen import prepare
 from datagen import segments as drive_segments
-from datagen.lanes.find import MappedSegment
+from datagen.lanes.find import MappedSegment, check_lane
 from datagen.lanes.trace import TracedLane
 from datagen.segments import LanesOfDrive, SolvedDrive
 from datagen.settings import MapSettings
@@ -111,6 +111,7 @@ def _map(
     no_lane: tuple[int, ...] = (),
     one_line: tuple[int, ...] = (),
     other_lane: tuple[int, ...] = (),
+    doubt: str = "",
 ) -> LanesOfDrive:
     """Map a drive whose segments of some lengths show no lane, one line only, or another lane."""
 
@@ -127,7 +128,7 @@ def _map(
 
     monkeypatch.setattr(drive_segments, "find_lane", find_lane)
     solved = _solve(monkeypatch, drive, [])
-    return drive_segments.fit_lanes(_prepared(drive), solved.segments, solved.refused)
+    return drive_segments.fit_lanes(_prepared(drive), solved.segments, solved.refused, doubt)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +152,25 @@ def test_the_longest_segment_says_why_nothing_could_be_mapped(monkeypatch):
         _map(monkeypatch, drive, no_lane=(130,), other_lane=(70,))
     with pytest.raises(CalibrationError, match="a lane of 30 cm in 130 frames"):
         _map(monkeypatch, drive, no_lane=(70,), other_lane=(130,))
+
+
+def test_a_doubtful_camera_is_why_nothing_could_be_mapped(monkeypatch):
+    with pytest.raises(CalibrationError, match=r"made-up: no such camera\. .*no pair of lines in 130 frames"):
+        _map(monkeypatch, made_up_drive(130), no_lane=(130,), doubt="no such camera")
+
+
+def test_marks_on_the_floor_that_were_joined_are_no_line(monkeypatch):
+    drive = made_up_drive(200)
+    (whole,) = _map(monkeypatch, drive).segments
+    one = replace(whole, lines=[_line("left", 30.0), _line("right", 600.0)])
+    with pytest.raises(TrackingLostError, match="one line only"):
+        check_lane(one, drive)
+    seldom = np.where(np.arange(100) % 4 == 0, 0.0, np.nan)
+    with pytest.raises(TrackingLostError, match="no line"):
+        check_lane(
+            replace(one, lane=replace(one.lane, left_cm=seldom, right_cm=seldom, centre_cm=np.zeros(100))),
+            drive,
+        )
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):

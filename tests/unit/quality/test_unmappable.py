@@ -173,7 +173,7 @@ def test_real_drives_move_and_have_edges(shared_data):
 
 
 def test_a_bare_floor_has_no_edges(tmp_path):
-    ramp = np.tile(np.linspace(60, 90, 80).astype(np.uint8)[None, :, None], (60, 1, 3))
+    ramp = np.tile(np.linspace(60, 75, 80).astype(np.uint8)[None, :, None], (60, 1, 3))
     frames = [np.roll(ramp, k, axis=1) // 2 + k % 40 for k in range(70)]
     drive = open_drive(written(tmp_path / "drive", [f.astype(np.uint8) for f in frames]))
     with pytest.raises(TrackingLostError, match=r"edge points.*expected 20"):
@@ -202,10 +202,10 @@ def border(right: bool, met: float, spread_px: float, seed: int) -> BorderSample
     return BorderSamples(np.full(n, right), rng.uniform(0.0, 45.0, n), off)
 
 
-def shown(*lines: BorderSamples) -> MapQuality:
-    none = np.empty((0, 6))
-    every, nothing = join_samples(list(lines)), join_samples([])
-    return MapQuality(np.arange(1), [every], nothing, [], none, none.astype(bool))
+def shown(*lines: BorderSamples, chance: BorderSamples | None = None) -> MapQuality:
+    none, every = np.empty((0, 6)), join_samples(list(lines))
+    aside = join_samples([] if chance is None else [chance])
+    return MapQuality(np.arange(1), [every], aside, [], none, none.astype(bool))
 
 
 def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
@@ -214,6 +214,10 @@ def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
     check_lines_seen(shown(left, right), drive, 40.0, None)
     # A worn line is found along little of its length, but where it is.
     check_lines_seen(shown(border(False, 0.1, 1.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    # But not where the middle of the lane, on a mottled floor, meets as many.
+    with pytest.raises(TrackingLostError, match=r"one line only .*of the left line"):
+        worn = border(False, 0.1, 1.0, 1)
+        check_lines_seen(shown(worn, right, chance=border(False, 0.08, 3.0, 2)), drive, 40.0, None)
     # A map that is bent is looked at, and rejected.
     check_lines_seen(shown(border(False, 0.9, 4.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
     with pytest.raises(
