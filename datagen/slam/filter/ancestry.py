@@ -278,7 +278,7 @@ class MapArrays(NamedTuple):
     counting: bool
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def grow(tree, row, frame, states, chosen):
     """Follow a resampling: give every node its new interval, and the survivors nodes of their own.
@@ -314,7 +314,7 @@ def grow(tree, row, frame, states, chosen):
     tree.version[0] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def prune(tree, cells, pages, a, b, memory):
     """Prune a cell: drop dead entries, and move those that all particles share into its root.
@@ -376,7 +376,7 @@ def prune(tree, cells, pages, a, b, memory):
     _free(pages, rest)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _free(pages, page):
     """Return a chain of pages to the free ones."""
@@ -388,7 +388,7 @@ def _free(pages, page):
         page = following
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def write(shared, row, start):
     """Enter the points of a row, seen from each of its nodes.
@@ -470,7 +470,7 @@ def write(shared, row, start):
     return tree.size[row]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def _forget(recent):
     """Forget the cells of all nodes."""
@@ -479,7 +479,7 @@ def _forget(recent):
             recent[node, slot, 0] = recent[node, slot, 1] = _NOWHERE
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def collapse(shared, row):
     """Collapse a row of the tree: its entries move into the roots or are dropped.
@@ -536,7 +536,7 @@ def collapse(shared, row):
     return forced
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
 def score(shared, poses, points, frame):
     """Return the log likelihood of each particle: its view of a frame against the map of its own lineage.

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numba import njit
 
 from lanenet.data.drives import Drive
@@ -16,6 +16,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadEdges, RoadTable
+from lanenet.processes import in_threads
 
 Progress = Callable[[int, int], None]
 
@@ -24,8 +25,8 @@ _SECTORS = 4
 #: Distance at which a point weighs one half, camera heights. Chosen: lines that were seen only beyond 3.5
 #: camera heights were wrong on ``donkey_circuit``.
 _HALF_WEIGHT_HEIGHTS = 4.0
-#: Frames whose edges are lifted at once. Chosen: more only takes more memory.
-_LIFTED_AT_ONCE = 64
+#: Frames that are dealt with at once. Chosen: more only takes more memory.
+_AT_ONCE = 64
 
 
 class Scan(NamedTuple):
@@ -85,7 +86,16 @@ class Scans:
 
 def edges_of_drive(drive: Drive, settings: EdgeSettings, table: RoadTable) -> list[EdgePixels]:
     """Find the edge pixels of every frame that see the road."""
-    return [find_edges(drive.image(k), settings, table.keep, table.scale) for k in range(len(drive))]
+
+    def edges_of(image: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
+        return find_edges(image, settings, table.keep, table.scale, table.sample)
+
+    found: list[EdgePixels] = []
+    for first in range(0, len(drive), _AT_ONCE):
+        # Read here: not every source of images can be read from several threads.
+        images = [drive.image(k) for k in range(first, min(first + _AT_ONCE, len(drive)))]
+        found += in_threads(edges_of, images)
+    return found
 
 
 def scans_of(
@@ -107,9 +117,9 @@ def scans_of(
     if tilt_rad is None:
         frames = [table.lift(pixels) for pixels in kept]
     else:
-        blocks = range(0, len(kept), _LIFTED_AT_ONCE)
-        parts = (slice(first, first + _LIFTED_AT_ONCE) for first in blocks)
-        frames = [road for part in parts for road in lift_tilted(kept[part], camera, tilt_rad[part])]
+        parts = [slice(first, first + _AT_ONCE) for first in range(0, len(kept), _AT_ONCE)]
+        lifted = in_threads(lambda part: lift_tilted(kept[part], camera, tilt_rad[part]), parts)
+        frames = [road for part in lifted for road in part]
     return pack_scans(frames, camera.mounting.height_cm)
 
 
