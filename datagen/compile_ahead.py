@@ -17,9 +17,11 @@ from datagen.slam.filter.dp_slam import run_filter
 from datagen.slam.loops.revisits import DirectionField
 from datagen.slam.odometry.odometry import Odometry
 from datagen.slam.odometry.scans import pack_scans
+from datagen.slam.stripes import true_borders
 from datagen.slam.track import motion_about
+from datagen.slam.view import mapping_range
 from lanenet.perception.edges.pixels import EdgePixels
-from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.edges.road import RoadEdges, RoadTable
 
 #: Frames of the made-up drive: two neighbouring steps are the least that the adjustment compares.
 _FRAMES = 3
@@ -43,11 +45,12 @@ def _made_up_drive() -> None:
     steps, turns = np.full(_FRAMES, 0.1 * height_cm), np.zeros(_FRAMES)
     points = np.stack([np.linspace(-1.0, 1.0, 9), np.linspace(2.0, 3.0, 9)], axis=1) * height_cm
     normals = np.tile([1.0, 0.0], (len(points), 1))
+    edges = EdgePixels(camera.project_ground(points), normals)
+    true_borders([edges] * _FRAMES, RoadTable(camera, mapping_range(height_cm, settings.perception.range)))
     scans = pack_scans([RoadEdges(points, normals)] * _FRAMES, height_cm)
     odometry = Odometry(steps, turns)
     motion = motion_about(odometry, settings.motion, height_cm, np.ones(_FRAMES))
     run_filter(scans, motion, settings.filter, height_cm, camera.wheelbase_cm, rng)
-    edges = EdgePixels(camera.project_ground(points).astype(np.float32), normals.astype(np.float32))
     start = BundleEstimate.level(odometry.poses, camera)
     adjust(Observations([edges] * _FRAMES), start, settings.bundle, rng)
     field, scan = DirectionField.empty(height_cm, 64), scans.scan(0)
