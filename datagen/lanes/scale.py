@@ -112,6 +112,8 @@ def fitted_width(lines: list[LaneLine], lane: TracedLane, s_cm: Float[np.ndarray
     known = np.isfinite(apart)
     straight, bend = apart[known & (turn <= _STRAIGHT_RAD)], apart[known & (turn >= _BEND_RAD)]
     least = round(1.0 / _COMPARED_LANES)
+    if not known.any():
+        return LaneWidth(width_cm)
     if len(straight) < least:
         low, high = (float(q) for q in np.percentile(apart[known], [10.0, 90.0]))
         return LaneWidth(width_cm, open_cm=(low, high) if high > _VARIES * low else None)
