@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.lanes.fit import FitSettings, fit_lines
+from datagen.lanes.kinks import with_kinks
 from datagen.lanes.markings import TraceSettings
-from datagen.lanes.path import Path, shared_path, without_frames
+from datagen.lanes.path import Path, edges_on_map, shared_path, without_frames
 from datagen.lanes.profile import without_crossings
 from datagen.lanes.scale import AHEAD_HEIGHTS, STEP_HEIGHTS, edges_of_segment
 from datagen.lanes.trace import (
@@ -34,6 +35,9 @@ _OWN_LANE_REACH, _NEXT_LANE_REACH = 1.2, 1.6
 #: Share of the path along which a line is painted: with less, it is marks on the floor that were joined.
 #: Chosen: short dashes leave a third, and on a floor without lines it was a quarter.
 _PAINTED = 0.3
+#: Distance ahead of a frame up to which its edges show kinks, in camera heights. Chosen: further ones
+#: scatter.
+_KINK_HEIGHTS = 3.0
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,9 @@ def find_lane(
     adjacent = without_crossings(path, adjacent.towards_dark() if dark else adjacent, height, side_cm)
     lane = trace_adjacent(path, adjacent, lane, height, trace)
     lines = fit_lines(path, edges, lane, height, fit, adjacent)
+    near = edges_on_map(scans, segment.poses, segment.camera.wheelbase_cm, _KINK_HEIGHTS * height)
+    near = near.towards_dark() if dark else near
+    lines = [with_kinks(line, near, height) if line.rank == 0 else line for line in lines]
     return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)
 
 

@@ -274,6 +274,45 @@ class PathEdges:
         return replace(self, side=-self.side, along=-self.along)
 
 
+@dataclass(frozen=True)
+class MapEdges:
+    """Edge points on the map.
+
+    Attributes:
+        xy_cm: Places, frame map.
+        normals: Unit normals, towards the brighter side.
+        frame: Frame that saw each.
+        row: Position of the point in the scans.
+        distance_cm: Distance from the front axle at which it was seen.
+    """
+
+    xy_cm: Float[np.ndarray, "m 2"]
+    normals: Float[np.ndarray, "m 2"]
+    frame: Int[np.ndarray, "m"]
+    row: Int[np.ndarray, "m"]
+    distance_cm: Float[np.ndarray, "m"]
+
+    def towards_dark(self) -> MapEdges:
+        """Return the points with normals to the darker side, as :meth:`PathEdges.towards_dark`."""
+        return replace(self, normals=-self.normals)
+
+
+def edges_on_map(
+    scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float
+) -> MapEdges:
+    """Move every frame's edge points up to a distance from its front axle to the map."""
+    distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
+    keep = distance <= reach_cm
+    frame = scans.frame_of_point[keep]
+    ahead = np.stack([np.cos(poses[frame, 2]), np.sin(poses[frame, 2])], axis=1)
+    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    points, normals = (
+        car[keep, 1:] * ahead + car[keep, :1] * right
+        for car in (scans.points_cm + [0.0, wheelbase_cm], scans.normals)
+    )
+    return MapEdges(points + poses[frame, :2], normals, frame, np.flatnonzero(keep), distance[keep])
+
+
 def edges_along_path(
     path: Path, scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float
 ) -> PathEdges:
@@ -289,22 +328,13 @@ def edges_along_path(
         wheelbase_cm: Distance between the axles.
         reach_cm: Largest distance of edge points from the front axle.
     """
-    distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
-    keep = distance <= reach_cm
-    frame = scans.frame_of_point[keep]
-    ahead = np.stack([np.cos(poses[frame, 2]), np.sin(poses[frame, 2])], axis=1)
-    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
-    points, normals = (
-        car[keep, 1:] * ahead + car[keep, :1] * right
-        for car in (scans.points_cm + [0.0, wheelbase_cm], scans.normals)
-    )
-    points += poses[frame, :2]
-    forward, span_cm = path.drives_forward[frame], reach_cm + 2.0 * wheelbase_cm
+    edges = edges_on_map(scans, poses, wheelbase_cm, reach_cm)
+    forward, span_cm = path.drives_forward[edges.frame], reach_cm + 2.0 * wheelbase_cm
     row = _nearest_rows(
-        path.xy_cm, path.step_cm, path.closed, path.s_frames_cm[frame], forward, points, span_cm
+        path.xy_cm, path.step_cm, path.closed, path.s_frames_cm[edges.frame], forward, edges.xy_cm, span_cm
     )
     seen = row >= 0
-    row, normals, off = row[seen], normals[seen], points[seen] - path.xy_cm[row[seen]]
+    row, normals, off = row[seen], edges.normals[seen], edges.xy_cm[seen] - path.xy_cm[row[seen]]
     left = path.left[row]
     # The tangent is the left normal rotated clockwise by 90 degrees.
     tangent = np.stack([left[:, 1], -left[:, 0]], axis=1)
@@ -314,9 +344,9 @@ def edges_along_path(
         d_cm=np.sum(off * left, axis=1),
         side=np.sum(normals * left, axis=1),
         along=np.sum(normals * tangent, axis=1),
-        weight=scans.weights[keep][seen],
-        distance_cm=distance[keep][seen],
-        frame=frame[seen],
+        weight=scans.weights[edges.row[seen]],
+        distance_cm=edges.distance_cm[seen],
+        frame=edges.frame[seen],
     )
 
 

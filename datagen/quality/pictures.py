@@ -58,7 +58,7 @@ def draw_map(
         for line in lines:
             end = s.max() + 60.0 if line.period_cm is None else s.min() + line.period_cm + 2.0
             colour = _ADJACENT if line.rank else _LEFT if line.side == "left" else _RIGHT
-            at_cm = np.arange(s.min(), end, 2.0)
+            at_cm = line.with_corners(np.arange(s.min(), end, 2.0))
             points, withheld = line.points(at_cm), line.contradicted(at_cm)
             lanes.append((segment, points, colour, 1))
             lanes.append((segment, np.where(withheld[:, None], points, np.nan), _WITHHELD, 5))

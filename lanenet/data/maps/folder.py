@@ -27,8 +27,8 @@ from lanenet.outputs import restore_output
 from lanenet.reading import FolderFiles, parsing, read_json
 
 FORMAT = "lanenet-map/1"
-#: The second format had no sections that the images contradict.
-_LANES_FORMAT, _OLDER_LANES_FORMAT = "lanenet-lanes/3", "lanenet-lanes/2"
+#: The second format had no sections that the images contradict, the third no kinks.
+_LANES_FORMAT, _OLDER_LANES_FORMATS = "lanenet-lanes/4", ("lanenet-lanes/3", "lanenet-lanes/2")
 _EDGES_FORMAT = "lanenet-edges/2"
 _REPORT_FORMAT = "lanenet-map-report/1"
 #: The resolved settings of the mapping, in the map's folder.
@@ -283,11 +283,11 @@ def kept_map(out: Path) -> str:
 def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
     plain = read_json(path, MapFormatError)
     with parsing(f"{path}: lane lines cannot be read", MapFormatError):
-        if plain["format"] not in (_LANES_FORMAT, _OLDER_LANES_FORMAT):
+        if plain["format"] not in (_LANES_FORMAT, *_OLDER_LANES_FORMATS):
             raise MapFormatError(f"{path}: format is {plain['format']!r}, expected {_LANES_FORMAT!r}")
         lines: dict[int, list[LaneLine]] = {}
         for item in plain["lines"]:
-            if plain["format"] == _OLDER_LANES_FORMAT:
+            if plain["format"] == _OLDER_LANES_FORMATS[1]:
                 item["contradicted_cm"] = []
             lines.setdefault(int(item["segment"]), []).append(_line(item))
     for segment in sorted(segments):
@@ -333,8 +333,14 @@ def _line(item: dict[str, Any]) -> LaneLine:
         for values in (knots, coefficients, supported, contradicted, sigma_s, sigma_at)
     ):
         raise ValueError(f"all numbers must be finite and at most {MAX_PLACE:g}")
-    # The three at either end may be equal: there the line begins and ends.
-    if not ((np.diff(knots) >= 0.0).all() and (np.diff(knots[3:-3]) > 0.0).all()):
+    # Four at either end may be equal, where the line begins and ends, and three in between, at a kink.
+    inner = knots[4:-4]
+    if not (
+        (np.diff(knots) >= 0.0).all()
+        and (inner[3:] > inner[:-3]).all()
+        and knots[3] < knots[4]
+        and knots[-5] < knots[-4]
+    ):
         raise ValueError("knots_cm must increase")
     for name, sections in (("supported_cm", supported), ("contradicted_cm", contradicted)):
         if not (sections[:, 1] >= sections[:, 0]).all():

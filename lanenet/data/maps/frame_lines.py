@@ -80,11 +80,14 @@ def lines_of_frame(
         forward: Whether the car drives in the path's direction; if not, left and right swap.
         max_sigma_cm: A line is masked where its sigma exceeds this, and where the images contradict it.
     """
-    along = np.arange(-_BEHIND_CM, wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
-    s = s_cm + (along if forward else -along)
     by_index = {line.index: line for line in lines}
     pair = (lane, lane + 1) if forward else (lane + 1, lane)
     bounds = [by_index.get(i) for i in pair]
+    along = np.arange(-_BEHIND_CM, wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
+    s = np.sort(s_cm + (along if forward else -along))
+    for line in bounds:
+        s = s if line is None else line.with_corners(s)
+    s = s if forward else s[::-1]
     left, right = (_polyline(line, s, pose, wheelbase_cm, max_sigma_cm) for line in bounds)
     points = np.concatenate([label_rows(left), label_rows(right)])
     assert points.shape == (N_POINTS,)

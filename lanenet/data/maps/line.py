@@ -29,6 +29,8 @@ def _no_sections() -> Float[np.ndarray, "0 2"]:
 class LaneLine:
     """One lane line: cubic B-splines x(s), y(s) over the position s along the path.
 
+    Where straight pieces of tape meet, it has a triple knot: a corner.
+
     Attributes:
         side: Side of the driven lane, seen in the path's direction.
         knots_cm: Knots in s, with three more on either side of the first and last break.
@@ -68,6 +70,22 @@ class LaneLine:
     def dashed(self) -> bool:
         """Whether the line is dashed; then there is a lane on either side of it."""
         return self.unpainted > _DASHED_SHARE
+
+    @property
+    def kinks_cm(self) -> Float[np.ndarray, "n"]:
+        """Positions where the line turns in a corner: its triple knots."""
+        inner = self.knots_cm[4:-4]
+        return np.unique(inner[2:][inner[2:] == inner[:-2]])
+
+    def with_corners(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n"]:
+        """Add the corners between increasing positions, which on a lap may go beyond the seam."""
+        kinks = self.kinks_cm
+        if not len(kinks) or not len(s_cm):
+            return s_cm
+        if self.period_cm is not None:
+            laps = np.arange(np.floor(s_cm[0] / self.period_cm) - 1.0, s_cm[-1] / self.period_cm + 1.0)
+            kinks = (kinks + self.period_cm * laps[:, None]).ravel()
+        return np.union1d(s_cm, kinks[(kinks > s_cm[0]) & (kinks < s_cm[-1])])
 
     def points(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
         """Evaluate the line or a derivative along s, frame map; NaN where it is not supported."""

@@ -117,6 +117,25 @@ def test_sections_that_images_contradict_are_read_back_and_older_maps_have_none(
     assert not read_map(tmp_path).lines[0][1].contradicted(places).any()
 
 
+def test_kinks_are_read_back(tmp_path):
+    written = _closed_map()
+    breaks = np.sort(np.concatenate([np.linspace(0.0, 300.0, 21), [97.0] * 3, [299.5] * 3]))
+    basis = CubicBasis(breaks, periodic=True)
+    angle = 2.0 * np.pi * np.arange(basis.size) / basis.size
+    ring = 30.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    left = replace(written.lines[0][0], knots_cm=basis.knots_cm, coefficients_cm=basis.unfolded(ring))
+    written = replace(written, lines={0: [left, *written.lines[0][1:]]})
+    write_map(tmp_path, written, {"frame": np.arange(2)}, {}, "given")
+    again = read_map(tmp_path).lines[0][0]
+    np.testing.assert_allclose(again.kinks_cm, [97.0, 299.5])
+    s_cm = np.array([90.0, 97.0, 299.5, 300.5])
+    np.testing.assert_allclose(again.points(s_cm), left.points(s_cm), atol=1e-9)
+    # Also before and beyond the lap.
+    np.testing.assert_allclose(
+        again.with_corners(np.array([-2.0, 390.0, 598.0])), [-2.0, -0.5, 97.0, 299.5, 390.0, 397.0, 598.0]
+    )
+
+
 def test_the_drive_is_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "map"
@@ -269,7 +288,7 @@ def _damage(plain: dict, what: str) -> object:
         for pair in (plain["lines"][:2], plain["lines"][2:]):
             pair[0]["side"], pair[1]["side"] = "right", "left"
     elif what == "equal knots":
-        line["knots_cm"][6] = line["knots_cm"][5]
+        line["knots_cm"][6:9] = [line["knots_cm"][5]] * 3
     elif what == "knots beyond all measure":
         line["knots_cm"] = [1e300 * k for k in line["knots_cm"]]
     elif what == "support that ends before it begins":

@@ -81,6 +81,30 @@ def test_a_straight_lane_gives_the_analytic_points(heading, offset):
     np.testing.assert_allclose(found.points_cm, expected, atol=1e-6)
 
 
+def _kinked(at_cm: float) -> list[LaneLine]:
+    """Straight lines whose left one turns right by 45 degrees at a corner."""
+    left, right = _straight()
+    knots = np.sort(np.concatenate([left.knots_cm, [at_cm] * 3]))
+    s = np.array([knots[i + 1 : i + 4].mean() for i in range(len(knots) - 4)])
+    control = np.column_stack([s, HALF_CM - np.maximum(s - at_cm, 0.0)])
+    return [LaneLine("left", knots, control, left.supported_cm, 0.1), right]
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_a_corner_is_not_cut(forward):
+    # The corner lies in the row of y = 15 cm, between two samples of the polyline.
+    at_cm = 150.0 + (1.0 if forward else -1.0) * (WHEELBASE_CM + 15.0)
+    lines = _kinked(at_cm)
+    pose = np.array([150.0, 0.0, 0.0 if forward else np.pi])
+    found = lines_of_frame(lines, pose, 150.0, WHEELBASE_CM, forward=forward)
+    labels = found.points_cm[:3] if forward else found.points_cm[3:]
+    # Before the corner the line is straight; beyond it, it comes nearer, or, on the way back, did.
+    beyond = [0.0, 0.0, -15.0] if forward else [15.0, 0.0, 0.0]
+    expected = HALF_CM + np.array(beyond) if forward else HALF_CM - np.array(beyond)
+    np.testing.assert_allclose(np.abs(labels), expected, atol=1e-6)
+    assert np.diff(found.left_cm[:, 1]).min() > 0.0
+
+
 def test_left_is_negative_and_the_polylines_recede():
     found = lines_of_frame(_straight(), np.array([150.0, 0.0, 0.0]), 150.0, WHEELBASE_CM)
     np.testing.assert_allclose(found.points_cm, [-20.0] * 3 + [20.0] * 3, atol=1e-9)
