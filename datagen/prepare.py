@@ -13,7 +13,8 @@ from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Commands, Drive, open_drive
-from lanenet.data.drives.recording import ImageSource
+from lanenet.data.drives.recording import MAX_PAUSE_S, ImageSource
+from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
@@ -104,6 +105,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     check_moving(recorded)
     notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
     drive, found = following_frames(recorded)
+    drive, deleted = without_deleted(drive)
     check_count(drive)
     # Deleted frames get no labels; where the car leaves the road, they show nothing of the lines.
     held_out = held_out_frames(len(drive), settings.held_out_every, settings.seed) & ~drive.deleted
@@ -119,7 +121,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
                 f"{request.camera_path or drive.path}: the camera is known, {known.mounting.height_cm:g} cm "
                 f"high, but --camera-height gives {request.camera_height_cm:g} cm: expected one of them"
             )
-    notes += [*found, *nominal, *hidden]
+    notes += [*found, *deleted, *nominal, *hidden]
     return PreparedDrive(request, drive, held_out, settings, known, tuple(notes))
 
 
@@ -173,6 +175,24 @@ def readable_frames(drive: Drive) -> tuple[Drive, list[str]]:
         raise first
     kept = np.setdiff1d(np.arange(len(drive)), list(errors))
     return drive.subset(kept), [f"{len(errors)} images cannot be read and are left out, the first: {first}"]
+
+
+def without_deleted(drive: Drive) -> tuple[Drive, list[str]]:
+    """Leave out the long sections that the driver deleted: there the car left the road, or was carried.
+
+    Poses that follow such motion draw the lines away from the tape. Short sections stay, though they get no
+    labels: they hold together what lies before and after them.
+
+    Returns:
+        The drive that is left, and a note on what was left out.
+    """
+    seconds = drive.t_s
+    out = np.zeros(len(drive), dtype=bool)
+    for run in true_runs(drive.deleted):
+        out[run] = seconds[run[-1]] - seconds[run[0]] > MAX_PAUSE_S
+    if not out.any() or len(drive) - out.sum() < LEAST_FRAMES:
+        return drive, []
+    return drive.subset(~out), [f"{out.sum()} frames are left out, long sections that the driver deleted"]
 
 
 def _throttle_notes(commands: Commands) -> list[str]:

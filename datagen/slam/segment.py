@@ -30,7 +30,7 @@ from datagen.slam.loops.consistency import (
 )
 from datagen.slam.loops.parts import connected, placing_revisits, whole_turns
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
-from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_revisits, thumbnails
+from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_beside, propose_revisits, thumbnails
 from datagen.slam.odometry.scans import Progress, Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
@@ -56,6 +56,9 @@ _DRIFT_RAD, _GAP_RAD = (0.3, 0.8), 0.05
 #: Times that loops are closed again with the revisits that the closed poses confirm. Chosen: two or three
 #: rounds are usual.
 _MOST_GROWTH = 6
+#: Rounds in which revisits spread along sections that none holds, by up to 12 camera heights each. Chosen:
+#: ends where none is found; a lap of 240 heights in any case.
+_MOST_SPREAD = 20
 
 
 @dataclass(frozen=True)
@@ -263,6 +266,12 @@ def _pairs(revisits: list[Revisit]) -> tuple[tuple[int, int], ...]:
     return tuple(sorted((r.earlier, r.later) for r in revisits))
 
 
+def _together(matched: list[Revisit], closed: list[Revisit]) -> list[Revisit]:
+    """All candidates, with those that were found since by their place."""
+    known = {(r.earlier, r.later) for r in matched}
+    return matched + [r for r in closed if (r.earlier, r.later) not in known]
+
+
 class _DenseSegment:
     """A drive that is tracked by all of its frames."""
 
@@ -290,7 +299,7 @@ class _DenseSegment:
         closure = self.choose_closure(opened, matched)
         road, bundle = view.road, opened
         if closure is not None and self.find_camera:
-            road, closure = self.adjust_with_camera(closure, matched)
+            road, closure = self.adjust_with_camera(closure, _together(matched, closure.revisits))
         if closure is not None:
             bundle = closure.bundle
         return SolvedSegment(
@@ -308,13 +317,14 @@ class _DenseSegment:
 
     def find_revisits(self, opened: BundleResult) -> list[Revisit]:
         """Propose pairs of frames that look alike, and align each with the map around the earlier one."""
-        scans = self.view.road.scans(opened.camera, opened.tilt)
-        s, rng = self.revisit_settings, self.solver.rng
-        periods = self.view.commands.periods
+        s, periods = self.revisit_settings, self.view.commands.periods
         pairs = propose_revisits(thumbnails(self.view.drive), opened.poses, periods, self.height, s)
-        matcher = PlaceMatcher(scans, opened.poses, self.part, self.view.camera, s)
-        found = [matcher.match(pair, rng) for pair in pairs]
-        return [revisit for revisit in found if revisit is not None]
+        return self.place_matcher(opened).matched(pairs, self.solver.rng)
+
+    def place_matcher(self, opened: BundleResult) -> PlaceMatcher:
+        """Aligns visits of a place by the edges that the open loop maps around each."""
+        scans = self.view.road.scans(opened.camera, opened.tilt)
+        return PlaceMatcher(scans, opened.poses, self.part, self.view.camera, self.revisit_settings)
 
     def choose_closure(self, opened: BundleResult, matched: list[Revisit]) -> _Closure | None:
         """Close the loops with each set of revisits that may be true; the likeliest wins."""
@@ -334,10 +344,33 @@ class _DenseSegment:
         if best is None:
             return None
         # The adjusted map tells better which revisits are true; those that it contradicts still pull.
-        confirmed = self.confirmed(best.bundle.poses, matched)
+        confirmed = self.spread_out(opened, best, matched)
         if _pairs(confirmed) == _pairs(best.revisits) or len(confirmed) < self.revisit_settings.min_revisits:
             return best
         return self.try_closure(confirmed, opened) or best
+
+    def spread_out(self, opened: BundleResult, closure: _Closure, matched: list[Revisit]) -> list[Revisit]:
+        """Revisits that a closed map confirms, and more along the sections that none of them holds.
+
+        These sections are bent by the drift of the open loop, the more, the further from a revisit: each
+        round of close ones brings the next within reach.
+        """
+        matcher, rng = self.place_matcher(opened), self.solver.rng
+        periods, s = self.view.commands.periods, self.revisit_settings
+        poses, pool = closure.bundle.poses, list(matched)
+        confirmed = self.confirmed(poses, pool)
+        tried = {(r.earlier, r.later) for r in pool}
+        for _ in range(_MOST_SPREAD):
+            pairs = [p for p in propose_beside(poses, periods, confirmed, self.height, s) if p not in tried]
+            found = matcher.matched(pairs, rng)
+            tried.update(pairs)
+            if not found:
+                break
+            pool += found
+            grown = without_contradicted(opened.poses, self.confirmed(poses, pool), self.height)
+            confirmed = grown
+            poses, _ = close_loops(opened.poses, confirmed, self.height, periods)
+        return confirmed
 
     def sets_to_try(
         self, poses: Float[np.ndarray, "n 3"], matched: list[Revisit]

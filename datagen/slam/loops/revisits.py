@@ -7,6 +7,7 @@ brightens in the same direction.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
 
@@ -22,7 +23,7 @@ from datagen.slam.odometry.stillness import SMALL_HEIGHT, SMALL_WIDTH, small_ima
 from lanenet.config import Settings
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.frames import map_from_car, map_from_car_directions
+from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
 from lanenet.geometry.poses import path_lengths, relative_pose
 from lanenet.processes import in_threads
 
@@ -38,6 +39,9 @@ _DIAGONAL = 4
 #: similar, nearly. Measured on ``garage_tape`` and ``donkey_circuit`` with gaps: 3 instead of 0 gave a fifth
 #: more true revisits, at the same share of false ones.
 _MUTUAL = 3
+#: How far from a known revisit others are proposed by their place, in the spacing of pairs. Chosen: two or
+#: three frames on each side.
+_WITHIN_REACH = 3.0
 #: Frames whose similarity to all before them is held at once: that of all pairs of a long drive is too much.
 _BLOCK = 256
 #: Frames to either side that make the map of the earlier visit and the edges of the later one: the first must
@@ -182,6 +186,48 @@ def propose_revisits(
     return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda pair: pair[2])]
 
 
+def propose_beside(
+    poses: Float[np.ndarray, "n 3"],
+    periods: Float[np.ndarray, "n"],
+    known: Sequence[Revisit],
+    camera_height_cm: float,
+    settings: RevisitSettings,
+) -> list[tuple[int, int]]:
+    """Propose pairs (earlier, later) of frames that closed poses have at about the same place.
+
+    Images of one place need not be similar: the car may look another way, or light and people have changed.
+    Where no known revisit holds a section, a frame in every so much path from the next one is paired with the
+    nearest one of another visit. Further on, the open loop may have drifted away from its true place.
+
+    Args:
+        poses: Poses after closing loops.
+        periods: Time from the frame before to each frame, in typical time steps.
+        known: Revisits by which they were closed.
+        camera_height_cm: Sets the scale.
+        settings: Bounds.
+    """
+    path, recording = path_lengths(poses), np.cumsum(periods >= BREAK_PERIODS)
+    spacing_cm = settings.pair_heights * camera_height_cm
+    held_cm = np.sort([path[frame] for r in known for frame in (r.earlier, r.later)])
+    reach = np.array([settings.along_heights, settings.sideways_heights]) * camera_height_cm
+    pairs = []
+    cells = np.unique((path / spacing_cm).astype(np.int64), return_index=True)[1]
+    for frame in cells.tolist():
+        if not spacing_cm <= np.abs(held_cm - path[frame]).min() < _WITHIN_REACH * spacing_cm:
+            continue
+        off = relative_pose(np.broadcast_to(poses[frame], poses.shape), poses)
+        other = (np.abs(path - path[frame]) > settings.min_gap_heights * camera_height_cm) | (
+            recording != recording[frame]
+        )
+        near = other & (np.abs(off[:, :2]) < reach).all(axis=1)
+        near &= np.abs(wrap_angle(off[:, 2])) < settings.search_rad
+        if near.any():
+            apart = np.where(near, np.sum((off[:, :2] / reach) ** 2, axis=1), np.inf)
+            partner = int(np.argmin(apart))
+            pairs.append((min(frame, partner), max(frame, partner)))
+    return sorted(set(pairs))
+
+
 def similarities(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
     """Correlation of all thumbnails with all others, at the sideways shift at which it is highest."""
     images = b.reshape(len(b), SMALL_HEIGHT, SMALL_WIDTH)
@@ -220,6 +266,11 @@ class PlaceMatcher:
         """
         self.scans, self.poses, self.part, self.settings = scans, poses, part, settings
         self.height_cm, self.wheelbase_cm = camera.mounting.height_cm, camera.wheelbase_cm
+
+    def matched(self, pairs: Iterable[tuple[int, int]], rng: np.random.Generator) -> list[Revisit]:
+        """Align all pairs; those of which too few edges match are left out."""
+        found = (self.match(pair, rng) for pair in pairs)
+        return [revisit for revisit in found if revisit is not None]
 
     def match(self, pair: tuple[int, int], rng: np.random.Generator) -> Revisit | None:
         """Align two visits: a search over a grid on a coarse field, then two rounds of samples on finer ones.

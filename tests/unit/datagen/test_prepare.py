@@ -18,6 +18,7 @@ from datagen.prepare import (
     hide_bumper,
     prepare,
     readable_frames,
+    without_deleted,
 )
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import guessed_camera
@@ -137,6 +138,19 @@ def test_a_full_circle_fisheye_is_named_and_dark_corners_are_not():
         check_lens(replace(made_up_drive(60), images=_Lens(radius_px)))
     # A dark room with a lamp.
     check_lens(replace(made_up_drive(60), images=_Lens(20.0)))
+
+
+def test_long_deleted_sections_are_left_out_and_short_ones_hold_the_drive_together():
+    drive = made_up_drive(300, [])
+    deleted = np.zeros(300, dtype=bool)
+    # At 20 images a second: 1.9 s and 2.1 s from the first to the last frame.
+    deleted[50:89] = deleted[150:193] = True
+    left, (note,) = without_deleted(replace(drive, deleted=deleted))
+    np.testing.assert_array_equal(left.frames, np.delete(drive.frames, np.arange(150, 193)))
+    assert "43 frames" in note
+    assert np.flatnonzero(left.breaks).tolist() == [150]
+    everything = replace(drive, deleted=np.ones(300, dtype=bool))
+    assert without_deleted(everything) == (everything, [])
 
 
 @pytest.mark.parametrize(("sign", "count"), [(1.0, 0), (-1.0, 1)])

@@ -15,6 +15,7 @@ from datagen.slam.loops.revisits import (
     Revisit,
     RevisitSettings,
     diagonal_mean,
+    propose_beside,
     propose_revisits,
     similarities,
     thumbnails,
@@ -112,6 +113,29 @@ def test_a_long_drive_gets_as_many_pairs_per_way_as_a_short_one():
         assert len(pairs) <= path_lengths(poses)[-1] / (4.0 * HEIGHT_CM) + 1.0
     assert counts[0] > 4
     assert counts[1] > 1.5 * counts[0]
+
+
+def test_frames_of_another_visit_are_proposed_near_a_known_one_but_not_beside_it():
+    poses, settings = _circle(210, 0.0), RevisitSettings()
+    known = [Revisit(0, LAP, np.zeros(3), 1.0)]
+    # A pair in every 60 cm of path, 10 frames; the known visits hold theirs.
+    found = propose_beside(poses, np.ones(210), known, 15.0, settings)
+    assert found
+    assert {later - earlier for earlier, later in found} == {LAP}
+    near = {min(min(abs(frame - k) for k in (0, LAP)) for frame in pair) for pair in found}
+    assert min(near) >= 10
+    assert max(near) <= 30
+    held = [Revisit(k, k + LAP, np.zeros(3), 1.0) for k in range(0, 110, 5)]
+    assert propose_beside(poses, np.ones(210), held, 15.0, settings) == []
+
+
+@pytest.mark.parametrize(("off", "within_reach"), [([0.0, 20.0, 0.0], True), ([0.0, 40.0, 0.0], False)])
+def test_what_lies_out_of_reach_is_not_proposed(off, within_reach):
+    poses = _circle(210, 0.0)
+    poses[LAP:] = compose(poses[LAP:], np.broadcast_to(off, poses[LAP:].shape))
+    known = [Revisit(0, LAP, np.zeros(3), 1.0)]
+    pairs = propose_beside(poses, np.ones(210), known, 15.0, RevisitSettings())
+    assert bool(pairs) is within_reach
 
 
 def test_likeness_is_averaged_over_neighbours_of_both_frames():
