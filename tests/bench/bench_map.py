@@ -36,6 +36,7 @@ STAGES = (
     ("datagen.slam.view", "view_road"),
     ("datagen.slam.view", "edges_of_drive"),
     ("datagen.slam.view", "without_reflections"),
+    ("datagen.slam.view", "true_borders"),
     ("datagen.slam.view", "typical_step"),
     ("datagen.slam.view", "scans_of"),
     ("datagen.slam.segment", "track"),
