@@ -70,7 +70,7 @@ _SHORTEST, _JOINED = 5, 20
 #: many. Chosen: interruptions shorter than the lane is wide are bridged well.
 _BARE_LANES, _BARE_GAPS, _MIN_GAPS = 2.5, 1.5, 4
 #: Offset of the borders beyond which the ends of a section belong to it, as do places where the line is not
-#: met, and how far that may go, in places.
+#: met, and how far that may go, in places that frames look at.
 _END_CM, _END_PLACES = 0.7, 15
 
 
@@ -307,7 +307,8 @@ def wrong_places(
         # A line leaves its marking by degrees: what lies far beside a short section is something else.
         if abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM:
             continue
-        taken[_with_ends(run, (np.abs(mean_off) > _END_CM) | ~confirmed, closed)] = True
+        unseen = _around(evidence.views.sum(axis=0)[None], closed)[0] < 0.5
+        taken[_with_ends(run, (np.abs(mean_off) > _END_CM) | ~confirmed, unseen, closed)] = True
     low = _first_cm(line)
     places = []
     for run in true_runs(taken, closed):
@@ -359,12 +360,18 @@ def _too_long(empty: Bool[np.ndarray, "p"], lane_cm: float, closed: bool) -> lis
     return [run for run, length in zip(runs, lengths, strict=True) if length > bound]
 
 
-def _with_ends(run: Int[np.ndarray, "r"], off: Bool[np.ndarray, "p"], closed: bool) -> Int[np.ndarray, "_"]:
-    """Extend a run over the places at its ends where the line is off or not met, and by one more."""
+def _with_ends(
+    run: Int[np.ndarray, "r"], off: Bool[np.ndarray, "p"], unseen: Bool[np.ndarray, "p"], closed: bool
+) -> Int[np.ndarray, "_"]:
+    """Extend a run over the places at its ends where the line is off or not met, and by one more.
+
+    Places that no frame looks at, as where the line runs out of view in a bend, are no end of it.
+    """
     n = len(off)
     first, last = int(run[0]), int(run[0]) + len(run) - 1
     for step in (-1, 1):
-        for _ in range(_END_PLACES):
+        looked = 0
+        while looked < _END_PLACES and last - first < n:
             following = (first if step < 0 else last) + step
             if not closed and not 0 <= following < n:
                 break
@@ -374,6 +381,7 @@ def _with_ends(run: Int[np.ndarray, "r"], off: Bool[np.ndarray, "p"], closed: bo
                 last = following
             if not off[following % n]:
                 break
+            looked += not unseen[following % n]
     return np.unique(np.arange(first, min(last, first + n - 1) + 1) % n)
 
 

@@ -150,3 +150,16 @@ def test_where_neither_line_is_seen_both_are_withheld(monkeypatch):
     # The other line holds it in place.
     one = drive_of(monkeypatch, ("left", ends), ("right", where_mapped))
     assert places.withhold_wrong_places(one)[1] == []
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_wrong_section_goes_on_where_the_line_runs_out_of_view(closed):
+    run, off, unseen = np.arange(40, 46), np.zeros(100, dtype=bool), np.zeros(100, dtype=bool)
+    off[38:90], unseen[50:88] = True, True
+    found = places._with_ends(run, off, unseen, closed)
+    np.testing.assert_array_equal(found, np.arange(37, 91))
+    # What is looked at and not met may be a gap.
+    found = places._with_ends(run, off, np.zeros(100, dtype=bool), closed)
+    assert found.max() < 65
+    everything = places._with_ends(run, np.ones(100, dtype=bool), np.ones(100, dtype=bool), closed)
+    np.testing.assert_array_equal(everything, np.arange(100))
