@@ -438,13 +438,16 @@ class _DenseSegment:
     def adjust_with_camera(self, closure: _Closure, matched: list[Revisit]) -> tuple[RoadView, _Closure]:
         """Adjust all of the camera with the poses, in rounds: another camera sees other edges on the road."""
         drive, revisits, bundle = self.view.drive, closure.revisits, closure.bundle
+        adjusted = partial(self.adjust, settings=self.solver.settings.bundle.with_free_tilt())
         for _ in range(_MAX_CAMERA_ROUNDS):
             road = view_road(drive, bundle.camera, self.solver.settings)
             before = bundle.camera.K[0, 0]
             revisits = self.confirmed(bundle.poses, matched)
             loops = loop_pairs(revisits, self.part)
             loops += neighbouring_laps(bundle.poses, self.height, self.revisit_settings)
-            bundle = self.adjust(road.observed(self.view.commands), bundle, loops=loops)
+            bundle = adjusted(road.observed(self.view.commands), bundle, loops=loops)
             if abs(bundle.camera.K[0, 0] / before - 1.0) < _SETTLED:
                 break
-        return road, _Closure(revisits, bundle)
+        # With the camera known, frames are nearly level again.
+        settled = self.adjust(road.observed(self.view.commands), bundle, free=(), loops=loops)
+        return road, _Closure(revisits, replace(settled, sigma=bundle.sigma))

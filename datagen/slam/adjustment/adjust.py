@@ -84,10 +84,13 @@ _FIXED_SIGMA = 1e-6
 #: Rows of an image 160 px wide, and ways that an edge may face, that share an error of the edge detector.
 #: Chosen: the width of a line in the image, and its blur, change little within ten rows.
 _BAND_PX, _WAYS = 10.0, 8
-#: Standard deviation of that error, for images 160 px wide: edges of seven simulated drives with all random
-#: effects lie 0.11 to 0.47 px beside the true borders (RMS over the groups, 0.29 together), mostly those of
-#: far lines, which are drawn wider than they are.
-_EDGE_ERROR_PX = 0.3
+#: Standard deviation of that error, for images 160 px wide: edges of eight simulated drives with all random
+#: effects, their narrow lines set right (``datagen.slam.stripes``), lie 0.05 to 0.17 px beside the true
+#: borders (RMS over the groups). Chosen: nearly the most, for looks that were not among them.
+_EDGE_ERROR_PX = 0.15
+#: Time in which a camera reads an image, as a share of that between two frames; the root of its mean square.
+#: Chosen: rolling shutters take 0 to 30 ms, and frames come 20 times a second.
+_READOUT = 0.35
 #: Side of the squares of road whose residuals may have an error in common, in camera heights. Chosen: what
 #: one frame sees best.
 _STRETCH_HEIGHTS = 3.0
@@ -413,7 +416,9 @@ class BundleProblem:
         Residuals are not independent. The same tape errs alike in each frame that shows it: scores are added
         up over stretches of road before they are squared. And an edge is found a little off wherever the same
         part of the image shows a line that faces the same way, in all frames alike: the camera takes on most
-        of such an error, so that no residual shows it. What is known of the edge detector takes its place.
+        of such an error, so that no residual shows it. What is known of the edge detector takes its place. A
+        rolling shutter is such an error too: low rows, read last, show the road as from further ahead, which
+        looks like another pitch.
 
         Args:
             state: The solution.
@@ -451,13 +456,32 @@ class BundleProblem:
         by_image = scores(np.ones_like(stretch), self._image_groups(self.edges, links.edge), count)
         by_image -= scores(stretch, self._image_groups(self.points, links.point), count)
         by_image *= _EDGE_ERROR_PX * self.scale
-        spread = by_road.T @ by_road + by_image.T @ by_image + np.diag(self.camera_sigmas[free] ** -2.0)
+        all_alike = np.zeros(len(stretch), np.int64)
+        by_readout = scores(self._readout_px(state, self.edges)[links.edge], all_alike, 1)
+        by_readout -= scores(stretch * self._readout_px(state, self.points)[links.point], all_alike, 1)
+        errors = np.concatenate([by_road, by_image, by_readout])
+        spread = errors.T @ errors + np.diag(self.camera_sigmas[free] ** -2.0)
         inverse = np.linalg.inv(information)
         return np.sqrt(np.maximum(np.diag(inverse @ spread @ inverse), 0.0))
 
     def _starts(self, links: Links) -> Int[np.ndarray, "p1"]:
         """First link of each pair, and one behind the last."""
         return np.searchsorted(links.pair, np.arange(len(self.pairs) + 1))
+
+    def _readout_px(self, state: BundleState, pixels: Pixels) -> Float[np.ndarray, "m"]:
+        """Return how far off edges may be along their gradient, since low rows are read later."""
+        camera = state.camera_like(self.prior_camera)
+        height, width = self.inner.shape
+        v, u = np.mgrid[:height, :width].astype(np.float64)
+        whole = np.stack([u.ravel(), v.ravel()], axis=1)
+        step_heights = float(np.median(np.hypot(*np.diff(state.poses[:, :2], axis=0).T)))
+        ahead_cm = _READOUT * step_heights * camera.mounting.height_cm * whole[:, 1] / height
+        road = camera.intersect_ground(whole)
+        road[:, 1] += ahead_cm
+        moved = np.nan_to_num(camera.project_ground(road) - whole)
+        nearest = np.rint(pixels.uv).astype(np.intp)
+        at = np.clip(nearest[:, 1], 0, height - 1) * width + np.clip(nearest[:, 0], 0, width - 1)
+        return np.sum(moved[at] * pixels.normals, axis=1)
 
     def _image_groups(self, pixels: Pixels, chosen: Int[np.ndarray, "r"]) -> Int[np.ndarray, "r"]:
         """Group edges that lie in one band of the image and face the same way."""

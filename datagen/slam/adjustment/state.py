@@ -41,7 +41,8 @@ class BundleSettings(Settings):
             neighbouring edge points share their errors and count for fewer.
         focal: Relative sigma of the focal length's prior; wide, for a guessed lens.
         centre_px: Sigma of the principal point, for images 160 px wide. Tight: with yaw and roll it is nearly
-            degenerate.
+            degenerate. But with half of it, cameras found from half of the frames of ``donkey_circuit`` had
+            it 1 px nearer to the image centre, and labels at 30 cm lay twice as far to one side.
         k1: Sigma of the first lens coefficient; the three real drives have -0.03 to -0.07.
         pitch: Sigma of the mounting's pitch.
         roll: Sigma of the mounting's roll: nearly degenerate with the principal point, hence tight.
@@ -65,7 +66,7 @@ class BundleSettings(Settings):
     cauchy_px: float = Field(default=0.7, gt=0.0)
     pixel_sigma: float = Field(default=2.0, gt=0.0)
     focal: float = Field(default=0.3, gt=0.0)
-    centre_px: float = Field(default=1.0, gt=0.0)
+    centre_px: float = Field(default=2.0, gt=0.0)
     k1: float = Field(default=0.03, gt=0.0)
     pitch: float = Field(default=0.2, gt=0.0)
     roll: float = Field(default=0.02, gt=0.0)
@@ -77,6 +78,14 @@ class BundleSettings(Settings):
     speed_change: float = Field(default=0.003, gt=0.0)
     recorded_speed: float = Field(default=0.2, gt=0.0)
     turn_change: float = Field(default=0.01, gt=0.0)
+
+    def with_free_tilt(self) -> BundleSettings:
+        """Return the same with frames that may tilt as they like, for a camera that is yet to be found.
+
+        A prior on tilts makes them too small, and the camera makes up for it: on 62 simulated drives the
+        focal length came out right without shaking and 2.5 % too long where the pitch shook by 0.0075 rad.
+        """
+        return self.model_copy(update={"frame_pitch": 0.03, "frame_roll": 0.02})
 
 
 @dataclass(frozen=True)
