@@ -139,9 +139,10 @@ def check_lane(segment: MappedSegment, drive: Drive) -> None:
     }
     if min(share.values()) >= LEAST_SEEN:
         return
-    found = ", ".join(f"the {side} one along {100.0 * share[side]:.0f} % of the path" for side in SIDES)
-    no_line = max(share.values()) < MAYBE_LINE or max(segment.lane.seen) < _PAINTED
-    what = "no line" if no_line else "one line only"
+    painted = dict(zip(SIDES, segment.lane.seen, strict=True))
+    no_line = max(share.values()) < MAYBE_LINE or max(painted.values()) < _PAINTED
+    what, shown, least = ("no line", painted, _PAINTED) if no_line else ("one line only", share, LEAST_SEEN)
+    found = ", ".join(f"the {side} one along {100.0 * shown[side]:.0f} % of the path" for side in SIDES)
     raise TrackingLostError(
-        f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * LEAST_SEEN:.0f} % for each"
+        f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * least:.0f} % for each"
     )
