@@ -95,8 +95,9 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
 def compare_with_frames(mapped: MappedDrive) -> tuple[MappedDrive, MapQuality]:
     """Mark what the images of a map contradict, and measure the rest in its held-out frames."""
     drive_map, wrong = withhold_wrong_places(mapped)
-    drive_map = replace(drive_map, contradicted=contradicted_lines(replace(mapped, drive_map=drive_map)))
     mapped = replace(mapped, drive_map=drive_map)
+    contradicted = drive_map.contradicted | contradicted_lines(mapped)
+    mapped = replace(mapped, drive_map=replace(drive_map, contradicted=contradicted))
     return mapped, replace(measure_map(mapped), wrong=tuple(wrong))
 
 

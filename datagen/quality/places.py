@@ -20,6 +20,7 @@ from numba import njit
 from scipy.ndimage import uniform_filter1d
 
 from datagen.quality.residuals import REFERENCE_WIDTH, frame_edges, in_view
+from datagen.slam.commands import MOST_BRIDGED
 from datagen.slam.odometry.scans import lift_tilted
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
@@ -69,6 +70,9 @@ _SHORTEST, _JOINED = 5, 20
 #: Longest section without paint: in lane widths, or relative to the usual gap of a line that has at least so
 #: many. Chosen: interruptions shorter than the lane is wide are bridged well.
 _BARE_LANES, _BARE_GAPS, _MIN_GAPS = 2.5, 1.5, 4
+#: Length along which one pass sees nothing where most see the line, in lane widths, so that its frames lie
+#: elsewhere. Chosen: a lamp's reflection covers less.
+_ONE_PASS_LANES = 0.5
 #: Offset of the borders beyond which the ends of a section belong to it, as do places where the line is not
 #: met, and how far that may go, in places that frames look at.
 _END_CM, _END_PLACES = 0.7, 15
@@ -149,10 +153,10 @@ class WrongPlace:
 
 
 def withhold_wrong_places(mapped: MappedDrive) -> tuple[DriveMap, list[WrongPlace]]:
-    """Mark the sections of a map's lines that its frames contradict.
+    """Mark the sections of a map's lines that its frames contradict, and the frames that lie elsewhere.
 
     Returns:
-        The map with these sections, and the sections, the longest first.
+        The map with these sections and frames, and the sections, the longest first.
     """
     drive_map = mapped.drive_map
     found: list[WrongPlace] = []
@@ -170,7 +174,33 @@ def withhold_wrong_places(mapped: MappedDrive) -> tuple[DriveMap, list[WrongPlac
         ]
         for segment in drive_map.lines
     }
-    return replace(drive_map, lines=lines), sorted(found, key=lambda place: -place.length_cm)
+    misplaced = np.repeat(misplaced_frames(drive_map, gathered)[:, None], 2, axis=1)
+    marked = replace(drive_map, lines=lines, contradicted=misplaced)
+    return marked, sorted(found, key=lambda place: -place.length_cm)
+
+
+def misplaced_frames(
+    drive_map: DriveMap, gathered: dict[tuple[int, int], PlaceEvidence]
+) -> Bool[np.ndarray, "n"]:
+    """Return the frames that look at a section of a line that their own pass contradicts, but others do not.
+
+    It is the pose of these frames that is wrong, as behind a gap of the recording: neither line is where the
+    map has it in them.
+
+    Args:
+        drive_map: The map.
+        gathered: What its frames see, see :func:`gather_evidence`.
+    """
+    passes = _passes(drive_map)
+    found = np.zeros(len(drive_map.frames), dtype=bool)
+    for (segment, index), evidence in gathered.items():
+        line = next(line for line in drive_map.lines[segment] if line.index == index)
+        against = sections_against(evidence, drive_map.meta.mapped_lane_cm, line.period_cm is not None)
+        for k in np.flatnonzero(drive_map.segment == segment).tolist():
+            if index - int(drive_map.lanes.lane[k]) in (0, 1):
+                seen = _places_ahead(drive_map, k, line)
+                found[k] |= int(against[passes[k] + seen.lap, seen.place].sum()) >= _SHORTEST
+    return found
 
 
 def withheld_figures(drive_map: DriveMap, wrong: list[WrongPlace]) -> dict[str, Any]:
@@ -269,30 +299,7 @@ def wrong_places(
         other_met: Where the other line of the lane is met; it holds this line in place where it has no paint.
     """
     closed = line.period_cm is not None
-    views, met = (_around(a, closed) for a in (evidence.views, evidence.met))
-    looked = evidence.views >= _MIN_VIEWS
-    share = met / np.maximum(views, 1)
-    # A border beside the line that is there also where the line is met is a thing of its own.
-    own = _around(evidence.along.sum(axis=0)[None], closed, _OTHER_PLACES)[0]
-    own = np.maximum(own, np.maximum(np.roll(own, 1, axis=1), np.roll(own, -1, axis=1)))
-    met_near = _around(evidence.met.sum(axis=0)[None], closed, _OTHER_PLACES)[0]
-    other = own > _OTHER * np.maximum(met_near, 1)[:, None]
-    beside, pairs = (np.where(other, 0, _around(a, closed)) for a in (evidence.beside, evidence.pairs))
-    # Beside the line lies what the line is where it is met: a marking with two borders, if those can be seen.
-    both = float(evidence.both.sum()) / max(int(evidence.met.sum()), 1)
-    # Of a faint line or a dashed one, frames see less, also where it lies beside its place on the map.
-    visible = max(float(evidence.met.sum()) / max(int(evidence.views.sum()), 1), _LEAST_VISIBLE)
-    enough = visible * views[:, :, None]
-    marking = (beside >= _BESIDE * enough) & (pairs >= _PAIRS * both * enough) & (beside >= _MIN_VIEWS)
-    against = looked & (share < _NOT_MET * visible) & marking.any(axis=2)
-    near, off_cm = _around(evidence.near, closed), _around(evidence.off_cm, closed)
-    off_cm = off_cm / np.maximum(near, 1)
-    bins = np.clip(np.rint(off_cm / _BIN_CM).astype(int) + _HALF_BINS, 0, 2 * _HALF_BINS)
-    off = (
-        (np.abs(off_cm) > _OFF_CM) & (near >= _BESIDE * visible * views) & ~other[np.arange(len(other)), bins]
-    )
-    against |= looked & off
-    bare = looked & (share < _BARE) & ~against
+    looked, against, bare, beside = _judged(evidence, closed)
     votes = np.maximum(looked.sum(axis=0), 1)
     wrong = against.sum(axis=0) >= np.maximum(_PASSES * votes, 1)
     empty = (against | bare).sum(axis=0) >= np.maximum(_PASSES * votes, 1)
@@ -324,6 +331,73 @@ def wrong_places(
             )
         )
     return places
+
+
+class _Judged(NamedTuple):
+    """What each pass over each place says.
+
+    Attributes:
+        looked: Whether enough of its frames looked at the place.
+        against: Whether they contradict the line there.
+        bare: Whether they see nothing of it there.
+        beside: Number of frames that see a border beside the line that is no thing of its own, by distance.
+    """
+
+    looked: Bool[np.ndarray, "v p"]
+    against: Bool[np.ndarray, "v p"]
+    bare: Bool[np.ndarray, "v p"]
+    beside: Float[np.ndarray, "v p b"]
+
+
+def _judged(evidence: PlaceEvidence, closed: bool) -> _Judged:
+    """Judge each place of a line by each pass over it."""
+    views, met = (_around(a, closed) for a in (evidence.views, evidence.met))
+    looked = evidence.views >= _MIN_VIEWS
+    share = met / np.maximum(views, 1)
+    # A border beside the line that is there also where the line is met is a thing of its own.
+    own = _around(evidence.along.sum(axis=0)[None], closed, _OTHER_PLACES)[0]
+    own = np.maximum(own, np.maximum(np.roll(own, 1, axis=1), np.roll(own, -1, axis=1)))
+    met_near = _around(evidence.met.sum(axis=0)[None], closed, _OTHER_PLACES)[0]
+    other = own > _OTHER * np.maximum(met_near, 1)[:, None]
+    beside, pairs = (np.where(other, 0, _around(a, closed)) for a in (evidence.beside, evidence.pairs))
+    # Beside the line lies what the line is where it is met: a marking with two borders, if those can be seen.
+    both = float(evidence.both.sum()) / max(int(evidence.met.sum()), 1)
+    # Of a faint line or a dashed one, frames see less, also where it lies beside its place on the map.
+    visible = max(float(evidence.met.sum()) / max(int(evidence.views.sum()), 1), _LEAST_VISIBLE)
+    enough = visible * views[:, :, None]
+    marking = (beside >= _BESIDE * enough) & (pairs >= _PAIRS * both * enough) & (beside >= _MIN_VIEWS)
+    against = looked & (share < _NOT_MET * visible) & marking.any(axis=2)
+    near, off_cm = _around(evidence.near, closed), _around(evidence.off_cm, closed)
+    off_cm = off_cm / np.maximum(near, 1)
+    bins = np.clip(np.rint(off_cm / _BIN_CM).astype(int) + _HALF_BINS, 0, 2 * _HALF_BINS)
+    off = (
+        (np.abs(off_cm) > _OFF_CM) & (near >= _BESIDE * visible * views) & ~other[np.arange(len(other)), bins]
+    )
+    against |= looked & off
+    bare = looked & (share < _BARE) & ~against
+    return _Judged(looked, against, bare, beside)
+
+
+def sections_against(evidence: PlaceEvidence, lane_cm: float, closed: bool) -> Bool[np.ndarray, "v p"]:
+    """Return where a pass by itself contradicts a line over a section: its frames lie elsewhere on the map.
+
+    It sees a marking beside the line, or for a while nothing where most passes see the line.
+    """
+    judged, confirmed = _judged(evidence, closed), met_places(evidence, closed)
+    # Where most passes contradict it, it is the line that is wrong.
+    alone = judged.against.sum(axis=0) <= _PASSES * judged.looked.sum(axis=0)
+    found = np.zeros_like(judged.against)
+    for one in range(len(found)):
+        against, bare = judged.against[one], judged.bare[one] & confirmed
+        for run in true_runs(against, closed):
+            far_cm = abs(_distance_cm(judged.beside[one : one + 1, run]))
+            # As for all passes together.
+            if len(run) >= _SHORTEST and not far_cm > len(run) * _PLACE_CM:
+                found[one, run] = True
+        for run in true_runs(against | bare, closed):
+            if len(run) * _PLACE_CM >= _ONE_PASS_LANES * lane_cm:
+                found[one, run] = True
+    return found & alone
 
 
 def _distance_cm(beside: Float[np.ndarray, "v r b"]) -> float:
@@ -457,6 +531,9 @@ def _passes(drive_map: DriveMap) -> Int[np.ndarray, "n"]:
             seams = np.cumsum(
                 -np.rint(np.diff(drive_map.s_cm[rows], prepend=drive_map.s_cm[rows[0]]) / period)
             )
+            # Behind a long gap another pass begins, with numbers of its own before and after it.
+            step_s = np.diff(drive_map.t_s[rows], prepend=drive_map.t_s[rows[0]])
+            seams += 3.0 * np.cumsum(step_s > MOST_BRIDGED * np.median(step_s))
             passes[rows] = (seams - seams.min()).astype(np.int64) + 1
     return passes
 

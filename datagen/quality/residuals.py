@@ -21,13 +21,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 
+from datagen.slam.odometry.scans import edges_of_drive
+from datagen.slam.stripes import true_borders
 from datagen.slam.view import mapping_range
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
 from lanenet.geometry.poses import path_lengths
-from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadTable
 
@@ -239,13 +240,17 @@ def summarise(samples: BorderSamples) -> ResidualFigures:
 def frame_edges(
     mapped: MappedDrive, rows: Int[np.ndarray, "m"]
 ) -> Iterator[tuple[int, EdgePixels, UInt8[np.ndarray, "h w"]]]:
-    """Yield frames of a map with their edges, normals into the markings, and the mask of road pixels."""
+    """Yield frames of a map with their edges, normals into the markings, and the mask of road pixels.
+
+    Borders of narrow lines are put where they are, as they were for the map.
+    """
     camera, perception = mapped.drive_map.camera, mapped.perception
     dark = mapped.drive_map.meta.markings == "dark"
     table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
-    for k in rows.tolist():
-        image = mapped.drive.image(int(mapped.rows[k]))
-        edges = find_edges(image, perception.edges, table.keep, table.scale)
+    if not len(rows):
+        return
+    found = edges_of_drive(mapped.drive.subset(mapped.rows[rows]), perception.edges, table)
+    for k, edges in zip(rows.tolist(), true_borders(found, table), strict=True):
         yield k, edges.towards_dark() if dark else edges, table.keep
 
 

@@ -115,7 +115,9 @@ class VerdictSettings(Settings):
         max_withheld: Share of the lines' length that is withheld because the images contradict it there.
             Chosen: a bend of a lap; the labels of the rest are as good.
         max_focal_sigma: Relative sigma of the focal length, if it was found from the drive. Chosen.
-        max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1 degree.
+        max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1.7 degrees;
+            the principal point takes on most of what the pitch is off. Labels of ``donkey_circuit`` with
+            cameras from two parts of it (sigma 0.013 and 0.017) lie 0.4 cm from those of the whole (0.022).
         max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
             recorded drives reached 0.03.
         lane_mismatch: Relative difference between measured and given lane width, if the camera sets the
@@ -141,7 +143,7 @@ class VerdictSettings(Settings):
     max_contradicted: float = Field(default=0.075, gt=0.0, lt=1.0)
     max_withheld: float = Field(default=0.15, gt=0.0, lt=1.0)
     max_focal_sigma: float = Field(default=0.05, gt=0.0)
-    max_pitch_sigma_rad: float = Field(default=0.02, gt=0.0)
+    max_pitch_sigma_rad: float = Field(default=0.03, gt=0.0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     lane_reject: float = Field(default=0.6, gt=0.0)

@@ -53,6 +53,9 @@ _SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
 #: found, and over a gap that was bridged. Measured: 0.14 on ``garage_tape`` and 0.65 on ``usi_mat``, whose
 #: cameras were found; 0.05 over the gaps of ``donkey_circuit``, the root of the mean square.
 _DRIFT_RAD, _GAP_RAD = (0.3, 0.8), 0.05
+#: Log likelihood of a revisit that a closure explains, over that of a false one, which may lie anywhere
+#: within the search. Chosen: far below the ratio of both volumes, 8, since neighbours err alike.
+_EXPLAINED = 1.0
 #: Times that loops are closed again with the revisits that the closed poses confirm. Chosen: two or three
 #: rounds are usual.
 _MOST_GROWTH = 6
@@ -359,7 +362,8 @@ class _DenseSegment:
         periods, s = self.view.commands.periods, self.revisit_settings
         poses, pool = closure.bundle.poses, list(matched)
         confirmed = self.confirmed(poses, pool)
-        tried = {(r.earlier, r.later) for r in pool}
+        alike = _pairs(matched)
+        tried = set(alike)
         for _ in range(_MOST_SPREAD):
             pairs = [p for p in propose_beside(poses, periods, confirmed, self.height, s) if p not in tried]
             found = matcher.matched(pairs, rng)
@@ -367,8 +371,10 @@ class _DenseSegment:
             if not found:
                 break
             pool += found
-            grown = without_contradicted(opened.poses, self.confirmed(poses, pool), self.height)
-            confirmed = grown
+            grown = self.confirmed(poses, pool)
+            agreeing = _pairs(without_contradicted(opened.poses, grown, self.height))
+            # Those whose images are alike are true without the odometry's word.
+            confirmed = [r for r in grown if (r.earlier, r.later) in {*alike, *agreeing}]
             poses, _ = close_loops(opened.poses, confirmed, self.height, periods)
         return confirmed
 
@@ -390,12 +396,12 @@ class _DenseSegment:
             yield [placing]
 
     def cost(self, closure: _Closure, opened: BundleResult) -> float:
-        """Negative log likelihood of a closure: how well the frames agree, and how far the open loop drifts.
+        """Negative log likelihood of a closure: how well frames and revisits agree, how far odometry drifts.
 
         A lap with five corners instead of four may look alike in all frames; the odometry knows better. It
         knows less where a gap was bridged, and where the camera is still to be found.
         """
-        agree = len(self.part) * closure.bundle.misfit
+        agree = len(self.part) * closure.bundle.misfit - _EXPLAINED * len(closure.revisits)
         within = [r for r in closure.revisits if self.part[r.earlier] == self.part[r.later]]
         if not within:
             return agree

@@ -152,6 +152,41 @@ def test_where_neither_line_is_seen_both_are_withheld(monkeypatch):
     assert places.withhold_wrong_places(one)[1] == []
 
 
+def passes_of_which_the_last_disagrees(beside: bool) -> places.PlaceEvidence:
+    """Three passes; the last one sees the tape 5 cm beside, or nothing, from place 60 to 90 of 150."""
+    evidence = places.PlaceEvidence.none(3, 150)
+    evidence.views[...] = evidence.met[...] = evidence.both[...] = evidence.near[...] = 4
+    evidence.met[2, 60:90] = evidence.both[2, 60:90] = evidence.near[2, 60:90] = 0
+    if beside:
+        middle = evidence.beside.shape[2] // 2
+        evidence.beside[2, 60:90, middle + 5] = evidence.pairs[2, 60:90, middle + 5] = 4
+    return evidence
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_pass_that_disagrees_with_the_others_lies_elsewhere(monkeypatch, beside):
+    evidence = passes_of_which_the_last_disagrees(beside)
+    assert places.wrong_places(0, straight("right"), evidence, 36.0) == []
+    found = places.sections_against(evidence, 36.0, False)
+    assert not found[:2].any()
+    assert abs(int(found[2].sum()) - 30) <= 4 and found[2, 65:85].all()
+    # All frames of this map are of pass 1.
+    mapped = drive_of(monkeypatch, ("left", where_mapped), ("right", where_mapped)).drive_map
+    turned = replace(
+        evidence, **{name: np.roll(values, 2, axis=0) for name, values in vars(evidence).items()}
+    )
+    misplaced = places.misplaced_frames(mapped, {(0, 1): turned})
+    x_cm = mapped.poses[misplaced, 0] + CAMERA.wheelbase_cm
+    assert x_cm.min() >= 120.0 - 45.0 and x_cm.max() <= 180.0 and misplaced.sum() > 15
+
+
+def test_what_most_passes_contradict_is_no_fault_of_their_frames():
+    evidence = passes_of_which_the_last_disagrees(True)
+    most = replace(evidence, **{name: values[[0, 2, 2]] for name, values in vars(evidence).items()})
+    assert len(places.wrong_places(0, straight("right"), most, 36.0)) == 1
+    assert not places.sections_against(most, 36.0, False).any()
+
+
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_wrong_section_goes_on_where_the_line_runs_out_of_view(closed):
     run, off, unseen = np.arange(40, 46), np.zeros(100, dtype=bool), np.zeros(100, dtype=bool)

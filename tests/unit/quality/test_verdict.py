@@ -134,7 +134,7 @@ def test_steering_of_the_wrong_sign_is_named(steering, remarks):
         (OPEN | {"sigma": {"focal": 0.04}}, "usable", "no place was seen twice.* 4 %.*max_focal_sigma"),
         ({"sigma": {"focal": 0.07}}, "usable", "focal length open by 7.0 %"),
         ({"sigma": {"focal": 0.12}}, "reject", "focal"),
-        ({"sigma": {"pitch": 0.03}}, "usable", "pitch open by 0.030 rad"),
+        ({"sigma": {"pitch": 0.04}}, "usable", "pitch open by 0.040 rad"),
         ({"closure_across_heights": 0.2}, "usable", "0.20 camera heights"),
         ({"closure_across_heights": 0.5}, "reject", "0.50 camera heights"),
     ],
