@@ -394,6 +394,9 @@ class _DenseSegment:
         placing = placing_revisits(poses, self.part, matched, self.height)
         if len(placing) >= s.min_revisits:
             yield [placing]
+        # A wrong camera bends the open loop: then true revisits explain each other better than it does.
+        if len(matched) >= s.min_revisits:
+            yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]]
 
     def cost(self, closure: _Closure, opened: BundleResult) -> float:
         """Negative log likelihood of a closure: how well frames and revisits agree, how far odometry drifts.
