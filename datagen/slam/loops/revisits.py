@@ -206,9 +206,11 @@ def propose_beside(
         camera_height_cm: Sets the scale.
         settings: Bounds.
     """
+    if not known:
+        return []
     path, recording = path_lengths(poses), np.cumsum(periods >= BREAK_PERIODS)
     spacing_cm = settings.pair_heights * camera_height_cm
-    held_cm = np.sort([path[frame] for r in known for frame in (r.earlier, r.later)])
+    held_cm = np.array([path[frame] for r in known for frame in (r.earlier, r.later)])
     reach = np.array([settings.along_heights, settings.sideways_heights]) * camera_height_cm
     pairs = []
     cells = np.unique((path / spacing_cm).astype(np.int64), return_index=True)[1]

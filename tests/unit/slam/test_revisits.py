@@ -127,6 +127,7 @@ def test_frames_of_another_visit_are_proposed_near_a_known_one_but_not_beside_it
     assert max(near) <= 30
     held = [Revisit(k, k + LAP, np.zeros(3), 1.0) for k in range(0, 110, 5)]
     assert propose_beside(poses, np.ones(210), held, 15.0, settings) == []
+    assert propose_beside(poses, np.ones(210), [], 15.0, settings) == []
 
 
 @pytest.mark.parametrize(("off", "within_reach"), [([0.0, 20.0, 0.0], True), ([0.0, 40.0, 0.0], False)])
