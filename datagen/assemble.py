@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.lanes.find import MappedSegment
-from datagen.lanes.scale import LaneWidth, fitted_width
+from datagen.lanes.scale import LaneWidth, ahead_sigma, fitted_width
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.segment import SolvedSegment
@@ -62,12 +62,15 @@ def near_points(solved: SolvedSegment) -> list[Float[np.ndarray, "_ 2"]]:
     return points
 
 
-def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSegment]) -> AssembledMap:
+def assemble(
+    prepared: PreparedDrive, camera: Camera, sigma: dict[str, float], mapped: Sequence[MappedSegment]
+) -> AssembledMap:
     """Put the segments in one map, in centimetres; the lane width sets the scale of an unknown camera.
 
     Args:
         prepared: The drive, with the lane width that was given.
         camera: The camera, known or found.
+        sigma: Standard deviation of each of its numbers, none for a known camera.
         mapped: Segments in its scale.
     """
     request, segments = prepared.request, list(mapped)
@@ -88,6 +91,7 @@ def assemble(prepared: PreparedDrive, camera: Camera, mapped: Sequence[MappedSeg
         scale_from="lane width" if prepared.camera is None else "camera",
         laps=max(int(s.laps.max()) for s in segments),
         markings="dark" if longest.dark else "light",
+        ahead_sigma_cm=ahead_sigma(camera, sigma),
     )
     numbers = [np.full(len(s.rows), i) for i, s in enumerate(segments)]
     drive_map = DriveMap(

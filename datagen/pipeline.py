@@ -93,7 +93,7 @@ def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures:
     # Track, close loops, adjust: SegmentSolver.solve.
     solved = attempt.solved = solve_drive(prepared, camera, solver)
     lanes = fit_lanes(prepared, solved.segments, solved.refused, camera.doubt)
-    assembled = assemble(prepared, camera.camera, lanes.segments)
+    assembled = assemble(prepared, camera.camera, camera.sigma, lanes.segments)
     checked = check_map(prepared, assembled, camera.figures)
     notes = [*prepared.notes, *camera.notes, *lanes.notes, *checked.notes]
     figures = {

@@ -53,6 +53,8 @@ class CameraOfDrive:
         figures: For the report.
         notes: A sentence each.
         doubt: Why a camera that was found is unlikely to be right; "" where nothing speaks against it.
+        sigma: Standard deviation of each of its numbers, see
+            :attr:`datagen.slam.camera.self_calibration.FoundCamera.sigma`; none where it was given.
     """
 
     camera: Camera
@@ -61,6 +63,7 @@ class CameraOfDrive:
     figures: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     doubt: str = ""
+    sigma: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,8 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
             f"{found.strain:.1f} standard deviations from those of ordinary cameras; calibrate it with "
             "photos of a chessboard (lanenet calibrate chessboard) and give it with --camera"
         )
-    return CameraOfDrive(found.camera, found.how, found.solved, figures, (found.note, *notes), doubt)
+    notes = (found.note, *notes)
+    return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
 
 
 def fit_height(

@@ -2,9 +2,10 @@
 
 The frames that pass a place of a line should see the borders of its marking. The place is wrong where they do
 not and see a marking of this width beside it instead that runs along the line; where they see its borders,
-but off to one side; or where they see nothing of either line of the lane over a length that is not usual. A
-gap between two dashes is not wrong, and neither is a line with something beside it that is also there where
-the line itself is seen: the other tape of a double line, or the verge.
+but off to one side; where they see nothing of either line of the lane over a length that is not usual; or
+nothing of this one where the other turns sharply. A gap between two dashes is not wrong, and neither is a
+line with something beside it that is also there where the line itself is seen: the other tape of a double
+line, or the verge.
 
 Every pass of the car over a place is judged by itself, and half of the passes have to agree.
 """
@@ -70,6 +71,10 @@ _SHORTEST, _JOINED = 5, 20
 #: Longest section without paint: in lane widths, or relative to the usual gap of a line that has at least so
 #: many. Chosen: interruptions shorter than the lane is wide are bridged well.
 _BARE_LANES, _BARE_GAPS, _MIN_GAPS = 2.5, 1.5, 4
+#: Shortest section without paint that hides a corner: where the other line turns by so much within so many
+#: centimetres, [rad], this one may turn in a corner or in an arc. Chosen: in a section of length l that turns
+#: by a, they are l a / 8 apart, here 0.75 cm; a smooth bend turns by this where its radius is 20 cm.
+_HIDDEN_CM, _SHARP_RAD, _WITHIN_CM = 12.0, 0.5, 10.0
 #: Length along which one pass sees nothing where most see the line, in lane widths, so that its frames lie
 #: elsewhere. Chosen: a lamp's reflection covers less.
 _ONE_PASS_LANES = 0.5
@@ -162,11 +167,15 @@ def withhold_wrong_places(mapped: MappedDrive) -> tuple[DriveMap, list[WrongPlac
     found: list[WrongPlace] = []
     gathered = gather_evidence(mapped)
     for (segment, index), evidence in gathered.items():
-        line = next(line for line in drive_map.lines[segment] if line.index == index)
+        by_index = {line.index: line for line in drive_map.lines[segment]}
+        line = by_index[index]
         # The one that the driven lane, or else the adjacent one, has on its other side.
-        other = gathered.get((segment, 1 - index if index in (0, 1) else index + (1 if index < 0 else -1)))
-        other_met = None if other is None else met_places(other, line.period_cm is not None)
-        found += wrong_places(segment, line, evidence, drive_map.meta.mapped_lane_cm, other_met)
+        across = 1 - index if index in (0, 1) else index + (1 if index < 0 else -1)
+        other = None
+        if (segment, across) in gathered:
+            met = met_places(gathered[segment, across], line.period_cm is not None)
+            other = OtherLine(met, sharp_places(by_index[across]))
+        found += wrong_places(segment, line, evidence, drive_map.meta.mapped_lane_cm, other)
     lines = {
         segment: [
             replace(line, contradicted_cm=_sections(found, segment, line.index))
@@ -287,7 +296,7 @@ def wrong_places(
     line: LaneLine,
     evidence: PlaceEvidence,
     lane_cm: float,
-    other_met: Bool[np.ndarray, "p"] | None = None,
+    other: OtherLine | None = None,
 ) -> list[WrongPlace]:
     """Find the sections of a line that the evidence contradicts.
 
@@ -296,7 +305,7 @@ def wrong_places(
         line: The line.
         evidence: What frames saw of it.
         lane_cm: Lane width of the map.
-        other_met: Where the other line of the lane is met; it holds this line in place where it has no paint.
+        other: The other line of the lane; it holds this line in place where it has no paint.
     """
     closed = line.period_cm is not None
     looked, against, bare, beside = _judged(evidence, closed)
@@ -305,8 +314,9 @@ def wrong_places(
     empty = (against | bare).sum(axis=0) >= np.maximum(_PASSES * votes, 1)
     confirmed = met_places(evidence, closed)
     found = [run for run in _joined(wrong, ~confirmed, closed) if len(run) >= _SHORTEST]
-    if other_met is not None and len(other_met) == len(empty):
-        empty &= ~other_met
+    if other is not None and len(other.met) == len(empty):
+        found += _hidden_corners(empty, other, closed)
+        empty &= ~other.met
     found += _too_long(empty, lane_cm, closed)
     mean_off = evidence.off_cm.sum(axis=0) / np.maximum(evidence.near.sum(axis=0), 1)
     taken = np.zeros(len(wrong), dtype=bool)
@@ -331,6 +341,34 @@ def wrong_places(
             )
         )
     return places
+
+
+class OtherLine(NamedTuple):
+    """The line on the other side of the lane, by place.
+
+    Attributes:
+        met: Where it is met, see :func:`met_places`.
+        sharp: Where it turns sharply, see :func:`sharp_places`.
+    """
+
+    met: Bool[np.ndarray, "p"]
+    sharp: Bool[np.ndarray, "p"]
+
+
+def sharp_places(line: LaneLine) -> Bool[np.ndarray, "p"]:
+    """Return where a line turns sharply. A line beside it that has no paint there may turn in any way."""
+    s_cm = _first_cm(line) + (np.arange(_place_count(line)) + 0.5) * _PLACE_CM
+    before, after = (line.everywhere(s_cm + by_cm, 1) for by_cm in (-0.5 * _WITHIN_CM, 0.5 * _WITHIN_CM))
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    return np.asarray(np.abs(np.arctan2(cross, np.sum(before * after, axis=1))) > _SHARP_RAD)
+
+
+def _hidden_corners(
+    empty: Bool[np.ndarray, "p"], other: OtherLine, closed: bool
+) -> list[Int[np.ndarray, "_"]]:
+    """Runs of places without a border beside a corner of the other line."""
+    runs = true_runs(empty, closed)
+    return [run for run in runs if len(run) * _PLACE_CM >= _HIDDEN_CM and other.sharp[run].any()]
 
 
 class _Judged(NamedTuple):

@@ -59,6 +59,8 @@ class MapMeta(Settings):
         scale_from: What sets the scale: the camera's height or the lane width.
         laps: Whole laps between revisits; 0 without a revisit.
         markings: Whether the markings are lighter or darker than the floor.
+        ahead_sigma_cm: Sigma of distances ahead of the car at the far label row, where the camera was found
+            from the drive, see :func:`datagen.lanes.scale.ahead_sigma`; 0 for a given camera.
         verdict: How far the map can be trusted; None until it has been judged.
     """
 
@@ -70,6 +72,7 @@ class MapMeta(Settings):
     scale_from: str
     laps: int = Field(ge=0)
     markings: Literal["light", "dark"] = "light"
+    ahead_sigma_cm: float = Field(default=0.0, ge=0.0, le=MAX_PLACE)
     verdict: Literal["good", "usable", "reject"] | None = None
 
     @property

@@ -18,7 +18,7 @@ from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
-from lanenet.data.maps.frame_lines import FrameLines, label_rows, lines_of_frame, parallel_line
+from lanenet.data.maps.frame_lines import STEEPEST, FrameLines, label_rows, lines_of_frame, parallel_line
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
@@ -124,7 +124,17 @@ def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LA
         int(drive_map.lanes.lane[k]),
         bool(drive_map.lanes.forward[k]),
         max_sigma_lanes * drive_map.meta.mapped_lane_cm,
+        steepest_label(drive_map),
     )
+
+
+def steepest_label(drive_map: DriveMap) -> float:
+    """Return how steeply a line may cross a label row, in centimetres across for one along the car.
+
+    What the camera leaves open along the car shows across, times this; it is bounded like a line's own sigma.
+    """
+    most_cm = _MAX_SIGMA_LANES * drive_map.meta.mapped_lane_cm
+    return min(STEEPEST, most_cm / max(drive_map.meta.ahead_sigma_cm, 1e-9))
 
 
 def known_lines(drive_map: DriveMap) -> Bool[np.ndarray, "n 2"]:
@@ -209,7 +219,8 @@ def points_in_window(drive_map: DriveMap, k: int, window: BirdseyeWindow) -> Boo
             (lines.right_cm, lines.left_cm, lane_cm),
         )
     ]
-    points = window.labelled(np.concatenate([label_rows(line) for line in sides]))
+    steepest = steepest_label(drive_map)
+    points = window.labelled(np.concatenate([label_rows(line, steepest) for line in sides]))
     unknown = np.concatenate([_rows_in_gaps(line) for line in sides])
     return np.asarray(np.isfinite(points) | unknown)
 

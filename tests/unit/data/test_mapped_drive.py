@@ -26,6 +26,7 @@ from lanenet.data.maps.mapped_drive import (
     known_lines,
     label_frame,
     labelled_points,
+    lines_at,
     open_mapped_drive,
     points_in_window,
     read_map_frames,
@@ -108,6 +109,22 @@ def test_the_map_gives_labels_and_keeps_the_frames_without(folder):
     np.testing.assert_allclose(others[:, 3], 22.0, atol=1e-6)
     seen_far = np.isfinite(np.delete(frames.points_cm, 5, axis=0)[:, 5])
     assert seen_far[:5].all() and not seen_far[-10:].any()
+
+
+def test_points_that_a_found_camera_leaves_open_are_not_labelled(folder):
+    mapped = open_mapped_drive(folder)
+    slanted = [
+        replace(line, coefficients_cm=line.coefficients_cm + np.outer(line.coefficients_cm[:, 0], [0.0, 1.3]))
+        for line in mapped.drive_map.lines[0]
+    ]
+    drive_map = replace(mapped.drive_map, lines={0: slanted, 1: slanted})
+    # 1.3 cm across for one along: with 0.04 lane widths, 1.6 cm, the sigma along may be 1.2 cm.
+    for sigma_cm, labelled in ((0.0, True), (1.1, True), (1.4, False)):
+        drive_map = replace(drive_map, meta=drive_map.meta.model_copy(update={"ahead_sigma_cm": sigma_cm}))
+        assert np.isfinite(lines_at(drive_map, 3).points_cm[:3]).all() == labelled
+        # A complete map would not label them either.
+        window = BirdseyeWindow(left_cm=-150.0, columns=400)
+        assert points_in_window(drive_map, 3, window)[:3].all() == labelled
 
 
 def test_frames_after_an_unmapped_stretch_start_afresh(folder):

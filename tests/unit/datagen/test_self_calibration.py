@@ -14,7 +14,7 @@ from scipy.interpolate import make_lsq_spline
 import datagen.segments
 import datagen.slam.camera.self_calibration
 from datagen.calibrate_drive import calibrate_drive, starting_camera, straight_frames
-from datagen.lanes.scale import LaneScale, fitted_width, spacing_cm, width_sigma
+from datagen.lanes.scale import LaneScale, ahead_sigma, fitted_width, spacing_cm, width_sigma
 from datagen.lanes.trace import TracedLane
 from datagen.prepare import MapRequest, keep_images, prepare
 from datagen.segments import fit_height
@@ -305,6 +305,17 @@ def test_the_width_of_the_lane_depends_on_the_camera_as_the_geometry_says():
     both = width_sigma(CAMERA, {**nothing, "pitch": 0.01, "focal": 0.02}, 40.0)
     focal = width_sigma(CAMERA, {**nothing, "focal": 0.02}, 40.0)
     assert both == pytest.approx(math.hypot(pitch, focal))
+
+
+def test_what_lies_ahead_is_known_as_well_as_lens_and_place_of_the_camera():
+    camera = CAMERA.with_mounting(height_cm=20.0, ahead_of_front_axle_cm=-10.0)
+    assert ahead_sigma(camera, {}) == 0.0
+    # 5 % of the 40 cm from the camera to the far row, and 0.1 camera heights.
+    assert ahead_sigma(camera, {"focal": 0.05}) == pytest.approx(2.0)
+    assert ahead_sigma(camera, {"lever": 0.1}) == pytest.approx(2.0)
+    assert ahead_sigma(camera, {"lever": 0.1, "focal": 0.05, "yaw": 0.1}) == pytest.approx(
+        math.hypot(2.0, 2.0)
+    )
 
 
 def test_pictures_show_where_the_car_drives_straight():

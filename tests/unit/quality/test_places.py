@@ -152,6 +152,24 @@ def test_where_neither_line_is_seen_both_are_withheld(monkeypatch):
     assert places.withhold_wrong_places(one)[1] == []
 
 
+@pytest.mark.parametrize(("turn_rad", "withheld"), [(0.0, False), (0.3, False), (1.0, True)])
+def test_a_corner_that_no_paint_shows_is_withheld(turn_rad, withheld):
+    # The other line turns in one place; this one has no paint for 40 cm around it, in every pass.
+    knots = np.sort(np.concatenate([straight("left").knots_cm, [150.0] * 3]))
+    s_cm = np.array([knots[i + 1 : i + 4].mean() for i in range(len(knots) - 4)])
+    control = np.column_stack([s_cm, HALF_CM + np.tan(turn_rad) * np.maximum(s_cm - 150.0, 0.0)])
+    kinked = replace(straight("left"), knots_cm=knots, coefficients_cm=control)
+    evidence = places.PlaceEvidence.none(2, 150)
+    evidence.views[...] = evidence.met[...] = evidence.both[...] = evidence.near[...] = 4
+    evidence.met[:, 65:85] = evidence.both[:, 65:85] = evidence.near[:, 65:85] = 0
+    other = places.OtherLine(np.ones(150, dtype=bool), places.sharp_places(kinked))
+    wrong = places.wrong_places(0, straight("right"), evidence, 36.0, other)
+    assert [place.section_cm for place in wrong] == ([(128.0, 172.0)] if withheld else [])
+    # A gap between two dashes hides little.
+    evidence.met[:, 65:74] = evidence.near[:, 65:74] = evidence.met[:, 77:85] = evidence.near[:, 77:85] = 4
+    assert places.wrong_places(0, straight("right"), evidence, 36.0, other) == []
+
+
 def passes_of_which_the_last_disagrees(beside: bool) -> places.PlaceEvidence:
     """Three passes; the last one sees the tape 5 cm beside, or nothing, from place 60 to 90 of 150."""
     evidence = places.PlaceEvidence.none(3, 150)
