@@ -102,6 +102,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
         DriveFormatError: If the recording cannot be read.
     """
     recorded, unreadable = readable_frames(keep_images(open_drive(request.drive_path)))
+    check_count(recorded)
     check_moving(recorded)
     notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
     drive, found = following_frames(recorded)

@@ -313,17 +313,19 @@ def wrong_places(
     wrong = against.sum(axis=0) >= np.maximum(_PASSES * votes, 1)
     empty = (against | bare).sum(axis=0) >= np.maximum(_PASSES * votes, 1)
     confirmed = met_places(evidence, closed)
-    found = [run for run in _joined(wrong, ~confirmed, closed) if len(run) >= _SHORTEST]
+    # A line leaves its marking by degrees: what lies far beside a short section is something else.
+    found = [
+        run
+        for run in _joined(wrong, ~confirmed, closed)
+        if len(run) >= _SHORTEST and not abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM
+    ]
     if other is not None and len(other.met) == len(empty):
-        found += _hidden_corners(empty, other, closed)
+        found += _hidden_corners(empty | _unpainted(evidence, closed), other, closed)
         empty &= ~other.met
     found += _too_long(empty, lane_cm, closed)
     mean_off = evidence.off_cm.sum(axis=0) / np.maximum(evidence.near.sum(axis=0), 1)
     taken = np.zeros(len(wrong), dtype=bool)
     for run in found:
-        # A line leaves its marking by degrees: what lies far beside a short section is something else.
-        if abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM:
-            continue
         unseen = _around(evidence.views.sum(axis=0)[None], closed)[0] < 0.5
         taken[_with_ends(run, (np.abs(mean_off) > _END_CM) | ~confirmed, unseen, closed)] = True
     low = _first_cm(line)
@@ -361,6 +363,12 @@ def sharp_places(line: LaneLine) -> Bool[np.ndarray, "p"]:
     before, after = (line.everywhere(s_cm + by_cm, 1) for by_cm in (-0.5 * _WITHIN_CM, 0.5 * _WITHIN_CM))
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     return np.asarray(np.abs(np.arctan2(cross, np.sum(before * after, axis=1))) > _SHARP_RAD)
+
+
+def _unpainted(evidence: PlaceEvidence, closed: bool) -> Bool[np.ndarray, "p"]:
+    """Where hardly a view meets the line, or none looks: all passes together."""
+    views, met = (_around(a.sum(axis=0)[None], closed)[0] for a in (evidence.views, evidence.met))
+    return np.asarray(met < _BARE * np.maximum(views, 1e-9))
 
 
 def _hidden_corners(

@@ -20,7 +20,7 @@ def map_drive(
     drive: DriveArgument,
     lane_width: Annotated[
         float,
-        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm."),
+        typer.Option(min=1.0, max=1000.0, help="Between the middles of the lane's two lines, cm."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the map.")],
     camera: CameraOption = None,

@@ -37,6 +37,15 @@ def test_a_drive_of_a_few_frames_cannot_be_mapped():
         check_count(made_up_drive(59, []))
 
 
+@pytest.mark.parametrize("frames", [1, 3])
+def test_a_handful_of_frames_is_refused_for_being_few(tmp_path, frames):
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k in range(frames):
+            writer.add(np.full((48, 64, 3), 20 * k, np.uint8), 0.05 * k)
+    with pytest.raises(TrackingLostError, match=f"{frames} frame"):
+        prepare(MapRequest(tmp_path / "drive", 40.0), MapSettings())
+
+
 def test_a_camera_of_another_size_is_refused():
     drive = made_up_drive(100, [])
     check_size(guessed_camera(160, 120, 80.0, 0.2, GuessSettings()), drive, None)

@@ -165,7 +165,13 @@ def test_a_corner_that_no_paint_shows_is_withheld(turn_rad, withheld):
     other = places.OtherLine(np.ones(150, dtype=bool), places.sharp_places(kinked))
     wrong = places.wrong_places(0, straight("right"), evidence, 36.0, other)
     assert [place.section_cm for place in wrong] == ([(128.0, 172.0)] if withheld else [])
+    # Something that one frame sees beside it changes nothing, and neither do passes of few frames.
+    evidence.beside[0, 75, 3] = evidence.pairs[0, 75, 3] = 1
+    assert len(places.wrong_places(0, straight("right"), evidence, 36.0, other)) == len(wrong)
+    evidence.views[:, 65:85] = 1
+    assert len(places.wrong_places(0, straight("right"), evidence, 36.0, other)) == len(wrong)
     # A gap between two dashes hides little.
+    evidence.views[...] = 4
     evidence.met[:, 65:74] = evidence.near[:, 65:74] = evidence.met[:, 77:85] = evidence.near[:, 77:85] = 4
     assert places.wrong_places(0, straight("right"), evidence, 36.0, other) == []
 
