@@ -1,4 +1,4 @@
-"""The network as a detector: an ONNX file and one frame after the other."""
+"""The network as a detector: an ONNX file, the edges that confirm it, and one frame after the other."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, proportional_angle_rad
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
+from lanenet.perception.network.tracker import LaneTracker
 
 #: A frame with more edges than this share of its road pixels is noise. Chosen: above the lane filter's 0.1,
 #: since a network copes with more clutter.
@@ -30,11 +31,11 @@ _CENTRE_TOLERANCE = 0.1
 
 
 class NetworkDetector:
-    """Frame in, lane out, by the network; the lane's width is all it keeps from earlier frames.
+    """Frame in, lane out: the network's lines, fitted to their markings and followed from frame to frame.
 
     Attributes:
         meta: What the model says about itself.
-        memory: Rebuilds the missing line of a frame with one.
+        memory: The lane's width; rebuilds the missing line of a frame with one.
         problems: Warnings about the inputs, a line each.
     """
 
@@ -71,6 +72,7 @@ class NetworkDetector:
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self.memory = LaneMemory(lane_width_cm)
+        self._tracker = LaneTracker(self.memory)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
         self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
@@ -88,20 +90,38 @@ class NetworkDetector:
         Raises:
             CalibrationError: If the frame's size is not the camera's.
         """
-        points_cm = self._extractor.extract_points(frame_bgr)
-        if self._extractor.is_crowded(len(points_cm), _MAX_EDGE_SHARE):
+        edges = self._extractor.extract(frame_bgr)
+        if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
             return LaneEstimate()
-        return self.detect_raster(self.meta.window.rasterise(points_cm, out=self._raster[0, 0]))
+        raster = self.meta.window.rasterise(edges.points_cm, out=self._raster[0, 0])
+        if not np.count_nonzero(raster):
+            return LaneEstimate()
+        points_cm, sigma_cm, presence = self._run()
+        points_cm, sigma_cm, _ = self._tracker.follow(points_cm, sigma_cm, presence, edges)
+        return self._estimate(points_cm, sigma_cm, presence)
 
     def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
-        """Find the lane in a bird's-eye raster of 0 and 255."""
+        """Find the lane in a bird's-eye raster of 0 and 255: the network alone, with the lane's width."""
         if not np.count_nonzero(raster):
             return LaneEstimate()
         if raster.base is not self._raster and raster is not self._raster:
             self._raster[0, 0] = raster
+        points_cm, sigma_cm, presence = self._run()
+        points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        return self._estimate(points_cm, sigma_cm, presence)
+
+    def _run(self) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
+        """Run the network on the raster."""
         found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
         points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
-        points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        return points_cm, sigma_cm, presence
+
+    def _estimate(
+        self,
+        points_cm: Float[np.ndarray, "6"],
+        sigma_cm: Float[np.ndarray, "6"],
+        presence: Float[np.ndarray, "2"],
+    ) -> LaneEstimate:
         row = 1
         centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))
         return LaneEstimate(
@@ -113,8 +133,9 @@ class NetworkDetector:
         )
 
     def reset(self) -> None:
-        """Forget the lane's width that earlier frames showed."""
+        """Forget what earlier frames showed: the lane, its width, and its markings."""
         self.memory.reset()
+        self._tracker.reset()
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:

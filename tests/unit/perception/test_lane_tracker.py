@@ -1,0 +1,90 @@
+"""Lines of a network on the edge points of their markings, and from frame to frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lanenet.geometry.lane import parabolas_from_points
+from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.network.refinement import RoadBorders, refine_lines
+from lanenet.perception.network.tracker import LaneTracker
+
+LANE_CM = 40.0
+BENT = np.array([-20.0, -19.0, -16.0, 20.0, 21.0, 24.0])
+SURE, SEEN = np.full(6, 0.8), np.ones(2)
+
+
+def edges_of(points_cm: np.ndarray, marking_cm: float = 3.0, sides: tuple[int, ...] = (0, 1)) -> RoadEdges:
+    """Borders of markings along the lines; a negative width is a dark marking."""
+    y = np.arange(2.0, 45.0, 0.5)
+    points, normals = [], []
+    for a, b, c in parabolas_from_points(points_cm)[list(sides)]:
+        slope = 2.0 * a * y + b
+        right = np.stack([np.ones_like(y), -slope], axis=1) / np.hypot(1.0, slope)[:, None]
+        middle = np.stack([a * y * y + b * y + c, y], axis=1)
+        for border in (-0.5, 0.5):
+            points.append(middle + border * abs(marking_cm) * right)
+            # Towards the brighter side: into a light marking, out of a dark one.
+            normals.append(-2.0 * border * np.sign(marking_cm) * right)
+    return RoadEdges(np.concatenate(points), np.concatenate(normals))
+
+
+@pytest.mark.parametrize("marking_cm", [3.0, 5.0, -2.5])
+def test_a_line_moves_onto_its_marking(marking_cm):
+    borders = RoadBorders(edges_of(BENT, marking_cm))
+    start = BENT.reshape(2, 3) + [[2.0, 2.5, 3.0], [-2.0, -2.0, -2.0]]
+    expected = np.full(2, 3.0 * np.sign(marking_cm))
+    found = refine_lines(start, np.full((2, 3), 2.0), borders, expected, np.full(2, 2.0))
+    np.testing.assert_allclose(found.points_cm, BENT.reshape(2, 3), atol=0.15)
+    np.testing.assert_allclose(found.marking_cm, marking_cm, atol=0.2)
+    assert (found.seen_cm > 30.0).all() and (found.sigma_cm < 1.0).all()
+
+
+def test_a_line_without_its_marking_keeps_the_networks_answer():
+    start = BENT.reshape(2, 3) + 1.0
+    marking, sigma = np.full(2, 3.0), np.full(2, 0.3)
+    given = np.full((2, 3), 2.0)
+    found = refine_lines(start, given, RoadBorders(edges_of(BENT, sides=(0,))), marking, sigma)
+    assert found.seen_cm[0] > 30.0 and found.seen_cm[1] == 0.0
+    np.testing.assert_array_equal(found.points_cm[1], start[1])
+    assert (found.sigma_cm[1] >= 2.0).all()
+    none = RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    found = refine_lines(start, given, RoadBorders(none), marking, sigma)
+    np.testing.assert_array_equal(found.points_cm, start)
+    assert not found.seen_cm.any()
+
+
+@pytest.mark.parametrize("marking_cm", [4.0, -4.0])
+def test_dark_and_light_markings_are_told_apart(marking_cm):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for _ in range(12):
+        points_cm, sigma_cm, seen_cm = tracker.follow(BENT + 1.5, SURE, SEEN, edges_of(BENT, marking_cm))
+    np.testing.assert_allclose(points_cm, BENT, atol=0.1)
+    assert (seen_cm > 30.0).all() and (sigma_cm < 1.0).all()
+
+
+def test_a_frame_that_looks_like_the_next_lane_does_not_change_the_lane():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    next_lane = BENT + LANE_CM
+    for _ in range(3):
+        tracker.follow(BENT, SURE, SEEN, edges_of(BENT))
+    # The network takes the line on the right for its left one, and guesses the other.
+    doubtful = np.array([0.9, 0.4])
+    points_cm, _, _ = tracker.follow(next_lane, SURE, doubtful, edges_of(BENT + 1.0))
+    np.testing.assert_allclose(points_cm, BENT + 1.0, atol=0.2)
+    # Nothing is kept beyond a reset.
+    tracker.reset()
+    points_cm, _, _ = tracker.follow(next_lane, SURE, doubtful, edges_of(BENT + 1.0))
+    np.testing.assert_allclose(points_cm[:3], BENT[3:] + 1.0, atol=0.2)
+
+
+def test_one_line_that_is_seen_tells_where_the_other_one_is():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    straight = np.array([-20.0] * 3 + [20.0] * 3)
+    unsure = np.concatenate([SURE[:3], np.full(3, 8.0)])
+    guess = straight + np.array([1.0] * 3 + [9.0] * 3)
+    points_cm, sigma_cm, seen_cm = tracker.follow(guess, unsure, SEEN, edges_of(straight, sides=(0,)))
+    np.testing.assert_allclose(points_cm, straight, atol=0.2)
+    assert seen_cm[1] == 0.0 and sigma_cm[3:].max() < 2.0
