@@ -161,7 +161,7 @@ def readable_frames(drive: Drive) -> tuple[Drive, list[str]]:
         The drive that is left, and a note on what was left out.
 
     Raises:
-        DriveFormatError: If these are more than a few; says what is wrong with the first.
+        DriveFormatError: If these are more than a few; says how many, and what is wrong with the first.
     """
     errors: dict[int, DriveFormatError] = {}
     for k in range(len(drive)):
@@ -173,7 +173,10 @@ def readable_frames(drive: Drive) -> tuple[Drive, list[str]]:
         return drive, []
     first = next(iter(errors.values()))
     if len(errors) > _UNREADABLE_SHARE * len(drive):
-        raise first
+        raise DriveFormatError(
+            f"{drive.path}: {len(errors)} of {len(drive)} images cannot be read, expected at most "
+            f"{_UNREADABLE_SHARE:.0%}; the first: {first}"
+        )
     kept = np.setdiff1d(np.arange(len(drive)), list(errors))
     return drive.subset(kept), [f"{len(errors)} images cannot be read and are left out, the first: {first}"]
 

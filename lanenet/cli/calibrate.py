@@ -15,6 +15,7 @@ from lanenet.cli.shared.options import (
     DriveArgument,
     MappingOption,
     WheelbaseOption,
+    centimetres_of_a_lane,
     check_ending,
     check_not_source,
     lock_outputs,
@@ -194,7 +195,10 @@ def drive_(
     out: _Out,
     lane_width: Annotated[
         float | None,
-        typer.Option(min=1.0, help="Between the middles of the lane's two lines, cm: sets the scale."),
+        typer.Option(
+            callback=centimetres_of_a_lane,
+            help="Between the middles of the lane's two lines, cm: sets the scale.",
+        ),
     ] = None,
     camera_height: Annotated[
         float | None,

@@ -13,6 +13,7 @@ from lanenet.cli.shared.options import (
     AnyCameraOption,
     MarkingOption,
     ModelOption,
+    centimetres_of_a_lane,
     check_not_source,
     lock_outputs,
 )
@@ -57,7 +58,7 @@ def detect(
     lane_width: Annotated[
         float | None,
         typer.Option(
-            min=1.0,
+            callback=centimetres_of_a_lane,
             help=f"Lane width for {_WITH_LANE_WIDTH}, cm; default: from the settings file or the drive.",
         ),
     ] = None,

@@ -8,7 +8,13 @@ from typing import Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import CameraOption, DriveArgument, MappingOption, WheelbaseOption
+from lanenet.cli.shared.options import (
+    CameraOption,
+    DriveArgument,
+    MappingOption,
+    WheelbaseOption,
+    centimetres_of_a_lane,
+)
 from lanenet.config import load_settings
 from lanenet.errors import LanenetError
 
@@ -20,7 +26,7 @@ def map_drive(
     drive: DriveArgument,
     lane_width: Annotated[
         float,
-        typer.Option(min=1.0, max=1000.0, help="Between the middles of the lane's two lines, cm."),
+        typer.Option(callback=centimetres_of_a_lane, help="Between the middles of the lane's two lines, cm."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the map.")],
     camera: CameraOption = None,

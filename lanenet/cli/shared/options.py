@@ -15,10 +15,26 @@ from lanenet.errors import ConfigError
 from lanenet.outputs import lock_output
 from lanenet.perception.registry import detector_names, listed
 
+#: Widths of lanes. Chosen: a tenth of the width of 1:10 cars, and a road of many lanes.
+_LANE_CM = (2.0, 1000.0)
+
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.")]
 OverridesArgument = Annotated[
     list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Settings that replace those of CONFIG.")
 ]
+
+
+def centimetres_of_a_lane(value: float | None) -> float | None:
+    """Refuse a lane's width that is no centimetres: the callback of ``--lane-width``."""
+    least, most = _LANE_CM
+    if value is not None and not least <= value <= most:
+        metres = f"; {value:g} m are {100.0 * value:g} cm" if least <= 100.0 * value <= most else ""
+        raise typer.BadParameter(
+            f"{value:g}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}{metres}"
+        )
+    return value
+
+
 DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="Camera YAML, or an earlier map of the same car.")

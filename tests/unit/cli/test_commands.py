@@ -193,6 +193,13 @@ def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
         assert text in result.stdout
 
 
+@pytest.mark.parametrize("width", ["0.31", "inf", "nan", "-40"])
+def test_a_lane_width_that_is_no_centimetres_is_a_usage_error(width: str, asked: Asked) -> None:
+    result = run("map", "tub", "--lane-width", width, "--out", "map")
+    assert result.exit_code == 2 and "--lane-width" in result.stderr
+    assert ("31 cm" in result.stderr) == (width == "0.31")
+
+
 def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
     map_drive = asked.function("map", Report(("verdict: reject",), "reject"))
     asked.module("datagen.pipeline", MapRequest=MapRequest, MapSettings=FakeSettings, map_drive=map_drive)

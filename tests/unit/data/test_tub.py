@@ -194,3 +194,11 @@ def test_real_tubs(shared_data: Path, name: str, n: int, n_deleted: int, first: 
     assert np.isfinite(drive.commands.angle).all()
     for i in (0, n // 2, n - 1):
         assert drive.image(i).std() > 5.0
+
+
+def test_a_path_beside_the_tub_is_answered_with_the_tub(tmp_path):
+    write_tub(tmp_path / "tubs" / "mine", [record(k) for k in range(3)])
+    with pytest.raises(DriveFormatError, match=r"folder above it, .*mine"):
+        open_drive(tmp_path / "tubs" / "mine" / "images")
+    with pytest.raises(DriveFormatError, match=r"a drive in it, .*mine"):
+        open_drive(tmp_path / "tubs")
