@@ -320,7 +320,9 @@ def wrong_places(
         if len(run) >= _SHORTEST and not abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM
     ]
     if other is not None and len(other.met) == len(empty):
-        found += _hidden_corners(empty | _unpainted(evidence, closed), other, closed)
+        hidden = _hidden_corners(empty | _unpainted(evidence, closed), other, closed)
+        # What no frame looks at gives no label.
+        found += [run for run in hidden if evidence.views[:, run].any()]
         empty &= ~other.met
     found += _too_long(empty, lane_cm, closed)
     mean_off = evidence.off_cm.sum(axis=0) / np.maximum(evidence.near.sum(axis=0), 1)

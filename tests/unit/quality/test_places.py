@@ -170,8 +170,12 @@ def test_a_corner_that_no_paint_shows_is_withheld(turn_rad, withheld):
     assert len(places.wrong_places(0, straight("right"), evidence, 36.0, other)) == len(wrong)
     evidence.views[:, 65:85] = 1
     assert len(places.wrong_places(0, straight("right"), evidence, 36.0, other)) == len(wrong)
+    # Where no frame looks there is nothing to withhold, and no frame to name.
+    evidence.views[:, 60:90] = evidence.met[:, 60:90] = 0
+    assert places.wrong_places(0, straight("right"), evidence, 36.0, other) == []
     # A gap between two dashes hides little.
     evidence.views[...] = 4
+    evidence.met[:, 60:65] = evidence.met[:, 85:90] = 4
     evidence.met[:, 65:74] = evidence.near[:, 65:74] = evidence.met[:, 77:85] = evidence.near[:, 77:85] = 4
     assert places.wrong_places(0, straight("right"), evidence, 36.0, other) == []
 
