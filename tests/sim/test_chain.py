@@ -141,15 +141,15 @@ def test_the_steps_one_by_one(finished):
     model = folder / "ck" / "tiny" / "model.onnx"
     output = invoke("val", model, folder / "labels.parquet", "--out", folder / "table")
     assert "against the map" in output and (folder / "table.md").is_file()
-    # The same map with its frames: the same network on the same edges, and the other detectors too.
+    # The same map with its frames: the other detectors too, and the network on markings, with memory.
     output = invoke("val", model, folder / "map", drive, "--out", folder / "frames")
     assert "against the map and truth" in output
     on_labels, on_frames = (
         json.loads((folder / f"{name}.json").read_text())["sources"][0]["detectors"]
         for name in ("table", "frames")
     )
-    for name in ("network", "lane-filter"):
-        assert on_frames[name]["rmse_cm"] == pytest.approx(on_labels[name]["rmse_cm"], rel=0.02)
+    assert on_frames["lane-filter"]["rmse_cm"] == pytest.approx(on_labels["lane-filter"]["rmse_cm"], rel=0.02)
+    assert on_frames["network"]["rmse_cm"] < on_labels["network"]["rmse_cm"]
     assert on_frames["painter"]["count"] > 0
     exported = folder / "again.onnx"
     invoke("export", folder / "ck" / "tiny", "--out", exported)
