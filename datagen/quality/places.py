@@ -369,7 +369,7 @@ def sharp_places(line: LaneLine) -> Bool[np.ndarray, "p"]:
 
 def _unpainted(evidence: PlaceEvidence, closed: bool) -> Bool[np.ndarray, "p"]:
     """Where hardly a view meets the line, or none looks: all passes together."""
-    views, met = (_around(a.sum(axis=0)[None], closed)[0] for a in (evidence.views, evidence.met))
+    views, met = _all_views(evidence, closed)
     return np.asarray(met < _BARE * np.maximum(views, 1e-9))
 
 
@@ -454,9 +454,17 @@ def _distance_cm(beside: Float[np.ndarray, "v r b"]) -> float:
     return float(int(counts.argmax()) - _HALF_BINS) * _BIN_CM if counts.any() else float("nan")
 
 
+def _all_views(
+    evidence: PlaceEvidence, closed: bool
+) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    """Views around each place, and those that meet the line, of all passes together."""
+    views, met = (_around(a.sum(axis=0)[None], closed)[0] for a in (evidence.views, evidence.met))
+    return views, met
+
+
 def met_places(evidence: PlaceEvidence, closed: bool) -> Bool[np.ndarray, "p"]:
     """Return where most views meet the line."""
-    views, met = (_around(a.sum(axis=0)[None], closed)[0] for a in (evidence.views, evidence.met))
+    views, met = _all_views(evidence, closed)
     return np.asarray((met >= 0.5 * views) & (views > 0.5))
 
 

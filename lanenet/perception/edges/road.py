@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -210,17 +209,6 @@ class RoadEdgeExtractor:
         points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
         good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
         return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])
-
-    def extract_points(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> Float[np.ndarray, "n 2"]:
-        """Return the points of :meth:`extract` alone, which is all that a raster takes.
-
-        Raises:
-            CalibrationError: If the frame's size is not the camera's.
-            DriveFormatError: If the array is no image.
-        """
-        points = self.table.lift_points(self._find(frame_bgr)).astype(np.float32)
-        # A normal is missing only where its point is. One sum shows whether anything is missing at all.
-        return points if math.isfinite(points.sum()) else points[np.isfinite(points).all(axis=1)]
 
     def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
         check_size(check_frame(frame_bgr), self.camera)

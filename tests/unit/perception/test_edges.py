@@ -275,16 +275,6 @@ def test_a_range_that_leaves_no_rows_is_refused() -> None:
         RoadTable(CAMERA, RangeSettings(top_row=200, bottom_rows=40))
 
 
-def test_points_alone_are_those_of_the_whole_extraction(tape_frame: np.ndarray) -> None:
-    settings = PerceptionSettings(range=RangeSettings(far_cm=300.0, max_cm_per_px=50.0))
-    noise = np.random.default_rng(0).integers(0, 256, tape_frame.shape).astype(np.uint8)
-    found = RoadEdgeExtractor(CAMERA, settings)
-    for frame in (tape_frame, noise, np.zeros_like(noise)):
-        whole, points = found.extract(frame).points_cm, found.extract_points(frame)
-        assert (whole.dtype, whole.shape, whole.tobytes()) == (points.dtype, points.shape, points.tobytes())
-    assert len(found.extract_points(noise)) > 1000
-
-
 def test_the_sample_of_a_mask_is_found_alike_by_the_caller_and_by_the_search(tape_frame: np.ndarray) -> None:
     keep = np.zeros((240, 320), np.uint8)
     keep[120:, 40:] = 255
