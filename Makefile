@@ -19,7 +19,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain traps golden golden-renew arm neutral check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install chain traps judge golden golden-renew arm neutral check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -28,6 +28,7 @@ help:
 	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
 	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
+	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
@@ -61,6 +62,15 @@ chain: $(VENV)/.stamp-dev
 traps: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps
+
+# Two hours on two cores; JUDGE adds arguments, such as --workers 8. Of the road cameras each competition has its
+# own, hence --any-camera for the network that was trained with one.
+JUDGED := truth,network=checkpoints/general,network=checkpoints/small,lane-filter,hough,hough=configs/detectors/hough_value.yaml,painter
+judge: $(VENV)/.stamp-train
+	OMP_NUM_THREADS=1 $(BIN)/lanenet judge --config configs/judge/competition.yaml --detectors $(JUDGED) \
+	  --any-camera --out runs/competition $(JUDGE)
+	OMP_NUM_THREADS=1 $(BIN)/lanenet judge --config configs/judge/across.yaml --detectors $(JUDGED) \
+	  --any-camera --out runs/across $(JUDGE)
 
 golden: $(VENV)/.stamp-dev
 	$(PYTEST) tests/golden

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from datagen.judge.run import TRUE_POINTS, TRUTH, Entrant, RunResult, Trajectory, drive_run
-from datagen.judge.settings import JudgeSettings, road_names, road_simulation
-from datagen.world.world import SimulationSettings, draw_track
+from datagen.judge.settings import JudgeSettings, Road, contest_roads
+from datagen.world.world import draw_track
 from lanenet.data.files import write_json
 from lanenet.data.tables import ColumnSpec, read_csv, write_csv
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
@@ -25,6 +25,8 @@ from lanenet.reading import is_regular, read_json
 
 #: Of the runs; raise it when the same settings give other results.
 _VERSION = 2
+#: Settings that a run does not depend on, or that stand in its road.
+_NOT_OF_ONE_RUN = {"seed", "count", "counts", "tracks", "simulation", "track_width_cm"}
 _NUMBERS = ("s_cm", "offset_cm", "steering_rad")
 _FLAGS = ("answered", "over", "put_back")
 
@@ -35,25 +37,21 @@ class Job:
 
     Attributes:
         settings: The contest.
-        simulation: The road's world.
+        road: The road and its car.
         entrant: Who drives.
-        kind: Kind of road.
-        number: Number of the road.
         path: JSON file of its result.
     """
 
     settings: JudgeSettings
-    simulation: SimulationSettings
+    road: Road
     entrant: Entrant
-    kind: str
-    number: int
     path: Path
 
     @property
     def key(self) -> str:
         """Hash of all that the run depends on, which does not include how many other runs there are."""
-        contest = self.settings.model_dump(mode="json", exclude={"seed", "count", "tracks", "simulation"})
-        parts = [_VERSION, contest, self.simulation.model_dump(mode="json")]
+        contest = self.settings.model_dump(mode="json", exclude=_NOT_OF_ONE_RUN)
+        parts = [_VERSION, contest, self.road.simulation.model_dump(mode="json"), self.road.track_width_cm]
         text = json.dumps([*parts, self.entrant.name, self.entrant.identity], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -113,19 +111,18 @@ def contest_jobs(settings: JudgeSettings, entrants: Sequence[Entrant], out: Path
     if blind:
         raise ConfigError(f"detectors: {blind[0]!r}: without a detector, expected {TRUTH} or {TRUE_POINTS}")
     jobs = []
-    for index, (kind, number) in enumerate(road_names(settings)):
-        simulation = road_simulation(settings, index)
-        if number == 0:
-            draw_track(simulation)
+    for road in contest_roads(settings):
+        if road.number == 0:
+            draw_track(road.simulation)
         for entrant in entrants:
-            path = out / "runs" / f"{kind}_{number:02d}_{entrant.name}.json"
-            jobs.append(Job(settings, simulation, entrant, kind, number, path))
+            path = out / "runs" / f"{road.kind}_{road.number:02d}_{entrant.name}.json"
+            jobs.append(Job(settings, road, entrant, path))
     return jobs
 
 
 def run_job(job: Job) -> RunResult:
     """Drive one run and write it; in any process."""
-    result, trajectory = drive_run(job.settings, job.simulation, job.entrant, job.kind, job.number)
+    result, trajectory = drive_run(job.settings, job.road, job.entrant)
     write_run(job.path, job.key, result, trajectory)
     return result
 

@@ -30,7 +30,10 @@ _MEASURES: tuple[tuple[str, str, int, float], ...] = (
     ("no answer, %", "unanswered", 1, 100.0),
     ("time, s", "time_s", 0, 1.0),
 )
-_HEADERS: tuple[str, ...] = ("completed", "clean", *(header for header, *_ in _MEASURES))
+_COUNTS = ("completed", "clean")
+#: In addition, where cars start across their lane.
+_BACK = "back in lane"
+_BACK_MEASURE = ("back after, s", "back_after_s", 1, 1.0)
 
 _SIDE_PX = 1100  # of the longer side of the road
 _MARGIN_CM = 50.0
@@ -57,8 +60,9 @@ def summarise(results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """Return a row per kind of road and entrant, in the order in which they first occur.
 
     Returns:
-        ``kind``, ``entrant``, ``runs``, ``completed``, ``clean`` (completed without a departure),
-        ``laps_mean``, and ``*_mean`` and ``*_worst`` of the measures of :class:`RunResult`.
+        ``kind``, ``entrant``, ``runs``, ``completed``, ``clean`` (completed without a departure), ``back``
+        (in the lane after a start across it), ``laps_mean``, and ``*_mean`` and ``*_worst`` of the measures
+        of :class:`RunResult`.
     """
     groups: dict[tuple[str, str], list[RunResult]] = {}
     for result in results:
@@ -71,9 +75,10 @@ def summarise(results: Sequence[RunResult]) -> list[dict[str, Any]]:
             "runs": len(runs),
             "completed": sum(run.completed for run in runs),
             "clean": sum(run.completed and run.departures == 0 for run in runs),
+            "back": sum(run.back for run in runs),
             "laps_mean": float(np.mean([run.laps for run in runs])),
         }
-        for _, name, _, _ in _MEASURES:
+        for _, name, _, _ in (*_MEASURES, _BACK_MEASURE):
             values = [float(getattr(run, name)) for run in runs]
             row |= {f"{name}_mean": float(np.mean(values)), f"{name}_worst": max(values)}
         rows.append(row)
@@ -82,20 +87,31 @@ def summarise(results: Sequence[RunResult]) -> list[dict[str, Any]]:
 
 def tables(results: Sequence[RunResult]) -> dict[str, list[list[str]]]:
     """Return a table per kind of road, as text: a row per entrant, under the headers of its first row."""
+    counts, measures = list(_COUNTS), list(_MEASURES)
+    headers = ["", *_COUNTS]
+    if any(result.across_deg for result in results):
+        counts, headers = [*counts, "back"], [*headers, _BACK]
+        measures = [_BACK_MEASURE, *measures]
+    headers += [header for header, *_ in measures]
     found: dict[str, list[list[str]]] = {}
     for row in summarise(results):
-        cells = [row["entrant"], f"{row['completed']}/{row['runs']}", f"{row['clean']}/{row['runs']}"]
-        for _, measure, decimals, factor in _MEASURES:
+        cells = [row["entrant"], *(f"{row[count]}/{row['runs']}" for count in counts)]
+        for _, measure, decimals, factor in measures:
             values = (row[f"{measure}_mean"] * factor, row[f"{measure}_worst"] * factor)
             cells.append("/".join(f"{value:.{decimals}f}" for value in values))
-        found.setdefault(row["kind"], [["", *_HEADERS]]).append(cells)
+        found.setdefault(row["kind"], [headers]).append(cells)
     return found
 
 
 def table_title(settings: JudgeSettings, kind: str) -> str:
     """Return a line that says what was driven."""
+    far = f"{settings.laps} laps"
+    if settings.distance_cm is not None:
+        far += f", at most {settings.distance_cm:g} cm,"
+    if settings.start_across_deg:
+        far = f"started {settings.start_across_deg:g} degrees across, {far}"
     return (
-        f"{kind}: {settings.count} roads, {settings.laps} laps at {settings.speed_cm_s:g} cm/s, "
+        f"{kind}: {settings.counts.get(kind, settings.count)} roads, {far} at {settings.speed_cm_s:g} cm/s, "
         f"{settings.simulation.rate_hz:g} frames/s, {settings.pilot.law}, seed {settings.seed}; "
         "mean/worst over the runs"
     )
@@ -167,6 +183,8 @@ def draw_top_view(
             f"{result.put_backs} put back, offset {result.mean_offset_cm:.2f} cm mean, "
             f"{result.worst_offset_cm:.1f} cm worst"
         )
+        if result.across_deg:
+            text += f", back after {result.back_after_s:.1f} s" if result.back else ", not back"
         _write(image, text, index + 1, COLOURS_BGR[index % len(COLOURS_BGR)])
     return image
 

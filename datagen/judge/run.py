@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.judge.settings import JudgeSettings
+from datagen.judge.settings import JudgeSettings, Road
 from datagen.world.car.driver import (
     DetectorPilot,
     DriverPilot,
@@ -20,7 +20,7 @@ from datagen.world.car.driver import (
 )
 from datagen.world.road.track import Track
 from datagen.world.simulate import ClosedLoop, LoopFrame
-from datagen.world.world import SimulationSettings, World, assemble_world
+from datagen.world.world import World, assemble_world
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 from lanenet.perception.estimate import Detector
@@ -68,13 +68,16 @@ class DepartureCounter:
 
     def update(self, offsets_cm: Float[np.ndarray, "wheels"]) -> bool:
         """Take the wheels' offsets of the next frame; return whether the car is out."""
-        furthest_cm = float(np.max(np.abs(offsets_cm)))
-        if furthest_cm > self._half_cm:
+        if float(np.max(np.abs(offsets_cm))) > self._half_cm:
             self.count += not self.over
             self.over = True
-        elif furthest_cm < self._half_cm - _BACK_INSIDE_CM:
+        elif self.well_inside(offsets_cm):
             self.over = False
         return self.over
+
+    def well_inside(self, offsets_cm: Float[np.ndarray, "wheels"]) -> bool:
+        """Return whether all wheels are inside by as much as ends a departure."""
+        return float(np.max(np.abs(offsets_cm))) < self._half_cm - _BACK_INSIDE_CM
 
 
 #: Makes a detector for a camera, a lane width and a width of the markings, both in cm.
@@ -85,6 +88,11 @@ TRUTH, TRUE_POINTS = "truth", "true-points"
 
 #: A car that faces further away from the road has left the lane; chosen: no bend is driven at 70 degrees.
 _FACING_AWAY_RAD = 1.2
+#: A car that started across is back in its lane when, for this time, all its wheels have been inside by as
+#: much as ends a departure, and it has faced along the road within this angle. Chosen: half a second is no
+#: swing through the lane, and 10 degrees are a correction like others.
+_BACK_FOR_S, _BACK_WITHIN_RAD = 0.5, math.radians(10.0)
+_SAME_TIME_S = 1e-6
 #: A car that has not gone this far for ``stuck_s`` is stuck.
 _MOVED_CM = 5.0
 #: How far ahead a car that is stuck is put back: past what stopped it.
@@ -120,7 +128,8 @@ class RunResult:
         completed: Whether the whole distance was driven, put back or not.
         ended: Why the run ended: ``completed``, ``left the lane``, ``stuck`` or ``out of time``.
         laps: Driven; of an open road the driven share.
-        departures: How often a wheel went over a line.
+        departures: How often a wheel went over a line, but not while a start across was being corrected;
+            a car that was lost in the meantime has departed once.
         put_backs: How often the car had to be put back.
         mean_offset_cm: Mean distance of the front axle's middle from the lane's centre.
         worst_offset_cm: Largest such distance.
@@ -128,6 +137,10 @@ class RunResult:
         unanswered: Share of the frames without an answer.
         frames: Number of frames.
         time_s: Time driven.
+        across_deg: By how much the car was turned in its lane at the start, positive left.
+        back: Whether it came back into its lane after such a start, without being put back and in time; true
+            where it started straight.
+        back_after_s: Time until it was back, or until it was clear that it would not be.
     """
 
     entrant: str
@@ -145,6 +158,9 @@ class RunResult:
     unanswered: float
     frames: int
     time_s: float
+    across_deg: float = 0.0
+    back: bool = True
+    back_after_s: float = 0.0
 
     @property
     def road(self) -> str:
@@ -163,7 +179,7 @@ class Trajectory:
         offset_cm: Its offset from the lane's centre, left positive.
         steering_rad: Commanded steering.
         answered: Whether the detector had an answer.
-        over: Whether the car was out of its lane.
+        over: Whether the car was out of its lane, as departures are counted.
         put_back: Whether the car was put back after this frame.
     """
 
@@ -177,22 +193,22 @@ class Trajectory:
     put_back: Bool[np.ndarray, "n"]
 
 
-def drive_run(
-    settings: JudgeSettings, simulation: SimulationSettings, entrant: Entrant, kind: str, number: int
-) -> tuple[RunResult, Trajectory]:
+def drive_run(settings: JudgeSettings, road: Road, entrant: Entrant) -> tuple[RunResult, Trajectory]:
     """Let an entrant drive a road.
 
     Args:
         settings: The contest.
-        simulation: The road's world, see :func:`datagen.judge.settings.road_simulation`.
+        road: The road and its car, see :func:`datagen.judge.settings.contest_roads`.
         entrant: Who drives.
-        kind: Kind of road, for the result.
-        number: Number of the road, for the result.
     """
-    world = assemble_world(simulation)
+    world, across_deg = assemble_world(road.simulation), road.across_deg(settings)
+    if across_deg:
+        driver = world.driver
+        world.car.place(driver.pose_at(driver.s_cm, slope=math.tan(math.radians(across_deg))))
     loop = ClosedLoop(world, build_pilot(world, entrant, settings.pilot), settings.pilot, settings.speed_cm_s)
-    referee = _Referee(settings, world, loop.s_cm)
-    most_frames = math.ceil(settings.slack * referee.distance_cm / settings.speed_cm_s * simulation.rate_hz)
+    referee = _Referee(settings, road, world, loop.s_cm)
+    rate_hz = road.simulation.rate_hz
+    most_frames = math.ceil(settings.slack * referee.distance_cm / settings.speed_cm_s * rate_hz)
     ended = "out of time"
     for _ in range(most_frames):
         lost = referee.look(loop.next_frame())
@@ -208,22 +224,58 @@ def drive_run(
     trajectory = referee.trajectory()
     result = RunResult(
         entrant=entrant.name,
-        kind=kind,
-        number=number,
-        seed=simulation.seed,
+        kind=road.kind,
+        number=road.number,
+        seed=road.simulation.seed,
         completed=ended == "completed",
         ended=ended,
-        laps=referee.share * (settings.laps if world.track.closed else 1),
+        laps=referee.share * referee.laps,
         departures=referee.wheels.count,
         put_backs=int(trajectory.put_back.sum()),
         mean_offset_cm=float(np.abs(trajectory.offset_cm).mean()),
         worst_offset_cm=float(np.abs(trajectory.offset_cm).max()),
-        steering_rms_rad_s=_steering_rms_rad_s(trajectory, simulation.rate_hz),
+        steering_rms_rad_s=_steering_rms_rad_s(trajectory, rate_hz),
         unanswered=float(1.0 - trajectory.answered.mean()),
         frames=len(trajectory.t_s),
         time_s=float(trajectory.t_s[-1]),
+        across_deg=across_deg,
+        back=referee.start.back,
+        back_after_s=referee.start.after_s,
     )
     return result, trajectory
+
+
+class StartWatch:
+    """Watches a car that started across its lane until it is back, or cannot be any more.
+
+    Attributes:
+        open: Whether it is neither.
+        back: Whether it is back in its lane.
+        after_s: Time since the start at which it was back; while it is not, the last time.
+    """
+
+    def __init__(self, across: bool, within_s: float) -> None:
+        """Start; a car that does not start across is back at once."""
+        self.open, self.back, self.after_s = across, not across, 0.0
+        self._within_s = within_s
+        self._since_s: float | None = None
+
+    def update(self, t_s: float, inside: bool, straight: bool) -> None:
+        """Take the next frame.
+
+        Args:
+            t_s: Time since the start.
+            inside: Whether all wheels are well inside the lane.
+            straight: Whether the car faces along the road.
+        """
+        self.after_s = t_s
+        if not (inside and straight):
+            self._since_s = None
+            self.open = t_s < self._within_s
+            return
+        self._since_s = t_s if self._since_s is None else self._since_s
+        if t_s - self._since_s > _BACK_FOR_S - _SAME_TIME_S:
+            self.open, self.back, self.after_s = False, True, self._since_s
 
 
 class _Referee:
@@ -231,34 +283,41 @@ class _Referee:
 
     Attributes:
         distance_cm: To be driven.
+        laps: That distance in laps; of an open road its share.
         share: Of the distance, driven so far.
         wheels: Counts the departures.
+        start: Watches a start across the lane.
     """
 
-    def __init__(self, settings: JudgeSettings, world: World, start_cm: float) -> None:
-        self._settings, self._track = settings, world.track
-        self._wheelbase_cm = world.settings.car.wheelbase_cm
-        length_cm = world.track.length_cm
+    def __init__(self, settings: JudgeSettings, road: Road, world: World, start_cm: float) -> None:
+        self._settings, self._track, self._driver = settings, world.track, world.driver
+        self._wheelbase_cm, self._track_width_cm = world.settings.car.wheelbase_cm, road.track_width_cm
+        length_cm, laps = world.track.length_cm, settings.laps if world.track.closed else 1
         if world.track.closed:
-            self.distance_cm = settings.laps * length_cm
+            whole_cm = laps * length_cm
         else:
-            self.distance_cm = max(length_cm - _BEFORE_THE_END_CM - start_cm, 1.0)
+            whole_cm = max(length_cm - _BEFORE_THE_END_CM - start_cm, 1.0)
+        self.distance_cm = min(whole_cm, settings.distance_cm or whole_cm)
+        self.laps = laps * self.distance_cm / whole_cm
         self.share = 0.0
         self.wheels = DepartureCounter(world.track.lane_width_cm)
+        self.start = StartWatch(settings.start_across_deg > 0.0, settings.back_within_s)
         self._start_cm, self._moved_at_s, self._moved_to_cm = start_cm, 0.0, start_cm
         self._rows: list[list[float]] = []
 
     def look(self, frame: LoopFrame) -> str:
         """Take a frame; return why the car cannot recover, or an empty text."""
-        state, settings, track = frame.state, self._settings, self._track
-        over = self.wheels.update(
-            wheel_offsets_cm(track, state.pose, self._wheelbase_cm, settings.track_width_cm, frame.s_cm)
-        )
+        state, lost = frame.state, self._lost(frame)
+        over = self._over(frame, lost)
         front_cm = map_from_car(np.zeros((1, 2)), state.pose, self._wheelbase_cm)[0]
         flags = [float(frame.answered), float(over), 0.0]
         numbers = [state.t_s, *map(float, front_cm), frame.s_cm, frame.offset_cm, state.steering_rad]
         self._rows.append(numbers + flags)
         self.share = min(max((frame.s_cm - self._start_cm) / self.distance_cm, 0.0), 1.0)
+        return lost
+
+    def _lost(self, frame: LoopFrame) -> str:
+        state, settings, track = frame.state, self._settings, self._track
         if abs(frame.s_cm - self._moved_to_cm) > _MOVED_CM:
             self._moved_at_s, self._moved_to_cm = state.t_s, frame.s_cm
         away_rad = math.remainder(float(state.pose[2]) - track.point(frame.s_cm)[1], 2.0 * math.pi)
@@ -266,6 +325,21 @@ class _Referee:
         if outside or abs(away_rad) > _FACING_AWAY_RAD:
             return "left the lane"
         return "stuck" if state.t_s - self._moved_at_s > settings.stuck_s else ""
+
+    def _over(self, frame: LoopFrame, lost: str) -> bool:
+        """Return whether the car is out of its lane; a start across is given time."""
+        pose = frame.state.pose
+        offsets_cm = wheel_offsets_cm(self._track, pose, self._wheelbase_cm, self._track_width_cm, frame.s_cm)
+        if self.start.open:
+            # As a car stands that follows the road: in a bend its nose points outwards.
+            along_rad = float(self._driver.pose_at(frame.s_cm)[2])
+            away_rad = abs(math.remainder(float(pose[2]) - along_rad, 2.0 * math.pi))
+            inside = self.wheels.well_inside(offsets_cm)
+            self.start.update(frame.state.t_s, inside, away_rad < _BACK_WITHIN_RAD)
+            if self.start.open and not lost:
+                return False
+            self.start.open = False
+        return self.wheels.update(offsets_cm)
 
     def put_back(self, s_cm: float) -> None:
         """The car stands in the lane again, at a place along the road."""

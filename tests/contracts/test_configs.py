@@ -58,6 +58,16 @@ def read_car(path: Path) -> Any:
     return load_drive_settings(path)
 
 
+def read_contest(path: Path) -> Any:
+    from datagen.judge.settings import JudgeSettings, contest_roads
+    from lanenet.config import check_settings, read_yaml
+
+    settings = check_settings(JudgeSettings, read_yaml(path), str(path))
+    return contest_roads(
+        settings.model_copy(update={"count": 1, "counts": dict.fromkeys(settings.counts, 1)})
+    )
+
+
 #: What reads the YAML files of each folder below configs/.
 READERS = {
     ".": read_training_run,
@@ -66,6 +76,7 @@ READERS = {
     "tracks": read_track,
     "cameras": read_camera_file,
     "detectors": read_detector_settings,
+    "judge": read_contest,
     "donkeycar": read_donkeycar_pilot,
 }
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datagen.judge.run import Entrant, build_pilot
-from datagen.judge.settings import JudgeSettings, road_simulation
+from datagen.judge.settings import JudgeSettings, contest_roads
 from datagen.world.car.driver import Pilot, Sight
 from datagen.world.simulate import ClosedLoop
 from datagen.world.world import assemble_world
@@ -50,7 +50,7 @@ class Watched:
 @pytest.mark.parametrize(("pitch_deg", "worst"), [(0.0, {Concern.NONE}), (-5.0, {Concern.STOP})])
 @pytest.mark.parametrize("road", [0, 1])
 def test_a_driving_car_notices_its_camera(road: int, pitch_deg: float, worst: set[Concern]) -> None:
-    world = assemble_world(road_simulation(SETTINGS, road))
+    world = assemble_world(contest_roads(SETTINGS)[road].simulation)
     entrant = Entrant(
         "network", lambda camera, width_cm, _: NetworkDetector(MODEL, camera, lane_width_cm=width_cm)
     )

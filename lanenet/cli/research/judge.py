@@ -19,7 +19,7 @@ from lanenet.perception.registry import KINDS, build_detector, detector_names, k
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
-    from datagen.judge.settings import JudgeSettings
+    from datagen.judge.settings import JudgeSettings, Road
     from lanenet.geometry.camera import Camera
     from lanenet.perception.estimate import Detector
 
@@ -39,8 +39,9 @@ def judge(
     detectors: Annotated[
         str | None,
         typer.Option(
-            help=f"Entrants, separated by commas; {_WITH_SETTINGS} also as NAME=SETTINGS.yaml; truth is the "
-            f"scripted driver, true-points the steering law on the true lane. Default: {_DETECTORS}."
+            help=f"Entrants, separated by commas; {_WITH_SETTINGS} also as NAME=SETTINGS.yaml, "
+            "the network as network=MODEL; truth is the scripted driver, true-points the steering law on the "
+            f"true lane. Default: {_DETECTORS}."
         ),
     ] = None,
     model: Annotated[
@@ -49,11 +50,17 @@ def judge(
     ] = None,
     tracks: Annotated[
         str | None,
-        typer.Option(help="random (loops), open, presets or track files (.yaml), separated by commas."),
+        typer.Option(
+            help="random (loops), open, varied, presets or track files (.yaml), separated by commas."
+        ),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Roads of each kind; default 20.")] = None,
     laps: Annotated[int | None, typer.Option(min=1, help="Laps of each run; default 2.")] = None,
     speed: Annotated[float | None, typer.Option(min=1.0, help="Speed, cm/s; default 60.")] = None,
+    across: Annotated[
+        float | None,
+        typer.Option(help="Degrees by which each car starts turned, to the left and right in turns."),
+    ] = None,
     law: Annotated[
         str | None,
         typer.Option(help="proportional (default), pure-pursuit, or own: the detector's own steering."),
@@ -75,7 +82,7 @@ def judge(
     """Let detectors drive synthetic roads in closed loop and show how they do; finished runs are kept."""
     from datagen.judge.contest import judge as run_contest
     from datagen.judge.report import table_title, tables, write_report
-    from datagen.judge.settings import JudgeSettings
+    from datagen.judge.settings import JudgeSettings, contest_roads
 
     lock_outputs(out)
     given: dict[str, Any] = {
@@ -83,6 +90,7 @@ def judge(
         "count": count,
         "laps": laps,
         "speed_cm_s": speed,
+        "start_across_deg": across,
         "put_back": put_back,
         "seed": seed,
     }
@@ -97,8 +105,13 @@ def judge(
             console.show_problems([f"{SHIPPED_MODEL} is not there: without the network; --model names one"])
     names = [text.strip() for text in detectors.split(",")]
     entrants = [named_entrant(name, model, "--detectors", any_camera) for name in names]
-    _try_out(settings, entrants)
-    warn_of_widths(entrants, _lane_widths_cm(settings))
+    # The narrowest and the widest road of each kind: varied ones have a hundred widths.
+    by_width = sorted(contest_roads(settings), key=lambda road: road.simulation.track.lane_width_cm)
+    ends = [*{road.kind: road for road in reversed(by_width)}.values()]
+    ends += {road.kind: road for road in by_width}.values()
+    for road in ends:
+        _try_out(road, entrants)
+    warn_of_widths(entrants, [road.simulation.track.lane_width_cm for road in ends])
     with console.progress_bar("judge") as progress:
         results = run_contest(settings, entrants, out, workers, progress)
     for kind, (measures, *table) in tables(results).items():
@@ -115,6 +128,7 @@ def judge(
         "--count": count,
         "--laps": laps,
         "--speed": speed,
+        "--across": across,
         "--law": "proportional" if settings.pilot.law == "own" else "own",
         "--no-put-back": put_back is False,
         "--put-back": put_back is True,
@@ -126,17 +140,9 @@ def judge(
     console.next_command("judge", *console.given(again))
 
 
-def _lane_widths_cm(settings: JudgeSettings) -> list[float]:
-    """Return the lane width of one road of each kind."""
-    from datagen.judge.settings import road_simulation
-
-    kinds = range(len(settings.tracks))
-    return [road_simulation(settings, kind * settings.count).track.lane_width_cm for kind in kinds]
-
-
-def _try_out(settings: JudgeSettings, entrants: list[Entrant]) -> None:
+def _try_out(road: Road, entrants: list[Entrant]) -> None:
     """Build each detector once, so that one that cannot be built is refused before the first run."""
-    simulation = settings.simulation
+    simulation = road.simulation
     camera = simulation.camera.build(simulation.car.wheelbase_cm)
     for entrant in entrants:
         if entrant.build is not None:
@@ -162,7 +168,7 @@ def _draw_pictures(
         ]
         road = runs[0][0].road
         title = f"{road}, seed {runs[0][0].seed}, {settings.laps} laps, {settings.speed_cm_s:g} cm/s"
-        picture = draw_top_view(draw_track(jobs[first].simulation), runs, title)
+        picture = draw_top_view(draw_track(jobs[first].road.simulation), runs, title)
         write_bytes(folder / f"{road}.png", png_bytes(picture))
     return folder
 
@@ -206,8 +212,10 @@ def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) 
     """Return the entrant that a text names.
 
     Args:
-        text: ``truth``, ``true-points``, or a detector's name; ``NAME=SETTINGS.yaml`` if it takes settings.
-        model: Model or checkpoint folder of the network; None takes the shipped one, and says so.
+        text: ``truth``, ``true-points``, or a detector's name; ``NAME=SETTINGS.yaml`` if it takes settings,
+            ``network=MODEL``.
+        model: Model or checkpoint folder of a network that names none; None takes the shipped one, and says
+            so.
         option: The option that holds the text, for error messages.
         any_camera: Accept a model that was trained with another camera.
 
@@ -221,15 +229,14 @@ def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) 
         return Entrant(name)
     if name not in KINDS:
         raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *KINDS))}")
+    shown = f"{name}-{Path(file).stem}" if equals else name
+    if kind_of(name).needs_model:
+        detector = NamedDetector(name, _network_model(Path(file) if equals else model), None, any_camera)
+        return Entrant(shown, detector, detector.identity)
     if equals and not Path(file).is_file():
         raise ConfigError(f"{option} {text!r}: {file}: no such file")
-    detector = NamedDetector(
-        name,
-        _network_model(model) if kind_of(name).needs_model else None,
-        Path(file).resolve() if equals else None,
-        any_camera,
-    )
-    return Entrant(f"{name}-{Path(file).stem}" if equals else name, detector, detector.identity)
+    detector = NamedDetector(name, None, Path(file).resolve() if equals else None, any_camera)
+    return Entrant(shown, detector, detector.identity)
 
 
 def _network_model(given: Path | None) -> Path:

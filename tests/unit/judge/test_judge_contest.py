@@ -20,7 +20,7 @@ from datagen.world.road.build import random_track
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.world import SimulationSettings, draw_track
 from lanenet.cli.app import app
-from lanenet.cli.research.judge import NamedDetector
+from lanenet.cli.research.judge import NamedDetector, named_entrant
 from lanenet.errors import ConfigError, LanenetError
 
 # Short open roads: a run is a few dozen frames.
@@ -59,9 +59,9 @@ def test_finished_runs_are_kept_and_others_driven_again(
 ) -> None:
     driven: list[tuple[str, int]] = []
 
-    def counted(settings, simulation, entrant, kind, number):
-        driven.append((entrant.name, number))
-        return _result(entrant.name, number), TRAJECTORY
+    def counted(settings, road, entrant):
+        driven.append((entrant.name, road.number))
+        return _result(entrant.name, road.number), TRAJECTORY
 
     monkeypatch.setattr("datagen.judge.contest.drive_run", counted)
     entrants = [Entrant(TRUTH), Entrant(TRUE_POINTS)]
@@ -96,7 +96,7 @@ def test_a_run_comes_back_from_disk_as_it_was(tmp_path: Path) -> None:
     result = run_job(job)
     assert read_run(job.path, job.key) == result
     assert read_run(job.path, "another") is None
-    _, trajectory = drive_run(SETTINGS, job.simulation, job.entrant, job.kind, job.number)
+    _, trajectory = drive_run(SETTINGS, job.road, job.entrant)
     again = read_trajectory(job.path)
     for name in ("t_s", "xy_cm", "s_cm", "offset_cm", "steering_rad", "answered", "over", "put_back"):
         np.testing.assert_allclose(getattr(again, name), getattr(trajectory, name), rtol=1e-8, atol=1e-12)
@@ -136,13 +136,37 @@ def test_the_table_shows_mean_and_worst(tmp_path: Path) -> None:
     assert len(paths[2].read_text().splitlines()) == 4
 
 
+def test_the_table_says_who_came_back_where_cars_start_across() -> None:
+    straight = tables([_result("a", 0)])["open"][0]
+    across = [
+        _result("a", 0, across_deg=30.0, back_after_s=0.5),
+        _result("a", 1, across_deg=-30.0, back=False, back_after_s=5.0),
+    ]
+    headers, row = tables(across)["open"]
+    assert set(headers) - set(straight) == {"back in lane", "back after, s"}
+    shown = dict(zip(headers, row, strict=True))
+    assert shown["back in lane"] == "1/2" and shown["back after, s"] == "2.8/5.0"
+    assert summarise(across)[0]["back"] == 1
+
+
+def test_several_networks_take_part_by_their_models() -> None:
+    models = Path(__file__).parents[3] / "checkpoints"
+    entrants = [
+        named_entrant(f"network={models / name}", None, "--detectors", True) for name in ("small", "general")
+    ]
+    assert [entrant.name for entrant in entrants] == ["network-small", "network-general"]
+    assert entrants[0].identity != entrants[1].identity
+    with pytest.raises(LanenetError, match="nowhere"):
+        named_entrant("network=nowhere", None, "--detectors", True)
+
+
 def test_the_top_view_shows_who_drove_where(tmp_path: Path) -> None:
     job = contest_jobs(SETTINGS, [Entrant(TRUTH)], tmp_path)[0]
-    result, trajectory = drive_run(SETTINGS, job.simulation, job.entrant, "open", 0)
+    result, trajectory = drive_run(SETTINGS, job.road, job.entrant)
     away = type(trajectory)(
         **{**trajectory.__dict__, "xy_cm": trajectory.xy_cm + 25.0, "put_back": trajectory.t_s == 2.0}
     )
-    track = draw_track(job.simulation)
+    track = draw_track(job.road.simulation)
     plain = draw_top_view(track, [], "road")
     picture = draw_top_view(track, [(result, trajectory), (result, away)], "road")
     legend = picture.shape[0] - plain.shape[0]
@@ -230,7 +254,7 @@ def test_everybody_drives_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (["--detectors", "truth", "--law", "magic"], "pilot.law"),
         (
             ["--detectors", "truth", "--tracks", "random,moon"],
-            "tracks: found 'moon', expected random or open (drawn roads), a preset (bfmc, carolo_cup, ",
+            "tracks: found 'moon', expected random, open, varied (drawn roads), a preset (bfmc, carolo_cup, ",
         ),
         (["--detectors", "truth", "--tracks", "donkytape"], "(.yaml), did you mean 'donkey_tape'?"),
         (["--detectors", "truth,truth"], "each may be named once"),

@@ -16,14 +16,15 @@ from datagen.judge.run import (
     DepartureCounter,
     Entrant,
     RunResult,
+    StartWatch,
     Trajectory,
     drive_run,
     wheel_offsets_cm,
 )
-from datagen.judge.settings import JudgeSettings, road_names, road_simulation
+from datagen.judge.settings import JudgeSettings, competition_cars, contest_roads
 from datagen.world.car.camera import CameraSettings
 from datagen.world.road.track import Track
-from datagen.world.road.track_settings import TrackSettings
+from datagen.world.road.track_settings import TrackSettings, preset_names
 from datagen.world.world import SimulationSettings
 from lanenet.errors import ConfigError
 from lanenet.perception.estimate import LaneEstimate
@@ -73,8 +74,7 @@ def _ring(radius_cm: float = 100.0) -> Track:
 def _run(
     entrant: Entrant, settings: JudgeSettings = SETTINGS, index: int = 0
 ) -> tuple[RunResult, Trajectory]:
-    kind, number = road_names(settings)[index]
-    return drive_run(settings, road_simulation(settings, index), entrant, kind, number)
+    return drive_run(settings, contest_roads(settings)[index], entrant)
 
 
 def test_wheels_on_a_straight_road_by_hand():
@@ -168,14 +168,17 @@ def test_an_open_road_is_driven_once():
 
 
 def test_roads_differ_and_do_not_depend_on_the_rest_of_the_contest():
-    first, second = (road_simulation(SETTINGS, index) for index in (0, 1))
+    first, second = (contest_roads(SETTINGS)[index].simulation for index in (0, 1))
     assert first.seed != second.seed and first.track.closed
     more = JudgeSettings(count=7, tracks=("open", "random"), simulation=COMMON)
-    assert road_simulation(more, 7) == first
-    assert road_simulation(more, 0).seed == first.seed and not road_simulation(more, 0).track.closed
-    assert road_simulation(SETTINGS.model_copy(update={"seed": 1}), 0).seed != first.seed
+    assert contest_roads(more)[7].simulation == first
+    assert (
+        contest_roads(more)[0].simulation.seed == first.seed
+        and not contest_roads(more)[0].simulation.track.closed
+    )
+    assert contest_roads(SETTINGS.model_copy(update={"seed": 1}))[0].simulation.seed != first.seed
     with pytest.raises(ConfigError, match="each may be named once"):
-        road_names(JudgeSettings(tracks=("open", "open")))
+        contest_roads(JudgeSettings(tracks=("open", "open")))
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -187,8 +190,82 @@ def test_no_road_is_one_of_a_training_run_with_the_same_seed(seed, tmp_path):
         for number in range(getattr(data.synthetic, role))
     }
     settings = JudgeSettings(seed=seed, count=20)
-    judged = {road_simulation(settings, index).seed for index in range(20)}
+    judged = {contest_roads(settings)[index].simulation.seed for index in range(20)}
     assert len(judged) == 20 and not judged & trained
+
+
+def test_a_start_across_is_over_when_the_car_stays_in_its_lane():
+    def watched(*frames: tuple[float, bool, bool]) -> tuple[bool, bool, float]:
+        watch = StartWatch(True, within_s=2.0)
+        for t_s, inside, straight in frames:
+            watch.update(t_s, inside, straight)
+        return watch.open, watch.back, watch.after_s
+
+    # Straight for a moment while a wheel is out, inside for a moment, then both for half a second.
+    swing = ((0.0, True, False), (0.4, False, True), (0.6, True, True), (0.8, False, True))
+    assert watched(*swing) == (True, False, 0.8)
+    assert watched(*swing, (1.0, True, True), (1.25, True, True)) == (True, False, 1.25)
+    assert watched(*swing, (1.0, True, True), (1.5, True, True)) == (False, True, 1.0)
+    assert watched(*swing, (2.0, True, False)) == (False, False, 2.0)
+    # Whoever is inside when the time is up may stay there for its half second.
+    assert watched((1.8, True, True), (2.1, True, True)) == (True, False, 2.1)
+    assert watched((1.8, True, True), (2.3, True, True)) == (False, True, 1.8)
+    straight = StartWatch(False, within_s=2.0)
+    assert (straight.open, straight.back, straight.after_s) == (False, True, 0.0)
+
+
+def test_cars_start_across_their_lane_and_come_back():
+    settings = SETTINGS.model_copy(update={"start_across_deg": 30.0, "distance_cm": 200.0})
+    for index, side in ((0, 1.0), (1, -1.0)):
+        result, trajectory = _run(Entrant(TRUTH), settings, index)
+        # The rear wheels stand over the line at first: not a departure while the car is coming back.
+        assert result.across_deg == 30.0 * side and result.back and 0.2 < result.back_after_s < 2.0
+        assert result.completed and result.departures == 0 and not trajectory.over.any()
+        assert abs(trajectory.offset_cm[0]) < 0.1
+        assert side * trajectory.offset_cm[np.abs(trajectory.offset_cm).argmax()] > 3.0
+        assert result.laps == pytest.approx(0.25)
+    lost, trajectory = _run(LEFT, settings)
+    assert not lost.back and lost.departures >= 1 and lost.put_backs >= 1
+    assert lost.back_after_s == trajectory.t_s[trajectory.put_back][0]
+
+
+def test_varied_roads_are_of_many_kinds_and_their_presets_have_their_cars():
+    settings = JudgeSettings(tracks=("varied", "mat"), count=1, counts={"varied": 12})
+    roads = contest_roads(settings)
+    assert [(road.kind, road.number) for road in roads] == [*(("varied", n) for n in range(12)), ("mat", 0)]
+    presets = {road.simulation.track.preset for road in roads[:12]}
+    assert None in presets and len(presets) > 3
+    assert roads[0].simulation == contest_roads(settings.model_copy(update={"count": 2}))[0].simulation
+    assert [road.simulation.seed for road in roads[:2]] == [
+        road.simulation.seed for road in contest_roads(JudgeSettings(count=2))
+    ]
+    for road in roads:
+        own = competition_cars().get(road.simulation.track.preset or "")
+        width_cm, wheelbase_cm = (16.0, 26.0) if own is None else (own.track_width_cm, own.wheelbase_cm)
+        assert (road.track_width_cm, road.simulation.car.wheelbase_cm) == (width_cm, wheelbase_cm)
+    with pytest.raises(ConfigError, match="counts: found 'moon'"):
+        contest_roads(JudgeSettings(counts={"moon": 3}))
+
+
+def test_cars_of_competitions_stand_back_behind_what_the_settings_name():
+    (road,) = contest_roads(JudgeSettings(tracks=("duckietown",), count=1))
+    assert road.track_width_cm + 9.0 < road.simulation.track.lane_width_cm
+    assert road.simulation.camera.height_cm == competition_cars()["duckietown"].camera_height_cm < 15.0
+    named = JudgeSettings.model_validate(
+        {
+            "tracks": ("duckietown",),
+            "count": 1,
+            "track_width_cm": 16.0,
+            "simulation": {"car": {"wheelbase_cm": 20.0}, "camera": {"height_cm": 18.0}},
+        }
+    )
+    (road,) = contest_roads(named)
+    assert road.track_width_cm == 16.0
+    assert road.simulation.car.wheelbase_cm == 20.0 and road.simulation.camera.height_cm == 18.0
+
+
+def test_every_competition_car_has_its_road():
+    assert set(competition_cars()) == {"carolo_cup", "bfmc", "duckietown"} <= set(preset_names())
 
 
 def test_an_unknown_road_is_refused():
@@ -196,11 +273,11 @@ def test_an_unknown_road_is_refused():
     with pytest.raises(ConfigError, match="no-such-road"):
         from datagen.world.world import draw_track
 
-        draw_track(road_simulation(settings, 0))
+        draw_track(contest_roads(settings)[0].simulation)
 
 
 def test_common_track_settings_hold_for_random_roads():
     common = COMMON.model_copy(update={"track": TrackSettings(lane_width_cm=36.0)})
     settings = JudgeSettings(tracks=("random", "open"), count=1, simulation=common)
     for index in (0, 1):
-        assert road_simulation(settings, index).track.lane_width_cm == 36.0
+        assert contest_roads(settings)[index].simulation.track.lane_width_cm == 36.0
