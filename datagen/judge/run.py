@@ -20,9 +20,10 @@ from datagen.world.car.driver import (
 )
 from datagen.world.road.track import Track
 from datagen.world.simulate import ClosedLoop, LoopFrame
+from datagen.world.variety import tightest_bend_cm
 from datagen.world.world import World, assemble_world
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.frames import map_from_car
+from lanenet.geometry.frames import map_from_car, wrap_angle
 from lanenet.perception.estimate import Detector
 
 #: How far inside all wheels must be before the next departure counts; chosen: half a tape.
@@ -93,6 +94,9 @@ _FACING_AWAY_RAD = 1.2
 #: swing through the lane, and 10 degrees are a correction like others.
 _BACK_FOR_S, _BACK_WITHIN_RAD = 0.5, math.radians(10.0)
 _SAME_TIME_S = 1e-6
+#: Such a start is where the next metre turns by no more than this share of what the car can. Chosen: with 30
+#: degrees outwards in a bend that takes the full lock, no driver comes back.
+_GENTLE_CM, _GENTLE_SHARE = 100.0, 0.5
 #: A car that has not gone this far for ``stuck_s`` is stuck.
 _MOVED_CM = 5.0
 #: How far ahead a car that is stuck is put back: past what stopped it.
@@ -204,6 +208,7 @@ def drive_run(settings: JudgeSettings, road: Road, entrant: Entrant) -> tuple[Ru
     world, across_deg = assemble_world(road.simulation), road.across_deg(settings)
     if across_deg:
         driver = world.driver
+        driver.s_cm = gentle_start_cm(world.track, tightest_bend_cm(world.settings.car), driver.s_cm)
         world.car.place(driver.pose_at(driver.s_cm, slope=math.tan(math.radians(across_deg))))
     loop = ClosedLoop(world, build_pilot(world, entrant, settings.pilot), settings.pilot, settings.speed_cm_s)
     referee = _Referee(settings, road, world, loop.s_cm)
@@ -243,6 +248,30 @@ def drive_run(settings: JudgeSettings, road: Road, entrant: Entrant) -> tuple[Ru
         back_after_s=referee.start.after_s,
     )
     return result, trajectory
+
+
+def gentle_start_cm(track: Track, tightest_cm: float, from_cm: float) -> float:
+    """Return where a car that starts across its lane can come back into it.
+
+    Args:
+        track: The road.
+        tightest_cm: Smallest radius that the car can follow.
+        from_cm: Earliest place along the road.
+
+    Returns:
+        The first place in the half road from there on whose next metre turns by no more than half of what the
+        car can; the gentlest place if there is none.
+    """
+    turns_rad = np.abs(wrap_angle(np.diff(track.heading_rad, append=track.heading_rad[:1])))
+    if not track.closed:
+        turns_rad[-1] = 0.0
+    ahead = max(1, round(_GENTLE_CM / track.step_cm))
+    sums_rad = np.concatenate([[0.0], np.cumsum(np.concatenate([turns_rad, turns_rad[: ahead - 1]]))])
+    turned_rad = sums_rad[ahead:] - sums_rad[:-ahead]
+    reach = np.flatnonzero((track.s_cm >= from_cm) & (track.s_cm <= from_cm + 0.5 * track.length_cm))
+    gentle = reach[turned_rad[reach] <= _GENTLE_SHARE * _GENTLE_CM / tightest_cm]
+    first = gentle[0] if len(gentle) else reach[np.argmin(turned_rad[reach])]
+    return max(from_cm, float(track.s_cm[first]))
 
 
 class StartWatch:

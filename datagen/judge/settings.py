@@ -40,7 +40,7 @@ class JudgeSettings(Settings):
         distance_cm: Driven at most; None: the laps.
         speed_cm_s: Commanded speed.
         start_across_deg: Each car starts with its front axle in the middle of the lane, turned by this, to
-            the left on roads of even number and to the right on the others.
+            the left on roads of even number and to the right on the others, where the road lets it come back.
         back_within_s: Time to get back into the lane after such a start. Until then, or until the car is
             back, wheels over a line do not count as departures.
         track_width_cm: Distance between the contact points of an axle's wheels. On a preset whose

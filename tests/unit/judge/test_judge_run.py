@@ -19,6 +19,7 @@ from datagen.judge.run import (
     StartWatch,
     Trajectory,
     drive_run,
+    gentle_start_cm,
     wheel_offsets_cm,
 )
 from datagen.judge.settings import JudgeSettings, competition_cars, contest_roads
@@ -212,6 +213,20 @@ def test_a_start_across_is_over_when_the_car_stays_in_its_lane():
     assert watched((1.8, True, True), (2.3, True, True)) == (False, True, 1.8)
     straight = StartWatch(False, within_s=2.0)
     assert (straight.open, straight.back, straight.after_s) == (False, True, 0.0)
+
+
+def test_a_start_across_is_where_a_car_can_come_back():
+    assert gentle_start_cm(_straight(), 70.0, 40.0) == 40.0
+    # On a ring as tight as the car's own, one place is like the other; on one twice as wide, all are fine.
+    assert 0.0 <= gentle_start_cm(_ring(), 100.0, 0.0) <= 315.0
+    assert gentle_start_cm(_ring(210.0), 100.0, 0.0) == 0.0
+    # A quarter turn with a radius of 70 cm, then a straight.
+    s = np.arange(0.0, 500.0)
+    heading = np.minimum(s / 70.0, 0.5 * np.pi)
+    xy = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    curvature = np.where(heading < 0.5 * np.pi, 1.0 / 70.0, 0.0)
+    bend = Track(s, xy, heading, curvature, False, 40.0, ())
+    assert gentle_start_cm(bend, 70.0, 0.0) == pytest.approx(70.0 * 0.5 * np.pi - 50.0, abs=1.5)
 
 
 def test_cars_start_across_their_lane_and_come_back():
