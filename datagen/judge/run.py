@@ -94,9 +94,10 @@ _FACING_AWAY_RAD = 1.2
 #: swing through the lane, and 10 degrees are a correction like others.
 _BACK_FOR_S, _BACK_WITHIN_RAD = 0.5, math.radians(10.0)
 _SAME_TIME_S = 1e-6
-#: Such a start is where the next metre turns by no more than this share of what the car can. Chosen: with 30
-#: degrees outwards in a bend that takes the full lock, no driver comes back.
-_GENTLE_CM, _GENTLE_SHARE = 100.0, 0.5
+#: Such a start is where the road turns, over this distance, by no more than this share of what the car can.
+#: Chosen: 30 degrees are turned in 40 cm, delay included; outwards in a bend that takes the full lock, no
+#: driver comes back from them.
+_GENTLE_CM, _GENTLE_SHARE = 50.0, 0.25
 #: A car that has not gone this far for ``stuck_s`` is stuck.
 _MOVED_CM = 5.0
 #: How far ahead a car that is stuck is put back: past what stopped it.
@@ -259,8 +260,8 @@ def gentle_start_cm(track: Track, tightest_cm: float, from_cm: float) -> float:
         from_cm: Earliest place along the road.
 
     Returns:
-        The first place in the half road from there on whose next metre turns by no more than half of what the
-        car can; the gentlest place if there is none.
+        The first place in the half road from there on whose next 50 cm turn by no more than a quarter of what
+        the car can; the gentlest place if there is none.
     """
     turns_rad = np.abs(wrap_angle(np.diff(track.heading_rad, append=track.heading_rad[:1])))
     if not track.closed:

@@ -217,16 +217,16 @@ def test_a_start_across_is_over_when_the_car_stays_in_its_lane():
 
 def test_a_start_across_is_where_a_car_can_come_back():
     assert gentle_start_cm(_straight(), 70.0, 40.0) == 40.0
-    # On a ring as tight as the car's own, one place is like the other; on one twice as wide, all are fine.
+    # On a ring as tight as the car turns no place is gentle; on one four times as wide, all are.
     assert 0.0 <= gentle_start_cm(_ring(), 100.0, 0.0) <= 315.0
-    assert gentle_start_cm(_ring(210.0), 100.0, 0.0) == 0.0
+    assert gentle_start_cm(_ring(420.0), 100.0, 0.0) == 0.0
     # A quarter turn with a radius of 70 cm, then a straight.
     s = np.arange(0.0, 500.0)
     heading = np.minimum(s / 70.0, 0.5 * np.pi)
     xy = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
     curvature = np.where(heading < 0.5 * np.pi, 1.0 / 70.0, 0.0)
     bend = Track(s, xy, heading, curvature, False, 40.0, ())
-    assert gentle_start_cm(bend, 70.0, 0.0) == pytest.approx(70.0 * 0.5 * np.pi - 50.0, abs=1.5)
+    assert gentle_start_cm(bend, 70.0, 0.0) == pytest.approx(70.0 * 0.5 * np.pi - 12.5, abs=1.5)
 
 
 def test_cars_start_across_their_lane_and_come_back():
