@@ -30,7 +30,7 @@ from lanenet.evaluation.errors import (
     sigma_stats,
 )
 from lanenet.evaluation.sources import Opened, at_frames, distance_to_training_cm, lines_seen
-from lanenet.geometry.lane import ROWS_CM
+from lanenet.geometry.lane import ROWS_CM, SIDES
 
 if TYPE_CHECKING:
     from lanenet.data.label_set import LabelSet
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from lanenet.evaluation.answers import Answers, Compared, Progress
 
 FORMAT = "lanenet-evaluation/1"
+
+#: Rows in groups: a detector that measures edges extrapolates to the first one, which no frame shows.
+SHARED_ROWS = {"y = 0": (0,), "y = 15, 30": (1, 2)}
 
 _UNITS = {"*_cm": "centimetre", "coverage": "share of the labelled points, 0 to 1"}
 
@@ -51,6 +54,8 @@ class SourceAnswers:
         kind: ``simulated drive``, ``map`` or ``label set``.
         reference: Where the labels come from: ``truth`` or ``map``.
         truth_cm: Six labels per frame; NaN where there is none.
+        all_cm: As ``truth_cm``, with the points whose place is known although they are no labels; None
+            where the labels are all that is known.
         answers_cm: By detector, six points per frame; NaN where it has no answer.
         sigma_cm: By detector, its sigmas; a detector that predicts none may be left out.
         presence: By detector, its probability that the left and the right line can be seen; likewise.
@@ -67,6 +72,7 @@ class SourceAnswers:
     presence: Mapping[str, Float[np.ndarray, "_ 2"]] = field(default_factory=dict)
     visible: Float[np.ndarray, "n 2"] | None = None
     conditions: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
+    all_cm: Float[np.ndarray, "n 6"] | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,19 @@ class SharedErrors:
 
     own: ErrorStats
     first: ErrorStats
+
+
+@dataclass(frozen=True)
+class WholeTruth:
+    """Errors of a detector over the points that have no label, and over all whose place is known.
+
+    Attributes:
+        masked: Outside the network's window, or of a frame that is not to be labelled.
+        all: With a label or without.
+    """
+
+    masked: ErrorStats
+    all: ErrorStats
 
 
 @dataclass(frozen=True)
@@ -110,6 +129,8 @@ class Comparison:
         tables: Errors by detector, over all sources together.
         shared: By detector but the first: it and the first on the points that both answered. A detector that
             answers only what is easy looks good on its own answers.
+        shared_rows: As ``shared``, by the group of rows (``SHARED_ROWS``).
+        whole: By detector, the errors that the labels leave out; empty where they leave nothing out.
         sources: The errors by source.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
         breakdown: Where the errors come from.
@@ -118,6 +139,8 @@ class Comparison:
     reference: str
     tables: dict[str, ErrorTable]
     shared: dict[str, SharedErrors]
+    shared_rows: dict[str, dict[str, SharedErrors]]
+    whole: dict[str, WholeTruth]
     sources: tuple[SourceErrors, ...]
     errors_cm: dict[str, Float[np.ndarray, "n 6"]]
     breakdown: Breakdown
@@ -137,6 +160,12 @@ class Comparison:
                 "shared_with": None if shared is None else self.first,
                 "shared": None if shared is None else shared.own.as_dict(),
                 "first_on_shared": None if shared is None else shared.first.as_dict(),
+                "shared_rows": {
+                    rows: {"own": pair.own.as_dict(), "first": pair.first.as_dict()}
+                    for rows, pair in self.shared_rows.get(name, {}).items()
+                },
+                "masked": self.whole[name].masked.as_dict() if name in self.whole else None,
+                "all_known": self.whole[name].all.as_dict() if name in self.whole else None,
                 **self.breakdown.of(name),
             }
         sources = [
@@ -234,18 +263,47 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
     }
     errors = {name: np.abs(answer - truth) for name, answer in answers.items()}
     labelled, first = np.isfinite(truth), errors[names[0]]
-    shared = {}
+    shared, shared_rows = {}, {}
     for name in names[1:]:
         both = np.isfinite(first) & np.isfinite(errors[name])
-        shared[name] = SharedErrors(*(error_stats(e, both, labelled) for e in (errors[name], first)))
+        pair = (errors[name], first)
+        shared[name] = SharedErrors(*(error_stats(e, both, labelled) for e in pair))
+        shared_rows[name] = {
+            group: SharedErrors(*(error_stats(*(part[:, at] for part in (e, both, labelled))) for e in pair))
+            for group, at in ((g, _columns_of(rows)) for g, rows in SHARED_ROWS.items())
+        }
     return Comparison(
         reference=reference,
         tables={name: point_errors(answer, truth, reference) for name, answer in answers.items()},
         shared=shared,
+        shared_rows=shared_rows,
+        whole=_whole_truth(sources, truth, answers),
         sources=tuple(_source_errors(source) for source in sources),
         errors_cm=errors,
         breakdown=_break_down(sources, names, truth, errors),
     )
+
+
+def _columns_of(rows: Sequence[int]) -> list[int]:
+    """Columns of both lines' points on some of the label rows."""
+    return [side * len(ROWS_CM) + row for side in range(len(SIDES)) for row in rows]
+
+
+def _whole_truth(
+    sources: Sequence[SourceAnswers],
+    truth_cm: Float[np.ndarray, "n 6"],
+    answers_cm: Mapping[str, Float[np.ndarray, "n 6"]],
+) -> dict[str, WholeTruth]:
+    """Return the errors of each detector without labels; empty if no source knows more than its labels."""
+    parts = [source.truth_cm if source.all_cm is None else source.all_cm for source in sources]
+    known_cm = np.concatenate(parts).astype(np.float64)
+    unlabelled = np.where(np.isfinite(truth_cm), np.nan, known_cm)
+    if not np.isfinite(unlabelled).any():
+        return {}
+    return {
+        name: WholeTruth(*(point_errors(answer, part).all for part in (unlabelled, known_cm)))
+        for name, answer in answers_cm.items()
+    }
 
 
 def _describe(
@@ -253,7 +311,7 @@ def _describe(
 ) -> SourceAnswers:
     """Return the answers to a source with its labels and conditions; ``answers`` are those to frames."""
     frames, labels = source.frames, source.labels
-    conditions, visible = {}, None
+    conditions, visible, all_cm = {}, None, None
     if labels is not None:
         visible = lines_seen(labels)
         conditions["place"] = distance_to_training_cm(labels, training)
@@ -263,7 +321,7 @@ def _describe(
         answer = compared.answer_labels(labels, source.path)
     else:
         kind = "simulated drive" if frames.reference == "truth" else "map"
-        reference, truth_cm = frames.reference, frames.points_cm
+        reference, truth_cm, all_cm = frames.reference, frames.points_cm, frames.all_cm
         answer = next(answers)
         if labels is not None and visible is not None:
             visible = at_frames(visible, labels.frame, frames.frames)
@@ -280,6 +338,7 @@ def _describe(
         presence=answer.presence,
         visible=visible,
         conditions=conditions,
+        all_cm=all_cm,
     )
 
 

@@ -65,8 +65,10 @@ class TextTable:
 
 
 def lay_out(comparison: Comparison) -> list[TextTable]:
-    """Lay out a comparison: by point, on shared points, by source, by condition, sigma and presence."""
+    """Lay out a comparison: by point, with masked ones, shared points, by source and condition, sigma."""
     tables = [_by_point(comparison)]
+    if comparison.whole:
+        tables.append(_with_masked(comparison))
     if comparison.shared:
         tables.append(_on_shared_points(comparison))
     if len(comparison.sources) > 1:
@@ -118,18 +120,40 @@ def _by_point(comparison: Comparison) -> TextTable:
     )
 
 
+def _with_masked(comparison: Comparison) -> TextTable:
+    lines = []
+    for name, whole in comparison.whole.items():
+        groups = {"label": comparison.tables[name].all, "masked": whole.masked, "all": whole.all}
+        for i, (points, stats) in enumerate(groups.items()):
+            count, values = str(stats.truth_count), map(show_cm, _values(stats))
+            lines.append([name if i == 0 else "", points, count, _percent(stats), *values])
+    return TextTable(
+        title="All points whose place is known, in cm, and those without a label apart",
+        header=["detector", "which", "points", "answered", *_STATS],
+        lines=lines,
+        note="masked: beside the network's window, or of a car that is on the line between two lanes; the "
+        "other tables count points with a label only",
+        texts=2,
+        grouped=True,
+    )
+
+
 def _on_shared_points(comparison: Comparison) -> TextTable:
     first = comparison.first
     lines = []
     for name, shared in comparison.shared.items():
-        for label, stats in ((name, shared.own), (first, shared.first)):
-            share = _percent(stats) if label == name else ""
-            lines.append([label, share, *map(show_cm, _values(stats))])
+        groups = {"all": shared, **comparison.shared_rows[name]}
+        for rows, pair in groups.items():
+            for label, stats in ((name, pair.own), (first, pair.first)):
+                share = _percent(stats) if label == name else ""
+                lines.append([label, rows if label == name else "", share, *map(show_cm, _values(stats))])
     return TextTable(
         title=f"Each detector and {first} on the points that both answered, in cm",
-        header=["detector", "shared", *_STATS],
+        header=["detector", "rows", "shared", *_STATS],
         lines=lines,
-        note=f"two lines each: a detector, and {first} on the same points; shared: of the labelled points",
+        note=f"two lines each: a detector, and {first} on the same points; shared: of the labelled points. "
+        "No frame shows y = 0: a detector that measures edges extrapolates there",
+        texts=2,
     )
 
 

@@ -23,11 +23,11 @@ LOG = logging.getLogger(__name__)
 HOUGH_VALUE = Path(__file__).resolve().parents[2] / "configs" / "detectors" / "hough_value.yaml"
 
 #: Rough cameras of the tubs (focal length, k1, pitch in degrees), not calibrations. The lane's width in cm is
-#: a guess for the first, and for the others the median of what the painter measured with that camera.
+#: assumed, as in the configs of these names: nobody has measured it.
 TUBS = {
     "donkey_circuit": (80.0, -0.03, 15.0, 59.0),
-    "usi_mat": (105.0, -0.05, 18.0, 31.0),
-    "garage_tape": (86.0, -0.07, 13.0, 41.0),
+    "usi_mat": (105.0, -0.05, 18.0, 41.0),
+    "garage_tape": (86.0, -0.07, 13.0, 31.0),
 }
 
 

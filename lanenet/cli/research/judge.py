@@ -15,7 +15,14 @@ from lanenet.config import apply_overrides, check_settings, read_yaml
 from lanenet.errors import ConfigError
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.network.model_file import find_model
-from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed
+from lanenet.perception.registry import (
+    KINDS,
+    build_detector,
+    compared_names,
+    detector_names,
+    kind_of,
+    listed,
+)
 
 if TYPE_CHECKING:
     from datagen.judge.run import Entrant, RunResult
@@ -27,7 +34,7 @@ app = typer.Typer()
 
 #: Drives as the network unless ``--model`` names another.
 SHIPPED_MODEL = Path("checkpoints/small")
-_DETECTORS = ",".join(("truth", *KINDS))
+_DETECTORS = ",".join(("truth", *compared_names()))
 _WITH_SETTINGS = listed(detector_names(lambda kind: kind.settings is not None))
 _BESIDE = 5  # detectors in one table on the screen: a terminal is narrow
 
@@ -101,7 +108,7 @@ def judge(
     if detectors is None:
         detectors = _DETECTORS
         if model is None and not SHIPPED_MODEL.exists():
-            detectors = ",".join(("truth", *detector_names(lambda kind: not kind.needs_model)))
+            detectors = ",".join(("truth", *compared_names(lambda kind: not kind.needs_model)))
             console.show_problems([f"{SHIPPED_MODEL} is not there: without the network; --model names one"])
     names = [text.strip() for text in detectors.split(",")]
     entrants = [named_entrant(name, model, "--detectors", any_camera) for name in names]
@@ -227,8 +234,9 @@ def named_entrant(text: str, model: Path | None, option: str, any_camera: bool) 
     name, equals, file = text.partition("=")
     if name in (TRUTH, TRUE_POINTS) and not equals:
         return Entrant(name)
-    if name not in KINDS:
-        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *KINDS))}")
+    known = compared_names()
+    if name not in known or (equals and name not in KINDS):
+        raise ConfigError(f"{option} {text!r}: expected {', '.join((TRUTH, TRUE_POINTS, *known))}")
     shown = f"{name}-{Path(file).stem}" if equals else name
     if kind_of(name).needs_model:
         detector = NamedDetector(name, _network_model(Path(file) if equals else model), None, any_camera)

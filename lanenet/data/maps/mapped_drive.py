@@ -279,6 +279,8 @@ class LabelledFrames:
         starts: True where a frame does not continue the one before.
         points_cm: The six labels of each frame, frame car; NaN where there is none.
         image: Reads frame i (by position); DriveFormatError naming the file if it cannot.
+        all_cm: As ``points_cm``, with the points that a simulator knows although they are no labels; None
+            where the labels are all that is known.
     """
 
     name: str
@@ -291,6 +293,7 @@ class LabelledFrames:
     starts: Bool[np.ndarray, "n"]
     points_cm: Float[np.ndarray, "n 6"]
     image: Callable[[int], UInt8[np.ndarray, "h w 3"]] = field(repr=False)
+    all_cm: Float[np.ndarray, "n 6"] | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -309,6 +312,7 @@ class LabelledFrames:
             frames=self.frames[rows],
             starts=self.starts[rows],
             points_cm=self.points_cm[rows],
+            all_cm=None if self.all_cm is None else self.all_cm[rows],
             image=partial(_image_at, self.image, rows),
         )
 
@@ -346,6 +350,7 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
     window = BirdseyeWindow() if window is None else window
     starts = drive.breaks.copy()
     starts[0] = True
+    all_cm = np.stack([truth[name] for name in POINT_NAMES], axis=1)
     return LabelledFrames(
         name=str(path),
         reference="truth",
@@ -355,8 +360,9 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
         perception=PerceptionSettings(),
         frames=drive.frames,
         starts=starts,
-        points_cm=window.labelled(np.stack([truth[name] for name in POINT_NAMES], axis=1)),
+        points_cm=window.labelled(all_cm),
         image=drive.image,
+        all_cm=all_cm,
     )
 
 

@@ -45,6 +45,29 @@ def test_each_detector_is_held_against_the_first_on_shared_points():
     assert shared.own.coverage == 0.5
 
 
+def test_the_row_that_no_frame_shows_stands_apart():
+    own = TRUTH + [9.0, 1.0, 1.0] * 2
+    rows = compare_detectors([source(bold=bold(), own=own)]).shared_rows["own"]
+    assert rows["y = 0"].own.rmse_cm == pytest.approx(9.0) and rows["y = 0"].own.count == 10
+    assert rows["y = 15, 30"].own.rmse_cm == pytest.approx(1.0)
+    assert rows["y = 15, 30"].first.rmse_cm == pytest.approx(np.sqrt((4 + 100) / 2))
+
+
+def test_points_without_a_label_are_counted_beside_those_with_one():
+    label = TRUTH.copy()
+    label[:, 5] = NAN
+    answer = TRUTH + [1.0, 1.0, 1.0, 1.0, 1.0, 7.0]
+    masked = SourceAnswers("runs/a", "simulated drive", "truth", label, {"one": answer}, all_cm=TRUTH)
+    found = compare_detectors([masked, source("b", one=TRUTH + 1.0)])
+    whole = found.whole["one"]
+    assert found.tables["one"].all.rmse_cm == pytest.approx(1.0)
+    assert (whole.masked.rmse_cm, whole.masked.truth_count) == (pytest.approx(7.0), 5)
+    assert (whole.all.rmse_cm, whole.all.truth_count) == (pytest.approx(np.sqrt(5.0)), 60)
+    assert found.as_dict()["detectors"]["one"]["all_known"]["count"] == 60
+    assert "| masked | 5 | 100% | 7.00 |" in as_markdown(found)
+    assert not compare_detectors([source(one=TRUTH)]).whole
+
+
 def test_a_detector_that_answers_nothing_spoils_no_other():
     mute = np.full_like(TRUTH, NAN)
     found = compare_detectors([source(bold=bold(), mute=mute, shy=shy())])

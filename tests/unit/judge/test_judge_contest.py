@@ -236,13 +236,13 @@ def test_everybody_drives_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     # Without the network where there is none, and it says so.
     result = CliRunner().invoke(app, ["judge"])
-    assert asked == [["truth", "lane-filter", "hough", "painter"]]
+    assert asked == [["truth", "lane-filter", "hough", "hough-value", "painter"]]
     assert "checkpoints/small is not there" in result.stderr
     # A model that is asked for has to be there; the one that ships drives with the others.
     assert "mine.onnx: no such file" in CliRunner().invoke(app, ["judge", "--model", "mine.onnx"]).stderr
     (tmp_path / "checkpoints").symlink_to(Path(__file__).parents[3] / "checkpoints")
     CliRunner().invoke(app, ["judge"])
-    assert asked[1:] == [["truth", "network", "lane-filter", "hough", "painter"]]
+    assert asked[1:] == [["truth", "network", "lane-filter", "hough", "hough-value", "painter"]]
 
 
 @pytest.mark.parametrize(
