@@ -35,7 +35,8 @@ def val(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Also write the report under this name: .md, .json, .png, -breakdown.png, -worst.jpg."
+            help="Also write the report under this name: .md, .json, .png, -breakdown.png, -worst.jpg, "
+            "-plain.jpg."
         ),
     ] = None,
     detectors: Annotated[

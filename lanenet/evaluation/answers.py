@@ -8,15 +8,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from lanenet.data.label_set import LabelSet
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.evaluation.detect import run_detectors
+from lanenet.evaluation.plain_sight import in_plain_sight
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, SIDES
-from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector, DetectorInputs, EdgeDetector
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, open_model
 from lanenet.perception.registry import build_detector, build_on_edges, compared_names, kind_of
@@ -41,6 +42,7 @@ class Answers:
         presence: Probability that the left and the right line can be seen; likewise.
         confidence: Of each frame; empty for label sets.
         brightness: Mean grey level of each frame, 0 to 255; None for label sets.
+        plain: Frames with both markings in plain sight; None for label sets.
     """
 
     points_cm: dict[str, Float[np.ndarray, "n 6"]]
@@ -48,6 +50,7 @@ class Answers:
     presence: dict[str, Float[np.ndarray, "n 2"]] = field(default_factory=dict)
     confidence: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
     brightness: Float[np.ndarray, "n"] | None = None
+    plain: Bool[np.ndarray, "n"] | None = None
 
 
 def answer_frames(
@@ -66,19 +69,24 @@ def answer_frames(
         LanenetError: As :func:`run_detectors`.
     """
     n = len(frames)
-    brightness = np.empty(n)
+    brightness, plain = np.empty(n), np.zeros(n, bool)
+    extractor = RoadEdgeExtractor(frames.camera, frames.perception)
     answers = Answers(
         {name: np.full((n, N_POINTS), np.nan) for name in detectors},
         {name: np.full((n, N_POINTS), np.nan) for name in detectors},
         {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
         {name: np.full(n, np.nan) for name in detectors},
         brightness,
+        plain,
     )
     for seen in run_detectors(frames, detectors):
         i, image = seen.index, seen.image
         assert image is not None
         # Every fourth pixel is enough for a mean.
         brightness[i] = image[::4, ::4].mean()
+        if np.isfinite(frames.points_cm[i]).all():
+            road = extractor.extract(image)
+            plain[i] = in_plain_sight(road.points_cm, road.normals, frames.points_cm[i])
         for name, found in seen.estimates.items():
             answers.points_cm[name][i] = found.points_cm
             answers.sigma_cm[name][i] = found.sigma_cm

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lanenet.errors import LabelFormatError
 from lanenet.evaluation.errors import (
@@ -29,6 +29,7 @@ from lanenet.evaluation.errors import (
     rmse_interval_cm,
     sigma_stats,
 )
+from lanenet.evaluation.plain_sight import OFF_CM, PlainSight, count_off, off_markings
 from lanenet.evaluation.sources import Opened, at_frames, distance_to_training_cm, lines_seen
 from lanenet.geometry.lane import ROWS_CM, SIDES
 
@@ -60,6 +61,7 @@ class SourceAnswers:
         sigma_cm: By detector, its sigmas; a detector that predicts none may be left out.
         presence: By detector, its probability that the left and the right line can be seen; likewise.
         visible: Whether each line can be seen: 1, 0, or NaN for unknown; None if unknown throughout.
+        plain: Frames with both markings in plain sight; None where there are no frames.
         conditions: By name (see :data:`lanenet.evaluation.errors.GROUPS`) its value for each frame.
     """
 
@@ -73,6 +75,7 @@ class SourceAnswers:
     visible: Float[np.ndarray, "n 2"] | None = None
     conditions: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
     all_cm: Float[np.ndarray, "n 6"] | None = None
+    plain: Bool[np.ndarray, "n"] | None = None
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,7 @@ class Comparison:
             answers only what is easy looks good on its own answers.
         shared_rows: As ``shared``, by the group of rows (``SHARED_ROWS``).
         whole: By detector, the errors that the labels leave out; empty where they leave nothing out.
+        plain: By detector, what it says about markings in plain sight; empty where no frame shows them so.
         sources: The errors by source.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
         breakdown: Where the errors come from.
@@ -141,6 +145,7 @@ class Comparison:
     shared: dict[str, SharedErrors]
     shared_rows: dict[str, dict[str, SharedErrors]]
     whole: dict[str, WholeTruth]
+    plain: dict[str, PlainSight]
     sources: tuple[SourceErrors, ...]
     errors_cm: dict[str, Float[np.ndarray, "n 6"]]
     breakdown: Breakdown
@@ -165,6 +170,7 @@ class Comparison:
                     for rows, pair in self.shared_rows.get(name, {}).items()
                 },
                 "masked": self.whole[name].masked.as_dict() if name in self.whole else None,
+                "plain_sight": vars(self.plain[name]) if name in self.plain else None,
                 "all_known": self.whole[name].all.as_dict() if name in self.whole else None,
                 **self.breakdown.of(name),
             }
@@ -180,6 +186,28 @@ class Comparison:
             "sources": sources,
             "detectors": detectors,
         }
+
+
+@dataclass(frozen=True)
+class SeenSource:
+    """What the first detector of a comparison answers on frames, for pictures.
+
+    Attributes:
+        frames: The source.
+        answers_cm: Six points for each frame; NaN where it has no answer.
+        plain: Frames with both markings in plain sight.
+    """
+
+    frames: LabelledFrames
+    answers_cm: Float[np.ndarray, "n 6"]
+    plain: Bool[np.ndarray, "n"]
+
+    @property
+    def off_cm(self) -> Float[np.ndarray, "n 6"]:
+        """The answers off a marking in plain sight, on the rows that frames show; NaN otherwise."""
+        off = self.plain & (off_markings(self.answers_cm, self.frames.points_cm) > OFF_CM)
+        shown = np.tile(np.array(ROWS_CM) > 0.0, len(SIDES))
+        return np.where(off[:, None] & shown, self.answers_cm, np.nan)
 
 
 def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[str, ...]:
@@ -200,7 +228,7 @@ def evaluate(
     training: Sequence[LabelSet] = (),
     workers: int = 1,
     progress: Progress | None = None,
-) -> tuple[Comparison, list[tuple[LabelledFrames, Float[np.ndarray, "_ 6"]]]]:
+) -> tuple[Comparison, list[SeenSource]]:
     """Run detectors over sources and compare them.
 
     Args:
@@ -212,7 +240,7 @@ def evaluate(
             done, sources).
 
     Returns:
-        The comparison; and the sources that have frames, each with the first detector's points on them.
+        The comparison; and what the first detector answers on the sources that have frames.
 
     Raises:
         LanenetError: If a source cannot be read or does not fit a detector.
@@ -222,9 +250,9 @@ def evaluate(
     answered = [_describe(source, compared, answers, training) for source in sources]
     comparison = compare_detectors(answered)
     seen = [
-        (source.frames, answer.answers_cm[comparison.first])
+        SeenSource(source.frames, answer.answers_cm[comparison.first], answer.plain)
         for source, answer in zip(sources, answered, strict=True)
-        if source.frames is not None
+        if source.frames is not None and answer.plain is not None
     ]
     return comparison, seen
 
@@ -262,6 +290,8 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         for name in names
     }
     errors = {name: np.abs(answer - truth) for name, answer in answers.items()}
+    shows = [np.zeros(len(s.truth_cm), bool) if s.plain is None else s.plain for s in sources]
+    plain = np.concatenate(shows)
     labelled, first = np.isfinite(truth), errors[names[0]]
     shared, shared_rows = {}, {}
     for name in names[1:]:
@@ -278,6 +308,7 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         shared=shared,
         shared_rows=shared_rows,
         whole=_whole_truth(sources, truth, answers),
+        plain={name: count_off(answer, truth, plain) for name, answer in answers.items() if plain.any()},
         sources=tuple(_source_errors(source) for source in sources),
         errors_cm=errors,
         breakdown=_break_down(sources, names, truth, errors),
@@ -339,6 +370,7 @@ def _describe(
         visible=visible,
         conditions=conditions,
         all_cm=all_cm,
+        plain=answer.plain,
     )
 
 

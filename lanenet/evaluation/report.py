@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import LabelFormatError
-from lanenet.evaluation.comparison import Comparison
+from lanenet.evaluation.comparison import Comparison, SeenSource
 from lanenet.evaluation.errors import GROUPS, RELIABILITY_SHARES
 from lanenet.evaluation.tables import as_markdown
 from lanenet.geometry.lane import ROWS_CM, SIDES
@@ -28,30 +28,33 @@ _LEAST_CM = 0.01
 _TILE_WIDTH_PX, _COLUMNS, _LEGEND_PX = 400, 4, 24
 #: Neighbours look alike: of frames this close only the worst is shown. Chosen.
 _APART_FRAMES = 15
+#: Frames at most with an answer off a marking in plain sight. Chosen: as many as a person looks at.
+_OFF_FRAMES = 20
 #: A sheet of photographs takes a tenth of its size as PNG.
 _JPEG_QUALITY = 88
 
 
-def report_files(
-    comparison: Comparison, seen: Sequence[tuple[LabelledFrames, Float[np.ndarray, "_ 6"]]]
-) -> dict[str, str | bytes]:
+def report_files(comparison: Comparison, seen: Sequence[SeenSource]) -> dict[str, str | bytes]:
     """Return the files of a report, by the ending of the name.
 
     Args:
         comparison: The figures.
-        seen: Sources with frames, and the first detector's points on each.
+        seen: The first detector's points on each source with frames.
 
     Returns:
         ``.md``, and where they can be made ``.png`` (errors by row), ``-breakdown.png`` (errors by bend, and
-        coverage of sigma) and ``-worst.jpg`` (the frames with the first detector's largest errors).
+        coverage of sigma), ``-worst.jpg`` (the frames with the first detector's largest errors) and
+        ``-plain.jpg`` (the same of the frames in which it is off a marking in plain sight).
     """
-    frames, answers_cm = [source for source, _ in seen], [answer for _, answer in seen]
+    frames, answers_cm = [source.frames for source in seen], [source.answers_cm for source in seen]
     worst = find_worst(frames, answers_cm)
+    off = find_worst(frames, [source.off_cm for source in seen], _OFF_FRAMES)
     files = {
         ".md": as_markdown(comparison),
         ".png": plot_errors(comparison),
         "-breakdown.png": plot_breakdown(comparison),
         "-worst.jpg": jpeg_bytes(draw_worst(frames, answers_cm, worst)) if worst else None,
+        "-plain.jpg": jpeg_bytes(draw_worst(frames, answers_cm, off)) if off else None,
     }
     return {ending: content for ending, content in files.items() if content is not None}
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from lanenet.errors import printable
 from lanenet.evaluation.comparison import Comparison
 from lanenet.evaluation.errors import GROUPS, INTERVALS, ErrorStats
+from lanenet.evaluation.plain_sight import OFF_CM
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
 
 _STATS = ("RMSE", "median", "p95", "worst")
@@ -71,6 +72,8 @@ def lay_out(comparison: Comparison) -> list[TextTable]:
         tables.append(_with_masked(comparison))
     if comparison.shared:
         tables.append(_on_shared_points(comparison))
+    if comparison.plain:
+        tables.append(_in_plain_sight(comparison))
     if len(comparison.sources) > 1:
         tables.append(_by_source(comparison))
     for condition, by_detector in comparison.breakdown.groups.items():
@@ -154,6 +157,19 @@ def _on_shared_points(comparison: Comparison) -> TextTable:
         note=f"two lines each: a detector, and {first} on the same points; shared: of the labelled points. "
         "No frame shows y = 0: a detector that measures edges extrapolates there",
         texts=2,
+    )
+
+
+def _in_plain_sight(comparison: Comparison) -> TextTable:
+    lines = []
+    for name, found in comparison.plain.items():
+        per_1000 = f"{1000.0 * found.off / found.answered:.1f}" if found.answered else "-"
+        lines.append([name, *map(str, (found.frames, found.answered, found.off)), per_1000])
+    return TextTable(
+        title="Frames with both markings in plain sight",
+        header=["detector", "frames", "answered", "off", "off per 1000"],
+        lines=lines,
+        note=f"off: an answer at y = 15 or 30 cm lies more than {OFF_CM:.0f} cm across off a marking",
     )
 
 
