@@ -92,7 +92,7 @@ def label_map(
         seen = found.lines[k]
         assert seen is not None
         road = extractor.extract(mapped.drive.image(int(mapped.rows[k])))
-        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
+        edges.append(road.rows())
         lines.append((seen.left_cm, seen.right_cm))
         residuals.append(frame_residual_cm(road.points_cm, seen, drive_map.meta.tape_cm))
     residual_cm = np.array(residuals)

@@ -48,7 +48,7 @@ def truth_labels(
     edges = []
     for i in range(len(drive)):
         road = extractor.extract(drive.image(i))
-        edges.append(np.concatenate([road.points_cm, road.normals], axis=1).astype(np.float32))
+        edges.append(road.rows())
     n = len(drive)
     window = BirdseyeWindow() if window is None else window
     poses = np.stack([truth["x_cm"], truth["y_cm"], truth["heading_rad"]], axis=1)

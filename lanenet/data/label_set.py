@@ -22,12 +22,13 @@ from lanenet.data.tables import MAX_PLACE, ParquetTable, float_array, list_array
 from lanenet.errors import ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
-from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.perception.edges.raster import fill_raster, new_raster
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
 from lanenet.reading import image_size, parsing
 
 __all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
 
-FORMAT = "lanenet-labels/1"
+FORMAT = "lanenet-labels/2"
 Source = Literal["map", "truth"]
 
 
@@ -58,7 +59,14 @@ class LabelMeta:
     camera_cm: tuple[float, float, float] | None = None
 
 
-_EDGE_COLUMNS = ("edges_x_cm", "edges_y_cm", "edges_normal_x", "edges_normal_y")
+_EDGE_COLUMNS = (
+    "edges_x_cm",
+    "edges_y_cm",
+    "edges_normal_x",
+    "edges_normal_y",
+    "edges_yellow",
+    "edges_red",
+)
 _LINE_COLUMNS = (("left_line_x_cm", "left_line_y_cm"), ("right_line_x_cm", "right_line_y_cm"))
 _DIVIDES_COLUMNS = ("left_divides", "right_divides")
 _POSE_COLUMNS = ("x_cm", "y_cm", "heading_rad")
@@ -77,7 +85,8 @@ class LabelSet:
         lap: Lap in its drive, from 0.
         poses: Rear-axle poses, [cm], [cm], [rad], frame map.
         points_cm: The six labels, frame car; NaN where masked.
-        edges: Per frame x, y, normal x, normal y of the edge points, [cm], frame car.
+        edges: Per frame x, y, normal x, normal y, yellow and red of the edge points, [cm], frame car, see
+            :meth:`RoadEdges.rows`.
         lines: Per frame the left and the right line as polylines in the direction of travel, [cm], frame
             car; NaN rows break them.
         quality: 0 (worthless) to 1.
@@ -92,7 +101,7 @@ class LabelSet:
     lap: Int[np.ndarray, "n"]
     poses: Float[np.ndarray, "n 3"]
     points_cm: Float[np.ndarray, "n 6"]
-    edges: list[Float[np.ndarray, "_ 4"]]
+    edges: list[Float[np.ndarray, "_ 6"]]
     lines: list[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]]
     quality: Float[np.ndarray, "n"]
     divides: Bool[np.ndarray, "n 2"]
@@ -108,9 +117,10 @@ class LabelSet:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def raster(self, i: int) -> UInt8[np.ndarray, "r c"]:
-        """Return the bird's-eye raster of row ``i``."""
-        return self.meta.window.rasterise(self.edges[i][:, :2])
+    def raster(self, i: int) -> UInt8[np.ndarray, "p r c"]:
+        """Return the bird's-eye raster of row ``i``, with all planes."""
+        window = self.meta.window
+        return fill_raster(window, RoadEdges.of_rows(self.edges[i]), new_raster(window))
 
     def subset(self, keep: slice | Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> LabelSet:
         """Return the selected rows, in the given order."""
@@ -207,7 +217,7 @@ _UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 t
 class _MetaFile(Settings):
     """The metadata in the file, see :class:`LabelMeta`."""
 
-    format: Literal["lanenet-labels/1"]
+    format: Literal["lanenet-labels/2"]
     rows_cm: tuple[float, ...]
     order: tuple[str, ...]
     units: dict[str, str]

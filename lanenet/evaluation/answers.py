@@ -236,7 +236,7 @@ def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarra
         if not follows:
             detector.reset()
         edges = np.asarray(edges, np.float64)
-        points[i] = detector.estimate(edges[:, :2], edges[:, 2:]).points_cm
+        points[i] = detector.estimate(edges[:, :2], edges[:, 2:4]).points_cm
     return points
 
 
@@ -293,12 +293,12 @@ class RasterModel:
             )
 
     def answer(
-        self, rasters: UInt8[np.ndarray, "n 1 r c"], lane_cm: Float[np.ndarray, "n"] | None = None
+        self, rasters: UInt8[np.ndarray, "n p r c"], lane_cm: Float[np.ndarray, "n"] | None = None
     ) -> RasterAnswers:
-        """Run the model on rasters of 0 and 255.
+        """Run the model on rasters.
 
         Args:
-            rasters: Bird's-eye rasters.
+            rasters: Bird's-eye rasters with all planes, see :mod:`lanenet.perception.edges.raster`.
             lane_cm: Lane width of each, for a model that takes it; None: not known.
         """
         n = len(rasters)
@@ -306,15 +306,15 @@ class RasterModel:
         values = {name: np.full((n, width), np.nan) for name, width in columns.items()}
         for start in range(0, n, _CHUNK):
             part = rasters[start : start + _CHUNK]
-            feed = {INPUT_NAME: part}
+            feed = {INPUT_NAME: np.ascontiguousarray(part[:, : self.meta.planes])}
             if self.meta.takes_width and lane_cm is not None:
                 feed[WIDTH_NAME] = lane_cm[start : start + _CHUNK].astype(np.float32)
             # As on the car: an empty raster gets no points.
-            marked = np.asarray(part.any(axis=(1, 2, 3)))[:, None]
+            marked = np.asarray(part[:, 0].any(axis=(1, 2)))[:, None]
             for name, answer in zip(values, self._session.run(list(values), feed), strict=True):
                 values[name][start : start + _CHUNK] = np.where(marked, answer, np.nan)
         # An empty raster shows no line; that is an answer.
-        values["presence"][~rasters.any(axis=(1, 2, 3))] = 0.0
+        values["presence"][~rasters[:, 0].any(axis=(1, 2))] = 0.0
         return RasterAnswers(**values)
 
     def answer_labels(self, labels: LabelSet) -> RasterAnswers:
@@ -324,7 +324,7 @@ class RasterModel:
             ModelMismatchError: If it has another window or other edges.
         """
         self.check_rasters(labels.meta.window, labels.meta.perception)
-        rasters = [labels.raster(i)[None] for i in range(len(labels.points_cm))]
-        shape = (-1, 1, self.meta.window.rows, self.meta.window.columns)
+        rasters = [labels.raster(i)[: self.meta.planes] for i in range(len(labels.points_cm))]
+        shape = (-1, self.meta.planes, self.meta.window.rows, self.meta.window.columns)
         lane_cm = np.full(len(rasters), labels.meta.lane_width_cm)
         return self.answer(np.array(rasters, np.uint8).reshape(shape), lane_cm)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
@@ -77,12 +77,19 @@ class BirdseyeWindow:
         """
         raster = np.zeros((self.rows, self.columns), np.uint8) if out is None else out
         raster[...] = 0
+        row, column, _ = self.places(points_car_cm)
+        raster[row, column] = 255
+        return raster
+
+    def places(
+        self, points_car_cm: Float[np.ndarray, "n 2"]
+    ) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"], Bool[np.ndarray, "n"]]:
+        """Return row and column of the cell of each point inside the window, and which points those are."""
         x = (points_car_cm[:, 0] - self.left_cm) / self.cell_cm
         y = (self.far_cm - points_car_cm[:, 1]) / self.cell_cm
         with np.errstate(invalid="ignore"):
             inside = (x >= 0.0) & (x < self.columns) & (y >= 0.0) & (y < self.rows)
-        raster[y[inside].astype(np.intp), x[inside].astype(np.intp)] = 255
-        return raster
+        return y[inside].astype(np.intp), x[inside].astype(np.intp), inside
 
 
 class WindowFile(Settings):

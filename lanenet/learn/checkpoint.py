@@ -222,12 +222,13 @@ def write_checkpoint(
         perception=samples.perception,
         lane_width_range_cm=samples.lane_widths_cm,
         takes_width=settings.network.takes_width,
+        planes=network.planes,
     )
-    rasters = _spread_rasters(val, _N_CHECK_RASTERS)
+    rasters = _spread_rasters(val, _N_CHECK_RASTERS, network.planes)
     write_text(folder / CONFIG_NAME, dump_settings(settings))
     write_weights(folder / WEIGHTS_NAME, network, meta)
     write_rasters(folder / RASTERS_NAME, rasters)
-    write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS))
+    write_rasters(folder / CALIBRATION_NAME, _spread_rasters(samples, _N_CALIBRATION_RASTERS, network.planes))
     difference = export_onnx(network, meta, rasters, folder / MODEL_NAME)
     write_curve(folder, history)
     presence = presence_stats(answers.presence, answers.present)
@@ -253,10 +254,10 @@ def write_checkpoint(
     return errors.all.rmse_cm
 
 
-def _spread_rasters(samples: LaneSamples, count: int) -> UInt8[np.ndarray, "_ 1 r c"]:
+def _spread_rasters(samples: LaneSamples, count: int, planes: int) -> UInt8[np.ndarray, "_ p r c"]:
     """Return rasters of frames spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
-    return samples.plain_batch(chosen).rasters
+    return np.ascontiguousarray(samples.plain_batch(chosen).rasters[:, :planes])
 
 
 @contextmanager

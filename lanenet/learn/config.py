@@ -26,6 +26,8 @@ class NetworkSettings(Settings):
         bins: The network answers each point as a distribution over this many places from the left to the
             right end of the window; 0 as a number with its sigma. The default was compared with numbers in
             docs/learning.md ("Loss"): RMSE 0.45 cm against 0.51 cm. Without bins for ``alexnet``.
+        planes: How many planes of a raster it sees, see :data:`lanenet.perception.edges.raster.PLANES`: 1 for
+            edges alone, 5 for their directions and colours too.
         takes_width: The network can be given the lane width beside the raster. Where lanes of many widths are
             learned together, the width tells the lane from two lanes, or from half a lane.
         weights: File with pretrained weights, for ``alexnet`` as torchvision names them; None starts from
@@ -38,6 +40,7 @@ class NetworkSettings(Settings):
     )
     hidden: int | None = Field(default=None, ge=4, le=1024)
     bins: int = Field(default=64, ge=0, le=512)
+    planes: Literal[1, 5] = 5
     takes_width: bool = False
     weights: Path | None = None
 
@@ -45,7 +48,9 @@ class NetworkSettings(Settings):
     @classmethod
     def _no_bins_where_they_cannot_be(cls, data: Any) -> Any:
         trunk = TRUNKS.get(data.get("kind", "small")) if isinstance(data, dict) else None
-        return data if trunk is None or "bins" in trunk.uses else {"bins": 0, **data}
+        if trunk is None or "bins" in trunk.uses:
+            return data
+        return {"bins": 0, "planes": 1, **data}
 
     @field_validator("bins")
     @classmethod
@@ -63,8 +68,9 @@ class NetworkSettings(Settings):
 
     @model_validator(mode="after")
     def _check_uses(self) -> NetworkSettings:
-        for name in ("channels", "hidden", "bins", "takes_width", "weights"):
-            if getattr(self, name) not in (None, 0, False) and name not in TRUNKS[self.kind].uses:
+        for name in ("channels", "hidden", "bins", "planes", "takes_width", "weights"):
+            plain = (None, 0, False, 1) if name == "planes" else (None, 0, False)
+            if getattr(self, name) not in plain and name not in TRUNKS[self.kind].uses:
                 raise ValueError(f"{name}: {self.kind} does not use it, found {getattr(self, name)}")
         return self
 

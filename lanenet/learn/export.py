@@ -75,7 +75,7 @@ _ROUNDS, _WARM_UP = 200, 20
 
 
 def export_onnx(
-    network: LaneNet, meta: ModelMeta, rasters: UInt8[np.ndarray, "n 1 r c"], path: Path
+    network: LaneNet, meta: ModelMeta, rasters: UInt8[np.ndarray, "n p r c"], path: Path
 ) -> float:
     """Write a network as ONNX, after a check against PyTorch.
 
@@ -138,7 +138,7 @@ def export_checkpoint(
         label_set = read_labels(file)
         if label_set.meta.window != meta.window:
             raise CheckpointError(f"{file}: made for {label_set.meta.window}, expected {meta.window}")
-        rasters.append(np.stack([label_set.raster(i) for i in range(len(label_set))])[:, None])
+        rasters.append(np.stack([label_set.raster(i)[: meta.planes] for i in range(len(label_set))]))
     every = np.concatenate(rasters)
     return path, len(every), export_onnx(network, meta, every, path)
 
@@ -208,7 +208,7 @@ def read_network(checkpoint: Path) -> tuple[LaneNet, ModelMeta]:
     return network.eval(), meta
 
 
-def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
+def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n p r c"]) -> None:
     """Write rasters as one tall image, so that a later export can be checked without the data."""
     tall = rasters.reshape(-1, rasters.shape[-1])
     done, png = cv2.imencode(".png", tall)
@@ -217,7 +217,7 @@ def write_rasters(path: Path, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
     write_bytes(path, png.tobytes())
 
 
-def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
+def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n p r c"]:
     """Read what :func:`write_rasters` wrote.
 
     Raises:
@@ -227,10 +227,12 @@ def read_rasters(path: Path, meta: ModelMeta) -> UInt8[np.ndarray, "n 1 r c"]:
         raise CheckpointError(f"{path}: no such file; an export needs its rasters")
     image = read_image(path, CheckpointError, cv2.IMREAD_GRAYSCALE)
     rows, columns = meta.window.rows, meta.window.columns
-    if image.shape[1] != columns or image.shape[0] % rows:
+    if image.shape[1] != columns or image.shape[0] % (meta.planes * rows):
         found = f"{image.shape[0]} x {image.shape[1]}"
-        raise CheckpointError(f"{path}: found {found}, expected rasters of {rows} x {columns}")
-    return image.reshape(-1, 1, rows, columns)
+        raise CheckpointError(
+            f"{path}: found {found}, expected rasters of {meta.planes} x {rows} x {columns}"
+        )
+    return image.reshape(-1, meta.planes, rows, columns)
 
 
 @dataclass(frozen=True)
@@ -342,7 +344,7 @@ def _write_tested(
     path: Path,
     model: onnx.ModelProto,
     session: onnxruntime.InferenceSession,
-    rasters: UInt8[np.ndarray, "n 1 r c"],
+    rasters: UInt8[np.ndarray, "n p r c"],
     tolerance: float = SELF_TEST_TOLERANCE,
 ) -> onnxruntime.InferenceSession:
     """Write a model with its self-test and its hash; open it as the car does.
@@ -351,7 +353,7 @@ def _write_tested(
         ModelMismatchError: If it cannot be used.
     """
     # The raster with the most edges: its answer depends on the most weights.
-    fullest = rasters[int(np.argmax(np.count_nonzero(rasters, axis=(1, 2, 3)))), 0]
+    fullest = rasters[int(np.argmax(np.count_nonzero(rasters[:, 0], axis=(1, 2))))]
     entry = model.metadata_props.add()
     entry.key, entry.value = SELF_TEST_NAME, self_test(session, fullest, tolerance)
     path.write_bytes(sealed(model.SerializeToString()))
@@ -359,7 +361,7 @@ def _write_tested(
 
 
 def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
-    example = [torch.zeros(2, 1, meta.window.rows, meta.window.columns, dtype=torch.uint8)]
+    example = [torch.zeros(2, meta.planes, meta.window.rows, meta.window.columns, dtype=torch.uint8)]
     inputs, shapes = [INPUT_NAME], [{0: torch.export.Dim(BATCH_NAME, min=1)}]
     if meta.takes_width:
         # Two, not one: the exporter takes a dimension of one for a constant.
@@ -409,7 +411,7 @@ def _make_optional(graph: onnx.GraphProto) -> None:
 
 
 def _largest_difference(
-    deployed: DeployedLaneNet, session: onnxruntime.InferenceSession, rasters: UInt8[np.ndarray, "n 1 r c"]
+    deployed: DeployedLaneNet, session: onnxruntime.InferenceSession, rasters: UInt8[np.ndarray, "n p r c"]
 ) -> float:
     off = []
     widths_cm = _CHECKED_WIDTHS_CM if deployed.network.width_bias is not None else ()
@@ -445,7 +447,7 @@ def _quiet() -> Iterator[None]:
 class _Rasters(CalibrationDataReader):  # type: ignore[misc]
     """Feeds the quantiser one raster after the other."""
 
-    def __init__(self, rasters: UInt8[np.ndarray, "n 1 r c"]) -> None:
+    def __init__(self, rasters: UInt8[np.ndarray, "n p r c"]) -> None:
         self._rest: Iterator[np.ndarray] = iter(rasters)
 
     def get_next(self) -> dict[str, np.ndarray] | None:

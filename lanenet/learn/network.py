@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM, SIDES
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.trunks import TRUNKS
+from lanenet.perception.edges.raster import MIDDLE, STEPS
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]
@@ -66,9 +67,11 @@ class LaneNet(nn.Module):
 
     def __init__(self, settings: NetworkSettings, rows: int, columns: int) -> None:
         super().__init__()
-        self.rows, self.columns = rows, columns
+        self.rows, self.columns, self.planes = rows, columns, settings.planes
         n_outputs = N_POINTS * ((settings.bins or 1) + 1) + len(SIDES)
-        self.trunk = trunk = TRUNKS[settings.kind](rows, columns, settings.channels, settings.hidden)
+        self.trunk = trunk = TRUNKS[settings.kind](
+            rows, columns, settings.channels, settings.hidden, settings.planes
+        )
         self.head: nn.Module
         self.width_bias: nn.ModuleList | None = None
         hidden = trunk.hidden_width
@@ -97,14 +100,15 @@ class LaneNet(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def forward(
-        self, raster: Float[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"] | None = None
+        self, raster: Float[Tensor, "n p r c"], lane_cm: Float[Tensor, "w"] | None = None
     ) -> LaneOutput:
-        """Find the lane in rasters with values 0..1.
+        """Find the lane in rasters as :func:`input_of_rasters` returns them.
 
         Args:
-            raster: Bird's-eye rasters.
+            raster: Bird's-eye rasters with at least the network's planes.
             lane_cm: Lane width of each, or of all; 0 where it is not known. None: not known for any.
         """
+        raster = raster[:, : self.planes]
         if self.width_bias is None or lane_cm is None:
             outputs: Tensor = self.head(self.trunk(raster))
         else:
@@ -162,7 +166,7 @@ class DeployedLaneNet(nn.Module):
         self.register_buffer("parabola_from_points", matrix)
 
     def forward(
-        self, raster: UInt8[Tensor, "n 1 r c"], lane_cm: Float[Tensor, "w"] | None = None
+        self, raster: UInt8[Tensor, "n p r c"], lane_cm: Float[Tensor, "w"] | None = None
     ) -> tuple[
         Float[Tensor, "n 6"],
         Float[Tensor, "n 6"],
@@ -174,7 +178,7 @@ class DeployedLaneNet(nn.Module):
         """Find the lane in rasters.
 
         Args:
-            raster: Bird's-eye rasters, 255 where there is an edge, 0 elsewhere.
+            raster: Bird's-eye rasters with the network's planes.
             lane_cm: As in :meth:`LaneNet.forward`.
 
         Returns:
@@ -201,9 +205,13 @@ class DeployedLaneNet(nn.Module):
         )
 
 
-def input_of_rasters(rasters: UInt8[Tensor, "n 1 r c"]) -> Float[Tensor, "n 1 r c"]:
-    """Return rasters of 0 and 255 as the network's input, 0 and 1."""
-    return rasters.to(torch.float32) * (1.0 / 255.0)
+def input_of_rasters(rasters: UInt8[Tensor, "n p r c"]) -> Float[Tensor, "n p r c"]:
+    """Return rasters as the network's input: edges 0 or 1, directions and hues from -1 to 1."""
+    values = rasters.to(torch.float32)
+    edges = values[:, :1] * (1.0 / 255.0)
+    if rasters.shape[1] == 1:
+        return edges
+    return torch.cat([edges, (values[:, 1:] - float(MIDDLE)) * (1.0 / STEPS)], dim=1)
 
 
 def new_network(settings: NetworkSettings, rows: int, columns: int, seed: int) -> LaneNet:

@@ -53,9 +53,9 @@ class Answers:
 
 
 def answer_rasters(
-    network: LaneNet, rasters: UInt8[np.ndarray, "n 1 r c"], lane_cm: Float[np.ndarray, "n"]
+    network: LaneNet, rasters: UInt8[np.ndarray, "n p r c"], lane_cm: Float[np.ndarray, "n"]
 ) -> LaneOutput:
-    """Run a network over rasters of 0 and 255, given the lane width of each; its mode is left as it was."""
+    """Run a network over rasters, given the lane width of each; its mode is left as it was."""
     was_training, device = network.training, network.mean_cm.device
     network.eval()
     with torch.inference_mode():

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.perception.edges.raster import PLANES, STEPS
 from lanenet.samples.kernels import (
     Amounts,
     Frames,
@@ -34,20 +35,20 @@ class Batch(NamedTuple):
     """Samples as a network takes them.
 
     Attributes:
-        rasters: Of 0 and 255.
+        rasters: With all planes, see :mod:`lanenet.perception.edges.raster`.
         points_cm: Labels, [cm]; NaN where masked.
         present: Whether each line can be seen: 1, 0 or NaN for unknown.
         lane_cm: The lane width that the network is given, [cm]; 0 where it is kept back.
     """
 
-    rasters: UInt8[np.ndarray, "b 1 r c"]
+    rasters: UInt8[np.ndarray, "b p r c"]
     points_cm: Float[np.ndarray, "b 6"]
     present: Float[np.ndarray, "b 2"]
     lane_cm: Float[np.ndarray, "b"]
 
 
 def join_frames(
-    edges: Sequence[Float[np.ndarray, "_ 4"]],
+    edges: Sequence[Float[np.ndarray, "_ 6"]],
     lines_cm: Sequence[Lines],
     points_cm: Float[np.ndarray, "n 6"],
     camera_cm: Float[np.ndarray, "n 3"] | None = None,
@@ -57,7 +58,7 @@ def join_frames(
     """Concatenate frames, as the compiled loops take them.
 
     Args:
-        edges: Edge points of each frame, as label sets hold them: x, y, [cm], normal x, normal y, frame car.
+        edges: Edge points of each frame, as label sets hold them, see :meth:`RoadEdges.rows`.
         lines_cm: Left and right lane line of each frame, in the direction of travel, frame car.
         points_cm: Labels of each frame; a point that is masked here stays masked.
         camera_cm: Optical centre of each frame's camera (right, ahead, up), frame car; None takes
@@ -77,6 +78,7 @@ def join_frames(
         edges_cm=np.concatenate([np.empty((0, 2), np.float32), *(e[:, :2] for e in edges)]).astype(
             np.float32
         ),
+        edge_looks=np.concatenate([np.empty((0, 4), np.int8), *(_looks(e) for e in edges)]),
         edge_lines=np.concatenate([np.empty(0, np.uint8), *lines_of_edges]),
         edge_start=_starts(edges),
         lines_cm=np.concatenate([np.empty((0, 2)), *polylines]),
@@ -139,12 +141,18 @@ def augment_batch(
     return Batch(rasters, labels, present, given)
 
 
+def _looks(edges: Float[np.ndarray, "n 6"]) -> Int8[np.ndarray, "n 4"]:
+    """Normals and hues in the steps of a raster."""
+    return np.rint(np.float32(STEPS) * edges[:, 2:].astype(np.float32)).astype(np.int8)
+
+
 def _starts(parts: Sequence[np.ndarray]) -> Int[np.ndarray, "_"]:
     return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
 
 
 def _empty(size: int, window: BirdseyeWindow) -> tuple[np.ndarray, np.ndarray]:
-    return np.empty((size, 1, window.rows, window.columns), np.uint8), np.empty((size, 2), np.float32)
+    shape = (size, len(PLANES), window.rows, window.columns)
+    return np.empty(shape, np.uint8), np.empty((size, 2), np.float32)
 
 
 def _grid(window: BirdseyeWindow) -> Grid:

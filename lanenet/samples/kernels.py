@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, ROWS_CM
+from lanenet.perception.edges.raster import MIDDLE, STEPS
 from lanenet.samples.random_stream import (
     kernel,
     next_amount,
@@ -57,6 +58,10 @@ _EDGE_CM = (4.0, 40.0)
 _DASH_CM, _GAP_CM = (5.0, 30.0), (5.0, 30.0)
 #: Offset of the dashes from the middle of the lane, in lane widths.
 _OFF_MIDDLE = 0.04
+#: Share of the things beside the lane that have a colour of their own.
+_COLOURED = 0.3
+#: Range of the factor on a frame's hues: cameras store colour weaker or stronger.
+_HUE_GAIN = (0.5, 1.5)
 
 
 #: :class:`AugmentSettings` as numbers, by the same names; ``limit`` is 1 for draws at the limit.
@@ -68,11 +73,13 @@ Amounts: Any = namedtuple(  # type: ignore[misc]
 class Frames(NamedTuple):
     """Frames, concatenated: frame i owns the edges from ``edge_start[i]`` on, its lines 2 i and 2 i + 1.
 
-    ``edge_lines`` are the bits of :func:`near_lines`; the others are explained at
+    ``edge_looks`` are normals and hues in steps of a raster, ``edge_lines`` the bits of :func:`near_lines`;
+    the others are explained at
     :func:`lanenet.samples.augment.join_frames`.
     """
 
     edges_cm: np.ndarray
+    edge_looks: np.ndarray
     edge_lines: np.ndarray
     edge_start: np.ndarray
     lines_cm: np.ndarray
@@ -101,10 +108,10 @@ def rasterise_frames(out, indices, frames, grid, present):
     cells = np.zeros(2, np.int64)
     for slot in range(len(indices)):
         i = indices[slot]
-        out[slot, 0] = 0
+        clear(out[slot])
         cells[:] = 0
         for k in range(frames.edge_start[i], frames.edge_start[i + 1]):
-            if mark(out[slot, 0], frames.edges_cm[k, 0], frames.edges_cm[k, 1], grid):
+            if mark(out[slot], frames.edges_cm[k, 0], frames.edges_cm[k, 1], frames.edge_looks[k], grid):
                 count_cells(cells, frames.edge_lines[k])
         for side in range(2):
             present[slot, side] = presence(cells[side], frames, 2 * i + side, grid)
@@ -121,10 +128,10 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
     cells = np.empty(2, np.int64)
     corners = np.empty((amounts.objects, CORNERS, 2))
     opaque = np.empty(amounts.objects, np.bool_)
-    nothing = np.empty((0, 2))
+    nothing, look = np.empty((0, 3)), np.empty(4)
     for slot in range(len(indices)):
-        i, raster = indices[slot], out[slot, 0]
-        raster[:] = 0
+        i, raster = indices[slot], out[slot]
+        clear(raster)
         cells[:] = 0
         start_stream(rng, seed, epoch, streams[slot])
         mirror = next_uniform(rng) < amounts.mirror
@@ -163,6 +170,12 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
             next_spread(rng, amounts.width_error, amounts.limit),
         )
         given_cm[slot] = frames.lane_cm[i] * scale * (1.0 + error) if is_given else 0.0
+        light = -1.0 if next_uniform(rng) < amounts.inverted else 1.0
+        gain = next_between(rng, _HUE_GAIN[0], _HUE_GAIN[1])
+        if next_uniform(rng) < amounts.colourless:
+            gain = 0.0
+        yellow_cast = STEPS * next_spread(rng, amounts.hue_cast, amounts.limit)
+        red_cast = STEPS * next_spread(rng, amounts.hue_cast, amounts.limit)
         dashes = nothing
         # Without the width they could be the border of a narrower lane.
         if given_cm[slot] > 0.0 and next_uniform(rng) < amounts.middle_dashes:
@@ -173,9 +186,9 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
             if lines & missing or (share > 0.0 and next_uniform(rng) < share):
                 continue
             if k < last:
-                px, py = np.float64(frames.edges_cm[k, 0]), np.float64(frames.edges_cm[k, 1])
+                source, px, py = k, np.float64(frames.edges_cm[k, 0]), np.float64(frames.edges_cm[k, 1])
             else:
-                px, py = dashes[k - last, 0], dashes[k - last, 1]
+                source, px, py = int(dashes[k - last, 2]), dashes[k - last, 0], dashes[k - last, 1]
             if kind == 1 and (px - place_x) ** 2 + (py - place_y) ** 2 <= radius * radius:
                 continue
             if kind == 2 and abs(np.sqrt(px * px + py * py) - place_x) <= radius:
@@ -191,17 +204,23 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
             if amounts.jitter_cm > 0.0:
                 x += amounts.jitter_cm * next_bell(rng)
                 y += amounts.jitter_cm * next_bell(rng)
-            if mark(raster, x, y, grid):
+            nx, ny = frames.edge_looks[source, 0], frames.edge_looks[source, 1]
+            look[0] = light * (sign * c * nx + s * ny)
+            look[1] = light * (c * ny - sign * s * nx)
+            look[2] = gain * frames.edge_looks[source, 2] + yellow_cast
+            look[3] = gain * frames.edge_looks[source, 3] + red_cast
+            if mark(raster, x, y, look, grid):
                 count += 1
                 count_cells(cells, lines)
             if doubled > 0.0 and next_uniform(rng) < doubled:
                 x += next_between(rng, -_DOUBLE_CM, _DOUBLE_CM)
-                mark(raster, x, y + next_between(rng, -_DOUBLE_CM, _DOUBLE_CM), grid)
+                mark(raster, x, y + next_between(rng, -_DOUBLE_CM, _DOUBLE_CM), look, grid)
         for side in range(2):
             line = 2 * i + (1 - side if mirror else side)
             present[slot, side] = presence(cells[1 - side if mirror else side], frames, line, grid)
         for o in range(n_objects):
-            mark_outline(raster, corners[o], grid)
+            _draw_look(rng, look)
+            mark_outline(raster, corners[o], look, grid)
         add_clutter(rng, raster, count, grid, amounts)
 
 
@@ -324,31 +343,64 @@ def misplace(x, y, camera_x, camera_y, camera_z, height, pitch, roll):
 
 
 @kernel
-def mark(raster, x_cm, y_cm, grid):
+def clear(raster):
+    """Mark nothing in any plane."""
+    raster[0] = 0
+    raster[1:] = MIDDLE
+
+
+@kernel
+def mark(raster, x_cm, y_cm, look, grid):
     """Mark the cell of a point; return whether it lies in the window and was not marked before.
 
-    In single precision, as :meth:`BirdseyeWindow.rasterise` does it with edge points.
+    Args:
+        raster: All planes, as :func:`lanenet.perception.edges.raster.fill_raster` writes them: in single
+            precision, the last point of a cell for its looks.
+        x_cm: Of the point, frame car; the next one is y.
+        y_cm: Likewise.
+        look: Its normal and its hues, in steps of the raster.
+        grid: The window.
     """
     column = (np.float32(x_cm) - grid.left_cm) / grid.cell_cm
     row = (grid.far_cm - np.float32(y_cm)) / grid.cell_cm
     if not (column >= 0.0 and column < grid.columns and row >= 0.0 and row < grid.rows):
         return False
     i, j = int(row), int(column)
-    fresh = raster[i, j] == 0
-    raster[i, j] = 255
+    fresh = raster[0, i, j] == 0
+    raster[0, i, j] = 255
+    for k in range(4):
+        raster[1 + k, i, j] = np.uint8(MIDDLE + min(max(np.rint(look[k]), -STEPS), STEPS))
     return fresh
 
 
 @kernel
-def mark_edge(raster, ax, ay, bx, by, grid):
-    """Mark a straight edge without holes; return how many cells it added."""
-    steps = 1 + int(np.hypot(bx - ax, by - ay) / (0.7 * grid.cell_cm))
+def mark_edge(raster, ax, ay, bx, by, look, grid):
+    """Mark a straight edge without holes; return how many cells it added.
+
+    Its normal is across it, to one side or the other by the sign of ``look[0]``; that of a point is as given.
+    """
+    length = np.hypot(bx - ax, by - ay)
+    steps = 1 + int(length / (0.7 * grid.cell_cm))
     added = 0
+    turned = look.copy()
+    if length > 0.0:
+        across = (STEPS if look[0] >= 0.0 else -STEPS) / length
+        turned[0], turned[1] = across * (by - ay), across * (ax - bx)
     for k in range(steps + 1):
         t = k / steps
-        if mark(raster, ax + t * (bx - ax), ay + t * (by - ay), grid):
+        if mark(raster, ax + t * (bx - ax), ay + t * (by - ay), turned, grid):
             added += 1
     return added
+
+
+@kernel
+def _draw_look(rng, look):
+    """Draw the direction of a point, and the hues of a thing, most often none."""
+    angle = next_between(rng, 0.0, 2.0 * np.pi)
+    look[0], look[1] = STEPS * np.cos(angle), STEPS * np.sin(angle)
+    coloured = 1.0 if next_uniform(rng) < _COLOURED else 0.0
+    look[2] = coloured * next_between(rng, -STEPS, STEPS)
+    look[3] = coloured * next_between(rng, -STEPS, STEPS)
 
 
 @kernel
@@ -463,11 +515,11 @@ def is_inside(x, y, corners):
 
 
 @kernel
-def mark_outline(raster, corners, grid):
-    """Mark a closed outline."""
+def mark_outline(raster, corners, look, grid):
+    """Mark a closed outline, brighter inside or outside by the sign of ``look[0]``."""
     for k in range(CORNERS):
         a, b = corners[k], corners[(k + 1) % CORNERS]
-        mark_edge(raster, a[0], a[1], b[0], b[1], grid)
+        mark_edge(raster, a[0], a[1], b[0], b[1], look, grid)
 
 
 @kernel
@@ -497,7 +549,9 @@ def _add_edge(rng, raster, longest_cm, grid):
     angle = next_between(rng, 0.0, np.pi)
     half = 0.5 * min(next_between(rng, _EDGE_CM[0], _EDGE_CM[1]), longest_cm)
     dx, dy = half * np.cos(angle), half * np.sin(angle)
-    return mark_edge(raster, x - dx, y - dy, x + dx, y + dy, grid)
+    look = np.empty(4)
+    _draw_look(rng, look)
+    return mark_edge(raster, x - dx, y - dy, x + dx, y + dy, look, grid)
 
 
 @kernel
@@ -505,12 +559,16 @@ def _add_point(rng, raster, grid):
     """Mark a cell at a random place; return how many cells that added."""
     x = grid.left_cm + grid.columns * grid.cell_cm * next_uniform(rng)
     y = grid.far_cm - grid.rows * grid.cell_cm * next_uniform(rng)
-    return 1 if mark(raster, x, y, grid) else 0
+    look = np.empty(4)
+    _draw_look(rng, look)
+    return 1 if mark(raster, x, y, look, grid) else 0
 
 
 @kernel
 def middle_dashes(rng, frames, i):
-    """Copy a line of a frame to the middle of its lane, in dashes; return their points, [cm], frame car.
+    """Copy a line of a frame to the middle of its lane, in dashes.
+
+    Returns x and y of their points, [cm], frame car, and the edge points whose looks they have.
 
     The line of which the frame shows more is copied, with its blur, gaps and range. There are none if the two
     lines are not sampled alike.
@@ -526,7 +584,7 @@ def middle_dashes(rng, frames, i):
     starts = frames.line_start
     n = starts[2 * i + 1] - starts[2 * i]
     if n < 2 or starts[2 * i + 2] - starts[2 * i + 1] != n:
-        return np.empty((0, 2))
+        return np.empty((0, 3))
     along = np.zeros(2, np.int64)
     for k in range(first, last):
         along[0] += (frames.edge_lines[k] >> 2) & 1
@@ -540,7 +598,7 @@ def middle_dashes(rng, frames, i):
             frames.lines_cm[line + j, 1] - frames.lines_cm[line + j - 1, 1],
         )
         distance[j] = distance[j - 1] + (0.0 if np.isnan(step) else step)
-    points, count = np.empty((along[side], 2)), 0
+    points, count = np.empty((along[side], 3)), 0
     for k in range(first, last):
         if not (frames.edge_lines[k] >> (2 + side)) & 1:
             continue
@@ -556,6 +614,6 @@ def middle_dashes(rng, frames, i):
         px = x + (0.5 + off) * (frames.lines_cm[other + at, 0] - frames.lines_cm[line + at, 0])
         py = y + (0.5 + off) * (frames.lines_cm[other + at, 1] - frames.lines_cm[line + at, 1])
         if not np.isnan(px + py):
-            points[count, 0], points[count, 1] = px, py
+            points[count, 0], points[count, 1], points[count, 2] = px, py, k
             count += 1
     return points[:count]

@@ -22,6 +22,8 @@ _PRESETS: dict[str, dict[str, object]] = {
         "missing_stretch": 0.1,
         "missing_line": 0.05,
         "missing_both": 0.0,
+        "inverted": 0.0,
+        "colourless": 0.05,
         "objects": 0,
         "clutter_segments": 1,
         "clutter_points": 10,
@@ -65,6 +67,9 @@ class AugmentSettings(Settings):
         pitch_rad: Its assumed pitch is wrong by up to this much.
         roll_rad: Its assumed roll likewise.
         untold_width: Probability that the lane width is kept from a network that takes it.
+        inverted: Probability that bright and dark change places: markings of dark tape on a bright floor.
+        colourless: Probability that colours are lost, as in gray light.
+        hue_cast: By up to this the light adds to each hue of a frame; 1 is all of an edge.
         width_error: The given lane width is wrong by up to this share.
         draw: ``even`` draws every amount for each sample; ``limit`` takes all amounts at their limits, with
             either sign, for tests of robustness.
@@ -90,6 +95,9 @@ class AugmentSettings(Settings):
     roll_rad: float = Field(default=0.0175, ge=0.0, le=0.2)
     untold_width: float = Field(default=0.3, ge=0.0, le=1.0)
     width_error: float = Field(default=0.02, ge=0.0, le=0.3)
+    inverted: float = Field(default=0.1, ge=0.0, le=1.0)
+    colourless: float = Field(default=0.2, ge=0.0, le=1.0)
+    hue_cast: float = Field(default=0.15, ge=0.0, le=1.0)
     draw: Literal["even", "limit"] = "even"
 
     @model_validator(mode="before")

@@ -9,6 +9,7 @@ import numpy as np
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import rows_of_polyline
+from lanenet.perception.edges.road import RoadEdges
 
 WINDOW = BirdseyeWindow(left_cm=-48.0, near_cm=0.0, cell_cm=3.0, rows=24, columns=32)
 
@@ -39,7 +40,7 @@ def make_label_set(
         x = np.concatenate([x_of(y_edge, o) for o in (-21.0, -19.0, 19.0, 21.0)])
         xy = np.stack([x, np.tile(y_edge, 4)], axis=1)
         normals = np.tile([1.0, 0.0], (len(xy), 1))
-        edges.append(np.concatenate([xy, normals], axis=1).astype(np.float32))
+        edges.append(RoadEdges(xy, normals).rows())
     return LabelSet(
         meta=LabelMeta(window, camera_hash, wheelbase_cm, 40.0, source),
         drive=["d"] * n,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -33,7 +34,9 @@ class AlexNetTrunk(Trunk):
     head_learns_faster = True
     n_features = 4096
 
-    def __init__(self, rows: int, columns: int, channels: None = None, hidden: None = None) -> None:
+    def __init__(
+        self, rows: int, columns: int, channels: None = None, hidden: None = None, planes: Literal[1] = 1
+    ) -> None:
         super().__init__()
         # Here, since its import takes two seconds that no other network should wait for.
         from torchvision.models import alexnet

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 class Trunk(nn.Module, ABC):
     """The layers between the raster and the head.
 
-    Made with (rows, columns, channels, hidden): the raster's size, and the settings of the same names.
+    Made with (rows, columns, channels, hidden, planes): the raster's size, and the settings of those names.
 
     Attributes:
-        uses: Which of ``channels``, ``hidden``, ``bins``, ``takes_width`` and ``weights`` of the network's
-            settings it can be given.
+        uses: Which of ``channels``, ``hidden``, ``bins``, ``planes``, ``takes_width`` and ``weights`` of the
+            network's settings it can be given.
         head_learns_faster: Whether ``learn.head_rate`` raises the learning rate of the head, as for a trunk
             with pretrained weights.
         n_features: Values per raster that it gives to the head.
@@ -35,9 +35,9 @@ class Trunk(nn.Module, ABC):
 
     @abstractmethod
     def forward(
-        self, raster: Float[Tensor, "n 1 r c"], biases: Sequence[Tensor] = ()
+        self, raster: Float[Tensor, "n p r c"], biases: Sequence[Tensor] = ()
     ) -> Float[Tensor, "n f"]:
-        """Return the features of rasters with values 0..1; ``biases`` has n x channels per biased layer."""
+        """Return the features of rasters; ``biases`` has n x channels per biased layer."""
 
     def load_pretrained(self, path: Path) -> None:
         """Read pretrained weights; only for trunks that use ``weights``.
@@ -60,17 +60,22 @@ class SmallTrunk(Trunk):
         default_hidden: Width of the hidden layer before the outputs. Both were chosen by ``lanenet sweep``.
     """
 
-    uses = frozenset({"channels", "hidden", "bins", "takes_width"})
+    uses = frozenset({"channels", "hidden", "bins", "planes", "takes_width"})
     default_channels: ClassVar[tuple[int, ...]] = (16, 32, 48, 64, 80)
     default_hidden: ClassVar[int] = 64
 
     def __init__(
-        self, rows: int, columns: int, channels: tuple[int, ...] | None = None, hidden: int | None = None
+        self,
+        rows: int,
+        columns: int,
+        channels: tuple[int, ...] | None = None,
+        hidden: int | None = None,
+        planes: int = 1,
     ) -> None:
         super().__init__()
         channels = channels or self.default_channels
         layers: list[nn.Module] = []
-        before, height, width = 1, rows, columns
+        before, height, width = planes, rows, columns
         for i, after in enumerate(channels):
             kernel, stride = (7, 4) if i == 0 else (3, 2)
             layers += [
@@ -87,7 +92,7 @@ class SmallTrunk(Trunk):
         self.biased_channels = channels[1:]
 
     def forward(
-        self, raster: Float[Tensor, "n 1 r c"], biases: Sequence[Tensor] = ()
+        self, raster: Float[Tensor, "n p r c"], biases: Sequence[Tensor] = ()
     ) -> Float[Tensor, "n f"]:
         """Return the features; a bias is added after the normalisation of each convolution but the first."""
         x, norms = raster, 0

@@ -13,7 +13,7 @@ from lanenet.config import Settings
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.markings_only import ColourSettings, PixelScale, colour_edges
-from lanenet.perception.edges.pixels import EdgePixels, edge_pixels, gradients, prefer_stronger
+from lanenet.perception.edges.pixels import EdgePixels, Slopes, edge_pixels, gradients, prefer_stronger
 
 # Channels of BGR; gray is mostly green.
 _BLUE, _RED = 0, 2
@@ -87,15 +87,16 @@ def find_edges(
     gray = to_gray(frame_bgr)
     dx, dy = gradients(gray, settings.blur_px)
     raised = 1.0
+    hues: tuple[Slopes, ...] = ()
     if settings.method == "directional":
         if frame_bgr.ndim == 3 and settings.colour_weight > 0.0:
             # Gray minus blue shows yellow, red minus gray red; white, gray and black have neither. Both
             # rise towards the inside of yellow tape, as brightness does for white tape, so that normals mean
-            # the same. White tape on a yellow floor may get normals that point to the floor; networks use
-            # positions alone.
+            # the same. White tape on a yellow floor may get normals that point to the floor.
             channels = (cv2.extractChannel(frame_bgr, channel) for channel in (_BLUE, _RED))
             blue, red = (gradients(channel, settings.blur_px) for channel in channels)
-            for hue_dx, hue_dy in ((dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)):
+            hues = (dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)
+            for hue_dx, hue_dy in hues:
                 prefer_stronger(dx, dy, hue_dx, hue_dy, settings.colour_weight, settings.low)
         if sample is None:
             sample = sample_pixels(np.ones_like(gray) if keep is None else keep)
@@ -106,7 +107,7 @@ def find_edges(
     edges = cv2.Canny(dx, dy, raised * settings.low, raised * settings.high, L2gradient=True)
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
-    return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional")
+    return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional", hues=hues)
 
 
 def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:

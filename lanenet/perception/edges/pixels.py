@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +11,9 @@ from jaxtyping import Float, Int, Int16, UInt8
 
 _TAN_22_5 = float(np.tan(np.pi / 8.0))
 _BEFORE_AND_AFTER = np.array([-1, 1]).reshape(2, 1, 1)
+
+#: Sobel responses of a channel along u and v.
+Slopes = tuple[Int16[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True)
@@ -19,14 +23,17 @@ class EdgePixels:
     Attributes:
         uv_px: Positions u, v, frame image.
         normals: Unit gradient at each edge, towards the brighter side, in image axes.
+        hues: By how much the image gets yellower, and redder, along the normal, as a share of the gradient,
+            from -1 to 1; None where colours were not looked at.
     """
 
     uv_px: Float[np.ndarray, "n 2"]
     normals: Float[np.ndarray, "n 2"]
+    hues: Float[np.ndarray, "n 2"] | None = None
 
     def towards_dark(self) -> EdgePixels:
         """Return the points with normals to the darker side: dark markings look like bright ones."""
-        return EdgePixels(self.uv_px, -self.normals)
+        return replace(self, normals=-self.normals)
 
 
 def gradients(
@@ -78,6 +85,7 @@ def edge_pixels(
     dx: Int16[np.ndarray, "h w"],
     dy: Int16[np.ndarray, "h w"],
     subpixel: bool,
+    hues: Sequence[Slopes] = (),
 ) -> EdgePixels:
     """Collect the marked pixels with their directions.
 
@@ -86,6 +94,7 @@ def edge_pixels(
         dx: Sobel response along u.
         dy: Sobel response along v.
         subpixel: Move each point along its gradient to where the gradient peaks.
+        hues: Sobel responses of yellow and of red; empty where colours are not looked at.
 
     Returns:
         The points in rows from top to bottom.
@@ -107,7 +116,25 @@ def edge_pixels(
     uv = places.astype(np.float64)
     if subpixel and len(at):
         uv += _subpixel_offset(dx, dy, places, normals, strength) * normals
-    return EdgePixels(np.ascontiguousarray(uv.T), np.ascontiguousarray(normals.T))
+    points, directions = np.ascontiguousarray(uv.T), np.ascontiguousarray(normals.T)
+    return EdgePixels(points, directions, _hue_shares(hues, at, normals, strength) if hues else None)
+
+
+def _hue_shares(
+    hues: Sequence[Slopes],
+    at: Int[np.ndarray, "n"],
+    normals: Float[np.ndarray, "2 n"],
+    strength: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "n k"]:
+    """Responses of hues along the normals, as shares of the gradient."""
+    shares = np.empty((len(at), len(hues)))
+    for column, (hue_dx, hue_dy) in enumerate(hues):
+        along = hue_dx.reshape(-1).take(at) * normals[0]
+        along += hue_dy.reshape(-1).take(at) * normals[1]
+        shares[:, column] = along
+    shares /= np.maximum(strength, 1.0)[:, None]
+    np.maximum(shares, -1.0, out=shares)
+    return np.minimum(shares, 1.0, out=shares)
 
 
 def _subpixel_offset(

@@ -70,10 +70,22 @@ class RoadEdges:
     Attributes:
         points_cm: Positions, frame car.
         normals: Unit vectors across the edge, towards the brighter side, frame car.
+        hues: As :attr:`EdgePixels.hues`.
     """
 
     points_cm: Float[np.ndarray, "n 2"]
     normals: Float[np.ndarray, "n 2"]
+    hues: Float[np.ndarray, "n 2"] | None = None
+
+    def rows(self) -> Float[np.ndarray, "n 6"]:
+        """Return x, y, normal x, normal y, yellow, red of each point, as label sets hold them."""
+        hues = np.zeros_like(self.points_cm) if self.hues is None else self.hues
+        return np.concatenate([self.points_cm, self.normals, hues], axis=1).astype(np.float32)
+
+    @staticmethod
+    def of_rows(rows: Float[np.ndarray, "n 6"]) -> RoadEdges:
+        """Return the points of :meth:`rows`."""
+        return RoadEdges(rows[:, :2], rows[:, 2:4], rows[:, 4:])
 
 
 class RoadTable:
@@ -153,7 +165,7 @@ class RoadTable:
         np.subtract(x_u * normal_v, x_v * normal_u, out=across[1])
         across *= np.sign(x_u * y_v - x_v * y_u)
         across *= 1.0 / np.maximum(np.sqrt(across[0] * across[0] + across[1] * across[1]), 1e-12)
-        return RoadEdges(np.ascontiguousarray(points.T), np.ascontiguousarray(across.T))
+        return RoadEdges(np.ascontiguousarray(points.T), np.ascontiguousarray(across.T), edges.hues)
 
     def lift_points(self, edges: EdgePixels) -> Float[np.ndarray, "n 2"]:
         """Return the points of :meth:`lift` alone."""
@@ -207,8 +219,11 @@ class RoadEdgeExtractor:
         edges = self.table.lift(self._find(frame_bgr))
         # The precision of label files: a raster from a file equals one made on the car.
         points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
+        hues = None if edges.hues is None else edges.hues.astype(np.float32)
         good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
-        return RoadEdges(points, normals) if good.all() else RoadEdges(points[good], normals[good])
+        if good.all():
+            return RoadEdges(points, normals, hues)
+        return RoadEdges(points[good], normals[good], None if hues is None else hues[good])
 
     def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
         check_size(check_frame(frame_bgr), self.camera)

@@ -12,6 +12,7 @@ from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM, lane_width_cm, proportional_angle_rad
+from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
@@ -74,9 +75,8 @@ class NetworkDetector:
         self.memory = LaneMemory(lane_width_cm)
         self._tracker = LaneTracker(self.memory)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
-        shape = (1, 1, self.meta.window.rows, self.meta.window.columns)
-        self._raster: UInt8[np.ndarray, "1 1 r c"] = np.zeros(shape, np.uint8)
-        self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster}
+        self._raster = new_raster(self.meta.window, self.meta.planes)
+        self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
         if self.meta.takes_width and lane_width_cm is not None:
             self._feed[WIDTH_NAME] = np.array([lane_width_cm], np.float32)
 
@@ -93,19 +93,18 @@ class NetworkDetector:
         edges = self._extractor.extract(frame_bgr)
         if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
             return LaneEstimate()
-        raster = self.meta.window.rasterise(edges.points_cm, out=self._raster[0, 0])
-        if not np.count_nonzero(raster):
+        raster = fill_raster(self.meta.window, edges, self._raster)
+        if not np.count_nonzero(raster[0]):
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm, _ = self._tracker.follow(points_cm, sigma_cm, presence, edges)
         return self._estimate(points_cm, sigma_cm, presence)
 
-    def detect_raster(self, raster: UInt8[np.ndarray, "r c"]) -> LaneEstimate:
-        """Find the lane in a bird's-eye raster of 0 and 255: the network alone, with the lane's width."""
-        if not np.count_nonzero(raster):
+    def detect_raster(self, raster: UInt8[np.ndarray, "p r c"]) -> LaneEstimate:
+        """Find the lane in a bird's-eye raster with all planes: the network alone, with the lane's width."""
+        self._raster[:] = raster[: len(self._raster)]
+        if not np.count_nonzero(self._raster[0]):
             return LaneEstimate()
-        if raster.base is not self._raster and raster is not self._raster:
-            self._raster[0, 0] = raster
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
         return self._estimate(points_cm, sigma_cm, presence)

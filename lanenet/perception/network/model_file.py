@@ -31,6 +31,7 @@ from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM
 from lanenet.outputs import restore_output
+from lanenet.perception.edges.raster import PLANES
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.reading import MEBIBYTE, first_line, is_regular, parsing, read_bytes
 
@@ -44,7 +45,7 @@ MARKER_NAME = "checkpoint.yaml"
 #: Folders listed in an error; chosen: about two lines of a terminal.
 _MOST_NAMED = 8
 
-FORMAT = "lanenet-model/2"
+FORMAT = "lanenet-model/3"
 INPUT_NAME = "raster"
 #: Optional input for the lane's width, [cm]; 0 is unknown.
 WIDTH_NAME = "lane_width_cm"
@@ -129,6 +130,7 @@ class ModelMeta:
         lane_width_range_cm: The narrowest and the widest lane of its training data; None if all had the mean
             width.
         takes_width: The network has an input for the lane's width beside the raster.
+        planes: How many planes of a raster it sees, see :data:`lanenet.perception.edges.raster.PLANES`.
     """
 
     window: BirdseyeWindow
@@ -141,6 +143,7 @@ class ModelMeta:
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
     lane_width_range_cm: tuple[float, float] | None = None
     takes_width: bool = False
+    planes: int = 1
 
     @property
     def any_camera(self) -> bool:
@@ -210,6 +213,7 @@ class ModelMeta:
             "reference": self.reference,
             "perception": self.perception.model_dump_json(),
             "takes_width": json.dumps(self.takes_width),
+            "planes": json.dumps(PLANES[: self.planes]),
         }
 
     @staticmethod
@@ -238,6 +242,10 @@ class ModelMeta:
         for key, expected in (("rows_cm", list(ROWS_CM)), ("points", list(POINT_NAMES)), ("signs", _SIGNS)):
             if value(key) != expected:
                 raise ModelMismatchError(f"{where}: {key} {value(key)}, expected {expected}")
+        if (planes := value("planes")) not in (list(PLANES[:1]), list(PLANES)):
+            raise ModelMismatchError(
+                f"{where}: planes {planes}, expected {list(PLANES)} or the first of them"
+            )
         names = (*_MetaFile.model_fields,)
         texts: dict[str, Any] = {key: str(properties.get(key, "")) for key in ("training_hash", "reference")}
         try:
@@ -250,7 +258,8 @@ class ModelMeta:
             raise ModelMismatchError(f"{where}: rmse_cm has {len(file.rmse_cm)} values, expected {N_POINTS}")
         shared = {name: getattr(file, name) for name in names}
         errors = tuple(math.nan if v is None else v for v in file.rmse_cm)
-        return ModelMeta(**texts, **{**shared, "window": file.window.window(), "rmse_cm": errors})
+        shared |= {"window": file.window.window(), "rmse_cm": errors, "planes": len(planes)}
+        return ModelMeta(**texts, **shared)
 
 
 #: A width of the car or lane; chosen: ten metres.
@@ -281,20 +290,20 @@ class _SelfTestFile(Settings):
 
 def self_test(
     session: onnxruntime.InferenceSession,
-    raster: UInt8[np.ndarray, "r c"],
+    raster: UInt8[np.ndarray, "p r c"],
     tolerance: float = SELF_TEST_TOLERANCE,
 ) -> str:
     """Return the self-test of a model, for its property :data:`SELF_TEST_NAME`.
 
     Args:
         session: The model.
-        raster: A raster of 0 and 255 from its data.
+        raster: A raster from its data, with the planes that it sees.
         tolerance: Largest difference of an answer, [cm] and smaller units, on another computer.
     """
-    answers = session.run(OUTPUT_NAMES, {INPUT_NAME: raster[None, None]})
+    answers = session.run(OUTPUT_NAMES, {INPUT_NAME: raster[None]})
     data = {
         # JSON and ONNX hold text.
-        "raster": base64.b64encode(zlib.compress(np.packbits(raster > 0).tobytes(), 9)).decode(),
+        "raster": base64.b64encode(zlib.compress(raster.tobytes(), 9)).decode(),
         "answers": {
             name: [float(f"{value:.7g}") for value in np.asarray(answer).ravel().tolist()]
             for name, answer in zip(OUTPUT_NAMES, answers, strict=True)
@@ -305,24 +314,23 @@ def self_test(
 
 
 def _run_self_test(
-    session: onnxruntime.InferenceSession, text: str, window: BirdseyeWindow, where: str
+    session: onnxruntime.InferenceSession, text: str, shape: tuple[int, int, int], where: str
 ) -> None:
     """Refuse a model that answers otherwise than where it was made.
 
     Raises:
         ModelMismatchError: If the test is unreadable, or an answer differs; names the output.
     """
-    cells = window.rows * window.columns
+    cells = math.prod(shape)
     with parsing(f"{where}: property {SELF_TEST_NAME!r}", ModelMismatchError):
         try:
             test = check_settings(_SelfTestFile, json.loads(text), SELF_TEST_NAME)
-            packed = zlib.decompressobj().decompress(base64.b64decode(test.raster), (cells + 7) // 8)
+            packed = zlib.decompressobj().decompress(base64.b64decode(test.raster), cells)
         except (ConfigError, binascii.Error) as error:
             raise ModelMismatchError(f"{where}: {error}") from None
-        bits = np.unpackbits(np.frombuffer(packed, np.uint8))
-        if len(bits) != 8 * ((cells + 7) // 8):
+        if len(packed) != cells:
             raise ModelMismatchError(f"{where}: property {SELF_TEST_NAME!r}: no raster of its window")
-        raster = (255 * bits[:cells]).reshape(1, 1, window.rows, window.columns)
+        raster = np.frombuffer(packed, np.uint8).reshape(1, *shape)
     found = _run(session, OUTPUT_NAMES, raster, where)
     for name, answer in zip(OUTPUT_NAMES, found, strict=True):
         expected = np.array(test.answers.get(name, ()))
@@ -414,7 +422,8 @@ def open_model(
         raise ModelMismatchError(f"{path}: cannot be opened as an ONNX model ({reason})") from None
     meta = ModelMeta.from_properties(properties, str(path))
     inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
-    expected = {INPUT_NAME: ("tensor(uint8)", [1, meta.window.rows, meta.window.columns])}
+    shape = meta.planes, meta.window.rows, meta.window.columns
+    expected = {INPUT_NAME: ("tensor(uint8)", [*shape])}
     if inputs != expected:
         raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
     takes_width = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
@@ -428,7 +437,7 @@ def open_model(
         raise ModelMismatchError(f"{path}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
     if SELF_TEST_NAME not in properties:
         raise ModelMismatchError(f"{path}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
-    _run_self_test(session, properties[SELF_TEST_NAME], meta.window, str(path))
+    _run_self_test(session, properties[SELF_TEST_NAME], shape, str(path))
     return session, meta
 
 
