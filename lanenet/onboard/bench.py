@@ -22,7 +22,7 @@ from lanenet.control.steering import SteeringSettings
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
-from lanenet.perception.edges.canny import EdgeSettings, find_edges
+from lanenet.perception.edges.canny import EdgeSettings
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector, DetectorInputs
@@ -251,7 +251,7 @@ class _Stages:
         cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
         mark("canny")
         table = self._extractor.table
-        pixels = find_edges(frame, self._extractor.settings.edges, table.keep, table.scale, table.sample)
+        pixels = table.find(frame, self._extractor.settings.edges)
         mark("edges")
         road = table.lift(pixels)
         mark("lift")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 
 _TAN_22_5 = float(np.tan(np.pi / 8.0))
+_MOST_BYTE = 255
 _BEFORE_AND_AFTER = np.array([-1, 1]).reshape(2, 1, 1)
 
 #: Sobel responses of a channel along u and v.
@@ -70,12 +71,13 @@ def prefer_stronger(
     Source:
         The gradient of the strongest channel is that of Dalal and Triggs 2005; the weight is our own.
     """
-    strength = np.abs(other_dx)
-    strength += np.abs(other_dy)
-    # Few pixels are left: the sum of both responses is no less than the length of the gradient.
-    at = np.flatnonzero(strength.reshape(-1) > int(least / weight))
+    # Few pixels are left: the sum of both responses is no less than the length of the gradient. In bytes, of
+    # which larger ones are 255, that takes a quarter of the time.
+    total = cv2.add(cv2.convertScaleAbs(other_dx), cv2.convertScaleAbs(other_dy))
+    at = np.flatnonzero(total.reshape(-1) > min(int(least / weight), _MOST_BYTE - 1))
+    strength = np.abs(other_dx.reshape(-1).take(at)) + np.abs(other_dy.reshape(-1).take(at))
     flat_dx, flat_dy = dx.reshape(-1), dy.reshape(-1)
-    at = at[weight * strength.reshape(-1).take(at) > np.abs(flat_dx.take(at)) + np.abs(flat_dy.take(at))]
+    at = at[weight * strength > np.abs(flat_dx.take(at)) + np.abs(flat_dy.take(at))]
     flat_dx[at] = np.rint(weight * other_dx.reshape(-1).take(at))
     flat_dy[at] = np.rint(weight * other_dy.reshape(-1).take(at))
 

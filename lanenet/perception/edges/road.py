@@ -15,6 +15,8 @@ from lanenet.perception.edges.canny import EdgeSettings, check_frame, check_size
 from lanenet.perception.edges.markings_only import PixelScale
 from lanenet.perception.edges.pixels import EdgePixels
 
+#: Rows beyond the useful ones that blur, slopes and the search for maxima look at.
+_MARGIN_PX = 4
 #: Colour weight of the edges that networks see. Maps see each line in many frames, so that colour would only
 #: add the edges of coloured things beside the road. Chosen: below 1, since images store colour at half the
 #: resolution of brightness.
@@ -97,6 +99,7 @@ class RoadTable:
     Attributes:
         keep: uint8 mask of the pixels that see the useful part of the road.
         useful_pixels: Number of them.
+        rows: Rows of the image that hold them, and a few above and below, which filters look at.
         sample: Pixels from which :func:`lanenet.perception.edges.canny.find_edges` measures the contrast.
         scale: Road that a pixel spans sideways.
         points_cm: Road point of each pixel, [cm], frame car, height x width x 2; NaN off the road.
@@ -141,11 +144,23 @@ class RoadTable:
         self.sample = sample_pixels(self.keep)
         if not useful.any():
             raise CalibrationError("camera: no pixel sees the road in range; check pitch, height and range")
+        seen_rows = np.flatnonzero(useful.any(axis=1))
+        self.rows = slice(max(0, int(seen_rows[0]) - _MARGIN_PX), int(seen_rows[-1]) + 1 + _MARGIN_PX)
+        self._keep_rows = np.ascontiguousarray(self.keep[self.rows])
+        self._sample_rows = sample_pixels(self._keep_rows)
         across = np.linalg.norm(du, axis=-1)
         # A row without a useful pixel has no median.
         per_row, seen = np.full(self.height, np.nan), useful.any(axis=1)
         per_row[seen] = np.nanmedian(np.where(useful[seen], across[seen], np.nan), axis=1)
         self.scale = PixelScale(across, per_row)
+
+    def find(self, frame_bgr: UInt8[np.ndarray, "h w *c"], settings: EdgeSettings) -> EdgePixels:
+        """Find the edges of the road in a frame of the camera's size, without a look at the other rows."""
+        if settings.method == "colour":
+            return find_edges(frame_bgr, settings, self.keep, self.scale, self.sample)
+        found = find_edges(frame_bgr[self.rows], settings, self._keep_rows, None, self._sample_rows)
+        found.uv_px[:, 1] += self.rows.start
+        return found
 
     def lift(self, edges: EdgePixels) -> RoadEdges:
         """Move edge pixels to the road.
@@ -227,5 +242,4 @@ class RoadEdgeExtractor:
 
     def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
         check_size(check_frame(frame_bgr), self.camera)
-        table = self.table
-        return find_edges(frame_bgr, self.settings.edges, table.keep, table.scale, table.sample)
+        return self.table.find(frame_bgr, self.settings.edges)
