@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,8 @@ _PRESETS = ("donkey_tape", "mat", "garage", "duckietown", "bfmc", "carolo_cup", 
 _CROSSED = ("dashed", "random")
 #: Earliest change of lanes after the start.
 _FIRST_CHANGE_CM = 30.0
+#: Length of a road with kinks: further than the fastest driver gets in 100 frames.
+_KINKED_CM = 1500.0
 #: Seeds that are tried for a road.
 _TRIES = 8
 
@@ -93,7 +96,7 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     Lanes of tape are 30 to 69 cm wide, their lines 1.5 to 5.1 cm, dashes 8 to 30 cm with gaps of 5 to 30 cm.
     The tightest bends have radii of 0.9 to 1.3 lane widths; on one road of four, 30 to 80 % of the pieces are
     corners. Every other road has two lanes. On one of eight the line on the right is dashed too, and on every
-    other one up to a sixth of the tape has come off in short sections.
+    other one up to a sixth of the tape has come off in short sections. See also :func:`_as_laid_at_home`.
 
     Args:
         rng: Source of randomness.
@@ -101,6 +104,8 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     """
     drawn, number = rng.random(), int(rng.integers(len(_PRESETS)))
     two_lanes, width, tape, gaps, dash, gap, right, worn, tight, cornered, corners = rng.random(11)
+    # Drawn for presets too, so that one kind of road does not change the next draw.
+    laid_rng = rng.spawn(1)[0]
     if drawn >= _DRAWN_SHARE:
         return preset(_PRESETS[number])
     lane_cm = float(30.0 * 2.3**width)
@@ -119,7 +124,50 @@ def vary_road(rng: np.random.Generator, tightest_cm: float = 60.0) -> TrackSetti
     }
     left = {"kind": "random", "colour": "random", **dashes}
     road |= {"lanes": 2, "middle": left} if two_lanes < 0.5 else {"left": left}
-    return TrackSettings.model_validate(road)
+    return TrackSettings.model_validate(road | _as_laid_at_home(road, laid_rng))
+
+
+def _as_laid_at_home(road: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Draw what home-made roads have and plain ones lack; returns the keys that change.
+
+    One road of three with one lane is laid in straight sections with kinks, one of six widens in its
+    bends. One road of eight has tape up to 8 cm wide, one of three has things painted on it, and on one of
+    eight the tape is darker than the floor, or blue or red on a pale one.
+    """
+    kinked, widens, wide, width, furnished, dark, colour, floor = rng.random(8)
+    changes: dict[str, Any] = {}
+    if kinked < 1.0 / 3.0 and road.get("lanes") != 2:
+        changes |= {"pieces": _kinked_pieces(road["lane_width_cm"], rng), "corners": 0.0}
+    elif widens < 1.0 / 6.0 and road.get("lanes") != 2:
+        changes["widening"] = float(rng.uniform(0.1, 0.4))
+    if wide < 0.125:
+        changes["line_width_cm"] = 5.0 + 3.0 * float(width)
+    if furnished < 1.0 / 3.0:
+        names = ("stop_line", "zebra", "arrow", "junction", "parking")
+        rates = rng.uniform(0.0, 0.12, len(names))
+        changes["random_furniture"] = {
+            f"{name}_per_m": float(rate) for name, rate in zip(names, rates, strict=True)
+        }
+    if dark < 0.125:
+        paint = {"colour": ("black", "black", "blue", "red")[int(4.0 * colour)]}
+        pale = 150.0 + 70.0 * float(floor)
+        changes["floor_bgr"] = tuple(pale + float(tint) for tint in rng.uniform(-12.0, 12.0, 3))
+        for name in ("left", "middle", "right", "far"):
+            if name in road or (name == "far" and road.get("lanes") == 2):
+                changes[name] = {**road.get(name, {}), **paint}
+    return changes
+
+
+def _kinked_pieces(lane_cm: float, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Draw an open road of straights and kinks of 15 to 75 degrees, which never turns back on itself."""
+    pieces, heading_deg = [{"straight": {"length_cm": 150.0}}], 0.0
+    while sum(piece["straight"]["length_cm"] for piece in pieces if "straight" in piece) < _KINKED_CM:
+        angle_deg = float(rng.uniform(15.0, 75.0))
+        to_left = heading_deg < 0.0 if abs(heading_deg) > 40.0 else rng.random() < 0.5
+        heading_deg += angle_deg if to_left else -angle_deg
+        pieces.append({"kink": {"angle_deg": angle_deg, "direction": "left" if to_left else "right"}})
+        pieces.append({"straight": {"length_cm": float(rng.uniform(1.5, 4.0)) * lane_cm}})
+    return pieces
 
 
 def vary_driver(simulation: SimulationSettings, rng: np.random.Generator) -> DriverSettings:

@@ -64,7 +64,8 @@ def random_track(settings: TrackSettings, rng: np.random.Generator) -> Track:
     width_cm, items = settings.line_width_cm, settings.furniture
     things = listed_furniture(track, items, width_cm, settings.origin)
     # In the colour of the line on the right, except that a yellow road has white bars.
-    colour: Colour = "black" if settings.right.colour == "black" else "white"
+    right = settings.right.colour
+    colour: Colour = right if right in ("black", "blue", "red") else "white"
     middle = None if settings.middle is None or settings.middle.colour == "random" else settings.middle.colour
     things += random_furniture(
         track, settings.random_furniture, items, width_cm, colour, furniture_rng, middle

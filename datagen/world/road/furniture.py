@@ -20,13 +20,14 @@ from datagen.world.road.track import Bgr, Side, Track
 from lanenet.config import Settings
 from lanenet.errors import ConfigError
 
-Colour = Literal["white", "yellow", "orange", "red", "black"]
+Colour = Literal["white", "yellow", "orange", "red", "blue", "black"]
 
 COLOURS: dict[str, Bgr] = {
     "white": (235.0, 235.0, 235.0),
     "yellow": (40.0, 190.0, 230.0),
     "orange": (30.0, 110.0, 230.0),
     "red": (45.0, 40.0, 190.0),
+    "blue": (165.0, 90.0, 30.0),
     "black": (25.0, 25.0, 25.0),
 }
 #: Stop bars of side roads are twice as thick as lines, up to this; wide lines are not made thicker.

@@ -38,7 +38,7 @@ class MarkingSettings(Settings):
     """
 
     kind: Literal["solid", "dashed", "double", "none", "random"] = "solid"
-    colour: Literal["white", "yellow", "orange", "black", "random"] = "white"
+    colour: Literal["white", "yellow", "orange", "red", "blue", "black", "random"] = "white"
     dash_cm: float = Field(default=20.0, gt=0.0)
     gap_cm: float = Field(default=20.0, gt=0.0)
     phase: float | None = Field(default=None, ge=0.0, le=1.0)
