@@ -60,8 +60,6 @@ _DASH_CM, _GAP_CM = (5.0, 30.0), (5.0, 30.0)
 _OFF_MIDDLE = 0.04
 #: Share of the things beside the lane that have a colour of their own.
 _COLOURED = 0.3
-#: Range of the factor on a frame's hues: cameras store colour weaker or stronger.
-_HUE_GAIN = (0.5, 1.5)
 
 
 #: :class:`AugmentSettings` as numbers, by the same names; ``limit`` is 1 for draws at the limit.
@@ -171,7 +169,7 @@ def augment_frames(out, labels, present, given_cm, indices, streams, seed, epoch
         )
         given_cm[slot] = frames.lane_cm[i] * scale * (1.0 + error) if is_given else 0.0
         light = -1.0 if next_uniform(rng) < amounts.inverted else 1.0
-        gain = next_between(rng, _HUE_GAIN[0], _HUE_GAIN[1])
+        gain = np.exp(next_spread(rng, np.log1p(amounts.hue_gain), amounts.limit))
         if next_uniform(rng) < amounts.colourless:
             gain = 0.0
         yellow_cast = STEPS * next_spread(rng, amounts.hue_cast, amounts.limit)

@@ -69,6 +69,8 @@ class AugmentSettings(Settings):
         untold_width: Probability that the lane width is kept from a network that takes it.
         inverted: Probability that bright and dark change places: markings of dark tape on a bright floor.
         colourless: Probability that colours are lost, as in gray light.
+        hue_gain: All hues of a frame grow or shrink by up to this share: cameras store colour weaker or
+            stronger.
         hue_cast: By up to this the light adds to each hue of a frame; 1 is all of an edge.
         width_error: The given lane width is wrong by up to this share.
         draw: ``even`` draws every amount for each sample; ``limit`` takes all amounts at their limits, with
@@ -97,6 +99,7 @@ class AugmentSettings(Settings):
     width_error: float = Field(default=0.02, ge=0.0, le=0.3)
     inverted: float = Field(default=0.1, ge=0.0, le=1.0)
     colourless: float = Field(default=0.2, ge=0.0, le=1.0)
+    hue_gain: float = Field(default=0.5, ge=0.0, le=2.0)
     hue_cast: float = Field(default=0.15, ge=0.0, le=1.0)
     draw: Literal["even", "limit"] = "even"
 

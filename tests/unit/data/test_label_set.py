@@ -36,7 +36,8 @@ def make_labels(n: int = 6, seed: int = 0) -> LabelSet:
         m = 0 if k == 0 else int(rng.integers(5, 60))
         angle = rng.uniform(0.0, 2.0 * np.pi, m)
         xy = rng.uniform([-30.0, -5.0], [30.0, 60.0], (m, 2))
-        edges.append(np.column_stack([xy, np.cos(angle), np.sin(angle)]).astype(np.float32))
+        hues = rng.uniform(-1.0, 1.0, (m, 2))
+        edges.append(np.column_stack([xy, np.cos(angle), np.sin(angle), hues]).astype(np.float32))
         left = rng.normal(size=(k, 2)).astype(np.float32)
         right = rng.normal(size=(4, 2)).astype(np.float32)
         right[2] = np.nan
@@ -76,7 +77,7 @@ def test_round_trip(tmp_path: Path, n: int) -> None:
     write_labels(tmp_path / "labels.parquet", labels)
     back = read_labels(tmp_path / "labels.parquet")
     assert_same(back, labels)
-    assert all(edge.dtype == np.float32 and edge.shape[1] == 4 for edge in back.edges)
+    assert all(edge.dtype == np.float32 and edge.shape[1] == 6 for edge in back.edges)
     assert [p.name for p in tmp_path.iterdir()] == ["labels.parquet"]
 
 
@@ -88,12 +89,12 @@ def test_the_picture_is_the_raster(tmp_path: Path) -> None:
     images = pq.read_table(path).column("image").to_pylist()
     for i, image in enumerate(images):
         picture = cv2.imdecode(np.frombuffer(image["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(picture, back.raster(i))
-        np.testing.assert_array_equal(picture, labels.raster(i))
+        np.testing.assert_array_equal(picture, back.raster(i)[0])
+        np.testing.assert_array_equal(picture, labels.raster(i)[0])
         assert image["path"] == f"lap one_{10 + i:06d}.png"
-    assert back.raster(0).shape == (32, 32)
-    assert back.raster(0).max() == 0
-    assert back.raster(1).max() == 255
+    assert back.raster(0).shape == (5, 32, 32)
+    assert back.raster(0)[0].max() == 0
+    assert back.raster(1)[0].max() == 255
 
 
 def test_other_tools_see_nulls_units_and_an_image(tmp_path: Path) -> None:
@@ -107,7 +108,7 @@ def test_other_tools_see_nulls_units_and_an_image(tmp_path: Path) -> None:
     hugging_face = json.loads(table.schema.metadata[b"huggingface"])
     assert hugging_face["info"]["features"]["image"] == {"_type": "Image"}
     meta = json.loads(table.schema.metadata[b"lanenet"])
-    assert meta["format"] == "lanenet-labels/1"
+    assert meta["format"] == "lanenet-labels/2"
     assert meta["rows_cm"] == [0.0, 15.0, 30.0]
     assert meta["order"] == list(POINT_NAMES)
     assert meta["window"] == {"left_cm": -24.0, "near_cm": 0.0, "cell_cm": 1.5, "rows": 32, "columns": 32}
@@ -192,8 +193,8 @@ def rewritten(tmp_path: Path, meta: dict[str, Any] | None = None, **columns: Any
 @pytest.mark.parametrize(
     ("meta", "message"),
     [
-        ({"format": "lanenet-labels/2"}, "expected format 'lanenet-labels/1', found 'lanenet-labels/2'"),
-        ({"format": None}, "expected format 'lanenet-labels/1', found None"),
+        ({"format": "lanenet-labels/3"}, "expected format 'lanenet-labels/2', found 'lanenet-labels/3'"),
+        ({"format": None}, "expected format 'lanenet-labels/2', found None"),
         ({"rows_cm": [0, 10, 20]}, "expected labels at rows"),
         ({"order": list(POINT_NAMES[::-1])}, "in the order"),
         ({"source": "hand"}, "key 'source'"),

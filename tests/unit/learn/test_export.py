@@ -27,8 +27,9 @@ from lanenet.perception.network.model_file import ModelMeta, read_model_meta, se
 torch.set_num_threads(1)
 
 META = ModelMeta(WINDOW, ("cam0", "cam1"), 26.0, 40.0, "abc", (1.0, 0.5, 0.6, 1.1, 0.5, math.nan), "truth")
+META = replace(META, planes=5)
 LABELS = make_label_set(5, 3)
-RASTERS = np.stack([LABELS.raster(i) for i in range(5)])[:, None]
+RASTERS = np.stack([LABELS.raster(i) for i in range(5)])
 
 
 def make_network():

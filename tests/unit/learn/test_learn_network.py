@@ -25,7 +25,7 @@ def test_the_family_grows_and_stays_compact():
     ]
     sizes = [network.n_parameters for network in networks]
     assert sizes == sorted(sizes) and sizes[0] < 50_000 < sizes[1] <= 150_000 < sizes[2]
-    output = networks[1](torch.zeros(3, 1, window.rows, window.columns))
+    output = networks[1](torch.zeros(3, 5, window.rows, window.columns))
     assert [tuple(value.shape) for value in output[:3]] == [(3, 6), (3, 6), (3, 2)]
 
 
@@ -41,7 +41,7 @@ def test_channels_and_hidden_go_before_the_kind():
 @pytest.mark.parametrize("shape", [(96, 128), (33, 47), (1, 1)])
 def test_any_window_fits(shape):
     network = LaneNet(NetworkSettings(channels=(2, 3), hidden=4), *shape).eval()
-    assert network(torch.zeros(1, 1, *shape)).points_cm.shape == (1, 6)
+    assert network(torch.zeros(1, 5, *shape)).points_cm.shape == (1, 6)
 
 
 def test_alexnet_is_the_papers_and_300_times_as_large(alexnet):
@@ -104,7 +104,7 @@ def test_first_weights_follow_from_the_seed_and_leave_the_global_generator_alone
 
 def test_buffers_scale_the_output():
     network = LaneNet(NetworkSettings(bins=0), 24, 32).eval()
-    raster = torch.ones(1, 1, 24, 32)
+    raster = torch.ones(1, 5, 24, 32)
     plain = network(raster)
     network.mean_cm.fill_(7.0)
     network.scale_cm.fill_(2.0)
@@ -125,7 +125,7 @@ def test_points_of_bins_are_the_means_of_their_distributions():
     logits[2] = 0.0  # anywhere
     last.bias.data[54:60] = 0.3
     last.bias.data[60:] = 2.0
-    answer = network(torch.zeros(1, 1, 24, 32))
+    answer = network(torch.zeros(1, 5, 24, 32))
     torch.testing.assert_close(answer.points_cm[0, :3], torch.tensor([-10.0, 15.0, 0.0]), atol=1e-4, rtol=0.0)
     torch.testing.assert_close(answer.sigma_cm[0], answer.sigma_cm[0, :1].repeat(6))
     assert SIGMA_RANGE_CM[0] < answer.sigma_cm[0, 0] < SIGMA_RANGE_CM[1]
@@ -137,7 +137,7 @@ def test_points_of_bins_are_the_means_of_their_distributions():
 def test_the_spread_stays_within_its_range(bias, limit):
     network = LaneNet(NetworkSettings(channels=(2,), hidden=4, bins=0), 24, 32).eval()
     network.head[-1].bias.data[6:12] = bias
-    sigma = network(torch.zeros(1, 1, 24, 32)).sigma_cm
+    sigma = network(torch.zeros(1, 5, 24, 32)).sigma_cm
     torch.testing.assert_close(sigma, torch.full((1, 6), limit))
 
 
@@ -145,7 +145,7 @@ def test_deployed_outputs_follow_from_the_points():
     network = new_network(NetworkSettings(bins=0), 24, 32, 0).eval()
     network.mean_cm.copy_(torch.tensor([-20.0, -19.0, -17.0, 20.0, 22.0, 25.0]))
     rng = np.random.default_rng(0)
-    raster = torch.from_numpy(np.where(rng.random((5, 1, 24, 32)) < 0.1, 255, 0).astype(np.uint8))
+    raster = torch.from_numpy(np.where(rng.random((5, 5, 24, 32)) < 0.1, 255, 0).astype(np.uint8))
     with torch.inference_mode():
         deployed = (v.numpy() for v in DeployedLaneNet(network)(raster))
         points, sigma, presence, parabolas, centre, steering = deployed
@@ -165,7 +165,7 @@ def test_the_width_of_the_lane_is_an_input_of_its_own_and_may_be_unknown():
     network = new_network(
         NetworkSettings(channels=(4, 8), hidden=8, bins=0, takes_width=True), 24, 32, 0
     ).eval()
-    raster = torch.rand(3, 1, 24, 32)
+    raster = torch.rand(3, 5, 24, 32)
     with torch.inference_mode():
         unknown, zero = network(raster), network(raster, torch.zeros(1))
         narrow, mixed = (

@@ -161,7 +161,7 @@ def test_the_model_can_be_quantised(finished, tmp_path):
     assert small_meta == meta and small_meta.training_hash
     assert {"QuantizeLinear", "DequantizeLinear"} <= {node.op_type for node in onnx.load(path).graph.node}
     labels = make_label_set(30, 9)
-    rasters = np.stack([labels.raster(i) for i in range(30)])[:, None]
+    rasters = np.stack([labels.raster(i) for i in range(30)])
     a, b = (session.run(["points_cm"], {"raster": rasters})[0] for session in (floats, small))
     assert 0.0 < np.sqrt(np.mean((a - b) ** 2)) < 0.5
     figures = json.loads(path.with_suffix(".json").read_text())

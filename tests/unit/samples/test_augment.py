@@ -12,6 +12,8 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import mirror_points, rows_of_polyline
+from lanenet.perception.edges.raster import MIDDLE, STEPS, fill_raster, new_raster
+from lanenet.perception.edges.road import RoadEdges
 from lanenet.samples.augment import augment_batch, join_frames, plain_batch
 from lanenet.samples.kernels import misplace
 from lanenet.samples.settings import AugmentSettings
@@ -24,7 +26,8 @@ ALL = np.arange(12)
 
 
 def augment(changes, window=WINDOW, seed=0):
-    return augment_batch(FRAMES, ALL, window, NOTHING.model_copy(update=changes), seed, 0)[:2]
+    batch = augment_batch(FRAMES, ALL, window, NOTHING.model_copy(update=changes), seed, 0)
+    return batch.rasters[:, :1], batch.points_cm
 
 
 def lines_present(edges, lines_cm, window):
@@ -58,19 +61,57 @@ def test_rasters_are_those_of_the_window_byte_for_byte(points, window):
         [window.left_cm + k * window.cell_cm, window.far_cm - k * window.cell_cm] for k in range(-1, 52)
     ]
     edges = np.array([*points, *border, [np.nan, 3.0], [3.0, np.inf]], np.float32)
-    normals = np.tile(np.float32([1.0, 0.0]), (len(edges), 1))
-    frames = join_frames(
-        [np.hstack([edges, normals])], [(np.empty((0, 2)), np.empty((0, 2)))], np.full((1, 6), np.nan)
-    )
-    expected = window.rasterise(edges)
-    np.testing.assert_array_equal(plain_batch(frames, np.array([0]), window)[0][0, 0], expected)
-    unchanged = augment_batch(frames, np.array([0]), window, NOTHING, 0, 0)[0][0, 0]
+    angle = np.arange(len(edges), dtype=np.float32)
+    looks = np.stack([np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(3.0 * angle)], axis=1)
+    rows = np.hstack([edges, looks]).astype(np.float32)
+    frames = join_frames([rows], [(np.empty((0, 2)), np.empty((0, 2)))], np.full((1, 6), np.nan))
+    expected = fill_raster(window, RoadEdges.of_rows(rows), new_raster(window))
+    np.testing.assert_array_equal(expected[0], window.rasterise(edges))
+    np.testing.assert_array_equal(plain_batch(frames, np.array([0]), window).rasters[0], expected)
+    unchanged = augment_batch(frames, np.array([0]), window, NOTHING, 0, 0).rasters[0]
     np.testing.assert_array_equal(unchanged, expected)
+
+
+@pytest.mark.parametrize("mirror", [0.0, 1.0])
+def test_normals_turn_with_the_points(mirror):
+    y = np.arange(10.0, 60.0, 0.5)
+    rows = np.stack([0.0 * y - 20.0, y, 0.0 * y + 0.8, 0.0 * y - 0.6, 0.0 * y, 0.0 * y], axis=1)
+    frames = join_frames([rows.astype(np.float32)], LABELS.lines[:1], LABELS.points_cm[:1])
+    changes = {"mirror": mirror, "rotate_rad": 0.2, "draw": "limit"}
+    raster = augment_batch(frames, ALL[:1], WINDOW, NOTHING.model_copy(update=changes), 0, 0).rasters[0]
+    at = np.nonzero(raster[0])
+    ahead = WINDOW.points(np.argwhere(raster[0]).astype(float))
+    x, along = np.polyfit(ahead[:, 1], ahead[:, 0], 1)[0], -0.2
+    turn = 0.2 if x < 0.0 else along
+    normal = np.array([-0.8 if mirror else 0.8, -0.6])
+    c, s = np.cos(turn), np.sin(turn)
+    expected = np.array([c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]])
+    found = (raster[1:3, at[0], at[1]].astype(float) - MIDDLE) / STEPS
+    np.testing.assert_allclose(found.T, np.tile(expected, (len(at[0]), 1)), atol=0.02)
+
+
+def test_light_and_colours_change_as_they_are_told():
+    rows = EDGES[0] + np.float32([0.0, 0.0, 0.0, 0.0, 0.4, -0.2])
+    frames = join_frames([rows], LABELS.lines[:1], LABELS.points_cm[:1])
+
+    def looks(**changes):
+        changed = NOTHING.model_copy(update=changes)
+        raster = augment_batch(frames, ALL[:1], WINDOW, changed, 0, 0).rasters[0]
+        return (raster[1:, raster[0] > 0].astype(float) - MIDDLE).mean(axis=1) / STEPS
+
+    np.testing.assert_allclose(looks(), [1.0, 0.0, 0.4, -0.2], atol=0.01)
+    np.testing.assert_allclose(looks(inverted=1.0), [-1.0, 0.0, 0.4, -0.2], atol=0.01)
+    np.testing.assert_allclose(looks(colourless=1.0), [1.0, 0.0, 0.0, 0.0], atol=0.01)
+    gain = looks(hue_gain=0.5, draw="limit")[2:] / [0.4, -0.2]
+    assert gain[0] == pytest.approx(gain[1], abs=0.05) and abs(np.log(gain[0])) == pytest.approx(
+        0.405, abs=0.04
+    )
+    np.testing.assert_allclose(np.abs(looks(hue_cast=0.1, draw="limit")[2:] - [0.4, -0.2]), 0.1, atol=0.01)
 
 
 def test_without_changes_the_sample_stays():
     rasters, points = augment({})
-    np.testing.assert_array_equal(rasters[3, 0], LABELS.raster(3))
+    np.testing.assert_array_equal(rasters[3], LABELS.raster(3)[:1])
     np.testing.assert_allclose(points, LABELS.points_cm, atol=1e-4)
 
 
@@ -78,7 +119,7 @@ def test_mirror_flips_raster_and_labels():
     rasters, points = augment({"mirror": 1.0})
     np.testing.assert_allclose(points, mirror_points(LABELS.points_cm), atol=1e-4)
     # A point on the border of two cells may fall into either.
-    different = rasters[:, 0] != np.stack([LABELS.raster(i)[:, ::-1] for i in range(12)])
+    different = rasters[:, 0] != np.stack([LABELS.raster(i)[0, :, ::-1] for i in range(12)])
     assert different.sum() <= 0.01 * np.count_nonzero(rasters)
 
 
@@ -120,7 +161,7 @@ def test_labels_are_those_of_the_moved_polylines():
     lines = (np.stack([-20.0 + 0.01 * y * y, y], 1), np.stack([20.0 + 0.3 * y, y], 1))
     lines[1][30] = np.nan
     points = np.array([-20.0, -20.0, np.nan, 20.0, 20.0, np.nan])
-    frames = join_frames([np.empty((0, 4), np.float32)], [lines], points[None])
+    frames = join_frames([np.empty((0, 6), np.float32)], [lines], points[None])
     window = BirdseyeWindow()
     for mirror, shift, turn in product((0.0, 1.0), (-5.0, 5.0), (-0.1, 0.0, 0.1)):
         # With no other change, "limit" leaves two shifts and two turns to draw from.
@@ -134,10 +175,10 @@ def test_labels_are_those_of_the_moved_polylines():
 
 def test_what_lies_across_a_missing_line_goes_with_it():
     # The ends of a tape lie across it: they would tell where the line was.
-    across = [edge * np.float32([1.0, 1.0, 0.0, 0.0]) + np.float32([0.0, 0.0, 0.0, 1.0]) for edge in EDGES]
+    across = [edge * np.float32([1, 1, 0, 0, 0, 0]) + np.float32([0, 0, 0, 1, 0, 0]) for edge in EDGES]
     frames = join_frames(across, LABELS.lines, LABELS.points_cm)
     gone = NOTHING.model_copy(update={"missing_both": 1.0})
-    assert not augment_batch(frames, ALL, WINDOW, gone, 0, 0)[0].any()
+    assert not augment_batch(frames, ALL, WINDOW, gone, 0, 0)[0][:, 0].any()
 
 
 def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
@@ -146,7 +187,7 @@ def test_the_next_lane_goes_with_a_missing_line_and_what_lies_about_stays():
 
     def column(x, normal):
         edge = np.stack([np.full(120, x), np.linspace(4.0, 64.0, 120)], 1)
-        return np.hstack([edge, np.tile(normal, (120, 1))]).astype(np.float32)
+        return RoadEdges(edge, np.tile(normal, (120, 1))).rows()
 
     # Left line, the next lane's border, a scratch between them, and the right line.
     parts = [column(-20.0, (1.0, 0.0)), column(-40.0, (1.0, 0.1)), column(-30.0, (0.0, 1.0))]
@@ -246,7 +287,7 @@ def test_missing_lines_are_not_present_and_the_labels_stay():
         np.testing.assert_array_equal(np.unique(present.sum(axis=1)), expected)
         assert np.isfinite(points).all()
         if changes == {"missing_both": 1.0}:
-            assert not rasters.any()
+            assert not rasters[:, 0].any()
         if changes == {"missing_line": 1.0}:
             assert set(map(tuple, present)) == {(0.0, 1.0), (1.0, 0.0)}
             for raster, (left, _) in zip(rasters, present, strict=True):
@@ -273,12 +314,12 @@ def test_presence_needs_enough_edges_near_the_line():
     # 1.5 cm of one edge are nothing, 10 cm could be anything, 25 cm are a line.
     for points, expected in ((3, 0.0), (20, np.nan), (50, 1.0)):
         np.testing.assert_array_equal(lines_present(near[:points], lines, fine), [expected, 0.0])
-    beside = near + np.float32([5.5, 0.0, 0.0, 0.0])
+    beside = near + np.float32([5.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert lines_present(beside, lines, fine)[0] == 0.0
     # As many edges, but across the road: the shadow of something, no tape.
     for lean_deg, expected in ((20.0, 1.0), (45.0, 0.0), (90.0, 0.0)):
         lean, turned = math.radians(lean_deg), near.copy()
-        turned[:, 2:] = math.cos(lean), math.sin(lean)
+        turned[:, 2:4] = math.cos(lean), math.sin(lean)
         np.testing.assert_array_equal(lines_present(turned, lines, fine), [expected, 0.0])
     nowhere = (np.full((3, 2), np.nan), np.empty((0, 2)))
     assert np.isnan(lines_present(near, nowhere, fine)).all()
@@ -310,12 +351,12 @@ def test_clutter_only_adds():
 
 
 def test_an_empty_frame_can_be_augmented():
-    edges, lines = np.empty((0, 4), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
+    edges, lines = np.empty((0, 6), np.float32), (np.empty((0, 2)), np.full((3, 2), np.nan))
     frames = join_frames([edges], [lines], np.full((1, 6), np.nan))
     changes = {"missing_stretch": 1.0, "missing_line": 1.0, "jitter_cm": 1.0, "clutter_share": 1.0}
     one = np.array([0])
     rasters, points, present, _ = augment_batch(frames, one, WINDOW, NOTHING.model_copy(update=changes), 0, 0)
-    assert not rasters.any() and np.isnan(points).all() and np.isnan(present).all()
+    assert not rasters[:, 0].any() and np.isnan(points).all() and np.isnan(present).all()
 
 
 def test_lines_cannot_be_missing_more_than_always():
@@ -375,8 +416,8 @@ def test_middle_dashes_lie_between_the_lines_and_change_nothing_else():
     rasters, points, present, told = augment_batch(frames, many, fine, dashed, 0, 0, streams)
     np.testing.assert_array_equal(points, plain.points_cm)
     np.testing.assert_array_equal(present, plain.present)
-    added = (rasters > 0) & (plain.rasters == 0)
-    assert not np.any(rasters < plain.rasters)
+    added = (rasters[:, :1] > 0) & (plain.rasters[:, :1] == 0)
+    assert not np.any(rasters[:, 0] < plain.rasters[:, 0])
     painted = []
     for i, new in zip(many, added[:, 0], strict=True):
         seen = fine.points(np.argwhere(new).astype(float))

@@ -27,7 +27,7 @@ def test_frames_of_two_sets_stay_in_order():
     assert both.camera_hashes == ["cam0", "cam1"]
     assert both.reference == "map and truth"
     rasters, points, present, _ = both.plain_batch(np.array([5, 0]))
-    np.testing.assert_array_equal(rasters[0, 0], b.raster(2))
+    np.testing.assert_array_equal(rasters[0], b.raster(2))
     np.testing.assert_allclose(points[1], a.points_cm[0], atol=1e-4)
     np.testing.assert_array_equal(present, np.ones((2, 2)))
     assert both.lane_widths_cm == (40.0, 40.0)
