@@ -162,7 +162,7 @@ def test_lane_filter_on_label_sets_starts_again_after_gaps() -> None:
         # Bright markings: their two edges face each other.
         lines = [(x + side - shift, -side) for x in (-60.0, -20.0, 20.0, 60.0) for side in (-1.0, 1.0)]
         return np.concatenate(
-            [np.stack([np.full_like(y, x), y, np.full_like(y, to), y * 0.0], axis=1) for x, to in lines]
+            [np.stack([0 * y + x, y, 0 * y + to, 0 * y, 0 * y, 0 * y], axis=1) for x, to in lines]
         )
 
     shifts = [0.0, 8.0, 16.0, 24.0, 24.0]

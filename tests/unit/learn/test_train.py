@@ -117,7 +117,7 @@ def test_the_folder_holds_what_it_should(finished, data):
     assert meta.camera_hashes == ("cam0",) and meta.lane_width_cm == 40.0
     assert math.isfinite(sum(meta.rmse_cm)) and meta.training_hash == metrics["run_hash"]
     session = onnxruntime.InferenceSession(finished.model_path, providers=["CPUExecutionProvider"])
-    assert session.get_inputs()[0].shape[1:] == [1, 24, 32]
+    assert session.get_inputs()[0].shape[1:] == [5, 24, 32]
     # Readable without trusting the file.
     torch.load(finished.folder / "last.pt", weights_only=True)
 
