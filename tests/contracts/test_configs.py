@@ -109,7 +109,8 @@ def write_quick_labels(path: Path, window: Any, source: str, camera: str) -> Non
     sides = (-16.0, -14.0, 14.0, 16.0)
     line = np.stack([0.0 * y, np.linspace(-20.0, 90.0, len(y))], axis=1)
     edges = [
-        np.concatenate([np.stack([y * 0 + x + s, y, y * 0 + 1, y * 0], axis=1) for x in sides]) for s in shift
+        np.concatenate([np.stack([y * 0 + x + s, y, y * 0 + 1, y * 0, y * 0, y * 0], axis=1) for x in sides])
+        for s in shift
     ]
     labels = LabelSet(
         LabelMeta(window, camera, 17.0, 30.0, source),  # type: ignore[arg-type]

@@ -166,9 +166,9 @@ def make_checkpoint(folder: Path) -> None:
     sized = NetworkSettings(**SIZE)
     network = new_network(sized, WINDOW.rows, WINDOW.columns, 0).eval()
     network.mean_cm.copy_(torch.tensor([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0]))
-    meta = ModelMeta(WINDOW, ("any",), 26.0, 40.0, "abc", (1.0,) * 6, "truth")
+    meta = ModelMeta(WINDOW, ("any",), 26.0, 40.0, "abc", (1.0,) * 6, "truth", planes=5)
     labels = make_label_set(2, 0)
-    rasters = np.stack([labels.raster(k) for k in range(2)])[:, None]
+    rasters = np.stack([labels.raster(k) for k in range(2)])
     (folder / "config.yaml").write_text(dump_settings(LearnSettings(network=sized)))
     (folder / "checkpoint.yaml").write_text("format: lanenet-checkpoint/1\nname: x\n")
     write_json(folder / "metrics.json", {"format": METRICS_FORMAT, "run_hash": "x", "val_rmse_cm": 1.0})

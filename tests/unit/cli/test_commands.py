@@ -255,7 +255,8 @@ def tiny_labels(path: Path) -> LabelSet:
         # Bright markings: their two edges face each other.
         sides = {-21.0: 1.0, -19.0: -1.0, 19.0: 1.0, 21.0: -1.0}
         both = [np.stack([y * 0 + x + shift, y, y * 0 + to, y * 0], axis=1) for x, to in sides.items()]
-        edges.append(np.concatenate(both).astype(np.float32))
+        rows = np.concatenate(both)
+        edges.append(np.hstack([rows, 0.0 * rows[:, :2]]).astype(np.float32))
         points.append(np.repeat([-20.0 + shift, 20.0 + shift], 3))
     n = len(points)
     line = np.array([[0.0, -20.0], [0.0, 60.0]], np.float32)

@@ -83,7 +83,7 @@ def car(tmp_path: Path, drive: Path) -> Path:
 def label_set(path: Path, camera_hash: str) -> Path:
     """Two straight lines, seen by a camera."""
     y = np.arange(1.0, 60.0, 0.3)
-    edges = [np.stack([y * 0 + x, y, y * 0 + np.sign(x), y * 0], axis=1) for x in (-20.0, 20.0)]
+    edges = [np.stack([y * 0 + x, y, y * 0 + np.sign(x), y * 0, y * 0, y * 0], axis=1) for x in (-20.0, 20.0)]
     line = np.array([[-20.0, -20.0], [-20.0, 60.0]])
     labels = LabelSet(
         LabelMeta(META.window, camera_hash, 26.0, 40.0, "map", META.perception),

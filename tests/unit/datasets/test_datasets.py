@@ -35,7 +35,7 @@ def _labels(frames: np.ndarray) -> LabelSet:
         lap=np.zeros(n, dtype=np.int64),
         poses=np.zeros((n, 3)),
         points_cm=np.column_stack([frames] * 6).astype(np.float64),
-        edges=[np.empty((0, 4), np.float32)] * n,
+        edges=[np.empty((0, 6), np.float32)] * n,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),
         divides=np.zeros((n, 2), dtype=bool),

@@ -30,7 +30,7 @@ def drive(laps: np.ndarray, step_cm: np.ndarray | float = 3.0, frames: np.ndarra
         lap=laps,
         poses=poses,
         points_cm=np.zeros((n, 6)),
-        edges=[np.empty((0, 4), np.float32)] * n,
+        edges=[np.empty((0, 6), np.float32)] * n,
         lines=[(nothing, nothing)] * n,
         quality=np.ones(n),
         divides=np.zeros((n, 2), dtype=bool),
