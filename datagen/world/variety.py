@@ -160,7 +160,8 @@ def _as_laid_at_home(road: dict[str, Any], rng: np.random.Generator) -> dict[str
 
 def _kinked_pieces(lane_cm: float, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Draw an open road of straights and kinks of 15 to 75 degrees, which never turns back on itself."""
-    pieces, heading_deg = [{"straight": {"length_cm": 150.0}}], 0.0
+    pieces: list[dict[str, dict[str, Any]]] = [{"straight": {"length_cm": 150.0}}]
+    heading_deg = 0.0
     while sum(piece["straight"]["length_cm"] for piece in pieces if "straight" in piece) < _KINKED_CM:
         angle_deg = float(rng.uniform(15.0, 75.0))
         to_left = heading_deg < 0.0 if abs(heading_deg) > 40.0 else rng.random() < 0.5

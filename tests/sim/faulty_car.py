@@ -21,7 +21,6 @@ from wire_log import guarded_wire, note, settings_of
 
 from lanenet.control.controller import ControlSettings, LaneController, Target
 from lanenet.control.steering import SteeringSettings
-from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
@@ -154,7 +153,7 @@ sink = guarded_wire(settings_of(wire, **actuator), safety.watchdog_s)
 detector = network.NetworkDetector(MODEL, camera, any_camera=True)
 detector._session = Session(detector._session)  # type: ignore[assignment]
 birdseye.find_edges = at_fault("edges", birdseye.find_edges, {})
-BirdseyeWindow.rasterise = at_fault("raster", BirdseyeWindow.rasterise, {})  # type: ignore[method-assign]
+network.fill_raster = at_fault("raster", network.fill_raster, {})
 network.confidence = at_fault("estimate", network.confidence, {"network doubts": doubtful})
 detect_well = detector.detect
 ends: dict[str, Callable[..., Any]] = {
