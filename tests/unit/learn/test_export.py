@@ -194,10 +194,11 @@ def test_an_output_that_is_no_number_is_a_difference(tmp_path):
 
 
 def test_the_width_of_the_lane_may_be_told_to_all_or_to_each_or_left_out(tmp_path):
-    settings = NetworkSettings(channels=(4, 8), hidden=8, bins=0, takes_width=True)
+    # Of one plane: those who have all of them need not know.
+    settings = NetworkSettings(channels=(4, 8), hidden=8, bins=0, planes=1, takes_width=True)
     network = new_network(settings, WINDOW.rows, WINDOW.columns, 1).eval()
-    meta = replace(META, takes_width=True)
-    assert export_onnx(network, meta, RASTERS, tmp_path / "m.onnx") < 1e-3
+    meta, rasters = replace(META, planes=1, takes_width=True), RASTERS[:, :1]
+    assert export_onnx(network, meta, rasters, tmp_path / "m.onnx") < 1e-3
     assert read_model_meta(tmp_path / "m.onnx").takes_width
     session = onnxruntime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
     # Who knows of rasters only is not asked for more.
@@ -205,16 +206,16 @@ def test_the_width_of_the_lane_may_be_told_to_all_or_to_each_or_left_out(tmp_pat
     deployed = DeployedLaneNet(network).eval()
     for widths in (None, [30.0], [0.0], [30.0, 0.0, 60.0, 45.0, 25.0]):
         told = None if widths is None else np.array(widths, np.float32)
-        feed = {"raster": RASTERS} | ({} if told is None else {"lane_width_cm": told})
+        feed = {"raster": rasters} | ({} if told is None else {"lane_width_cm": told})
         with torch.inference_mode():
-            expected = deployed(torch.from_numpy(RASTERS), None if told is None else torch.from_numpy(told))
+            expected = deployed(torch.from_numpy(rasters), None if told is None else torch.from_numpy(told))
         np.testing.assert_allclose(session.run(["points_cm"], feed)[0], expected[0].numpy(), atol=1e-3)
-    labels = make_label_set(3, 3)
-    found = RasterModel(tmp_path / "m.onnx").answer_labels(labels).points_cm
+    labels, model = make_label_set(3, 3), RasterModel(tmp_path / "m.onnx")
+    width_cm = labels.meta.lane_width_cm
     with torch.inference_mode():
-        expected = network(
-            input_of_rasters(torch.from_numpy(RASTERS[:3])), torch.tensor([labels.meta.lane_width_cm])
-        )
+        expected = network(input_of_rasters(torch.from_numpy(rasters[:3])), torch.tensor([width_cm]))
+    np.testing.assert_allclose(model.answer_labels(labels).points_cm, expected.points_cm.numpy(), atol=1e-3)
+    found = model.answer(RASTERS[:3], np.full(3, width_cm)).points_cm
     np.testing.assert_allclose(found, expected.points_cm.numpy(), atol=1e-3)
 
 

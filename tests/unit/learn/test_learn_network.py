@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 import torch
+from synthetic_labels import make_label_set
 
 from lanenet.errors import CheckpointError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import parabolas_from_points, proportional_angle_rad
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.network import SIGMA_RANGE_CM, DeployedLaneNet, LaneNet, input_of_rasters, new_network
+from lanenet.samples.dataset import LaneSamples
 
 torch.set_num_threads(1)
 
@@ -111,6 +113,29 @@ def test_buffers_scale_the_output():
     network.sigma_factor.fill_(3.0)
     torch.testing.assert_close(network(raster).points_cm, 2.0 * plain.points_cm + 7.0)
     torch.testing.assert_close(network(raster).sigma_cm, 3.0 * plain.sigma_cm)
+
+
+def test_a_network_sees_its_planes_and_no_others():
+    batch = LaneSamples([make_label_set(3, 3)], ["a"]).plain_batch(np.arange(3))
+    rasters = torch.from_numpy(batch.rasters)
+    turned = rasters.clone()
+    turned[:, 1] = 2 * 128 - turned[:, 1]
+    assert not torch.equal(turned, rasters)
+    for planes in (1, 5):
+        settings = NetworkSettings(channels=(4, 8), hidden=8, bins=0, planes=planes)
+        network = new_network(settings, *rasters.shape[2:], 0).eval()
+        with torch.inference_mode():
+            own, all_of_them, other = (
+                network(input_of_rasters(seen)).points_cm for seen in (rasters[:, :planes], rasters, turned)
+            )
+        torch.testing.assert_close(own, all_of_them)
+        assert torch.allclose(all_of_them, other) == (planes == 1)
+
+
+def test_rasters_become_numbers_from_minus_one_to_one():
+    raster = torch.tensor([[0, 255], [1, 255], [128, 128], [64, 192], [2, 254]], dtype=torch.uint8)
+    expected = torch.tensor([[0, 127], [-127, 127], [0, 0], [-64, 64], [-126, 126]]) / 127.0
+    torch.testing.assert_close(input_of_rasters(raster.reshape(1, 5, 1, 2))[0, :, 0], expected)
 
 
 def test_points_of_bins_are_the_means_of_their_distributions():

@@ -10,7 +10,13 @@ from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.canny import EdgeSettings, find_edges, sample_pixels, to_gray
 from lanenet.perception.edges.pixels import EdgePixels
-from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadEdgeExtractor, RoadTable
+from lanenet.perception.edges.road import (
+    COLOUR_WEIGHT,
+    PerceptionSettings,
+    RangeSettings,
+    RoadEdgeExtractor,
+    RoadTable,
+)
 
 DIRECTIONAL = EdgeSettings()
 CANNY = EdgeSettings(method="canny")
@@ -111,6 +117,42 @@ def test_normals_point_to_the_brighter_side(settings: EdgeSettings, degrees: flo
     np.testing.assert_allclose(np.linalg.norm(edges.normals, axis=1), 1.0, atol=1e-12)
     # Within two degrees of the true direction.
     assert (edges.normals[inner] @ normal).min() > math.cos(math.radians(2.0))
+
+
+@pytest.mark.parametrize(
+    ("tape_bgr", "yellow", "red"),
+    [
+        ((235, 235, 235), 0.0, 0.0),
+        ((25, 25, 25), 0.0, 0.0),
+        ((40, 190, 230), 1.0, 0.35),
+        # As bright as the road: it is found by its colour alone.
+        ((40, 105, 110), 1.0, 0.25),
+        # Brighter than the road in red, darker in blue.
+        ((45, 40, 190), 0.5, 1.0),
+        # Towards the road, which is yellower than the tape.
+        ((165, 90, 30), 1.0, 0.75),
+    ],
+)
+def test_hues_are_what_the_gradient_gains_in_yellow_and_in_red(
+    tape_bgr: tuple[int, int, int], yellow: float, red: float
+) -> None:
+    share, _, _ = blurred_step(0.3, 0.0, dark=0.0, bright=255.0)
+    frame = np.rint(100.0 + share / 255.0 * (np.array(tape_bgr) - 100.0)).astype(np.uint8)
+    edges = find_edges(frame, EdgeSettings(colour_weight=COLOUR_WEIGHT))
+    inner = away_from_the_border(edges)
+    assert edges.hues is not None and np.count_nonzero(inner) >= 45
+    np.testing.assert_allclose(np.median(edges.hues[inner], axis=0), [yellow, red], atol=0.1)
+
+
+def test_gray_images_have_no_hues() -> None:
+    frame, _, _ = blurred_step(0.3, 0.0)
+    weighted = EdgeSettings(colour_weight=COLOUR_WEIGHT)
+    assert find_edges(frame[:, :, 0].copy(), weighted).hues is None
+    assert find_edges(frame, DIRECTIONAL).hues is None
+    in_colour = find_edges(frame, weighted)
+    assert in_colour.hues is not None and not in_colour.hues.any()
+    without = extractor(DIRECTIONAL, RangeSettings()).extract(np.zeros((240, 320, 3), np.uint8))
+    assert without.hues is None and without.rows().shape == (0, 6)
 
 
 @pytest.mark.parametrize("settings", [CANNY, DIRECTIONAL])

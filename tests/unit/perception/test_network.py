@@ -1,4 +1,7 @@
+import base64
+import json
 import math
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -193,6 +196,9 @@ def test_a_frame_of_another_size_is_refused(model_path):
         ({"signs": '{"steering_rad": "positive right"}'}, "signs"),
         ({"rmse_cm": "[1.0]"}, "rmse_cm has 1 values, expected 6"),
         ({"lane_width_range_cm": "[30.0]"}, "unreadable description"),
+        ({"planes": None}, "'planes' is missing"),
+        ({"planes": '["edge", "red"]'}, r"planes \['edge', 'red'\], expected"),
+        ({"planes": '["edge"]'}, "do not fit its window"),
     ],
 )
 def test_faulty_descriptions_are_refused(model_path, tmp_path, changes, message):
@@ -336,6 +342,17 @@ def test_a_model_that_answers_otherwise_than_where_it_was_made_is_refused(model_
 )
 def test_a_model_without_a_usable_self_test_is_refused(model_path, tmp_path, test):
     path = change_properties(model_path, tmp_path / "m.onnx", self_test=test)
+    with pytest.raises(ModelMismatchError, match=r"m\.onnx.*self_test"):
+        read_model_meta(path)
+
+
+def test_the_self_test_shows_all_planes(model_path, tmp_path):
+    properties = {p.key: p.value for p in onnx.load(model_path).metadata_props}
+    test = json.loads(properties["self_test"])
+    packed = zlib.decompress(base64.b64decode(test["raster"]))
+    assert len(packed) == 5 * 24 * 32
+    first = base64.b64encode(zlib.compress(packed[: 24 * 32])).decode()
+    path = change_properties(model_path, tmp_path / "m.onnx", self_test=json.dumps(test | {"raster": first}))
     with pytest.raises(ModelMismatchError, match=r"m\.onnx.*self_test"):
         read_model_meta(path)
 
