@@ -62,13 +62,22 @@ def test_roads_vary_and_can_be_laid():
     assert len(widths) > 20 and {road.lanes for road in roads} == {1, 2}
     assert sum(road.preset is not None for road in roads) in range(18, 43)
     own = [road for road in roads if road.preset is None]
-    assert all(30.0 <= road.lane_width_cm <= 69.0 and 1.5 <= road.line_width_cm <= 5.1 for road in own)
+    assert all(30.0 <= road.lane_width_cm <= 69.0 and 1.5 <= road.line_width_cm <= 8.0 for road in own)
+    assert 0 < sum(road.line_width_cm > 5.1 for road in own) <= len(own) // 4
     assert {road.right.kind for road in own} == {"solid", "dashed"}
     cornered = [road.corners for road in roads if road.corners > 0.0]
     assert 3 <= len(cornered) <= len(own) // 2 and 0.3 <= min(cornered) < max(cornered) <= 0.8
-    for seed, road in enumerate(own[:4]):
+    kinked, wider, dark = (
+        [road for road in own if road.pieces],
+        [road for road in own if road.widening > 0.0],
+        [road for road in own if road.right.colour in ("black", "blue", "red")],
+    )
+    assert kinked and wider and dark and all(road.lanes == 1 for road in kinked + wider)
+    assert all(min(road.floor_bgr) > 135.0 and road.right.colour != "white" for road in dark)
+    for seed, road in enumerate([*own[:4], kinked[0], wider[0], dark[0]]):
         track = random_track(road.model_copy(update={"length_cm": 400.0}), np.random.default_rng(seed))
-        assert len(track.markings) >= 2
+        # Where a lane widens its lines are laid piece by piece.
+        assert len(track.boxes) > 20 if road.widening > 0.0 else len(track.markings) >= 2
 
 
 def test_a_road_without_room_gives_way_to_the_next_seed(monkeypatch):
