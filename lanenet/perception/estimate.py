@@ -156,7 +156,7 @@ class DetectorKind:
 
 #: Presence below which a line is missing, and above which it is certain. Chosen: more likely than not, and
 #: nine in ten.
-SEEN, _SURE = 0.5, 0.9
+SEEN, SURE = 0.5, 0.9
 #: Frames whose widths are remembered, and how many are needed. Chosen: 5 s and half a second at 20 frames/s.
 _LENGTH, _ENOUGH = 100, 10
 #: Sigma of a remembered width as a share of it. Chosen: 0.8 cm of a lane of 40 cm, laid by hand.
@@ -195,7 +195,7 @@ class LaneMemory:
                 it sees.
         """
         left, right = presence.tolist()
-        if left <= _SURE or right <= _SURE:
+        if left <= SURE or right <= SURE:
             return
         width_cm = lane_width_cm(points_cm)
         if 0.0 < width_cm < math.inf:

@@ -11,10 +11,10 @@ from jaxtyping import Float, UInt8
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import ROWS_CM, lane_width_cm, proportional_angle_rad
+from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, proportional_angle_rad
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
-from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
+from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 from lanenet.perception.network.tracker import LaneTracker
 
@@ -29,6 +29,15 @@ _WIDTH_TOLERANCE = 0.15
 #: Sigma of the lane's centre that halves the confidence, as a share of the width. Chosen: 4 cm of 40 cm, well
 #: above a good network's RMSE and well below half a car's width.
 _CENTRE_TOLERANCE = 0.1
+#: Widths of the same lane, as shares of the known one: it widens in bends and where it joins another. Chosen.
+_NARROW, _WIDE = 0.8, 1.25
+#: Sigma of the width by which one line tells the centre, as a share of it. Chosen: 2 cm of a lane of 40 cm.
+_ONE_LINE = 0.05
+#: Length along the road, [cm], from which a line is seen on its edges; below it what the network says of it
+#: counts by half. Chosen: three bins of the refinement.
+_SEEN_CM = 9.0
+#: Label row at which the car aims, 15 cm ahead.
+_AIM = 1
 
 
 class NetworkDetector:
@@ -97,8 +106,9 @@ class NetworkDetector:
         if not np.count_nonzero(raster[0]):
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
-        points_cm, sigma_cm, _ = self._tracker.follow(points_cm, sigma_cm, presence, edges)
-        return self._estimate(points_cm, sigma_cm, presence)
+        points_cm, sigma_cm, seen_cm = self._tracker.follow(points_cm, sigma_cm, presence, edges)
+        confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
+        return self._estimate(points_cm, sigma_cm, presence, confirmed)
 
     def detect_raster(self, raster: UInt8[np.ndarray, "p r c"]) -> LaneEstimate:
         """Find the lane in a bird's-eye raster with all planes: the network alone, with the lane's width."""
@@ -107,7 +117,7 @@ class NetworkDetector:
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
-        return self._estimate(points_cm, sigma_cm, presence)
+        return self._estimate(points_cm, sigma_cm, presence, presence)
 
     def _run(self) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
         """Run the network on the raster."""
@@ -120,14 +130,16 @@ class NetworkDetector:
         points_cm: Float[np.ndarray, "6"],
         sigma_cm: Float[np.ndarray, "6"],
         presence: Float[np.ndarray, "2"],
+        confirmed: Float[np.ndarray, "2"],
     ) -> LaneEstimate:
-        row = 1
-        centre_cm = 0.5 * (float(points_cm[row]) + float(points_cm[row + len(ROWS_CM)]))
+        """Return the answer; ``confirmed`` is the presence that the confidence counts."""
+        width_cm = self.memory.width_cm
+        aim_cm = _centre_cm(points_cm, width_cm)
         return LaneEstimate(
             points_cm=points_cm,
             sigma_cm=sigma_cm,
-            steering_rad=proportional_angle_rad(centre_cm, ROWS_CM[row]),
-            confidence=confidence(points_cm, sigma_cm, presence, self.meta.widths_cm),
+            steering_rad=math.nan if math.isnan(aim_cm) else proportional_angle_rad(aim_cm, ROWS_CM[_AIM]),
+            confidence=confidence(points_cm, sigma_cm, confirmed, self.meta.widths_cm, width_cm),
             presence=presence,
         )
 
@@ -164,48 +176,90 @@ def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
     return float(inside.mean())
 
 
+def _centre_cm(points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> float:
+    """Return the lane's centre at y = 15 cm, by one line if the other is unknown; NaN without any."""
+    left, right = points_cm.tolist()[_AIM :: len(ROWS_CM)]
+    if width_cm is not None:
+        left, right = (
+            right - width_cm if math.isnan(left) else left,
+            left + width_cm if math.isnan(right) else right,
+        )
+    return 0.5 * (left + right)
+
+
 def confidence(
     points_cm: Float[np.ndarray, "6"],
     sigma_cm: Float[np.ndarray, "6"],
     presence: Float[np.ndarray, "2"],
     width_range_cm: tuple[float, float],
+    known_width_cm: float | None = None,
 ) -> float:
-    """Rate an answer by the presence of its lines, the sigma of its centre and its width.
+    """Rate an answer by the presence of its lines, the sigma of its centre, its width, and its bend.
 
-    The product of three factors from 0 to 1:
+    The product of four factors from 0 to 1, with W the lane's width if it is known, else that of the answer
+    within the widths of the training:
 
     - the probability that at least one line is seen, ``1 - (1 - p_left) (1 - p_right)``;
-    - ``1 / (1 + (s / (0.1 W))^2)`` with s the standard deviation of the lane's centre at y = 15 cm, half the
-      root of the sum of the squares of both lines', and W the middle of the known widths;
+    - ``1 / (1 + (s / (0.1 W))^2)`` with s the standard deviation of the lane's centre at y = 15 cm: half the
+      root of the sum of the squares of both lines', or, of one line and W, that of the line and 0.05 W;
     - ``exp(-0.5 (d / (0.15 W'))^2)`` with d how far the width of the answer, across the lane, lies outside
-      the known widths, and W' the nearest of these; 1 within them.
+      0.8 to 1.25 W, or the widths of the training, and W' the nearest of these; 1 within them;
+    - ``1 - 0.5 (1 - p) min(1, W / R)`` with p the presence of the line that is seen less, and R the radius of
+      the bend: one line in a bend tells little of the other.
 
     Args:
-        points_cm: The six points, frame car.
+        points_cm: The six points, frame car; NaN where unknown.
         sigma_cm: Their standard deviations.
         presence: Probability that each line can be seen.
         width_range_cm: The narrowest and the widest lane that the network was trained on.
+        known_width_cm: The lane's width, given or remembered; None while unknown.
 
     Returns:
-        0 to 1; 0 if the right line does not lie to the right of the left one, or if anything is not a finite
-        number, a sigma is negative, or a presence is no probability.
+        0 to 1; 0 if no line is known 15 cm ahead, or one and no width, if the right line does not lie to the
+        right of the left one, or if a point is infinite, its sigma is none, or a presence is no probability.
 
     Source:
         Own choice; values in ``tests/unit/perception/test_confidence.py``.
     """
-    width_cm, sigmas, (left, right) = lane_width_cm(points_cm), sigma_cm.tolist(), presence.tolist()
+    points, sigmas, (left, right) = points_cm.tolist(), sigma_cm.tolist(), presence.tolist()
     # Written so that NaN fails as well.
-    if not (0.0 < width_cm < math.inf and min(sigmas) >= 0.0 and sum(sigmas) < math.inf):
-        return 0.0
     if not (0.0 <= left <= 1.0 and 0.0 <= right <= 1.0):
         return 0.0
+    if not all(
+        math.isnan(x) or (math.isfinite(x) and 0.0 <= s < math.inf)
+        for x, s in zip(points, sigmas, strict=True)
+    ):
+        return 0.0
     low, high = width_range_cm
+    if known_width_cm is not None:
+        low, high = _NARROW * known_width_cm, _WIDE * known_width_cm
+    known = [not math.isnan(x) for x in points[_AIM :: len(ROWS_CM)]]
+    if all(known):
+        across_cm = lane_width_cm(points_cm)
+        if math.isnan(across_cm):
+            across_cm = points[_AIM + len(ROWS_CM)] - points[_AIM]
+        if not across_cm > 0.0:
+            return 0.0
+        nearest_cm = min(max(across_cm, low), high)
+        off = (across_cm - nearest_cm) / (_WIDTH_TOLERANCE * nearest_cm)
+        unit_cm = known_width_cm or nearest_cm
+        centre_cm = 0.5 * math.hypot(sigmas[_AIM], sigmas[_AIM + len(ROWS_CM)])
+    elif any(known) and known_width_cm is not None:
+        off, unit_cm = 0.0, known_width_cm
+        side = known.index(True)
+        centre_cm = math.hypot(sigmas[_AIM + side * len(ROWS_CM)], _ONE_LINE * unit_cm)
+    else:
+        return 0.0
+    least = min(p if there else 0.0 for p, there in zip((left, right), known, strict=True))
+    bend = 0.0
+    for line in (points[: len(ROWS_CM)], points[len(ROWS_CM) :]):
+        if not any(map(math.isnan, line)):
+            a, b, _ = parabola_through(*line)
+            bend = max(bend, abs(2.0 * a) / math.hypot(1.0, 2.0 * a * ROWS_CM[_AIM] + b) ** 3)
     seen = 1.0 - (1.0 - left) * (1.0 - right)
-    centre_cm = 0.5 * math.hypot(sigmas[1], sigmas[4])
-    sure = 1.0 / (1.0 + (centre_cm / (_CENTRE_TOLERANCE * 0.5 * (low + high))) ** 2)
-    nearest_cm = min(max(width_cm, low), high)
-    off = (width_cm - nearest_cm) / (_WIDTH_TOLERANCE * nearest_cm)
-    return seen * sure * math.exp(-0.5 * off * off)
+    sure = 1.0 / (1.0 + (centre_cm / (_CENTRE_TOLERANCE * unit_cm)) ** 2)
+    alone = 1.0 - 0.5 * (1.0 - least) * min(1.0, unit_cm * bend)
+    return seen * sure * math.exp(-0.5 * off * off) * alone
 
 
 def _build(inputs: DetectorInputs) -> NetworkDetector:

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS
+from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
 from lanenet.perception.edges.road import RoadEdges
 
 #: Edge points that count, ahead of the front axle. Chosen: beyond the label rows by half a row, where the
@@ -20,7 +20,10 @@ from lanenet.perception.edges.road import RoadEdges
 _NEAR_CM, _FAR_CM = -4.0, 42.0
 #: Distance from the expected border up to which edge points count, at first and at last, and by how much that
 #: shrinks from step to step. The first was tried from 3.5 to 9 cm, see :func:`refine_lines`.
-_FIRST_CM, _LAST_CM, _SHRINK, _STEPS = 9.0, 1.2, 0.6, 4
+_FIRST_CM, _LAST_CM, _SHRINK, _STEPS = 9.0, 1.2, 0.6, 2
+#: The same for what a line has beyond its parabola: distance at first, the largest, steps, sigmas of its
+#: place that it spans, and the distance above which a border may have any direction near the line's. Tried.
+_BENT_FIRST_CM, _BENT_CM, _BENT_STEPS, _BENT_SIGMAS, _LOOSE_CM = 3.5, 9.0, 4, 2.5, 3.0
 #: Least cosine between a line's normal and that of an edge point of its borders. Chosen: 37 degrees.
 _COSINE = 0.8
 #: Sigma of an edge point across its line, at y = 0 and its growth per cm ahead; distance at which its weight
@@ -28,12 +31,31 @@ _COSINE = 0.8
 _EDGE_CM, _EDGE_GROWTH, _CAUCHY_CM, _INDEPENDENT = 0.5, 0.02, 0.5, 40.0
 #: Correlation of the errors of neighbouring label rows in a network's answer, as tried.
 _CORRELATION = 0.5
-#: Least number of edge points of a line, and width of markings.
-_LEAST, _MARKING_CM = 6, (0.8, 9.0)
+#: Least and largest number of edge points of a line, and width of markings.
+_LEAST, _MOST, _MARKING_CM = 6, 128, (0.8, 9.0)
 #: A line is seen in a bin along the road that has a border within this of its place, and length of a bin.
 _SEEN_CM, _BIN_CM = 0.8, 3.0
+_BINS = int((_FAR_CM - _NEAR_CM) / _BIN_CM) + 1
+#: Nodes of what a line has beyond its parabola, in half rows, and sigma of its third differences: 0 of a
+#: parabola, 5 cm where tape is laid with a kink of 35 degrees. Tried from 0.3 to 2.5.
+_NODE_CM = 7.5
+_NODES_CM = np.arange(-_NODE_CM, 45.1, _NODE_CM)
+_THIRD_CM = 1.5
+_ROWS_AT: Int[np.ndarray, "3"] = np.searchsorted(_NODES_CM, ROWS_CM)
+
+#: Cosine below which an edge point belongs to no line near that one, chosen; the golden ratio, by which any
+#: part of a series is spread evenly.
+_ROUGHLY, _GOLDEN = 0.6, 0.6180339887
+
+#: Bins within 6 cm of each label row: none where a line's place is a guess.
+_BESIDE = np.stack(
+    [np.floor((np.arange(-2, 2) * _BIN_CM + y - _NEAR_CM) / _BIN_CM).astype(np.int64) for y in ROWS_CM]
+)
 
 _ROW_CORRELATION = _CORRELATION ** np.abs(np.subtract.outer(range(3), range(3)))
+_THIRD = np.diff(np.eye(len(_NODES_CM)), n=3, axis=0)
+_SMOOTH = _THIRD.T @ _THIRD / _THIRD_CM**2
+_TO_ROWS = np.eye(len(_NODES_CM))[_ROWS_AT]
 
 
 class RefinedLines(NamedTuple):
@@ -45,12 +67,14 @@ class RefinedLines(NamedTuple):
         marking_cm: Width of the marking, negative for one that is darker than the floor.
         seen_cm: Length along the road in which the borders are where they should be, the mean of the two; 0
             where the line was not found, and its points are those that were given.
+        seen_at: Whether a border lies beside each label row, within ``_BESIDE_CM`` along the road.
     """
 
     points_cm: Float[np.ndarray, "m 3"]
     sigma_cm: Float[np.ndarray, "m 3"]
     marking_cm: Float[np.ndarray, "m"]
     seen_cm: Float[np.ndarray, "m"]
+    seen_at: Bool[np.ndarray, "m 3"]
 
 
 class RoadBorders:
@@ -65,20 +89,25 @@ class RoadBorders:
         # x of a line and its slope at these y, from its points at the label rows.
         self.at = np.stack([self.y * self.y, self.y, ones], axis=1) @ PARABOLA_FROM_POINTS
         self.slope = np.stack([2.0 * self.y, ones, 0.0 * ones], axis=1) @ PARABOLA_FROM_POINTS
-        self.weight = 1.0 / (_EDGE_CM + _EDGE_GROWTH * np.maximum(self.y, 0.0)) ** 2
-        self.bin: Int[np.ndarray, "n"] = ((self.y - _NEAR_CM) / _BIN_CM).astype(np.int64)
+        self._shuffled = (np.arange(len(self.x)) * _GOLDEN) % 1.0
 
     def off_cm(
         self, points_cm: Float[np.ndarray, "m 3"]
-    ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n"], Float[np.ndarray, "m n"]]:
-        """Distance of each edge point to the right of each line, cosine of the normals, and of the slope."""
+    ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n"]]:
+        """Distance of each edge point to the right of each line, and cosine of the normals."""
         slope = points_cm @ self.slope.T
         across = 1.0 / np.sqrt(1.0 + slope * slope)
-        return (
-            (self.x - points_cm @ self.at.T) * across,
-            (self.normal_x - self.normal_y * slope) * across,
-            across,
-        )
+        return (self.x - points_cm @ self.at.T) * across, (self.normal_x - self.normal_y * slope) * across
+
+    def beside(
+        self, points_cm: Float[np.ndarray, "m 3"], reach_cm: float
+    ) -> tuple[Int[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
+        """Indices of the edge points near each line, at most ``_MOST`` of them; false beyond their number."""
+        off_cm, agree = self.off_cm(points_cm)
+        key = np.where((np.abs(off_cm) < reach_cm) & (np.abs(agree) > _ROUGHLY), self._shuffled, 2.0)
+        most = min(_MOST, key.shape[1])
+        index = np.argpartition(key, most - 1, axis=1)[:, :most]
+        return index, np.take_along_axis(key, index, axis=1) < 1.5
 
 
 def refine_lines(
@@ -91,7 +120,9 @@ def refine_lines(
     """Fit lines and the widths of their markings to edge points.
 
     Each line is a parabola with its own marking; edge points that face its middle lie half a width beside it.
-    The points that are given are a prior with their sigmas, and so is the width.
+    The points that are given are a prior with their sigmas, and so is the width. Around the parabola the line
+    then bends further where its borders do: tape is laid in straight pieces as well. Where no border is near,
+    sigma grows with the distance to the next.
 
     Args:
         points_cm: x of each line at the label rows, frame car.
@@ -104,55 +135,110 @@ def refine_lines(
         The lines in the order given.
 
     Source:
-        Iteratively reweighted least squares with Cauchy weights (Holland and Welsch 1977), gated. The numbers
-        were tried on nine drives, eight of them simulated.
+        Iteratively reweighted least squares with Cauchy weights (Holland and Welsch 1977), gated; then the
+        same for a smoothing spline. The numbers were tried on nine drives, eight of them simulated.
     """
     m = len(points_cm)
     prior = sigma_cm[:, :, None] * sigma_cm[:, None, :] * _ROW_CORRELATION + 0.05 * np.eye(3)
-    information = np.zeros((m, 4, 4))
-    information[:, :3, :3] = np.linalg.inv(prior)
-    information[:, 3, 3] = marking_sigma_cm**-2
+    by_prior = np.linalg.inv(prior)
     start = np.concatenate([points_cm, marking_cm[:, None]], axis=1)
-    least, most = _MARKING_CM
-    found, hessian = start.copy(), information
     if len(borders.x) < _LEAST:
         return _unseen(start, prior)
-    enough = np.zeros(m, dtype=bool)
+    index, there = borders.beside(points_cm, _FIRST_CM + _BENT_CM + float(np.abs(marking_cm).max()))
+    x, y, normal_x, normal_y = (
+        borders.x[index],
+        borders.y[index],
+        borders.normal_x[index],
+        borders.normal_y[index],
+    )
+    at, slope_at = borders.at[index], borders.slope[index]
+    certain = there / (_EDGE_CM + _EDGE_GROWTH * np.maximum(y, 0.0)) ** 2
+
+    # 1. The parabola and the width of the marking.
+    information = np.zeros((m, 4, 4))
+    information[:, :3, :3] = by_prior
+    information[:, 3, 3] = marking_sigma_cm**-2
+    sign, (least, most) = np.sign(marking_cm), _MARKING_CM
+    found, enough = start.copy(), np.zeros(m, dtype=bool)
+    change = np.empty((*y.shape, 4))
     for step in range(_STEPS):
-        off_cm, agree, across = borders.off_cm(found[:, :3])
+        slope = (slope_at @ found[:, :3, None])[..., 0]
+        across = 1.0 / np.sqrt(1.0 + slope * slope)
+        agree = (normal_x - normal_y * slope) * across
         side = np.sign(agree)
-        gap_cm = off_cm + 0.5 * side * found[:, 3:]
-        gate_cm = max(_LAST_CM, _FIRST_CM * _SHRINK**step)
-        near = (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < gate_cm)
+        gap_cm = (x - (at @ found[:, :3, None])[..., 0]) * across + 0.5 * side * found[:, 3:]
+        most_cm = _FIRST_CM * _SHRINK**step
+        near = there & (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < most_cm)
         count = near.sum(axis=1)
         enough = count >= _LEAST
-        soft_cm = _CAUCHY_CM if step else 0.5 * gate_cm
-        weight = near * borders.weight / (1.0 + (gap_cm / soft_cm) ** 2)
+        weight = near * certain / (1.0 + (gap_cm / (_CAUCHY_CM if step else 0.5 * most_cm)) ** 2)
         weight /= np.maximum(1.0, count / _INDEPENDENT)[:, None]
         # Change of the gap with the line's points and with the width.
-        change = np.concatenate([-across[:, :, None] * borders.at, 0.5 * side[:, :, None]], axis=2)
-        weighted = change * weight[:, :, None]
-        hessian = information + weighted.transpose(0, 2, 1) @ change
-        pull = (information @ (start - found)[:, :, None])[:, :, 0]
-        pull -= (weighted * gap_cm[:, :, None]).sum(axis=1)
-        moved = found + np.linalg.solve(hessian, pull[:, :, None])[:, :, 0]
-        sign = np.where(marking_cm < 0.0, -1.0, 1.0)
+        np.multiply(at, -across[:, :, None], out=change[..., :3])
+        np.multiply(side, 0.5, out=change[..., 3])
+        weighted = (change * weight[:, :, None]).transpose(0, 2, 1)
+        pull = information @ (start - found)[:, :, None] - weighted @ gap_cm[:, :, None]
+        moved = found + np.linalg.solve(information + weighted @ change, pull)[:, :, 0]
         moved[:, 3] = sign * np.clip(sign * moved[:, 3], least, most)
         found = np.where(enough[:, None], moved, start)
     if not enough.any():
         return _unseen(start, prior)
-    off_cm, agree, _ = borders.off_cm(found[:, :3])
-    gap_cm = np.abs(off_cm + 0.5 * np.sign(agree) * found[:, 3:])
-    met = (np.abs(agree) > _COSINE) & (gap_cm < _SEEN_CM) & enough[:, None]
+
+    # 2. What it has beyond the parabola, linear between nodes along the road.
+    slope, beyond_cm = (slope_at @ found[:, :3, None])[..., 0], x - (at @ found[:, :3, None])[..., 0]
+    ahead = (_NODES_CM - y[..., None]) / _NODE_CM
+    share = np.maximum(1.0 - np.abs(ahead), 0.0)
+    lean = np.sign(ahead) * (share > 0.0) / _NODE_CM
+
+    def beside(extra_cm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance of the edge points from their borders, cosine of the normals, and of the slope."""
+        steep = slope + (lean @ extra_cm)[..., 0]
+        across = 1.0 / np.sqrt(1.0 + steep * steep)
+        agree = (normal_x - normal_y * steep) * across
+        off_cm = (beyond_cm - (share @ extra_cm)[..., 0]) * across
+        return off_cm + 0.5 * np.sign(agree) * found[:, 3:], agree, across
+
+    information = _SMOOTH + _TO_ROWS.T @ by_prior @ _TO_ROWS
+    wanted = _TO_ROWS.T @ by_prior @ (points_cm - found[:, :3])[:, :, None]
+    extra_cm, covariance = np.zeros((m, len(_NODES_CM), 1)), information
+    gate_cm = np.full(y.shape, _BENT_FIRST_CM)
+    for _ in range(_BENT_STEPS):
+        gap_cm, agree, across = beside(extra_cm)
+        cosine = np.where(gate_cm > _LOOSE_CM, _ROUGHLY, _COSINE)
+        near = there & (np.abs(agree) > cosine) & (np.abs(gap_cm) < gate_cm)
+        weight = near * certain / (1.0 + (gap_cm / _CAUCHY_CM) ** 2)
+        weight /= np.maximum(1.0, near.sum(axis=1) / _INDEPENDENT)[:, None]
+        weighted = (share * (weight * across)[:, :, None]).transpose(0, 2, 1)
+        covariance = np.linalg.inv(information + (weighted * across[:, None]) @ share)
+        pull = weighted @ (gap_cm + (share @ extra_cm)[..., 0] * across)[:, :, None]
+        extra_cm = covariance @ (pull + wanted)
+        # Where the line is known the next border is near; beyond, it may be anywhere that tape may bend to.
+        reach_cm = _BENT_SIGMAS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        gate_cm = (share @ np.clip(reach_cm, _LAST_CM, _BENT_CM)[:, :, None])[..., 0]
+    gap_cm, agree, _ = beside(extra_cm)
+    met = there & (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < _SEEN_CM) & enough[:, None]
     # The two borders apart: on a marking of the other polarity, a line meets only one of them.
-    seen = np.zeros((m, 2, int((_FAR_CM - _NEAR_CM) / _BIN_CM) + 1), dtype=bool)
+    seen = np.zeros((m, 2, _BINS), dtype=bool)
     row, column = np.nonzero(met)
-    seen[row, (agree[row, column] > 0.0).astype(np.int64), borders.bin[column]] = True
-    variance = np.diagonal(np.linalg.inv(hessian), axis1=1, axis2=2)[:, :3]
+    seen[
+        row,
+        (agree[row, column] > 0.0).astype(np.int64),
+        ((y[row, column] - _NEAR_CM) / _BIN_CM).astype(np.int64),
+    ] = True
+    points = np.where(enough[:, None], found[:, :3] + extra_cm[:, _ROWS_AT, 0], start[:, :3])
+    variance = np.diagonal(covariance, axis1=1, axis2=2)[:, _ROWS_AT]
     variance = np.where(enough[:, None], variance, np.diagonal(prior, axis1=1, axis2=2))
-    return RefinedLines(found[:, :3], np.sqrt(variance), found[:, 3], 0.5 * _BIN_CM * seen.sum(axis=(1, 2)))
+    return RefinedLines(
+        points,
+        np.sqrt(variance),
+        found[:, 3],
+        0.5 * _BIN_CM * seen.sum(axis=(1, 2)),
+        np.any(seen[:, :, _BESIDE], axis=(1, 3)),
+    )
 
 
 def _unseen(start: Float[np.ndarray, "m 4"], prior: Float[np.ndarray, "m 3 3"]) -> RefinedLines:
     sigma_cm = np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
-    return RefinedLines(start[:, :3], sigma_cm, start[:, 3], np.zeros(len(start)))
+    return RefinedLines(
+        start[:, :3], sigma_cm, start[:, 3], np.zeros(len(start)), np.zeros((len(start), 3), dtype=bool)
+    )

@@ -28,6 +28,33 @@ def test_values():
     assert confidence(np.full(6, np.nan), SURE, BOTH, WIDTHS) == 0.0
 
 
+def test_the_known_width_counts_in_place_of_those_of_the_training():
+    sigma = np.array([0.0, 4.0, 0.0, 0.0, 4.0 * math.sqrt(3.0), 0.0])
+    # 4 cm are a tenth of 40 cm, and a fifth of 20.
+    assert confidence(LANE, sigma, BOTH, (20.0, 100.0), 40.0) == pytest.approx(0.5)
+    assert confidence(0.5 * LANE, sigma, BOTH, (20.0, 100.0), 20.0) == pytest.approx(0.2)
+    assert confidence(LANE * 1.25, SURE, BOTH, (20.0, 100.0), 40.0) == pytest.approx(1.0)
+    assert confidence(LANE * 1.25 * 1.15, SURE, BOTH, (20.0, 100.0), 40.0) == pytest.approx(math.exp(-0.5))
+
+
+def test_one_line_tells_the_lane_where_its_width_is_known():
+    for lost in (slice(0, 3), slice(3, 6)):
+        points, sigma = LANE.copy(), np.zeros(6)
+        points[lost] = sigma[lost] = np.nan
+        assert confidence(points, sigma, BOTH, (20.0, 100.0)) == 0.0
+        # 0.05 W is half the tolerance of 0.1 W.
+        assert confidence(points, sigma, BOTH, (20.0, 100.0), 40.0) == pytest.approx(0.8)
+
+
+def test_confidence_falls_with_one_line_in_a_bend():
+    rows = np.array([0.0, 15.0, 30.0])
+    # The radius is 80 cm at y = 15 cm.
+    bend = np.concatenate([side + (rows - 15.0) ** 2 / 160.0 for side in (-20.0, 20.0)])
+    assert confidence(bend, SURE, BOTH, WIDTHS) == pytest.approx(1.0)
+    assert confidence(bend, SURE, np.array([1.0, 0.2]), WIDTHS) == pytest.approx(1.0 - 0.5 * 0.8 * 0.5)
+    assert confidence(LANE, SURE, np.array([1.0, 0.2]), WIDTHS) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("sigma", [math.nan, math.inf, -1.0])
 def test_a_sigma_that_is_none_gives_no_confidence(sigma):
     for at in range(6):

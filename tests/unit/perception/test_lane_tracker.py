@@ -9,7 +9,7 @@ from lanenet.geometry.lane import parabolas_from_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.refinement import RoadBorders, refine_lines
-from lanenet.perception.network.tracker import LaneTracker
+from lanenet.perception.network.tracker import LaneTracker, distances_cm
 
 LANE_CM = 40.0
 BENT = np.array([-20.0, -19.0, -16.0, 20.0, 21.0, 24.0])
@@ -88,3 +88,42 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     points_cm, sigma_cm, seen_cm = tracker.follow(guess, unsure, SEEN, edges_of(straight, sides=(0,)))
     np.testing.assert_allclose(points_cm, straight, atol=0.2)
     assert seen_cm[1] == 0.0 and sigma_cm[3:].max() < 2.0
+
+
+def test_tape_with_a_kink_is_followed():
+    # Straight ahead, then to the left by 31 degrees.
+    y = np.arange(-3.0, 42.0, 0.5)
+    x = -20.0 - 0.6 * np.maximum(y - 12.0, 0.0)
+    points = np.concatenate([np.stack([x + side, y], axis=1) for side in (-1.5, 1.5)])
+    right = np.where(y[:, None] < 12.0, [[1.0, 0.0]], np.array([[1.0, 0.6]]) / np.hypot(1.0, 0.6))
+    borders = RoadBorders(RoadEdges(points, np.concatenate([right, -right])))
+    start, sigma = np.full((1, 3), -20.0), np.array([[1.0, 2.0, 6.0]])
+    found = refine_lines(start, sigma, borders, np.array([3.0]), np.array([0.3]))
+    np.testing.assert_allclose(found.points_cm, [[-20.0, -21.8, -30.8]], atol=0.6)
+    assert found.seen_cm[0] > 36.0 and found.seen_at.all()
+
+
+def test_sigma_grows_where_no_border_is_near():
+    edges = edges_of(BENT, sides=(0,))
+    near = edges.points_cm[:, 1] < 18.0
+    borders = RoadBorders(RoadEdges(edges.points_cm[near], edges.normals[near]))
+    found = refine_lines(BENT[None, :3], np.full((1, 3), 8.0), borders, np.array([3.0]), np.array([0.3]))
+    assert found.seen_at.tolist() == [[True, True, False]]
+    assert found.sigma_cm[0, 2] > 4.0 * found.sigma_cm[0, 1]
+
+
+def test_a_line_that_nothing_tells_of_is_not_answered():
+    tracker = LaneTracker(LaneMemory())
+    guess = BENT + np.array([0.0] * 3 + [9.0] * 3)
+    unsure = np.concatenate([SURE[:3], np.full(3, 4.0)])
+    points_cm, sigma_cm, _ = tracker.follow(guess, unsure, np.array([1.0, 0.2]), edges_of(BENT, sides=(0,)))
+    np.testing.assert_allclose(points_cm[:3], BENT[:3], atol=0.2)
+    assert np.isnan(points_cm[3:]).all() and np.isnan(sigma_cm[3:]).all()
+
+
+def test_the_distance_of_two_lines_is_measured_across_the_lane_in_a_corner_as_well():
+    rows = np.array([0.0, 15.0, 30.0])
+    # Around (60, 0): beside each other, the inner one turns away earlier than a row's width tells.
+    left, right = (60.0 - np.sqrt(radius**2 - rows**2) for radius in (90.0, 50.0))
+    np.testing.assert_allclose(distances_cm(left[None], right[None]), 40.0, atol=1.0)
+    np.testing.assert_allclose(distances_cm(right[None], left[None]), -40.0, atol=1.0)

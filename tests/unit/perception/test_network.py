@@ -132,8 +132,9 @@ def test_a_frame_gives_what_its_raster_gives_on_the_markings(model_path):
     raster = fill_raster(WINDOW, make_extractor().extract(frame), new_raster(WINDOW))
     alone, refined = detector.detect_raster(raster).points_cm, detector.detect(frame).points_cm
     np.testing.assert_allclose(refined, alone, atol=0.5)
-    # The stripes lie 20 cm to either side.
-    assert np.abs(np.abs(refined) - 20.0).max() < 0.5 * np.abs(np.abs(alone) - 20.0).max()
+    # The stripes lie 20 cm to either side; at row 0 the camera does not see them.
+    ahead = [1, 2, 4, 5]
+    assert np.abs(np.abs(refined) - 20.0)[ahead].max() < 0.5 * np.abs(np.abs(alone) - 20.0)[ahead].max()
 
 
 def test_another_camera_is_refused_unless_allowed(model_path):
@@ -292,15 +293,14 @@ def test_a_frame_of_noise_gives_no_lane(model_path):
 def test_a_network_that_takes_the_width_gets_it(width_model_path, monkeypatch):
     # What the network itself answers.
     monkeypatch.setattr(LaneMemory, "complete", lambda self, points, sigma, presence: (points, sigma))
-    frame = striped_frame()
+    raster = fill_raster(WINDOW, make_extractor().extract(striped_frame()), new_raster(WINDOW))
     answers = [
-        NetworkDetector(width_model_path, CAMERA, lane_width_cm=width).detect(frame).points_cm
+        NetworkDetector(width_model_path, CAMERA, lane_width_cm=width).detect_raster(raster).points_cm
         for width in (None, 25.0, 60.0)
     ]
     session = onnxruntime.InferenceSession(width_model_path, providers=["CPUExecutionProvider"])
-    raster = fill_raster(WINDOW, make_extractor().extract(frame), new_raster(WINDOW))[None]
     for found, width in zip(answers, (0.0, 25.0, 60.0), strict=True):
-        told = {"raster": raster, "lane_width_cm": np.array([width], np.float32)}
+        told = {"raster": raster[None], "lane_width_cm": np.array([width], np.float32)}
         np.testing.assert_allclose(found, session.run(["points_cm"], told)[0][0], atol=1e-5)
     assert not np.allclose(answers[0], answers[1]) and not np.allclose(answers[1], answers[2])
 
