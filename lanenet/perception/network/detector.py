@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 from lanenet.perception.network.tracker import LaneTracker
+
+log = logging.getLogger(__name__)
 
 #: A frame with more edges than this share of its road pixels is noise. Chosen: above the lane filter's 0.1,
 #: since a network copes with more clutter.
@@ -46,7 +49,8 @@ class NetworkDetector:
     Attributes:
         meta: What the model says about itself.
         memory: The lane's width; rebuilds the missing line of a frame with one.
-        problems: Warnings about the inputs, a line each.
+        problems: Warnings about the inputs, a line each; that the lane has another width than was given comes
+            while frames are seen, and is logged.
     """
 
     def __init__(
@@ -81,6 +85,7 @@ class NetworkDetector:
             _check_camera(self.meta, camera, model_path)
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
+        self._told = False
         self.memory = LaneMemory(lane_width_cm)
         self._tracker = LaneTracker(self.memory)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
@@ -107,6 +112,10 @@ class NetworkDetector:
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm, seen_cm = self._tracker.follow(points_cm, sigma_cm, presence, edges)
+        if not self._told and (contradiction := self.memory.contradiction):
+            self._told = True
+            self.problems.append(contradiction)
+            log.warning(contradiction)
         confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
         return self._estimate(points_cm, sigma_cm, presence, confirmed)
 

@@ -64,6 +64,15 @@ def test_a_given_width_goes_before_the_remembered_one_and_is_not_forgotten():
     np.testing.assert_allclose(points[3:], 13.0, atol=1e-6)
 
 
+def test_a_width_that_is_given_wrong_is_said():
+    for given_cm in (30.0, 50.0):
+        assert taught([40.0] * 20, given_cm=given_cm).contradiction == ""
+        told = taught([40.0] * 60, given_cm=given_cm).contradiction
+        assert f"{given_cm:g} cm" in told and "40 cm" in told
+    assert taught([40.0] * 60, given_cm=37.0).contradiction == ""
+    assert taught([40.0] * 60).contradiction == ""
+
+
 def test_a_bend_tighter_than_the_lane_keeps_the_guess():
     # Radius 1 / (2 a) = 25 cm at most: no lane of 40 cm fits inside it.
     rows = np.array([0.0, 15.0, 30.0])

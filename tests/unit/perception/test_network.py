@@ -18,6 +18,7 @@ from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
 from lanenet.perception.edges.raster import fill_raster, new_raster
+from lanenet.perception import estimate
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
@@ -135,6 +136,17 @@ def test_a_frame_gives_what_its_raster_gives_on_the_markings(model_path):
     # The stripes lie 20 cm to either side; at row 0 the camera does not see them.
     ahead = [1, 2, 4, 5]
     assert np.abs(np.abs(refined) - 20.0)[ahead].max() < 0.5 * np.abs(np.abs(alone) - 20.0)[ahead].max()
+
+
+def test_a_lane_of_another_width_than_was_given_is_said_once(model_path, caplog, monkeypatch):
+    monkeypatch.setattr(estimate, "_CERTAIN", 5)
+    frame = striped_frame()
+    detector = NetworkDetector(model_path, CAMERA, lane_width_cm=32.0)
+    warned = list(detector.problems)
+    for _ in range(7):
+        detector.detect(frame)
+    (problem,) = [line for line in detector.problems if line not in warned]
+    assert "32 cm" in problem and "40 cm" in problem and caplog.text.count(problem) == 1
 
 
 def test_another_camera_is_refused_unless_allowed(model_path):
