@@ -221,8 +221,11 @@ def _chosen(
         raise ConfigError("--no-baselines: is the same as --detectors network, expected one of the two")
     names = default_names(sources, model is not None) if text is None else choose_names(text)
     names = ("network",) if no_baselines else names
-    if "network" in names and model is None:
-        raise ConfigError("detector network: expected a model before the sources (lanenet val MODEL SOURCE)")
+    without = [name for name in names if kind_of(name).needs_model and model is None]
+    if without:
+        raise ConfigError(
+            f"detector {without[0]}: expected a model before the sources (lanenet val MODEL SOURCE)"
+        )
     without_frames = [source.path for source in sources if source.frames is None]
     refused = [name for name in names if without_frames and not kind_of(name).on_label_sets]
     if refused:

@@ -152,7 +152,8 @@ class Compared:
                 kind,
                 DetectorInputs(
                     camera=frames.camera,
-                    model=self.models.get(name),
+                    # A variant of the network has its model.
+                    model=self.models.get(name, self.models.get(kind_of(kind).name)),
                     any_camera=self.any_camera,
                     # The network gets the same lane width as the lane filter, as on the car.
                     lane_width_cm=frames.lane_width_cm,

@@ -212,13 +212,11 @@ class SeenSource:
 
 def default_names(sources: Sequence[Opened], with_model: bool) -> tuple[str, ...]:
     """Return the detectors that all sources allow, in the order of the tables."""
-    from lanenet.perception.registry import compared_names
+    from lanenet.perception.registry import usual_names
 
     with_frames = all(source.frames is not None for source in sources)
     return tuple(
-        compared_names(
-            lambda kind: (with_frames or kind.on_label_sets) and (with_model or not kind.needs_model)
-        )
+        usual_names(lambda kind: (with_frames or kind.on_label_sets) and (with_model or not kind.needs_model))
     )
 
 

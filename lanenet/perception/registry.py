@@ -34,6 +34,11 @@ def compared_names(where: Callable[[DetectorKind], bool] = lambda kind: True) ->
     return [name for kind in KINDS.values() if where(kind) for name in (kind.name, *kind.variants)]
 
 
+def usual_names(where: Callable[[DetectorKind], bool] = lambda kind: True) -> list[str]:
+    """Return the same without the variants of networks, which are compared only where they are named."""
+    return [name for name in compared_names(where) if name in KINDS or not kind_of(name).needs_model]
+
+
 def listed(names: Sequence[str], word: str = "and") -> str:
     """Return names as prose lists them: ``a, b and c``."""
     *first, last = names
@@ -62,9 +67,6 @@ def build_detector(name: str, inputs: DetectorInputs) -> Detector:
         CalibrationError: If a camera is needed, sees no road, or the mask is of another size.
     """
     kind = kind_of(name)
-    if inputs.config is not None and kind.settings is None:
-        reason = ", its model holds them" if kind.needs_model else ""
-        raise ConfigError(f"detector {name}: takes no settings file{reason}; found {inputs.config}")
     if inputs.mask is not None:
         refuse_mask(name)
     if inputs.camera is None and kind.needs_camera:

@@ -22,6 +22,7 @@ from lanenet.perception.registry import (
     detector_names,
     kind_of,
     listed,
+    usual_names,
 )
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ app = typer.Typer()
 
 #: Drives as the network unless ``--model`` names another.
 SHIPPED_MODEL = Path("checkpoints/small")
-_DETECTORS = ",".join(("truth", *compared_names()))
-_WITH_SETTINGS = listed(detector_names(lambda kind: kind.settings is not None))
+_DETECTORS = ",".join(("truth", *usual_names()))
+_WITH_SETTINGS = listed(detector_names(lambda kind: kind.settings is not None and not kind.needs_model))
 _BESIDE = 5  # detectors in one table on the screen: a terminal is narrow
 
 

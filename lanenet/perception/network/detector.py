@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from lanenet.config import Settings
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
@@ -62,6 +63,7 @@ class NetworkDetector:
         threads: int = 1,
         mask: UInt8[np.ndarray, "h w"] | None = None,
         lane_width_cm: float | None = None,
+        keeps: bool = True,
     ) -> None:
         """Open a model for a camera.
 
@@ -75,6 +77,7 @@ class NetworkDetector:
                 leave out.
             lane_width_cm: The lane's width if it is known; a network with an input for it gets it. None takes
                 it from the frames that show both lines. A line that a frame lacks is rebuilt with it.
+            keeps: Keep the lane, its width and its markings from frame to frame; else each is the first one.
 
         Raises:
             CalibrationError: If the mask's size is not the camera's.
@@ -85,7 +88,7 @@ class NetworkDetector:
             _check_camera(self.meta, camera, model_path)
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
-        self._told = False
+        self._told, self._keeps = False, keeps
         self.memory = LaneMemory(lane_width_cm)
         self._tracker = LaneTracker(self.memory)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
@@ -104,6 +107,8 @@ class NetworkDetector:
         Raises:
             CalibrationError: If the frame's size is not the camera's.
         """
+        if not self._keeps:
+            self.reset()
         edges = self._extractor.extract(frame_bgr)
         if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
             return LaneEstimate()
@@ -271,12 +276,36 @@ def confidence(
     return seen * sure * math.exp(-0.5 * off * off) * alone
 
 
+class NetworkSettings(Settings):
+    """What a network is told beside its model.
+
+    Attributes:
+        memory: The lane, its width and its markings are kept from frame to frame; without it each frame is
+            answered as the first one.
+    """
+
+    memory: bool = True
+
+
 def _build(inputs: DetectorInputs) -> NetworkDetector:
     assert inputs.camera is not None and inputs.model is not None
     width_cm = inputs.drive_lane_width_cm if inputs.lane_width_cm is None else inputs.lane_width_cm
     return NetworkDetector(
-        inputs.model, inputs.camera, any_camera=inputs.any_camera, mask=inputs.mask, lane_width_cm=width_cm
+        inputs.model,
+        inputs.camera,
+        any_camera=inputs.any_camera,
+        mask=inputs.mask,
+        lane_width_cm=width_cm,
+        keeps=inputs.settings(NetworkSettings).memory,
     )
 
 
-KIND = DetectorKind("network", _build, needs_model=True, takes_lane_width=True, takes_mask=True)
+KIND = DetectorKind(
+    "network",
+    _build,
+    settings=NetworkSettings,
+    needs_model=True,
+    takes_lane_width=True,
+    takes_mask=True,
+    variants={"network-single": {"memory": False}},
+)

@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 import torch
 
-from lanenet.errors import CalibrationError, ModelMismatchError
+from lanenet.errors import CalibrationError, ConfigError, ModelMismatchError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.learn.config import NetworkSettings
@@ -20,9 +20,10 @@ from lanenet.learn.network import new_network
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception import estimate
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.estimate import DetectorInputs, LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.model_file import HASH_NAME, ModelMeta, read_model_meta, sealed
+from lanenet.perception.registry import build_detector
 
 torch.set_num_threads(1)
 
@@ -147,6 +148,20 @@ def test_a_lane_of_another_width_than_was_given_is_said_once(model_path, caplog,
         detector.detect(frame)
     (problem,) = [line for line in detector.problems if line not in warned]
     assert "32 cm" in problem and "40 cm" in problem and caplog.text.count(problem) == 1
+
+
+def test_without_memory_every_frame_is_the_first_one(model_path):
+    frame, other = striped_frame(), np.roll(striped_frame(), 12, axis=1)
+    inputs = DetectorInputs(camera=CAMERA, model=model_path)
+    single, kept = build_detector("network-single", inputs), build_detector("network", inputs)
+    first = kept.detect(frame).points_cm
+    for detector in (single, kept):
+        for _ in range(12):
+            detector.detect(other)
+    np.testing.assert_array_equal(single.detect(frame).points_cm, first)
+    assert not np.array_equal(kept.detect(frame).points_cm, first)
+    with pytest.raises(ConfigError, match="memory"):
+        build_detector("network", replace(inputs, config={"memori": False}))
 
 
 def test_another_camera_is_refused_unless_allowed(model_path):
