@@ -38,11 +38,11 @@ def read_camera_file(path: Path) -> Any:
 def read_detector_settings(path: Path) -> Any:
     from lanenet.perception.estimate import DetectorInputs
     from lanenet.perception.lane_filter import lane_filter_settings
-    from lanenet.perception.network.detector import NetworkSettings
+    from lanenet.perception.network.detector import NetworkDetectorSettings
     from lanenet.perception.registry import build_detector
 
     if path.stem == "network":
-        return load_settings(NetworkSettings, path)
+        return load_settings(NetworkDetectorSettings, path)
     # The detector's name comes first in the file's.
     if path.stem.startswith("lane_filter"):
         return lane_filter_settings(DetectorInputs(config=path, drive_lane_width_cm=40.0))

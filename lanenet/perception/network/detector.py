@@ -276,7 +276,7 @@ def confidence(
     return seen * sure * math.exp(-0.5 * off * off) * alone
 
 
-class NetworkSettings(Settings):
+class NetworkDetectorSettings(Settings):
     """What a network is told beside its model.
 
     Attributes:
@@ -296,14 +296,14 @@ def _build(inputs: DetectorInputs) -> NetworkDetector:
         any_camera=inputs.any_camera,
         mask=inputs.mask,
         lane_width_cm=width_cm,
-        keeps=inputs.settings(NetworkSettings).memory,
+        keeps=inputs.settings(NetworkDetectorSettings).memory,
     )
 
 
 KIND = DetectorKind(
     "network",
     _build,
-    settings=NetworkSettings,
+    settings=NetworkDetectorSettings,
     needs_model=True,
     takes_lane_width=True,
     takes_mask=True,

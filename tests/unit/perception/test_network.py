@@ -17,8 +17,8 @@ from lanenet.geometry.camera import Camera, Mounting
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.export import export_onnx
 from lanenet.learn.network import new_network
-from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception import estimate
+from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
