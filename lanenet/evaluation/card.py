@@ -59,13 +59,14 @@ def _what(meta: ModelMeta, metrics: Mapping[str, Any]) -> str:
     right_cm = window.left_cm + window.columns * window.cell_cm
     far_cm = window.near_cm + window.rows * window.cell_cm
     seen = "brightness and colour" if meta.perception.edges.colour_weight else "brightness"
+    if meta.planes > 1:
+        seen += ", with their directions and hues"
     return (
         f"A network of {metrics['parameters']:,} weights. In: the bird's-eye image of the edges of {seen}, "
-        f"{window.rows} x "
-        f"{window.columns} cells of {window.cell_cm:g} cm, from {window.left_cm:g} to {right_cm:g} cm across "
-        f"and {window.near_cm:g} to {far_cm:g} cm ahead.\nOut: x of the left and the right line 0, 15 and "
-        "30 cm ahead of the front axle, the uncertainty of each, and whether each line is there.\nIt "
-        "sees nothing beside the window or further ahead."
+        f"{window.rows} x {window.columns} cells of {window.cell_cm:g} cm, from {window.left_cm:g} to "
+        f"{right_cm:g} cm across and {window.near_cm:g} to {far_cm:g} cm ahead.\n"
+        "Out: x of the left and the right line 0, 15 and 30 cm ahead of the front axle, the uncertainty of "
+        "each, and whether each line is there.\nIt sees nothing beside the window or further ahead."
     )
 
 

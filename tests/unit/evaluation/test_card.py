@@ -66,3 +66,8 @@ def test_lane_widths_of_the_training_are_its_limits():
     text = card(1.0, meta=model_meta(lane_width_range_cm=(23.0, 74.6)))
     assert "lanes of 23 to 75 cm" in text and "narrower than 23 or wider than 75 cm" in text
     assert "over such drives" not in text
+
+
+def test_it_says_what_the_network_sees_of_an_edge():
+    assert "edges of brightness, 9" in card(1.0)
+    assert "edges of brightness, with their directions and hues, 9" in card(1.0, meta=model_meta(planes=5))
