@@ -2,7 +2,8 @@
 
 A single frame can look like another lane. The lane of the last frame, found again on this frame's edges, is
 a second answer beside the network's; of all pairs of lines the one is taken that shows most of its markings
-and has the lane's width.
+and has the lane's width. Once the car has crossed a line, the lane beyond it is one more, if its lines are
+seen.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM, SIDES
+from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.refinement import RefinedLines, RoadBorders, refine_lines
@@ -36,6 +37,12 @@ _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
 #: that it continues the last frame's; what its width costs at most, and sigma of the width's logarithm. The
 #: last two were tried: a lane may widen in plain sight, but the line of another lane is none of its own.
 _BY_PRESENCE_CM, _BY_CONTINUING_CM, _BY_WIDTH_CM, _WIDTH_SIGMA = 6.0, 3.0, 45.0, 0.2
+#: What it costs at most that the front axle's middle is not between the two, and how far beside them that is.
+#: Chosen: more than what a network's opinion brings, less than a line that is not to be seen.
+_BY_OUTSIDE_CM, _OUTSIDE_CM = 20.0, 2.0
+#: Length in which a line beyond a crossed one has to be seen. A single border, as that of a mat, is seen over
+#: half of the 46 cm that count.
+_BEYOND_SEEN_CM = 26.0
 #: Narrower than this share of the lane's width no pair is a lane.
 _NARROWEST = 0.3
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
@@ -125,6 +132,8 @@ class LaneTracker:
             if self._last is not None:
                 moved_cm = np.hypot(self._last[1][side], _MOVED_CM)
                 starts.append((side, self._last[0][side], moved_cm, _BY_CONTINUING_CM))
+        n_usual = len(starts)
+        starts += self._beyond_a_crossed_line()
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
         if starts:
             sides, points, sigmas, scores = zip(*starts, strict=True)
@@ -132,12 +141,30 @@ class LaneTracker:
             for i, (side, score_cm) in enumerate(zip(sides, scores, strict=True)):
                 seen_cm = float(refined.seen_cm[i])
                 score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
+                if i >= n_usual and seen_cm < _BEYOND_SEEN_CM:
+                    continue
                 line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
                 candidates[side].append(_Candidate(*line, seen_cm, score_cm, refined.seen_at[i]))
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (float(presence[side]) - 0.5)
             lines.append(_Candidate(own[0][side], own[1][side], 0.0, 0.0, doubt_cm, _NOWHERE))
         return candidates
+
+    def _beyond_a_crossed_line(self) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
+        """Return where the lines of the next lane are expected, once the front axle has crossed one."""
+        starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
+        width_cm = self.lane.width_cm
+        if self._last is None or width_cm is None:
+            return starts
+        for side, outwards in ((0, -1.0), (1, 1.0)):
+            crossed_cm, sigma_cm = self._last[0][side], np.hypot(self._last[1][side], _MOVED_CM)
+            if outwards * crossed_cm[0] >= 0.0:
+                continue
+            next_cm = parallel_points(crossed_cm, outwards * width_cm)
+            if np.isfinite(next_cm).all():
+                starts.append((1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM))
+                starts.append((side, next_cm, np.hypot(sigma_cm, _MOVED_CM), _BY_CONTINUING_CM))
+        return starts
 
     def _refine(
         self,
@@ -180,6 +207,11 @@ class LaneTracker:
             off = np.log(np.maximum(across_cm / width_cm, _NARROWEST)) / _WIDTH_SIGMA
             score_cm -= _BY_WIDTH_CM * (1.0 - np.exp(-0.5 * off * off))
             score_cm[across_cm < _NARROWEST * width_cm] = -np.inf
+        lefts_at_car, rights_at_car = (
+            np.array([line.points_cm[0] for line in lines]) for lines in candidates
+        )
+        outside_cm = np.maximum(lefts_at_car[:, None], -rights_at_car[None, :])
+        score_cm -= _BY_OUTSIDE_CM * np.clip(outside_cm / _OUTSIDE_CM, 0.0, 1.0)
         if not np.isfinite(score_cm).any():
             return candidates[0][-1], candidates[1][-1]
         left, right = np.unravel_index(int(np.argmax(score_cm)), score_cm.shape)

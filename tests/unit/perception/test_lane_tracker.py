@@ -90,6 +90,23 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     assert seen_cm[1] == 0.0 and sigma_cm[3:].max() < 2.0
 
 
+@pytest.mark.parametrize("painted", [True, False])
+def test_a_car_that_crosses_a_line_is_in_the_next_lane_if_there_is_one(painted):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    lines = np.repeat([-20.0, 20.0, -60.0], 3)
+    for shift_cm in np.arange(0.0, 31.0, 3.0):
+        moved = lines + shift_cm
+        edges = edges_of(moved[:6])
+        if painted:
+            beyond = edges_of(np.concatenate([moved[6:], moved[6:]]), sides=(0,))
+            both = zip((edges.points_cm, edges.normals), (beyond.points_cm, beyond.normals), strict=True)
+            edges = RoadEdges(*(np.concatenate(pair) for pair in both))
+        # The network stays with the lane that was left.
+        points_cm, _, _ = tracker.follow(moved[:6] + 0.3, SURE, SEEN, edges)
+    expected = np.concatenate([moved[6:], moved[:3]]) if painted else moved[:6]
+    np.testing.assert_allclose(points_cm, expected, atol=0.3)
+
+
 def test_tape_with_a_kink_is_followed():
     # Straight ahead, then to the left by 31 degrees.
     y = np.arange(-3.0, 42.0, 0.5)
