@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM, SIDES
+from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.network.refinement import RoadBorders
 
 #: An answer further from a marking that is in plain sight is off, [cm]. Chosen: a line over bare floor.
 OFF_CM = 3.0
@@ -47,26 +49,21 @@ def in_plain_sight(
         normals: Their unit normals, from dark to light or the other way round, but alike for all.
         label_cm: The six labels; a line without all three is not in plain sight.
     """
-    y_cm = edges_cm[:, 1]
-    section = np.floor((y_cm - _NEAR_CM) / _SECTION_CM)
-    looked_at = (y_cm >= _NEAR_CM) & (y_cm < _FAR_CM)
+    borders = RoadBorders(RoadEdges(edges_cm, normals))
+    section = np.floor((borders.y - _NEAR_CM) / _SECTION_CM)
+    looked_at = (borders.y >= _NEAR_CM) & (borders.y < _FAR_CM)
     wanted = _SHOWN * (_FAR_CM - _NEAR_CM) / _SECTION_CM
-    for three in label_cm.reshape(len(SIDES), -1):
-        if not np.isfinite(three).all():
-            return False
-        a, b, c = PARABOLA_FROM_POINTS @ three
-        slope = 2.0 * a * y_cm + b
-        cosine = 1.0 / np.sqrt(1.0 + slope * slope)
-        off_cm = (edges_cm[:, 0] - (a * y_cm * y_cm + b * y_cm + c)) * cosine
-        along = (normals[:, 0] - normals[:, 1] * slope) * cosine
+    if not np.isfinite(label_cm).all():
+        return False
+    for off_cm, along in zip(*borders.off_cm(label_cm.reshape(len(SIDES), -1)), strict=True):
         near = looked_at & (np.abs(off_cm) <= _REACH_CM) & (np.abs(along) >= _ALIGNED)
         # A light marking has one polarity, a dark one the other.
         shown = 0
         for side in (1.0, -1.0):
-            borders = [
+            sections = [
                 set(section[near & (s * off_cm > 0.0) & (s * side * along > 0.0)]) for s in (1.0, -1.0)
             ]
-            shown = max(shown, len(borders[0] & borders[1]))
+            shown = max(shown, len(sections[0] & sections[1]))
         if shown < wanted:
             return False
     return True

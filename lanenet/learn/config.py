@@ -13,6 +13,16 @@ from lanenet.config import Settings
 from lanenet.learn.trunks import TRUNKS
 from lanenet.samples.settings import AugmentSettings, Balance
 
+#: What settings of a network are where its trunk does not use them.
+_UNUSED: dict[str, Any] = {
+    "channels": None,
+    "hidden": None,
+    "bins": 0,
+    "planes": 1,
+    "takes_width": False,
+    "weights": None,
+}
+
 
 class NetworkSettings(Settings):
     """Which network, and its size.
@@ -50,7 +60,7 @@ class NetworkSettings(Settings):
         trunk = TRUNKS.get(data.get("kind", "small")) if isinstance(data, dict) else None
         if trunk is None or "bins" in trunk.uses:
             return data
-        return {"bins": 0, "planes": 1, **data}
+        return {**{name: _UNUSED[name] for name in ("bins", "planes")}, **data}
 
     @field_validator("bins")
     @classmethod
@@ -68,9 +78,8 @@ class NetworkSettings(Settings):
 
     @model_validator(mode="after")
     def _check_uses(self) -> NetworkSettings:
-        for name in ("channels", "hidden", "bins", "planes", "takes_width", "weights"):
-            plain = (None, 0, False, 1) if name == "planes" else (None, 0, False)
-            if getattr(self, name) not in plain and name not in TRUNKS[self.kind].uses:
+        for name, unused in _UNUSED.items():
+            if getattr(self, name) != unused and name not in TRUNKS[self.kind].uses:
                 raise ValueError(f"{name}: {self.kind} does not use it, found {getattr(self, name)}")
         return self
 

@@ -23,7 +23,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.edges.canny import EdgeSettings
-from lanenet.perception.edges.raster import fill_raster, new_raster
+from lanenet.perception.edges.raster import PLANES, fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import Detector, DetectorInputs
 from lanenet.perception.lane_filter import LaneFilter, LaneFilterSettings
@@ -236,9 +236,7 @@ class _Stages:
         self._lane_filter = LaneFilter(self._extractor, LaneFilterSettings(lane_width_cm=LANE_WIDTH_CM))
         self._network = network
         self._window = BirdseyeWindow() if network is None else network.meta.window
-        self._raster = (
-            new_raster(self._window) if network is None else new_raster(self._window, network.meta.planes)
-        )
+        self._raster = new_raster(self._window, len(PLANES) if network is None else network.meta.planes)
 
     def time(self, frame: UInt8[np.ndarray, "h w 3"]) -> tuple[dict[str, float], int]:
         """Return the time of each stage on a frame, [ms], and the number of edge points on the road."""

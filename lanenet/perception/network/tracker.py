@@ -198,19 +198,16 @@ class LaneTracker:
     ) -> tuple[_Candidate, _Candidate]:
         """Choose the left and the right line."""
         width_cm = self.lane.width_cm
+        lefts_cm, rights_cm = (np.array([line.points_cm for line in lines]) for lines in candidates)
         score_cm = np.add.outer(
             [line.score_cm for line in candidates[0]], [line.score_cm for line in candidates[1]]
         )
         if width_cm is not None:
-            lefts_cm, rights_cm = (np.array([line.points_cm for line in lines]) for lines in candidates)
             across_cm = distances_cm(lefts_cm, rights_cm)
             off = np.log(np.maximum(across_cm / width_cm, _NARROWEST)) / _WIDTH_SIGMA
             score_cm -= _BY_WIDTH_CM * (1.0 - np.exp(-0.5 * off * off))
             score_cm[across_cm < _NARROWEST * width_cm] = -np.inf
-        lefts_at_car, rights_at_car = (
-            np.array([line.points_cm[0] for line in lines]) for lines in candidates
-        )
-        outside_cm = np.maximum(lefts_at_car[:, None], -rights_at_car[None, :])
+        outside_cm = np.maximum.outer(lefts_cm[:, 0], -rights_cm[:, 0])
         score_cm -= _BY_OUTSIDE_CM * np.clip(outside_cm / _OUTSIDE_CM, 0.0, 1.0)
         if not np.isfinite(score_cm).any():
             return candidates[0][-1], candidates[1][-1]
