@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -17,6 +18,8 @@ Progress = Callable[[int, int], None]
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
 
+#: How often a worker process looks whether its parent is still there. Chosen: nobody waits for it.
+_LOOK_EVERY_S = 1.0
 #: Set in a worker process, whose siblings have the other cores.
 _ONE_THREAD = threading.Event()
 
@@ -94,12 +97,20 @@ def in_threads(work: Callable[[JobT], ResultT], jobs: Iterable[JobT]) -> Iterato
 
 
 def prepare_process() -> None:
-    """Make a worker process leave the cores to its siblings, and end at once at Ctrl-C."""
+    """Make a worker process leave the cores to its siblings, and end at once at Ctrl-C or with its parent."""
     import cv2
 
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     _ONE_THREAD.set()
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     cv2.setNumThreads(1)
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone: a parent that is killed tells nobody."""
+    while os.getppid() == parent:
+        time.sleep(_LOOK_EVERY_S)
+    os._exit(1)
 
 
 def _out_of_memory(name: str, workers: int) -> LanenetError:

@@ -21,7 +21,7 @@ VERSION_NAME = "format_version"
 SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
 #: Written only by detectors that measure them.
-LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm")
+LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm", "own_lane")
 #: Columns with empty cells where a detector does not know the value.
 _OPEN_COLUMNS = ("t_s", *POINT_NAMES, *SIGMA_NAMES, *PARABOLA_NAMES, "steering_rad")
 #: A straight lane has an infinite radius.
@@ -48,7 +48,8 @@ class DetectionTable:
                     estimate.points_cm,
                     estimate.sigma_cm,
                     estimate.parabolas.ravel(),
-                    [estimate.steering_rad, estimate.confidence, estimate.radius_cm, estimate.offset_cm],
+                    [estimate.steering_rad, estimate.confidence],
+                    [estimate.radius_cm, estimate.offset_cm, estimate.own_lane],
                 ]
             )
         )
@@ -73,8 +74,8 @@ class DetectionTable:
                 row = int(np.flatnonzero(bad)[0])
                 value = "NaN" if np.isnan(values[row]) else str(values[row])
                 raise LabelFormatError(f"{path}: frame {self._frames[row]}, column {name!r}: found {value}")
-        if all(np.isnan(columns[name]).all() for name in LANE_NAMES):
-            columns = {name: values for name, values in columns.items() if name not in LANE_NAMES}
+        unknown = [name for name in LANE_NAMES if np.isnan(columns[name]).all()]
+        columns = {name: values for name, values in columns.items() if name not in unknown}
         frame = np.array(self._frames, dtype=np.int64)
         if ending == ".csv":
             write_csv(

@@ -34,6 +34,8 @@ class LaneEstimate:
             know it.
         presence: Probability that the left and the right line can be seen; NaN where the detector does not
             know it.
+        own_lane: Probability that it is the lane to drive in, not the next one; NaN where the detector does
+            not know it.
     """
 
     points_cm: Float[np.ndarray, "6"] = field(default_factory=lambda: np.full(N_POINTS, np.nan))
@@ -43,6 +45,7 @@ class LaneEstimate:
     radius_cm: float = float("nan")
     offset_cm: float = float("nan")
     presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
+    own_lane: float = float("nan")
 
     @property
     def mask(self) -> np.ndarray:

@@ -17,6 +17,7 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, prop
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
+from lanenet.perception.network.lane_belief import Keep
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 from lanenet.perception.network.tracker import LaneTracker
 
@@ -64,6 +65,7 @@ class NetworkDetector:
         mask: UInt8[np.ndarray, "h w"] | None = None,
         lane_width_cm: float | None = None,
         keeps: bool = True,
+        keep: Keep | None = None,
     ) -> None:
         """Open a model for a camera.
 
@@ -78,6 +80,7 @@ class NetworkDetector:
             lane_width_cm: The lane's width if it is known; a network with an input for it gets it. None takes
                 it from the frames that show both lines. A line that a frame lacks is rebuilt with it.
             keeps: Keep the lane, its width and its markings from frame to frame; else each is the first one.
+            keep: Side of the road on which cars drive; with it the estimates say whether this is their lane.
 
         Raises:
             CalibrationError: If the mask's size is not the camera's.
@@ -90,7 +93,7 @@ class NetworkDetector:
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self._told, self._keeps = False, keeps
         self.memory = LaneMemory(lane_width_cm)
-        self._tracker = LaneTracker(self.memory)
+        self._tracker = LaneTracker(self.memory, keep)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         self._raster = new_raster(self.meta.window, self.meta.planes)
         self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
@@ -155,6 +158,7 @@ class NetworkDetector:
             steering_rad=math.nan if math.isnan(aim_cm) else proportional_angle_rad(aim_cm, ROWS_CM[_AIM]),
             confidence=confidence(points_cm, sigma_cm, confirmed, self.meta.widths_cm, width_cm),
             presence=presence,
+            own_lane=self._tracker.looks.own_lane,
         )
 
     def reset(self) -> None:
@@ -282,21 +286,26 @@ class NetworkDetectorSettings(Settings):
     Attributes:
         memory: The lane, its width and its markings are kept from frame to frame; without it each frame is
             answered as the first one.
+        keep: Side of the road on which cars drive, ``right`` or ``left``; None where there are no sides, or
+            nobody knows. It decides nothing but ``own_lane`` of the estimates.
     """
 
     memory: bool = True
+    keep: Keep | None = None
 
 
 def _build(inputs: DetectorInputs) -> NetworkDetector:
     assert inputs.camera is not None and inputs.model is not None
     width_cm = inputs.drive_lane_width_cm if inputs.lane_width_cm is None else inputs.lane_width_cm
+    settings = inputs.settings(NetworkDetectorSettings)
     return NetworkDetector(
         inputs.model,
         inputs.camera,
         any_camera=inputs.any_camera,
         mask=inputs.mask,
         lane_width_cm=width_cm,
-        keeps=inputs.settings(NetworkDetectorSettings).memory,
+        keeps=settings.memory,
+        keep=settings.keep,
     )
 
 

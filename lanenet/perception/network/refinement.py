@@ -68,6 +68,8 @@ class RefinedLines(NamedTuple):
         seen_cm: Length along the road in which the borders are where they should be, the mean of the two; 0
             where the line was not found, and its points are those that were given.
         seen_at: Whether a border lies beside each label row, within ``_BESIDE_CM`` along the road.
+        look: By how much the marking is yellower and redder than the floor, as a share of the contrast, and
+            the share of gaps between its nearest and its farthest border; NaN where nothing was seen.
     """
 
     points_cm: Float[np.ndarray, "m 3"]
@@ -75,6 +77,7 @@ class RefinedLines(NamedTuple):
     marking_cm: Float[np.ndarray, "m"]
     seen_cm: Float[np.ndarray, "m"]
     seen_at: Bool[np.ndarray, "m 3"]
+    look: Float[np.ndarray, "m 3"]
 
 
 class RoadBorders:
@@ -85,6 +88,7 @@ class RoadBorders:
         near = (y > _NEAR_CM) & (y < _FAR_CM)
         self.x, self.y = edges.points_cm[near].T.astype(np.float64)
         self.normal_x, self.normal_y = edges.normals[near].T.astype(np.float64)
+        self.hues = np.zeros((len(self.x), 2)) if edges.hues is None else edges.hues[near].astype(np.float64)
         ones = np.ones_like(self.y)
         # x of a line and its slope at these y, from its points at the label rows.
         self.at = np.stack([self.y * self.y, self.y, ones], axis=1) @ PARABOLA_FROM_POINTS
@@ -234,11 +238,25 @@ def refine_lines(
         found[:, 3],
         0.5 * _BIN_CM * seen.sum(axis=(1, 2)),
         np.any(seen[:, :, _BESIDE], axis=(1, 3)),
+        _look(
+            sign[:, None] * (met[:, None] @ borders.hues[index])[:, 0],
+            met.sum(axis=1),
+            np.asarray(seen.any(axis=1)),
+        ),
     )
+
+
+def _look(
+    hues: Float[np.ndarray, "m 2"], count: Int[np.ndarray, "m"], filled: Bool[np.ndarray, "m b"]
+) -> Float[np.ndarray, "m 3"]:
+    """Mean hues of lines, from their sums over the borders, and the share of gaps among their bins."""
+    first, last = filled.argmax(axis=1), filled.shape[1] - filled[:, ::-1].argmax(axis=1)
+    look = np.column_stack([hues / np.maximum(count, 1)[:, None], 1.0 - filled.sum(axis=1) / (last - first)])
+    return np.where(count[:, None] > 0, look, np.nan)
 
 
 def _unseen(start: Float[np.ndarray, "m 4"], prior: Float[np.ndarray, "m 3 3"]) -> RefinedLines:
     sigma_cm = np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
-    return RefinedLines(
-        start[:, :3], sigma_cm, start[:, 3], np.zeros(len(start)), np.zeros((len(start), 3), dtype=bool)
-    )
+    m = len(start)
+    nothing = np.zeros(m), np.zeros((m, 3), dtype=bool), np.full((m, 3), np.nan)
+    return RefinedLines(start[:, :3], sigma_cm, start[:, 3], *nothing)

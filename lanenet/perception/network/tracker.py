@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.refinement import RefinedLines, RoadBorders, refine_lines
 
 #: Factor on a network's own sigma. On nine drives, eight simulated, refined lines lay within one and two
@@ -45,13 +46,19 @@ _BY_OUTSIDE_CM, _OUTSIDE_CM = 20.0, 2.0
 _BEYOND_SEEN_CM = 26.0
 #: Narrower than this share of the lane's width no pair is a lane.
 _NARROWEST = 0.3
+_MIDDLE = 1
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
 _BARELY_CM, _AHEAD = 2.0, 3.0
 #: A point is unknown if its sigma is above this share of the lane's width, or of a common one. Tried from
 #: 0.06 to 1: 2 % of the points of two real drives are unknown, and a third of those more than 3 cm off.
 _MOST_LANES, _COMMON_CM = 0.1, 40.0
-_NOWHERE = np.zeros(3, dtype=bool)
+#: What it costs at most that a marking has another hue than its line had. Tried: 0, 15 and 40, which makes up
+#: for a line and loses those in the light of a lamp.
+_BY_LOOK_CM = 15.0
+#: A line is another one from this share of the lane's width away, and the same one within that share. Chosen.
+_CHANGED, _SAME = 0.5, 0.3
+_NOWHERE, _UNSEEN = np.zeros(3, dtype=bool), np.full(3, np.nan)
 
 
 class _Candidate(NamedTuple):
@@ -63,6 +70,7 @@ class _Candidate(NamedTuple):
     seen_cm: float
     score_cm: float
     seen_at: Bool[np.ndarray, "3"]
+    look: Float[np.ndarray, "3"]
 
 
 class LaneTracker:
@@ -70,16 +78,19 @@ class LaneTracker:
 
     Attributes:
         lane: The lane's width, given or remembered.
+        looks: What its lines look like, and whether it is the lane to drive in.
     """
 
-    def __init__(self, lane: LaneMemory) -> None:
+    def __init__(self, lane: LaneMemory, keep: Keep | None = None) -> None:
         self.lane = lane
+        self.looks = LineLooks(keep)
         self._last: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]] | None = None
         self._markings_cm: tuple[deque[float], deque[float]] = (deque(maxlen=_LENGTH), deque(maxlen=_LENGTH))
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         self._last = None
+        self.looks.reset()
         for widths_cm in self._markings_cm:
             widths_cm.clear()
 
@@ -105,9 +116,12 @@ class LaneTracker:
         own = points_cm.reshape(2, 3), _NETWORK_SIGMA * sigma_cm.reshape(2, 3)
         borders = RoadBorders(edges)
         pair = self._best_pair(self._candidates(own, presence, borders))
-        for line, widths_cm in zip(pair, self._markings_cm, strict=True):
+        self._notice_change(pair)
+        for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
-                widths_cm.append(line.marking_cm)
+                self._markings_cm[side].append(line.marking_cm)
+                self.looks.remember(side, line.look)
+        self.looks.judge()
         found_cm = np.concatenate([line.points_cm for line in pair])
         found_sigma_cm = np.concatenate([_sigma_cm(line) for line in pair])
         seen_cm = np.array([line.seen_cm for line in pair])
@@ -143,11 +157,16 @@ class LaneTracker:
                 score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
                 if i >= n_usual and seen_cm < _BEYOND_SEEN_CM:
                     continue
+                # Beyond the left line, that is the right one.
+                known_as = side if i < n_usual else 1 - side
+                score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as, refined.look[i])
                 line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
-                candidates[side].append(_Candidate(*line, seen_cm, score_cm, refined.seen_at[i]))
+                candidates[side].append(
+                    _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i])
+                )
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (float(presence[side]) - 0.5)
-            lines.append(_Candidate(own[0][side], own[1][side], 0.0, 0.0, doubt_cm, _NOWHERE))
+            lines.append(_Candidate(own[0][side], own[1][side], 0.0, 0.0, doubt_cm, _NOWHERE, _UNSEEN))
         return candidates
 
     def _beyond_a_crossed_line(self) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
@@ -165,6 +184,23 @@ class LaneTracker:
                 starts.append((1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM))
                 starts.append((side, next_cm, np.hypot(sigma_cm, _MOVED_CM), _BY_CONTINUING_CM))
         return starts
+
+    def _notice_change(self, pair: tuple[_Candidate, _Candidate]) -> None:
+        """Notice that one of the lane's lines was the other one before: the car is in the next lane."""
+        width_cm = self.lane.width_cm
+        if self._last is None or width_cm is None:
+            return
+        for side in range(len(SIDES)):
+            now_cm, was_cm, crossed_cm = (
+                points_cm[_MIDDLE]
+                for points_cm in (pair[1 - side].points_cm, *self._last[0][[1 - side, side]])
+            )
+            if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
+                self.looks.cross(side)
+                self._markings_cm[1 - side].clear()
+                self._markings_cm[1 - side].extend(self._markings_cm[side])
+                self._markings_cm[side].clear()
+                return
 
     def _refine(
         self,

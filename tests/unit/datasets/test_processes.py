@@ -6,7 +6,12 @@ import contextlib
 import math
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import pytest
@@ -73,3 +78,44 @@ def test_a_worker_process_has_one_thread(monkeypatch):
     monkeypatch.setattr(cv2, "setNumThreads", lambda _: None)
     processes.prepare_process()
     assert threads_used() == 1
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    program = (
+        "import os, time\n"
+        "from pathlib import Path\n"
+        "from lanenet.processes import run_jobs\n"
+        "if __name__ == '__main__':\n"
+        f"    command = 'echo $PPID > {tmp_path}/%d; sleep 60'\n"
+        "    run_jobs(os.system, [(str(k), command % k) for k in range(2)], 2)\n"
+    )
+    (tmp_path / "parent.py").write_text(program)
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py")])
+    try:
+        workers = wait_for(lambda: [int(text) for k in "01" if (text := read_if_there(tmp_path / k))], 2)
+        parent.kill()
+        parent.wait()
+        wait_for(lambda: [pid for pid in workers if not is_running(pid)], 2)
+    finally:
+        parent.kill()
+
+
+def wait_for(found: Callable[[], list[int]], count: int) -> list[int]:
+    """Ask until so many are found; fails after half a minute."""
+    until = time.monotonic() + 30.0
+    while len(numbers := found()) < count:
+        assert time.monotonic() < until, f"found {numbers}, expected {count}"
+        time.sleep(0.05)
+    return numbers
+
+
+def read_if_there(file: Path) -> str:
+    return file.read_text() if file.is_file() else ""
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

@@ -144,3 +144,37 @@ def test_the_distance_of_two_lines_is_measured_across_the_lane_in_a_corner_as_we
     left, right = (60.0 - np.sqrt(radius**2 - rows**2) for radius in (90.0, 50.0))
     np.testing.assert_allclose(distances_cm(left[None], right[None]), 40.0, atol=1.0)
     np.testing.assert_allclose(distances_cm(right[None], left[None]), -40.0, atol=1.0)
+
+
+def with_hues(edges: RoadEdges, yellow: tuple[float, float]) -> RoadEdges:
+    """The same edges, on markings that are more or less yellow: the left one, and the right one."""
+    share = np.where(edges.points_cm[:, 0] < 0.0, *yellow)
+    return RoadEdges(edges.points_cm, edges.normals, np.column_stack([share, 0.0 * share]))
+
+
+def test_the_looks_of_the_lines_tell_the_lane():
+    tracker = LaneTracker(LaneMemory(LANE_CM), keep="right")
+    for _ in range(40):
+        tracker.follow(BENT, SURE, SEEN, with_hues(edges_of(BENT), (0.8, 0.0)))
+    assert tracker.looks.own_lane > 0.95
+    tracker.reset()
+    for _ in range(40):
+        tracker.follow(BENT, SURE, SEEN, with_hues(edges_of(BENT, -3.0), (0.0, -0.8)))
+    # Dark markings have normals to the floor, so that a yellow one makes it less yellow along them.
+    assert tracker.looks.own_lane < 0.05
+
+
+@pytest.mark.parametrize(("yellow", "expected_cm"), [(0.8, 0.0), (0.0, -12.0)])
+def test_a_marking_of_another_hue_is_not_the_line(yellow, expected_cm):
+    tracker = LaneTracker(LaneMemory())
+    for _ in range(12):
+        tracker.follow(BENT, SURE, SEEN, with_hues(edges_of(BENT), (yellow, 0.0)))
+    # A white line appears beside the left one, and the network goes there.
+    beside = BENT - np.repeat([12.0, 0.0], 3)
+    line, white = (
+        with_hues(edges_of(BENT), (yellow, 0.0)),
+        with_hues(edges_of(beside, sides=(0,)), (0.0, 0.0)),
+    )
+    both = RoadEdges.of_rows(np.concatenate([line.rows(), white.rows()]))
+    points_cm, _, _ = tracker.follow(beside, SURE, SEEN, both)
+    assert points_cm[1] - BENT[1] == pytest.approx(expected_cm, abs=0.5)
