@@ -65,7 +65,7 @@ traps: $(VENV)/.stamp-dev
 
 # Two hours on two cores; JUDGE adds arguments, such as --workers 8. Of the road cameras each competition has its
 # own, hence --any-camera for the network that was trained with one.
-JUDGED := truth,network=checkpoints/general,network=checkpoints/small,lane-filter,hough,hough=configs/detectors/hough_value.yaml,painter
+JUDGED := truth,network=checkpoints/general,network=checkpoints/small,lane-filter,hough,hough-value,painter
 judge: $(VENV)/.stamp-train
 	OMP_NUM_THREADS=1 $(BIN)/lanenet judge --config configs/judge/competition.yaml --detectors $(JUDGED) \
 	  --any-camera --out runs/competition $(JUDGE)

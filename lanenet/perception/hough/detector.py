@@ -383,5 +383,5 @@ KIND = DetectorKind(
     settings=HoughSettings,
     needs_camera=False,
     # On most floors the paper's hue is noise, while the brightness shows the lines.
-    variants={"hough-value": {"edges": {"channel": "value"}}},
+    variants={"hough-value": {"edges": {"channel": "value", "threshold": 75}}},
 )

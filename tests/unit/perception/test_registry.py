@@ -92,6 +92,9 @@ def test_a_variant_is_the_detector_with_its_settings() -> None:
     assert kind_of("hough-value") is kind_of("hough")
     built = build_detector("hough-value", DetectorInputs(camera=example_camera()))
     assert built.settings.edges.channel == "value"  # type: ignore[attr-defined]
+    shipped = Path(__file__).resolve().parents[3] / "configs/detectors/hough_value.yaml"
+    same = build_detector("hough", DetectorInputs(camera=example_camera(), config=shipped))
+    assert built.settings == same.settings  # type: ignore[attr-defined]
 
 
 def test_what_does_not_exist_or_needs_frames_is_refused() -> None:
