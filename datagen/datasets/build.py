@@ -87,8 +87,11 @@ def prepare(
     ]
     jobs += [RecordedJob(drive, settings, work_dir / "drives") for drive in settings.drives]
     for role in ("train", "validation"):
-        if not settings.drives and not getattr(synthetic, role):
-            raise ConfigError(f"data: no {role} drives; set data.synthetic.{role} or list data.drives")
+        split = [drive for drive in settings.drives if role == "train" or drive.split != "none"]
+        if not split and not getattr(synthetic, role):
+            raise ConfigError(
+                f"data: no {role} drives; set data.synthetic.{role} or list data.drives that are split"
+            )
     # The first drive that is mapped compiles what all others use. The test drives, which need little of that,
     # run beside it, so that no second process compiles the same.
     jobs[1:] = sorted(jobs[1:], key=lambda job: not (isinstance(job, SyntheticJob) and job.role == "test"))

@@ -25,6 +25,7 @@ from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.data.files import write_json, write_text
 from lanenet.data.label_set import read_labels, write_labels
+from lanenet.data.maps.folder import read_map
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, TrackingLostError
 from lanenet.outputs import lock_output
 from lanenet.reading import read_json
@@ -34,6 +35,9 @@ ROLES: tuple[Role, ...] = ("train", "validation", "test")
 
 #: Synthetic drives of each role whose map and labels get pictures. Chosen: nobody looks at those of hundreds.
 _PICTURED = 2
+
+#: The width of a map's lane is that of the settings within this share. Chosen: it is given, not measured.
+_SAME_WIDTH = 0.01
 
 _VERSION = 15  # of drives, maps and label sets; raise it when the same settings give others
 
@@ -172,7 +176,7 @@ class SyntheticJob:
 
 @dataclass(frozen=True)
 class RecordedJob:
-    """Map and label a recorded drive, and split it into the three roles.
+    """Map and label a recorded drive, and split it into the three roles if it is to be split.
 
     Attributes:
         recording: The drive.
@@ -196,17 +200,25 @@ class RecordedJob:
         return f"{path.name}-{key_of(str(path))[:6]}"
 
     @property
+    def is_map(self) -> bool:
+        """Whether the drive has been mapped before."""
+        return (self.recording.path / "map.yaml").is_file()
+
+    @property
     def frames(self) -> Path:
         """The map."""
-        return self.folder / "maps" / self.name
+        return self.recording.path if self.is_map else self.folder / "maps" / self.name
 
     def run(self) -> tuple[Part, ...]:
-        """Make the three label sets.
+        """Make the three label sets, or the one to learn from.
 
         Raises:
             LanenetError: If the drive cannot be read, mapped or split.
+            ConfigError: If it is a map of a lane of another width.
         """
         settings, data = self.recording, self.data
+        if self.is_map:
+            self._check_width()
         files = [settings.path]
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
@@ -226,14 +238,19 @@ class RecordedJob:
             )
             for role in ROLES
         )
+        if settings.split == "none":
+            parts = (Part("train", whole.path, self.frames, settings.counts_as),)
 
         request = MapRequest(settings.path, settings.lane_width_cm, settings.camera)
 
         def make() -> None:
-            Output(self.frames / "map.yaml", key_of(mapped, *recording)).make(
-                lambda: map_drive(request, settings.map, self.frames)
-            )
+            if not self.is_map:
+                Output(self.frames / "map.yaml", key_of(mapped, *recording)).make(
+                    lambda: map_drive(request, settings.map, self.frames)
+                )
             label_map(self.frames, whole.path, window=data.window, colour_weight=data.colour_weight)
+            if settings.split == "none":
+                return
             for part, labels in zip(parts, split_recording(read_labels(whole.path), settings), strict=True):
                 write_labels(part.labels, labels)
 
@@ -241,6 +258,14 @@ class RecordedJob:
             whole.forget()
         whole.make_alone(make)
         return parts
+
+    def _check_width(self) -> None:
+        mapped_cm, given_cm = read_map(self.frames).meta.lane_width_cm, self.recording.lane_width_cm
+        if abs(mapped_cm - given_cm) > _SAME_WIDTH * given_cm:
+            raise ConfigError(
+                f"data.drives: {self.frames} is a map of a lane of {mapped_cm:g} cm, but lane_width_cm is "
+                f"{given_cm:g}; map it anew or give the map's"
+            )
 
 
 @dataclass(frozen=True)

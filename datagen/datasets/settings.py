@@ -50,14 +50,16 @@ class SyntheticSettings(Settings):
 
 
 class RecordedSettings(Settings):
-    """A recorded drive, split along its time or by its laps.
+    """A recorded drive, split along its time or by its laps, or all of it to learn from.
 
     Attributes:
-        path: Drive folder, tub or video, relative to the folder in which the command runs.
+        path: Drive folder, tub or video, or a finished map of one, relative to the folder in which the
+            command runs.
         lane_width_cm: Between the middles of the lines of the driven lane.
         camera: Camera file; without it the camera is found from the drive.
         split: ``time`` cuts at the shares below; ``lap`` keeps the last lap for the test, the one before it
-            for the validation and all earlier ones for learning.
+            for the validation and all earlier ones for learning; ``none`` learns from all of it, so that
+            other drives must choose the epoch.
         train_share: Share of the labelled frames, from the start, to learn from. Chosen, like the next.
         validation_share: Share of the following frames to choose the epoch by; the rest is for the test.
         gap_frames: Frames left out between the parts, so that neighbours are never on both sides. Chosen: 2 s
@@ -65,13 +67,13 @@ class RecordedSettings(Settings):
         gap_cm: Distance left out between the parts, likewise; the longer of the two gaps counts.
         counts_as: Number of drives that this one counts as beside synthetic ones: its frames are shown that
             many times as often.
-        map: Settings for mapping this drive.
+        map: Settings for mapping this drive, unless it is a map.
     """
 
     path: Path
     lane_width_cm: float = Field(gt=0.0)
     camera: Path | None = None
-    split: Literal["time", "lap"] = "time"
+    split: Literal["time", "lap", "none"] = "time"
     train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     gap_frames: int = Field(default=40, ge=0)

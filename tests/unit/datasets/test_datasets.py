@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from small_map import small_map
 
 from datagen.datasets.build import prepare, shared_camera
 from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
@@ -19,6 +20,7 @@ from datagen.datasets.splits import split_along_time
 from datagen.prepare import MapRequest
 from datagen.world.world import SimulationSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
+from lanenet.data.maps.folder import read_map, write_map
 from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
@@ -197,6 +199,39 @@ def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
     assert not given
     assert len(found.train) == 3 and len(set(found.train)) == 1
     assert len(found.validation) == len(found.of("test")) == 1
+
+
+def test_a_whole_recording_is_learned_from_and_other_drives_choose(tmp_path, monkeypatch):
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
+    monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
+    whole = _labels(np.arange(400))
+    for name in ("whole", "split"):
+        (tmp_path / name).mkdir()
+    drive = RecordedSettings(path=tmp_path / "whole", lane_width_cm=40.0, split="none", counts_as=2)
+    with pytest.raises(ConfigError, match="no validation drives"):
+        prepare(DataSettings(drives=(drive,)), tmp_path / "work")
+    other = RecordedSettings(path=tmp_path / "split", lane_width_cm=40.0)
+    for _ in range(2):  # made, and found again
+        found = prepare(DataSettings(drives=(drive, other), workers=1), tmp_path / "work")
+        assert [len(read_labels(path)) for path in found.train] == [400, 400, 240]
+        assert len(found.validation) == len(found.of("test")) == 1
+
+
+def test_a_map_is_taken_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: pytest.fail("mapped again"))
+    monkeypatch.setattr(
+        "datagen.datasets.jobs.label_map",
+        lambda folder, out, **__: write_labels(out, _labels(np.arange(read_map(folder).frames.size))),
+    )
+    drive_map = tmp_path / "map"
+    write_map(drive_map, small_map(), {"frame": np.arange(2)}, {}, "given")
+    recorded = RecordedSettings(path=drive_map, lane_width_cm=36.0, split="none")
+    parts = RecordedJob(recorded, DataSettings(), tmp_path / "work").run()
+    assert [(part.role, part.frames) for part in parts] == [("train", drive_map)]
+    assert len(read_labels(parts[0].labels)) == read_map(drive_map).frames.size
+    other = recorded.model_copy(update={"lane_width_cm": 40.0})
+    with pytest.raises(ConfigError, match="map of a lane of 36 cm, but lane_width_cm is 40"):
+        RecordedJob(other, DataSettings(), tmp_path / "work").run()
 
 
 def test_the_camera_is_that_of_all_drives_or_of_the_example(tmp_path):
