@@ -19,7 +19,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain traps judge golden golden-renew arm neutral check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm neutral check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -28,6 +28,7 @@ help:
 	@echo "make test-base-install  detection in an environment with the base installation only"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
 	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
+	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
@@ -62,6 +63,11 @@ chain: $(VENV)/.stamp-dev
 traps: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps
+
+# Half an hour on one core, once configs/general.yaml has made its drives; needs the drives of configs/tubs.yaml.
+# LEFT_OUT adds arguments, such as --start checkpoints/mine.
+left-out: $(VENV)/.stamp-train
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out $(LEFT_OUT)
 
 # Two hours on two cores; JUDGE adds arguments, such as --workers 8. Of the road cameras each competition has its
 # own, hence --any-camera for the network that was trained with one.
