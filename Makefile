@@ -7,6 +7,8 @@ CONFIG ?= configs/small.yaml
 PIP_ARGS ?=
 
 BIN := $(VENV)/bin
+# Built by pip where there is a C++ compiler.
+KERNELS := lanenet/perception/edges/_kernels.cpp
 PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt
 # Tests run on this many cores. Each process takes over a gigabyte, hence the bound for large machines.
 TEST_PROCESSES ?= auto
@@ -19,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm neutral check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm wheels neutral check format format-check lint types imports bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -33,6 +35,7 @@ help:
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
+	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
 	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
@@ -84,7 +87,11 @@ golden: $(VENV)/.stamp-dev
 golden-renew: $(VENV)/.stamp-dev
 	$(BIN)/python tests/golden/renew.py
 
-# Needs debootstrap and qemu-user-static, and root.
+wheels: $(VENV)/.stamp-train
+	PYTHON=$(abspath $(BIN)/python) contrib/wheel x86_64 dist
+	PYTHON=$(abspath $(BIN)/python) contrib/wheel aarch64 dist
+
+# Needs debootstrap, qemu-user-static and g++-aarch64-linux-gnu, and root.
 arm: $(VENV)/.stamp-train
 	PYTHON=$(abspath $(BIN)/python) contrib/arm/prove
 
@@ -119,12 +126,12 @@ clean:
 	find lanenet datagen tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is written only when pip has finished, so that an interrupted installation is taken up again.
-$(VENV)/.stamp-train: pyproject.toml constraints.txt | $(BIN)/python
+$(VENV)/.stamp-train: pyproject.toml constraints.txt $(KERNELS) | $(BIN)/python
 	$(PIP) -e '.[train,viz]'
 	touch $@
 
 # The developers' extra contains the other two.
-$(VENV)/.stamp-dev: pyproject.toml constraints.txt | $(BIN)/python
+$(VENV)/.stamp-dev: pyproject.toml constraints.txt $(KERNELS) | $(BIN)/python
 	$(PIP) -e '.[dev]'
 	touch $(VENV)/.stamp-train $@
 

@@ -16,6 +16,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
 State = Literal["ok", "note", "problem"]
@@ -57,7 +58,7 @@ def run_checks(camera: Path | None = None) -> list[Check]:
     Returns:
         All checks in the order of the report; problems are checks, not errors.
     """
-    checks = [_python(), *_packages(), _opencv_packages(), _opencv(), _onnxruntime()]
+    checks = [_python(), *_packages(), _opencv_packages(), _opencv(), _kernels(), _onnxruntime()]
     if camera is not None:
         checks += check_camera_file(camera)
     return checks
@@ -181,6 +182,15 @@ def _opencv() -> Check:
     if columns.size != 1 or abs(int(columns[0]) - 15.5) > 1.0 or back is None or back.shape != step.shape:
         return Check("opencv", "problem", f"{cv2.__version__}: self test gave a wrong answer; reinstall it")
     return Check("opencv", "ok", f"{cv2.__version__}, edges and JPEG work")
+
+
+def _kernels() -> Check:
+    if compiled.is_here():
+        return Check("edges", "ok", "by compiled loops")
+    text = (
+        "by NumPy and OpenCV, the same but slower: install g++ and the headers of Python, then lanenet again"
+    )
+    return Check("edges", "note", text)
 
 
 def _onnxruntime() -> Check:

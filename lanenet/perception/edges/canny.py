@@ -12,6 +12,7 @@ from pydantic import Field
 from lanenet.config import Settings
 from lanenet.errors import CalibrationError, DriveFormatError
 from lanenet.geometry.camera import Camera
+from lanenet.perception.edges import compiled
 from lanenet.perception.edges.markings_only import ColourSettings, PixelScale, colour_edges
 from lanenet.perception.edges.pixels import EdgePixels, Slopes, edge_pixels, gradients, prefer_stronger
 
@@ -84,11 +85,26 @@ def find_edges(
     """
     if settings.method == "colour":
         return colour_edges(check_frame(frame_bgr), settings.colour, settings.blur_px, keep, scale)
+    directional = settings.method == "directional"
+    if directional and sample is None:
+        sample = sample_pixels(np.ones(check_frame(frame_bgr).shape[:2], np.uint8) if keep is None else keep)
+    if compiled.finds_in(check_frame(frame_bgr)):
+        return compiled.find(
+            frame_bgr,
+            keep,
+            sample,
+            blur_px=settings.blur_px,
+            thresholds=(settings.low, settings.high),
+            colour_weight=settings.colour_weight if directional else 0.0,
+            contrast_share=settings.contrast_share if directional else 0.0,
+            subpixel=directional,
+            raising=(_DIM, _LEAST_RAISED, _CLEAR),
+        )
     gray = to_gray(frame_bgr)
     dx, dy = gradients(gray, settings.blur_px)
     raised = 1.0
     hues: tuple[Slopes, ...] = ()
-    if settings.method == "directional":
+    if directional:
         if frame_bgr.ndim == 3 and settings.colour_weight > 0.0:
             # Gray minus blue shows yellow, red minus gray red; white, gray and black have neither. Both
             # rise towards the inside of yellow tape, as brightness does for white tape, so that normals mean
@@ -98,16 +114,14 @@ def find_edges(
             hues = (dx - blue[0], dy - blue[1]), (red[0] - dx, red[1] - dy)
             for hue_dx, hue_dy in hues:
                 prefer_stronger(dx, dy, hue_dx, hue_dy, settings.colour_weight, settings.low)
-        if sample is None:
-            sample = sample_pixels(np.ones_like(gray) if keep is None else keep)
-        if settings.contrast_share > 0.0:
+        if settings.contrast_share > 0.0 and sample is not None:
             usual, strong = _responses(dx, dy, sample) / settings.high
             relative = settings.contrast_share * strong
             raised = max(relative, min(1.0, max(_DIM * relative, _LEAST_RAISED, _CLEAR * usual)))
     edges = cv2.Canny(dx, dy, raised * settings.low, raised * settings.high, L2gradient=True)
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
-    return edge_pixels(edges, dx, dy, subpixel=settings.method == "directional", hues=hues)
+    return edge_pixels(edges, dx, dy, subpixel=directional, hues=hues)
 
 
 def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RoadEdges
 
 #: Planes of a raster: whether the cell holds an edge point, 0 or 255; and for the last of its points x and y
@@ -33,6 +34,10 @@ def fill_raster(
     Returns:
         ``out``.
     """
+    looks = edges.points_cm, edges.normals, edges.hues
+    if compiled.is_here() and out.flags.c_contiguous:
+        compiled.raster(window, looks, out, MIDDLE, STEPS)
+        return out
     if len(out) == 1:
         window.rasterise(edges.points_cm, out=out[0])
         return out

@@ -11,6 +11,7 @@ from pydantic import Field
 from lanenet.config import Settings, flat_settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
+from lanenet.perception.edges import compiled
 from lanenet.perception.edges.canny import EdgeSettings, check_frame, check_size, find_edges, sample_pixels
 from lanenet.perception.edges.markings_only import PixelScale
 from lanenet.perception.edges.pixels import EdgePixels
@@ -171,6 +172,8 @@ class RoadTable:
         Returns:
             Their points and directions on the road, [cm], frame car.
         """
+        if compiled.is_here():
+            return RoadEdges(*compiled.lift(edges, self._rows, (self.height, self.width), single=False))
         points, rows = self._look_up(edges)
         _, _, x_u, y_u, x_v, y_v = rows
         normal_u, normal_v = edges.normals.T
@@ -181,6 +184,21 @@ class RoadTable:
         across *= np.sign(x_u * y_v - x_v * y_u)
         across *= 1.0 / np.maximum(np.sqrt(across[0] * across[0] + across[1] * across[1]), 1e-12)
         return RoadEdges(np.ascontiguousarray(points.T), np.ascontiguousarray(across.T), edges.hues)
+
+    def lift_single(self, edges: EdgePixels) -> RoadEdges:
+        """Return :meth:`lift` in the precision of label files, without points that are not finite.
+
+        So a raster from a file equals one made on the car.
+        """
+        if compiled.is_here():
+            return RoadEdges(*compiled.lift(edges, self._rows, (self.height, self.width), single=True))
+        road = self.lift(edges)
+        points, normals = road.points_cm.astype(np.float32), road.normals.astype(np.float32)
+        hues = None if road.hues is None else road.hues.astype(np.float32)
+        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
+        if good.all():
+            return RoadEdges(points, normals, hues)
+        return RoadEdges(points[good], normals[good], None if hues is None else hues[good])
 
     def lift_points(self, edges: EdgePixels) -> Float[np.ndarray, "n 2"]:
         """Return the points of :meth:`lift` alone."""
@@ -231,15 +249,5 @@ class RoadEdgeExtractor:
             CalibrationError: If the frame's size is not the camera's.
             DriveFormatError: If the array is no image.
         """
-        edges = self.table.lift(self._find(frame_bgr))
-        # The precision of label files: a raster from a file equals one made on the car.
-        points, normals = edges.points_cm.astype(np.float32), edges.normals.astype(np.float32)
-        hues = None if edges.hues is None else edges.hues.astype(np.float32)
-        good = np.isfinite(points[:, 0] + points[:, 1] + normals[:, 0] + normals[:, 1])
-        if good.all():
-            return RoadEdges(points, normals, hues)
-        return RoadEdges(points[good], normals[good], None if hues is None else hues[good])
-
-    def _find(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
         check_size(check_frame(frame_bgr), self.camera)
-        return self.table.find(frame_bgr, self.settings.edges)
+        return self.table.lift_single(self.table.find(frame_bgr, self.settings.edges))

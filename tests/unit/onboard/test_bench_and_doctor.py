@@ -12,6 +12,7 @@ from lanenet.errors import ModelMismatchError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, time_stages
 from lanenet.onboard.doctor.installation import check_camera, run_checks
+from lanenet.perception.edges import compiled
 
 
 def test_bench_reports_every_stage_with_its_ratio() -> None:
@@ -36,7 +37,7 @@ def test_bench_refuses_a_missing_model(tmp_path: Path) -> None:
 
 def test_this_installation_is_in_order() -> None:
     checks = {check.name: check for check in run_checks()}
-    assert {"python", "lanenet", "packages", "extra train", "opencv", "onnxruntime"} <= set(checks)
+    assert {"python", "lanenet", "packages", "extra train", "opencv", "edges", "onnxruntime"} <= set(checks)
     assert [c for c in checks.values() if c.state == "problem"] == []
 
 
@@ -50,6 +51,12 @@ def test_broken_runtime_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "Canny", lambda *_: np.zeros((32, 32), np.uint8))
     states = {check.name: check.state for check in run_checks()}
     assert states["onnxruntime"] == "problem" and states["opencv"] == "problem"
+
+
+def test_it_says_whether_the_compiled_loops_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kernels, state in ((object(), "ok"), (None, "note")):
+        monkeypatch.setattr(compiled, "_kernels", kernels)
+        assert {check.name: check.state for check in run_checks()}["edges"] == state
 
 
 def test_good_camera_sees_the_road(tmp_path: Path) -> None:

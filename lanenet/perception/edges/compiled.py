@@ -1,0 +1,117 @@
+"""The compiled loops, where they are: the bytes of NumPy and OpenCV in a fraction of the time.
+
+``_kernels.cpp`` is built when lanenet is installed and a C++ compiler is at hand. Where there is none the
+callers, in which each step is explained, do the work themselves; they also are what tests compare with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.perception.edges.pixels import EdgePixels
+
+try:
+    from lanenet.perception.edges import _kernels  # type: ignore[attr-defined]
+except ImportError:
+    _kernels = None
+
+#: Smallest side of an image; OpenCV treats the borders of smaller ones in its own way.
+_LEAST_PX = 3
+
+
+def is_here() -> bool:
+    """Tell whether the compiled loops are installed."""
+    return _kernels is not None
+
+
+def finds_in(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> bool:
+    """Tell whether :func:`find` can be called for such a frame."""
+    return is_here() and min(frame_bgr.shape[:2]) >= _LEAST_PX
+
+
+def find(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    keep: UInt8[np.ndarray, "h w"] | None,
+    sample: Int[np.ndarray, " n"] | None,
+    *,
+    blur_px: int,
+    thresholds: tuple[float, float],
+    colour_weight: float,
+    contrast_share: float,
+    subpixel: bool,
+    raising: tuple[float, float, float],
+) -> EdgePixels:
+    """Find edges as :func:`lanenet.perception.edges.canny.find_edges` does, but for the method ``colour``.
+
+    Args:
+        frame_bgr: Colour or gray image of at least 3 x 3 pixels.
+        keep: Mask of pixels that may be edges; None for all.
+        sample: Flat indices of the pixels whose contrast counts; may be None if ``contrast_share`` is 0.
+        blur_px: Size of the Gauss kernel, 3 or 5; 0 for none.
+        thresholds: Of the hysteresis, lower and upper.
+        colour_weight: Of yellow and red; 0 to leave them out.
+        contrast_share: As in the settings; 0 fixes the thresholds.
+        subpixel: Move each edge to where the gradient peaks.
+        raising: How far the thresholds fall in dim frames: the three constants of ``canny``.
+    """
+    rows, columns = frame_bgr.shape[:2]
+    found = _kernels.find(
+        np.ascontiguousarray(frame_bgr),
+        rows,
+        columns,
+        None if keep is None else np.ascontiguousarray(keep),
+        None if sample is None else np.ascontiguousarray(sample, np.int64),
+        blur_px,
+        *thresholds,
+        colour_weight,
+        contrast_share,
+        subpixel,
+        raising,
+    )
+    coloured = frame_bgr.ndim == 3 and colour_weight > 0.0
+    return EdgePixels(*np.frombuffer(found).reshape(3 if coloured else 2, -1, 2))
+
+
+def lift(
+    edges: EdgePixels, table: Float[np.ndarray, "p 6"], size: tuple[int, int], single: bool
+) -> tuple[np.ndarray, ...]:
+    """Move edge pixels to the road as ``RoadTable.lift`` does.
+
+    Args:
+        edges: Edge points of a frame.
+        table: Of each pixel the road point and its derivatives, as ``RoadTable`` holds them.
+        size: Rows and columns of the image.
+        single: Return float32, and leave out the points that are not finite.
+
+    Returns:
+        Points, normals, and hues if there are any, n x 2 each.
+    """
+    hues = None if edges.hues is None else np.ascontiguousarray(edges.hues, np.float64)
+    uv_px, normals = (np.ascontiguousarray(x, np.float64) for x in (edges.uv_px, edges.normals))
+    found = _kernels.lift(uv_px, normals, hues, table, *size, single)
+    return tuple(
+        np.frombuffer(found, np.float32 if single else np.float64).reshape(2 if hues is None else 3, -1, 2)
+    )
+
+
+def raster(
+    window: BirdseyeWindow,
+    looks: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    out: UInt8[np.ndarray, "p r c"],
+    middle: int,
+    steps: int,
+) -> None:
+    """Fill a raster as :func:`lanenet.perception.edges.raster.fill_raster` does.
+
+    Args:
+        window: Which patch of road, and its cells.
+        looks: Points, normals and hues, all float32 or all float64.
+        out: Contiguous; written.
+        middle: Value for nothing in the planes after the first.
+        steps: Values from nothing to 1.
+    """
+    points, normals, hues = (None if x is None else np.ascontiguousarray(x) for x in looks)
+    place = window.left_cm, window.far_cm, window.cell_cm, window.rows, window.columns
+    _kernels.raster(points, normals, hues, out, *place, len(out), middle, steps, looks[0].dtype == np.float32)
