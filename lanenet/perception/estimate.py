@@ -17,6 +17,7 @@ from lanenet.config import Settings, SettingsT, check_settings, load_settings
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, SIDES, lane_width_cm, parabolas_from_points, parallel_points
 from lanenet.perception.edges.road import PerceptionSettings
+from lanenet.perception.lane_width import WidthBelief
 
 
 @dataclass(frozen=True)
@@ -160,37 +161,55 @@ class DetectorKind:
 #: Presence below which a line is missing, and above which it is certain. Chosen: more likely than not, and
 #: nine in ten.
 SEEN, SURE = 0.5, 0.9
-#: Frames whose widths are remembered, and how many are needed. Chosen: 5 s and half a second at 20 frames/s.
-_LENGTH, _ENOUGH = 100, 10
+#: Frames whose widths are compared with a given one. Chosen: 5 s at 20 frames/s.
+_LENGTH = 100
 #: Frames whose widths contradict a given one, and how far their median is off, as a share. Chosen: 2 s at 20
 #: frames/s; a width wrong by 20 % was measured within 3 %, a right one within 8 % where the lane widens.
 _CERTAIN, _WRONG = 40, 0.17
-#: Sigma of a remembered width as a share of it. Chosen: 0.8 cm of a lane of 40 cm, laid by hand.
+#: Least sigma of a width as a share of it. Chosen: 0.8 cm of a lane of 40 cm, laid by hand.
 _WIDTH_SIGMA = 0.02
+#: Common lanes: nine of ten lie between. Chosen: from Duckietown's to twice the width of the paper's lane.
+COMMON_CM = (20.0, 80.0)
 #: How far beyond its label rows a parabola is extrapolated; chosen: the distance of two rows.
 _BEYOND_CM = 15.0
 
 
 class LaneMemory:
-    """The median width of the frames that showed both lines.
+    """The lane's width, given or found in the frames that show both lines.
 
     With a known width, one line determines the other. A network trained on lanes of many widths cannot infer
     it from one line, but from earlier frames.
 
     Attributes:
-        given_cm: A known width, used instead of the remembered one; None without one.
+        given_cm: A known width, used instead of the one that is found; None without one.
+        belief: What the frames say of the width.
     """
 
-    def __init__(self, given_cm: float | None = None) -> None:
+    def __init__(self, given_cm: float | None = None, common_cm: tuple[float, float] = COMMON_CM) -> None:
+        """Start without a frame.
+
+        Args:
+            given_cm: A known width.
+            common_cm: Widths between which nine lanes of ten lie.
+        """
         self.given_cm = given_cm
+        self.belief = WidthBelief(common_cm)
         self._widths_cm: deque[float] = deque(maxlen=_LENGTH)
 
     @property
     def width_cm(self) -> float | None:
         """The lane's width; None while it is unknown."""
-        if self.given_cm is not None:
-            return self.given_cm
-        return statistics.median(self._widths_cm) if len(self._widths_cm) >= _ENOUGH else None
+        return self.belief.width_cm if self.given_cm is None else self.given_cm
+
+    @property
+    def likely_cm(self) -> float:
+        """The lane's width, or while it is unknown the mean of what is possible."""
+        return self.belief.mean_cm if self.given_cm is None else self.given_cm
+
+    @property
+    def width_sigma(self) -> float:
+        """Standard deviation of the width as a share of it."""
+        return _WIDTH_SIGMA if self.given_cm is not None else max(self.belief.sigma, _WIDTH_SIGMA)
 
     @property
     def contradiction(self) -> str:
@@ -202,8 +221,15 @@ class LaneMemory:
             return ""
         return f"lane width {self.given_cm:g} cm: the lines that are seen lie {seen_cm:.0f} cm apart"
 
+    def match(self, widths_cm: Float[np.ndarray, "*shape"], sigma: float) -> Float[np.ndarray, "*shape"]:
+        """Rate widths from 0 to 1, the likeliest; ``sigma`` is that of the logarithm along the lane."""
+        if self.given_cm is None:
+            return self.belief.match(widths_cm, sigma)
+        off = np.log(widths_cm / self.given_cm) / sigma
+        return np.exp(-0.5 * off * off)
+
     def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> None:
-        """Remember the width of a frame in which both lines are certain; other frames are ignored.
+        """Learn the width of a frame in which both lines are certain; other frames are ignored.
 
         Args:
             points_cm: The six points, frame car; NaN where unknown.
@@ -216,10 +242,17 @@ class LaneMemory:
         width_cm = lane_width_cm(points_cm)
         if 0.0 < width_cm < math.inf:
             self._widths_cm.append(width_cm)
+            self.belief.learn(width_cm)
+
+    def doubt(self) -> None:
+        """Keep the width with little weight, as after a gap in a recording."""
+        self._widths_cm.clear()
+        self.belief.doubt()
 
     def reset(self) -> None:
         """Forget the frames; a given width stays."""
         self._widths_cm.clear()
+        self.belief.forget()
 
     def complete(
         self,
@@ -227,7 +260,7 @@ class LaneMemory:
         sigma_cm: Float[np.ndarray, "6"],
         presence: Float[np.ndarray, "2"],
     ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
-        """Learn from a frame with both lines; rebuild the missing line of a frame with one.
+        """Rebuild the missing line of a frame with one.
 
         The rebuilt line is parallel to the visible one. It replaces the network's own guess only if its sigma
         is smaller, and if it needs no extrapolation far beyond the visible line's points. A missing line
@@ -243,7 +276,6 @@ class LaneMemory:
             Points and standard deviations, changed for the missing line only.
         """
         width_cm = self.width_cm
-        self.learn(points_cm, presence)
         if width_cm is None or (presence < SEEN).sum() != 1:
             return points_cm, sigma_cm
         missing = int(np.argmin(presence))
@@ -251,7 +283,7 @@ class LaneMemory:
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()
         rebuilt = parallel_points(lines[1 - missing], side * width_cm, _BEYOND_CM)
-        rebuilt_sigma = np.hypot(sigmas[1 - missing], _WIDTH_SIGMA * width_cm)
+        rebuilt_sigma = np.hypot(sigmas[1 - missing], self.width_sigma * width_cm)
         if np.isfinite(rebuilt).all() and rebuilt_sigma.mean() < sigmas[missing].mean():
             lines[missing], sigmas[missing] = rebuilt, rebuilt_sigma
         return lines.reshape(6), sigmas.reshape(6)

@@ -92,13 +92,11 @@ class NetworkDetector:
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self._told, self._keeps = False, keeps
-        self.memory = LaneMemory(lane_width_cm)
+        self.memory = LaneMemory(lane_width_cm, self.meta.widths_cm)
         self._tracker = LaneTracker(self.memory, keep)
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         self._raster = new_raster(self.meta.window, self.meta.planes)
         self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
-        if self.meta.takes_width and lane_width_cm is not None:
-            self._feed[WIDTH_NAME] = np.array([lane_width_cm], np.float32)
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
         """Find the lane in one frame.
@@ -111,7 +109,8 @@ class NetworkDetector:
             CalibrationError: If the frame's size is not the camera's.
         """
         if not self._keeps:
-            self.reset()
+            self.memory.reset()
+            self._tracker.reset()
         edges = self._extractor.extract(frame_bgr)
         if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
             return LaneEstimate()
@@ -134,10 +133,13 @@ class NetworkDetector:
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
+        self.memory.learn(points_cm, presence)
         return self._estimate(points_cm, sigma_cm, presence, presence)
 
     def _run(self) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
-        """Run the network on the raster."""
+        """Run the network on the raster, with the lane's width as soon as it is known."""
+        if self.meta.takes_width:
+            self._feed[WIDTH_NAME] = np.array([self.memory.width_cm or 0.0], np.float32)
         found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
         points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         return points_cm, sigma_cm, presence
@@ -162,8 +164,8 @@ class NetworkDetector:
         )
 
     def reset(self) -> None:
-        """Forget what earlier frames showed: the lane, its width, and its markings."""
-        self.memory.reset()
+        """Forget the lane and its markings; its width stays likely, since most roads stay the same."""
+        self.memory.doubt()
         self._tracker.reset()
 
 

@@ -47,12 +47,15 @@ _BEYOND_SEEN_CM = 26.0
 #: Narrower than this share of the lane's width no pair is a lane.
 _NARROWEST = 0.3
 _MIDDLE = 1
+#: Length along the road in which both lines have to be seen to tell the lane's width. Tried: with 9 cm the
+#: width of 31 simulated drives was wrong more often, with 20 cm it was known later.
+_TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
 _BARELY_CM, _AHEAD = 2.0, 3.0
-#: A point is unknown if its sigma is above this share of the lane's width, or of a common one. Tried from
+#: A point is unknown if its sigma is above this share of the lane's width, or of the likely one. Tried from
 #: 0.06 to 1: 2 % of the points of two real drives are unknown, and a third of those more than 3 cm off.
-_MOST_LANES, _COMMON_CM = 0.1, 40.0
+_MOST_LANES = 0.1
 #: What it costs at most that a marking has another hue than its line had. Tried: 0, 15 and 40, which makes up
 #: for a line and loses those in the light of a lamp.
 _BY_LOOK_CM = 15.0
@@ -129,7 +132,7 @@ class LaneTracker:
         told = np.where(seen_cm >= _LINE_SEEN_CM, 1.0, 0.0)
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
         self._last = found_cm.reshape(2, 3), found_sigma_cm.reshape(2, 3)
-        unknown = found_sigma_cm > _MOST_LANES * (self.lane.width_cm or _COMMON_CM)
+        unknown = found_sigma_cm > _MOST_LANES * self.lane.likely_cm
         return np.where(unknown, np.nan, found_cm), np.where(unknown, np.nan, found_sigma_cm), seen_cm
 
     def _candidates(
@@ -232,22 +235,26 @@ class LaneTracker:
     def _best_pair(
         self, candidates: tuple[list[_Candidate], list[_Candidate]]
     ) -> tuple[_Candidate, _Candidate]:
-        """Choose the left and the right line."""
-        width_cm = self.lane.width_cm
+        """Choose the left and the right line, and learn the width from what would be chosen without."""
         lefts_cm, rights_cm = (np.array([line.points_cm for line in lines]) for lines in candidates)
         score_cm = np.add.outer(
             [line.score_cm for line in candidates[0]], [line.score_cm for line in candidates[1]]
         )
-        if width_cm is not None:
-            across_cm = distances_cm(lefts_cm, rights_cm)
-            off = np.log(np.maximum(across_cm / width_cm, _NARROWEST)) / _WIDTH_SIGMA
-            score_cm -= _BY_WIDTH_CM * (1.0 - np.exp(-0.5 * off * off))
-            score_cm[across_cm < _NARROWEST * width_cm] = -np.inf
+        across_cm, least_cm = distances_cm(lefts_cm, rights_cm), _NARROWEST * self.lane.likely_cm
         outside_cm = np.maximum.outer(lefts_cm[:, 0], -rights_cm[:, 0])
         score_cm -= _BY_OUTSIDE_CM * np.clip(outside_cm / _OUTSIDE_CM, 0.0, 1.0)
+        score_cm[across_cm < least_cm] = -np.inf
         if not np.isfinite(score_cm).any():
             return candidates[0][-1], candidates[1][-1]
+        likely = self.lane.match(np.maximum(across_cm, least_cm), _WIDTH_SIGMA)
         left, right = np.unravel_index(int(np.argmax(score_cm)), score_cm.shape)
+        shown = candidates[0][left], candidates[1][right]
+        # A belief must not choose its own evidence: else a wrong one would never be unlearned.
+        if outside_cm[left, right] <= 0.0 and min(line.seen_cm for line in shown) >= _TELLS_WIDTH_CM:
+            self.lane.learn(np.concatenate([line.points_cm for line in shown]), np.ones(len(SIDES)))
+        left, right = np.unravel_index(
+            int(np.argmax(score_cm - _BY_WIDTH_CM * (1.0 - likely))), score_cm.shape
+        )
         return candidates[0][left], candidates[1][right]
 
 

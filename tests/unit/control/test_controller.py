@@ -77,12 +77,12 @@ def test_one_line_is_enough_once_the_width_is_known() -> None:
         forgetful.target(LaneEstimate(lane(), confidence=1.0), 0.03 * k)
     assert math.isnan(forgetful.target(LaneEstimate(one, confidence=1.0), 0.6).steering_rad)
     controller = LaneController(settings(**no_smoothing))
-    for k in range(10):
-        assert controller.lane_width_cm is None
+    assert controller.lane_width_cm is None
+    for k in range(20):
         both = controller.target(LaneEstimate(lane(5.0), confidence=1.0), 0.03 * k)
-    assert controller.lane_width_cm == pytest.approx(40.0)
-    fallback = controller.target(LaneEstimate(one, confidence=1.0), 0.3)
-    assert fallback.steering_rad == pytest.approx(both.steering_rad)
+    assert controller.lane_width_cm == pytest.approx(40.0, rel=0.01)
+    fallback = controller.target(LaneEstimate(one, confidence=1.0), 0.6)
+    assert fallback.steering_rad == pytest.approx(both.steering_rad, abs=1e-3)
     controller.reset()
     assert controller.target(LaneEstimate(one, confidence=1.0), 0.0).steering_rad == fallback.steering_rad
 

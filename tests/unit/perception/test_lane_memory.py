@@ -12,35 +12,71 @@ LOST_RIGHT, LOST_LEFT = np.repeat([0.5, 6.0], 3), np.repeat([6.0, 0.5], 3)
 def taught(widths_cm, **options):
     memory = LaneMemory(**options)
     for width in widths_cm:
-        memory.complete(LANE * width / 40.0, SIGMA, BOTH)
+        memory.learn(LANE * width / 40.0, BOTH)
     return memory
 
 
-def test_the_width_is_the_median_of_sure_frames():
-    assert taught([40.0] * 9).width_cm is None
+def test_the_width_is_that_of_sure_frames():
+    assert taught([]).width_cm is None
     memory = taught([38.0, 40.0, 39.0] * 5 + [90.0] * 3)
-    assert memory.width_cm == pytest.approx(40.0, abs=1.01)
-    memory.complete(LANE * 2.0, SIGMA, np.array([0.99, 0.6]))
-    memory.complete(-LANE, SIGMA, BOTH)
-    assert memory.width_cm == pytest.approx(40.0, abs=1.01)
-    # Only the last hundred frames count.
-    for _ in range(100):
-        memory.complete(LANE * 0.5, SIGMA, BOTH)
-    assert memory.width_cm == pytest.approx(20.0)
+    assert memory.width_cm == pytest.approx(39.0, rel=0.02)
+    known_cm = memory.width_cm
+    memory.learn(LANE * 2.0, np.array([0.99, 0.6]))
+    memory.learn(-LANE, BOTH)
+    assert memory.width_cm == known_cm
     memory.reset()
     assert memory.width_cm is None
+
+
+@pytest.mark.parametrize("width_cm", [22.0, 40.0, 75.0])
+def test_a_lane_with_both_lines_tells_its_width_within_a_second(width_cm):
+    noise = np.random.default_rng(0).normal(0.0, 0.03, 20)
+    memory = taught(width_cm * np.exp(noise))
+    assert memory.width_cm == pytest.approx(width_cm, rel=0.05) and memory.width_sigma < 0.05
+
+
+def test_two_widths_live_side_by_side_until_frames_decide():
+    memory = taught([30.0, 60.0] * 10)
+    assert memory.width_cm is None
+    rates = memory.match(np.array([30.0, 42.4, 60.0]), 0.1)
+    assert min(rates[0], rates[2]) > 2.0 * rates[1]
+    for _ in range(20):
+        memory.learn(LANE * 1.5, BOTH)
+    assert memory.width_cm == pytest.approx(60.0, rel=0.03)
+
+
+def test_a_wrong_width_is_unlearned_and_lines_of_other_lanes_are_left_out():
+    memory = taught([30.0] * 200)
+    for width in [60.0, 60.0, 60.0, 90.0] * 100:
+        memory.learn(LANE * width / 40.0, BOTH)
+    assert memory.width_cm == pytest.approx(60.0, rel=0.03)
+
+
+def test_a_width_in_doubt_is_kept_until_a_few_frames_say_otherwise():
+    memory = taught([30.0] * 300)
+    memory.doubt()
+    assert memory.width_cm == pytest.approx(30.0, rel=0.05)
+    for _ in range(20):
+        memory.learn(LANE * 1.5, BOTH)
+    assert memory.width_cm == pytest.approx(60.0, rel=0.03)
+
+
+def test_before_any_frame_common_lanes_are_likelier():
+    memory = LaneMemory()
+    assert memory.match(np.array([40.0]), 0.2) > 0.95 > 0.5 > memory.match(np.array([120.0]), 0.2)
+    np.testing.assert_allclose(LaneMemory(120.0).match(np.array([120.0, 240.0]), 0.2), [1.0, 0.0], atol=0.01)
 
 
 @pytest.mark.parametrize(("presence", "sigma", "seen"), [(LEFT, LOST_RIGHT, 0), (RIGHT, LOST_LEFT, 1)])
 def test_either_line_is_rebuilt_from_the_other(presence, sigma, seen):
     guess = LANE.copy().reshape(2, 3)
     guess[1 - seen] += 7.0
-    points, spread = taught([30.0] * 20).complete(guess.ravel(), sigma, presence)
+    points, spread = taught([30.0] * 60).complete(guess.ravel(), sigma, presence)
     expected = LANE.copy().reshape(2, 3)
     expected[1 - seen] = expected[seen] + (30.0 if seen == 0 else -30.0)
-    np.testing.assert_allclose(points, expected.ravel(), atol=1e-6)
+    np.testing.assert_allclose(points, expected.ravel(), atol=0.1)
     # The seen line's doubt, and 2 % of the width.
-    np.testing.assert_allclose(spread.reshape(2, 3)[1 - seen], np.hypot(0.5, 0.6))
+    np.testing.assert_allclose(spread.reshape(2, 3)[1 - seen], np.hypot(0.5, 0.6), rtol=0.01)
     np.testing.assert_array_equal(spread.reshape(2, 3)[seen], 0.5)
     assert guess[1 - seen, 0] != points.reshape(2, 3)[1 - seen, 0]
 

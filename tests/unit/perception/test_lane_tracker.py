@@ -176,3 +176,23 @@ def test_a_marking_of_another_hue_is_not_the_line(yellow, expected_cm):
     white = with_hues(edges_of(beside, sides=(0,)), (0.0, 0.0)).rows()
     points_cm, _, _ = tracker.follow(beside, SURE, SEEN, RoadEdges.of_rows(np.concatenate([lane, white])))
     assert points_cm[0] - BENT[0] == pytest.approx(expected_cm, abs=0.5)
+
+
+def test_a_width_that_was_learned_wrong_is_unlearned_though_it_speaks_against_the_lane():
+    lane = LaneMemory()
+    for _ in range(100):
+        lane.learn(np.array([-40.0] * 3 + [40.0] * 3), np.ones(2))
+    assert lane.width_cm == pytest.approx(80.0, rel=0.02)
+    tracker = LaneTracker(lane)
+    for _ in range(150):
+        tracker.follow(BENT, SURE, SEEN, edges_of(BENT))
+    assert lane.width_cm == pytest.approx(LANE_CM, rel=0.04)
+
+
+def test_a_pair_beside_the_car_tells_nothing_of_the_lanes_width():
+    for beside_cm, known in ((0.0, True), (40.0, False)):
+        lane, lines = LaneMemory(), BENT + beside_cm
+        tracker = LaneTracker(lane)
+        for _ in range(20):
+            tracker.follow(lines, SURE, SEEN, edges_of(lines))
+        assert (lane.width_cm is not None) == known
