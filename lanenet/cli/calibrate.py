@@ -15,9 +15,10 @@ from lanenet.cli.shared.options import (
     DriveArgument,
     MappingOption,
     WheelbaseOption,
-    centimetres_of_a_lane,
     check_ending,
     check_not_source,
+    lane_cm,
+    length_cm,
     lock_outputs,
 )
 from lanenet.config import read_yaml
@@ -36,7 +37,7 @@ app = typer.Typer(
 )
 
 _Board = Annotated[str | None, typer.Option(help="Inner corners of the board, for example 9x6.")]
-_Square = Annotated[float, typer.Option(min=0.01, help="Side of a square, cm.")]
+_Square = Annotated[float, typer.Option(parser=length_cm, metavar="CM", help="Side of a square, cm.")]
 #: Left, near, right and far edge of the bird's-eye pictures, [cm]; chosen: two lanes wide, three car lengths.
 _AREA_CM = (-60.0, 0.0, 60.0, 120.0)
 #: Scale of bird's-eye pictures that stand side by side.
@@ -62,7 +63,8 @@ def chessboard(
         LensModel, typer.Option(help="Lens model; auto takes the one that fits better.")
     ] = LensModel.AUTO,
     height: Annotated[
-        float | None, typer.Option(min=0.1, help="Height of the lens above the ground, cm.")
+        float | None,
+        typer.Option(parser=length_cm, metavar="CM", help="Height of the lens above the ground, cm."),
     ] = None,
     pitch: Annotated[float | None, typer.Option(help="Downward tilt of the camera, degrees.")] = None,
     wheelbase: WheelbaseOption = None,
@@ -196,13 +198,18 @@ def drive_(
     lane_width: Annotated[
         float | None,
         typer.Option(
-            callback=centimetres_of_a_lane,
+            parser=lane_cm,
+            metavar="CM",
             help="Between the middles of the lane's two lines, cm: sets the scale.",
         ),
     ] = None,
     camera_height: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Height of the lens above the road, cm: sets the scale instead."),
+        typer.Option(
+            parser=length_cm,
+            metavar="CM",
+            help="Height of the lens above the road, cm: sets the scale instead.",
+        ),
     ] = None,
     camera: Annotated[
         Path | None,

@@ -13,8 +13,8 @@ from lanenet.cli.shared.options import (
     AnyCameraOption,
     MarkingOption,
     ModelOption,
-    centimetres_of_a_lane,
     check_not_source,
+    lane_cm,
     lock_outputs,
 )
 from lanenet.errors import CalibrationError, ConfigError, counted
@@ -58,7 +58,8 @@ def detect(
     lane_width: Annotated[
         float | None,
         typer.Option(
-            callback=centimetres_of_a_lane,
+            parser=lane_cm,
+            metavar="CM",
             help=f"Lane width for {_WITH_LANE_WIDTH}, cm; default: from the settings file or the drive.",
         ),
     ] = None,

@@ -13,7 +13,8 @@ from lanenet.cli.shared.options import (
     DriveArgument,
     MappingOption,
     WheelbaseOption,
-    centimetres_of_a_lane,
+    lane_cm,
+    length_cm,
 )
 from lanenet.config import load_settings
 from lanenet.errors import LanenetError
@@ -26,7 +27,7 @@ def map_drive(
     drive: DriveArgument,
     lane_width: Annotated[
         float,
-        typer.Option(callback=centimetres_of_a_lane, help="Between the middles of the lane's two lines, cm."),
+        typer.Option(parser=lane_cm, metavar="CM", help="Between the middles of the lane's two lines, cm."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the map.")],
     camera: CameraOption = None,
@@ -38,11 +39,14 @@ def map_drive(
     camera_height: Annotated[
         float | None,
         typer.Option(
-            min=0.1, help="Height of the lens above the road, cm: helps to find a camera that is not known."
+            parser=length_cm,
+            metavar="CM",
+            help="Height of the lens above the road, cm: helps to find a camera that is not known.",
         ),
     ] = None,
     tape_width: Annotated[
-        float | None, typer.Option(min=0.1, help="Width of the tape, cm: checks the lane width.")
+        float | None,
+        typer.Option(parser=length_cm, metavar="CM", help="Width of the tape, cm: checks the lane width."),
     ] = None,
 ) -> None:
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
@@ -17,6 +18,10 @@ from lanenet.perception.registry import detector_names, listed
 
 #: Widths of lanes. Chosen: a tenth of the width of 1:10 cars, and a road of many lanes.
 _LANE_CM = (2.0, 1000.0)
+#: A length is at least this; chosen: the thinnest tape has ten times as much.
+_LEAST_CM = 0.1
+#: Units that may follow a length, in cm; without one it is in cm.
+_UNITS_CM = {"": 1.0, "cm": 1.0, "mm": 0.1, "m": 100.0, "in": 2.54}
 
 ConfigArgument = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file with the settings.")]
 OverridesArgument = Annotated[
@@ -24,15 +29,35 @@ OverridesArgument = Annotated[
 ]
 
 
-def centimetres_of_a_lane(value: float | None) -> float | None:
-    """Refuse a lane's width that is no centimetres: the callback of ``--lane-width``."""
-    least, most = _LANE_CM
-    if value is not None and not least <= value <= most:
-        metres = f"; {value:g} m are {100.0 * value:g} cm" if least <= 100.0 * value <= most else ""
+def length_cm(text: str) -> float:
+    """Read a length in cm, or with its unit (``40``, ``40cm``, ``0.4 m``): the parser of such options."""
+    found = re.fullmatch(r"([+-]?[\d.,]+)\s*([a-z]*)", text.strip().lower(), re.ASCII)
+    number, unit = found.groups() if found is not None else ("", "")
+    try:
+        value_cm = float(number) * _UNITS_CM[unit]
+    except (ValueError, KeyError):
+        point = number.replace(",", ".")
+        instead = f": type {point}{unit}" if unit in _UNITS_CM and point.count(".") == 1 else ""
         raise typer.BadParameter(
-            f"{value:g}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}{metres}"
+            f"{text!r}: expected a number of cm, as 40 or 40.5, or one with its unit, as 40cm, 400mm, 0.4m "
+            f"or 16in{instead}"
+        ) from None
+    if value_cm < _LEAST_CM:
+        raise typer.BadParameter(f"{text}: expected a length in cm, {_LEAST_CM:g} at least")
+    return value_cm
+
+
+def lane_cm(text: str) -> float:
+    """Read the width of a lane as :func:`length_cm` does, and refuse one in metres: another parser."""
+    value_cm = length_cm(text)
+    least, most = _LANE_CM
+    if not least <= value_cm <= most:
+        metres = f"; {value_cm:g} m are {100.0 * value_cm:g} cm: type {100.0 * value_cm:g}"
+        raise typer.BadParameter(
+            f"{text}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}"
+            f"{metres if least <= 100.0 * value_cm <= most else ''}"
         )
-    return value
+    return value_cm
 
 
 DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
@@ -40,7 +65,8 @@ CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="Camera YAML, or an earlier map of the same car.")
 ]
 WheelbaseOption = Annotated[
-    float | None, typer.Option("--wheelbase", min=0.1, help="Distance between the car's axles, cm.")
+    float | None,
+    typer.Option("--wheelbase", parser=length_cm, metavar="CM", help="Distance between the car's axles, cm."),
 ]
 MappingOption = Annotated[
     Path | None, typer.Option("--config", help="YAML with the mapping's settings, or a map's settings.yaml.")
@@ -49,6 +75,8 @@ MarkingOption = Annotated[
     float | None,
     typer.Option(
         "--marking",
+        parser=length_cm,
+        metavar="CM",
         help=f"Width of the tape for {listed(detector_names(lambda kind: kind.takes_marking))}, cm.",
     ),
 ]

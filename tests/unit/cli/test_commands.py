@@ -19,6 +19,7 @@ from typer.testing import CliRunner, Result
 
 from datagen.prepare import MapRequest
 from lanenet.cli import app as cli
+from lanenet.cli.shared.options import lane_cm, length_cm
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
@@ -193,11 +194,27 @@ def test_map_hands_on_its_arguments(tmp_path: Path, asked: Asked) -> None:
         assert text in result.stdout
 
 
-@pytest.mark.parametrize("width", ["0.31", "inf", "nan", "-40"])
-def test_a_lane_width_that_is_no_centimetres_is_a_usage_error(width: str, asked: Asked) -> None:
+@pytest.mark.parametrize(
+    ("width", "instead"),
+    [
+        ("0.31", "0.31 m are 31 cm: type 31"),
+        ("40,5", "type 40.5"),
+        ("0,4m", "type 0.4m"),
+        *((width, "as 40 or 40.5") for width in ("forty", "40 kg", "inf", "nan", "")),
+        ("-40", "expected a length in cm"),
+        ("5000", "2 to 1000"),
+    ],
+)
+def test_a_lane_width_that_is_no_centimetres_is_a_usage_error(width: str, instead: str) -> None:
     result = run("map", "tub", "--lane-width", width, "--out", "map")
     assert result.exit_code == 2 and "--lane-width" in result.stderr
-    assert ("31 cm" in result.stderr) == (width == "0.31")
+    assert instead in result.stderr and ("type" in result.stderr) == ("type" in instead)
+
+
+@pytest.mark.parametrize("width", ["40", "40cm", "40 CM", "400mm", "0.4 m"])
+def test_a_length_may_have_its_unit(width: str) -> None:
+    assert lane_cm(width) == length_cm(width) == pytest.approx(40.0)
+    assert length_cm("2in") == pytest.approx(5.08)
 
 
 def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
