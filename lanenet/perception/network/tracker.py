@@ -47,8 +47,8 @@ _BEYOND_SEEN_CM = 26.0
 #: Narrower than this share of the lane's width no pair is a lane.
 _NARROWEST = 0.3
 _MIDDLE = 1
-#: Length along the road in which both lines have to be seen to tell the lane's width. Tried: with 9 cm the
-#: width of 31 simulated drives was wrong more often, with 20 cm it was known later.
+#: Length along the road in which both lines have to be seen to tell the lane's width. Tried: with 9,
+#: 15 and 20 cm the RMSE of 31 simulated drives was 4.4, 3.3 and 4.8 cm, more than half of the 3.3 by one drive.
 _TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
