@@ -151,6 +151,8 @@ class LaneTracker:
                 starts.append((side, self._last[0][side], moved_cm, _BY_CONTINUING_CM))
         n_usual = len(starts)
         starts += self._beyond_a_crossed_line()
+        # The next lane's lines need not look like those of this one.
+        crossed = self._last is not None and (self._last[0][0, 0] > 0.0 or self._last[0][1, 0] < 0.0)
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
         if starts:
             sides, points, sigmas, scores = zip(*starts, strict=True)
@@ -162,7 +164,8 @@ class LaneTracker:
                     continue
                 # Beyond the left line, that is the right one.
                 known_as = side if i < n_usual else 1 - side
-                score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as, refined.look[i])
+                if not crossed or i >= n_usual:
+                    score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as, refined.look[i])
                 line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
                 candidates[side].append(
                     _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i])
