@@ -66,13 +66,16 @@ class LineLooks:
         sign = 1.0 if self.keep == "right" else -1.0
         self._log_odds += sign * _PLAIN * max(-1.0, min(1.0, like_own))
 
-    def unlike(self, side: int, look: Float[np.ndarray, "3"]) -> float:
+    def hues(self, side: int | None) -> tuple[float, float]:
+        """Return by how much a line is yellower and redder than the floor; NaN while unknown, or of none."""
+        usual = None if side is None else self._usual(side)
+        return (math.nan, math.nan) if usual is None else usual[:2]
+
+    def unlike(self, side: int | None, look: Float[np.ndarray, "3"]) -> float:
         """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""
-        usual = self._usual(side)
-        if usual is None or math.isnan(look[0]):
-            return 0.0
-        off = math.hypot(usual[0] - look[0], usual[1] - look[1]) / _HUE_SIGMA
-        return 1.0 - math.exp(-0.5 * off * off)
+        yellow, red = self.hues(side)
+        off = math.hypot(yellow - look[0], red - look[1]) / _HUE_SIGMA
+        return 0.0 if math.isnan(off) else 1.0 - math.exp(-0.5 * off * off)
 
     def cross(self, side: int) -> None:
         """Go to the lane beyond the left line, 0, or the right one, 1: it is now on the other side."""

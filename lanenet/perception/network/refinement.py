@@ -29,6 +29,9 @@ _COSINE = 0.8
 #: Sigma of an edge point across its line, at y = 0 and its growth per cm ahead; distance at which its weight
 #: is halved; and edge points that count as independent, for all of a line: neighbours share their errors.
 _EDGE_CM, _EDGE_GROWTH, _CAUCHY_CM, _INDEPENDENT = 0.5, 0.02, 0.5, 40.0
+#: Difference of hues that takes three quarters of an edge point's weight. Tried from 0.2 to 0.4, and with the
+#: square: on 24 simulated drives 29 of 1000 points lie more than 3 cm off with it, 33 without.
+_HUE = 0.3
 #: Correlation of the errors of neighbouring label rows in a network's answer, as tried.
 _CORRELATION = 0.5
 #: Least and largest number of edge points of a line, and width of markings.
@@ -120,6 +123,7 @@ def refine_lines(
     borders: RoadBorders,
     marking_cm: Float[np.ndarray, "m"],
     marking_sigma_cm: Float[np.ndarray, "m"],
+    hues: Float[np.ndarray, "m 2"] | None = None,
 ) -> RefinedLines:
     """Fit lines and the widths of their markings to edge points.
 
@@ -134,6 +138,8 @@ def refine_lines(
         borders: The frame's edge points.
         marking_cm: Expected widths, negative for markings that are darker than the floor.
         marking_sigma_cm: Their standard deviations.
+        hues: By how much each marking is yellower and redder than the floor, as in ``look``;
+            NaN while unknown. Edge points of another hue count less.
 
     Returns:
         The lines in the order given.
@@ -157,6 +163,9 @@ def refine_lines(
     )
     at, slope_at = borders.at[index], borders.slope[index]
     certain = there / (_EDGE_CM + _EDGE_GROWTH * np.maximum(y, 0.0)) ** 2
+    if hues is not None:
+        off = np.sign(marking_cm)[:, None, None] * borders.hues[index] - hues[:, None]
+        certain /= np.nan_to_num(1.0 + (off * off).sum(axis=2) / _HUE**2, nan=1.0) ** 2
 
     # 1. The parabola and the width of the marking.
     information = np.zeros((m, 4, 4))

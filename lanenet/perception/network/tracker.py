@@ -48,7 +48,7 @@ _BEYOND_SEEN_CM = 26.0
 _NARROWEST = 0.3
 _MIDDLE = 1
 #: Length along the road in which both lines have to be seen to tell the lane's width. Tried: with 9,
-#: 15 and 20 cm the RMSE of 31 simulated drives was 4.4, 3.3 and 4.8 cm, more than half of the 3.3 by one drive.
+#: 15 and 20 cm the RMSE of 31 simulated drives was 4.4, 3.3 and 4.8 cm, more than half of 3.3 by one drive.
 _TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
@@ -156,16 +156,16 @@ class LaneTracker:
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
         if starts:
             sides, points, sigmas, scores = zip(*starts, strict=True)
-            refined = self._refine(np.array(points), np.array(sigmas), sides, borders)
+            # Beyond a crossed line, that is the lane's other one, and other lines may look like any.
+            known_as = [None if crossed else side for side in sides[:n_usual]]
+            known_as += [1 - side if k % 2 == 0 else None for k, side in enumerate(sides[n_usual:])]
+            refined = self._refine(np.array(points), np.array(sigmas), sides, known_as, borders)
             for i, (side, score_cm) in enumerate(zip(sides, scores, strict=True)):
                 seen_cm = float(refined.seen_cm[i])
                 score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
                 if i >= n_usual and seen_cm < _BEYOND_SEEN_CM:
                     continue
-                # Beyond the left line, that is the right one.
-                known_as = side if i < n_usual else 1 - side
-                if not crossed or i >= n_usual:
-                    score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as, refined.look[i])
+                score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as[i], refined.look[i])
                 line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
                 candidates[side].append(
                     _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i])
@@ -213,6 +213,7 @@ class LaneTracker:
         points_cm: Float[np.ndarray, "m 3"],
         sigma_cm: Float[np.ndarray, "m 3"],
         sides: Sequence[int],
+        known_as: Sequence[int | None],
         borders: RoadBorders,
     ) -> RefinedLines:
         """Refine lines; light or dark is tried until markings are known."""
@@ -223,10 +224,11 @@ class LaneTracker:
         ]
         marking = np.array([usual[side] for side in sides])
         sigma = np.array([_KNOWN_SIGMA_CM if known[side] else _MARKING_SIGMA_CM for side in sides])
-        light = refine_lines(points_cm, sigma_cm, borders, marking, sigma)
+        hues = np.array([self.looks.hues(side) for side in known_as])
+        light = refine_lines(points_cm, sigma_cm, borders, marking, sigma, hues)
         if all(known[side] for side in sides):
             return light
-        dark = refine_lines(points_cm, sigma_cm, borders, -marking, sigma)
+        dark = refine_lines(points_cm, sigma_cm, borders, -marking, sigma, hues)
         darker = (dark.seen_cm > light.seen_cm) & ~np.array([known[side] for side in sides])
         return RefinedLines(
             *(
