@@ -19,7 +19,15 @@ from lanenet.cli.shared.options import (
 )
 from lanenet.errors import CalibrationError, ConfigError, counted
 from lanenet.perception.estimate import DetectorInputs
-from lanenet.perception.registry import KINDS, build_detector, detector_names, kind_of, listed, refuse_mask
+from lanenet.perception.registry import (
+    KINDS,
+    build_detector,
+    detector_for,
+    detector_names,
+    kind_of,
+    listed,
+    refuse_mask,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,19 +48,21 @@ _WITH_MASK = listed(detector_names(lambda kind: kind.takes_mask))
 
 
 @app.command(
-    epilog="Example: lanenet detect tub --detector lane-filter --camera runs/camera.yaml --out runs/l.csv"
+    epilog="Example: lanenet detect tub --model checkpoints/general --camera runs/my_map --out runs/lanes.csv"
 )
 def detect(
     source: Annotated[
         Path,
         typer.Argument(metavar="SOURCE", help="Photo, folder of photos, video, drive or tub."),
     ],
-    detector: Annotated[DetectorName, typer.Option(help="Which detector.")],
     out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).")],
     model: ModelOption = None,
+    detector: Annotated[
+        DetectorName | None, typer.Option(help="Which detector; --model alone means the network.")
+    ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help=f"Camera YAML; {_WITHOUT_CAMERA} need none."),
+        typer.Option("--camera", help=f"Camera YAML, or a map of the same car; {_WITHOUT_CAMERA} need none."),
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
     lane_width: Annotated[
@@ -87,19 +97,21 @@ def detect(
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.detections import check_table_path
-    from lanenet.data.drives.sources import open_source
+    from lanenet.data.drives.sources import check_size, open_source
     from lanenet.evaluation.detect import run_detector
 
+    name = detector_for(detector, model)
     check_not_source(source, out, video)
     lock_outputs(out, video)
     check_table_path(out)
     whole = open_source(source)
     opened = whole if frames is None else whole.numbered(*_frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
-    if used_camera is None and kind_of(detector).needs_camera:
+    if used_camera is not None:
+        check_size(opened, used_camera, camera or source)
+    elif kind_of(name).needs_camera:
         raise CalibrationError(
-            f"{source}: has no camera, expected --camera camera.yaml; "
-            "lanenet map writes one into the map's folder"
+            f"{source}: has no camera, expected --camera with a camera file or a map; {opened.way_to_camera}"
         )
     inputs = DetectorInputs(
         camera=used_camera,
@@ -108,12 +120,12 @@ def detect(
         lane_width_cm=lane_width,
         drive_lane_width_cm=opened.lane_width_cm,
         marking_cm=marking,
-        mask=_mask_of(mask, whole, detector),
+        mask=_mask_of(mask, whole, name),
         config=config,
     )
-    chosen = build_detector(detector, inputs)
+    chosen = build_detector(name, inputs)
     console.show_problems(getattr(chosen, "problems", ()))
-    with console.progress_bar(f"detect ({detector})") as progress:
+    with console.progress_bar(f"detect ({name})") as progress:
         report = run_detector(
             opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
         )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.perception.estimate import DetectorInputs, DetectorKind, EdgeDetector
@@ -57,6 +58,27 @@ def kind_of(name: str) -> DetectorKind:
     raise ConfigError(f"detector {name!r}: expected one of {', '.join(compared_names())}")
 
 
+def detector_for(name: str | None, model: Path | None) -> str:
+    """Return the name of the detector that a person means who gave a name, a model, or both.
+
+    Raises:
+        ConfigError: If neither was given, or the detector of that name takes no model.
+    """
+    with_model = detector_names(lambda kind: kind.needs_model)
+    if name is None and model is None:
+        others = listed(detector_names(lambda kind: not kind.needs_model), "or")
+        raise ConfigError(
+            f"no detector was named: expected --model with a model or checkpoint folder for the "
+            f"{with_model[0]}, as --model checkpoints/general, or --detector {others}"
+        )
+    if name is not None and model is not None and not kind_of(name).needs_model:
+        raise ConfigError(
+            f"detector {name}: takes no model (--model {model}); leave out --detector to use the model, or "
+            "--model to use the detector"
+        )
+    return name or with_model[0]
+
+
 def build_detector(name: str, inputs: DetectorInputs) -> Detector:
     """Build a detector or a variant.
 
@@ -72,7 +94,9 @@ def build_detector(name: str, inputs: DetectorInputs) -> Detector:
     if inputs.camera is None and kind.needs_camera:
         raise CalibrationError(f"detector {name}: expected a camera (--camera camera.yaml)")
     if inputs.model is None and kind.needs_model:
-        raise ConfigError(f"detector {name}: expected a model (--model MODEL)")
+        raise ConfigError(
+            f"detector {name}: expected a model (--model MODEL, as --model checkpoints/general)"
+        )
     return kind.build(_of_variant(name, inputs))
 
 

@@ -81,6 +81,7 @@ def folders(*names: str) -> Callable[[Path], None]:
 MAP = ("--lane-width", "40", "--out", "@m")
 FILTER = ("--detector", "lane-filter", "--out", "@o.csv")
 HOUGH = ("--detector", "hough", "--out", "@o.csv")
+SMALL = Path(__file__).parents[2] / "checkpoints" / "small"
 #: What is done to the folder, the command (``@`` stands for the folder), and what its line has to name.
 BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, ...]]] = {
     "map: no drive": (None, ("map", "@nowhere", *MAP), ("nowhere",)),
@@ -100,7 +101,23 @@ BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, 
     "detect: another camera": (
         other_camera,
         ("detect", "@drive", "--camera", "@other.yaml", *FILTER),
-        ("80x60", "64x48"),
+        ("other.yaml", "80x60", "64x48", "lanenet map", "--camera MAP"),
+    ),
+    # Not the way out for a camera of another size.
+    "detect: another camera of a model": (
+        other_camera,
+        ("detect", "@drive", "--camera", "@other.yaml", "--model", f"{SMALL}", "--out", "@o.csv"),
+        ("80x60", "64x48", "expected the camera that took them"),
+    ),
+    "detect: no detector": (
+        None,
+        ("detect", "@drive", "--out", "@o.csv"),
+        ("--model checkpoints/general", "--detector lane-filter, hough or painter"),
+    ),
+    "detect: a model for a detector that takes none": (
+        None,
+        ("detect", "@drive", *HOUGH, "--model", f"{SMALL}"),
+        ("detector hough: takes no model", "leave out --detector"),
     ),
     "map: a nan in the table": (
         nan_in_the_table,

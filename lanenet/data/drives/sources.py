@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drives import find_format, formats_text, open_drive
-from lanenet.errors import ConfigError, DriveFormatError
+from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.static import find_static, spread_frames
 from lanenet.reading import read_image
@@ -53,6 +54,12 @@ class Source:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def way_to_camera(self) -> str:
+        """How to find the camera of these frames: the end of an error."""
+        drive = "DRIVE" if np.isnan(self.t_s).any() else shlex.quote(self.name)
+        return f"a map finds it: lanenet map {drive} --lane-width CM --out MAP, then --camera MAP"
+
     def numbered(self, first: int, last: int) -> Source:
         """Return the frames numbered first to last, both included.
 
@@ -91,6 +98,30 @@ def open_source(path: Path) -> Source:
             f"{path}: expected {formats_text()}, or photos ({', '.join(PHOTO_ENDINGS)}), found none of them"
         )
     return _photos(path, photos)
+
+
+def check_size(source: Source, camera: Camera, where: Path) -> None:
+    """Refuse a camera for frames of another size, by the first frame that can be read.
+
+    Args:
+        source: The frames.
+        camera: The camera.
+        where: Its file, or what named it.
+
+    Raises:
+        CalibrationError: Names both sizes, and how to find the camera.
+    """
+    for i in range(len(source)):
+        with contextlib.suppress(DriveFormatError):
+            height, width = source.image(i).shape[:2]
+            break
+    else:
+        return
+    if (camera.width, camera.height) != (width, height):
+        raise CalibrationError(
+            f"{where}: the camera is for {camera.width}x{camera.height} px, the images of {source.name} have "
+            f"{width}x{height}: expected the camera that took them, at this size; {source.way_to_camera}"
+        )
 
 
 def _is_photo(path: Path) -> bool:

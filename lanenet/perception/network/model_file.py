@@ -169,8 +169,9 @@ class ModelMeta:
         if not self.any_camera and camera_hash not in self.camera_hashes:
             raise ModelMismatchError(
                 f"{where}: trained with camera {', '.join(self.camera_hashes) or 'unknown'}, but {camera} is "
-                f"{camera_hash}; train with this camera, or allow any camera (--any-camera, "
-                "detector.any_camera) if both are calibrated and see about the same road"
+                f"{camera_hash}; use a model for any camera (checkpoints/general), or train with this camera "
+                "(lanenet train); if it is the same lens at the same place, calibrated once more, allow it "
+                "(--any-camera, detector.any_camera)"
             )
 
     def untrained_widths(self, lane_widths_cm: Iterable[float], where: str) -> list[str]:

@@ -107,7 +107,7 @@ def test_commands_take_the_folder_for_the_model(
     tmp_path: Path, drive: Path, car: Path, simulation: Path
 ) -> None:
     network = ("--detector", "network", "--model", CHECKPOINT)
-    result = run("detect", drive, *network, "--out", tmp_path / "l.csv")
+    result = run("detect", drive, "--model", CHECKPOINT, "--out", tmp_path / "l.csv")
     assert result.exit_code == 0, result.output
     assert np.isfinite(read_detections(tmp_path / "l.csv").points_cm).all()
     for words in (
@@ -167,8 +167,8 @@ def test_labels_of_another_camera_are_refused_as_its_frames_are(tmp_path: Path, 
     assert f"trained with camera {known}, but the camera of {labels} is {other}" in line
     run("simulate", simulation, "camera.height_cm=19", "--out", tmp_path / "d")
     of_frames = error_of(run("val", CHECKPOINT, tmp_path / "d", "--no-baselines"))
-    way_out = line.partition("train with this camera")[2]
-    assert way_out == of_frames.partition("train with this camera")[2] and "--any-camera" in way_out
+    way_out = line.partition("; use a model for any camera")[2]
+    assert way_out == of_frames.partition("; use a model for any camera")[2] and "--any-camera" in way_out
     # A model that is put beside it is asked the same, and the lane filter has no camera to know.
     assert "trained with camera" in error_of(run("val", labels, "--also", CHECKPOINT))
     assert run("val", labels).exit_code == 0
