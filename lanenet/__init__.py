@@ -1,3 +1,11 @@
-"""Lane perception, learning and driving for 1:10 cars."""
+"""Lane perception, learning and driving for 1:10 cars.
+
+In Python :func:`load` gives a network as a function of an image; :func:`map`, :func:`label` and :func:`train`
+do what the commands of these names do.
+"""
+
+from lanenet.api import label, load, map, train
+
+__all__ = ["label", "load", "map", "train"]
 
 __version__ = "0.1.0"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
+
+if TYPE_CHECKING:
+    from datagen.pipeline import Report
 
 app = typer.Typer()
 
@@ -26,6 +29,20 @@ def label(
     ] = None,
 ) -> None:
     """Project a map's lane lines into each frame: six labels per frame, and a report of their quality."""
+    report = label_set(map_folder, out, force, colour_weight)
+    console.show_lines(report.lines)
+    console.wrote(out)
+    console.next_command("val", "MODEL", out)
+
+
+def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | None) -> Report:
+    """Label a map as the command does, with its progress and without its words.
+
+    Raises:
+        ConfigError: If ``out`` is no Parquet file, or one of the map's own files.
+        TrackingLostError: As :func:`datagen.pipeline.label_map`.
+        LanenetError: If another run writes ``out``.
+    """
     from datagen.pipeline import label_map
     from lanenet.perception.edges.road import COLOUR_WEIGHT
 
@@ -34,7 +51,4 @@ def label(
     lock_outputs(out)
     with console.progress_bar("label") as progress:
         weight = COLOUR_WEIGHT if colour_weight is None else colour_weight
-        report = label_map(map_folder, out, progress, force=force, colour_weight=weight)
-    console.show_lines(report.lines)
-    console.wrote(out)
-    console.next_command("val", "MODEL", out)
+        return label_map(map_folder, out, progress, force=force, colour_weight=weight)

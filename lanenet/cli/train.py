@@ -66,6 +66,15 @@ def train(
     marking: MarkingOption = None,
 ) -> None:
     """Make the drives, maps and labels that CONFIG needs, then train, evaluate and export."""
+    train_run(load_settings(run_settings_schema(), config, overrides), marking)
+
+
+def train_run(settings: Any, marking: float | None = None) -> Path:
+    """Do what the command does with the settings of its config, see :func:`run_settings_schema`.
+
+    Returns:
+        The checkpoint's folder.
+    """
     from datagen.datasets.build import prepare
     from lanenet.data.files import json_text
     from lanenet.data.label_set import read_labels
@@ -80,7 +89,6 @@ def train(
     from lanenet.perception.network.model_file import read_model_meta
     from lanenet.samples.dataset import compile_kernels
 
-    settings: Any = load_settings(run_settings_schema(), config, overrides)
     checkpoint = settings.checkpoints_dir / settings.name
     lock_outputs(checkpoint)
     check_start(settings.learn, settings.data.window, settings.data.perceptions)
@@ -136,6 +144,7 @@ def train(
     }
     source = checkpoint / f"example{data.example.suffix}" if data.example is not None else "SOURCE"
     console.next_command("detect", source, *console.given(options))
+    return checkpoint
 
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:

@@ -15,6 +15,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from lanenet.errors import ConfigError
+
 ROWS_CM: tuple[float, float, float] = (0.0, 15.0, 30.0)
 SIDES: tuple[str, str] = ("left", "right")
 POINT_NAMES: tuple[str, ...] = tuple(f"{side}_{row:.0f}_cm" for side in SIDES for row in ROWS_CM)
@@ -22,6 +24,9 @@ N_POINTS = len(POINT_NAMES)
 #: Least distance of the front axle's middle from a line between two lanes, in lane widths; closer, the image
 #: does not show which lane is the car's. Chosen: 2 cm of a lane of 40 cm.
 BESIDE_DIVIDER_LANES = 0.05
+
+#: Widths of lanes. Chosen: a tenth of the width of 1:10 cars, and a road of many lanes.
+_LANE_CM = (2.0, 1000.0)
 
 #: x at the three rows = POINTS_FROM_PARABOLA @ (a, b, c).
 POINTS_FROM_PARABOLA: Float[np.ndarray, "3 3"] = np.array([[y * y, y, 1.0] for y in ROWS_CM])
@@ -31,6 +36,21 @@ PARABOLA_FROM_POINTS: Float[np.ndarray, "3 3"] = np.linalg.inv(POINTS_FROM_PARAB
 #: of a row's distance at most, so that a tight bend does not send the search away; six steps leave less than
 #: the tolerance.
 _STEPS, _MAX_STEP_CM, _TOLERANCE_CM = 6, 30.0, 1e-3
+
+
+def check_lane_width(width_cm: float) -> None:
+    """Refuse a lane's width that is no centimetres.
+
+    Raises:
+        ConfigError: Names the bounds, and the width in centimetres of what seem to be metres.
+    """
+    least, most = _LANE_CM
+    if not least <= width_cm <= most:
+        metres = f"; {width_cm:g} m are {100.0 * width_cm:g} cm: type {100.0 * width_cm:g}"
+        raise ConfigError(
+            f"{width_cm:g}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}"
+            f"{metres if least <= 100.0 * width_cm <= most else ''}"
+        )
 
 
 def parabolas_from_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 2 3"]:

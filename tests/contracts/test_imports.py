@@ -100,6 +100,10 @@ def test_what_starts_on_the_car_loads_no_heavy_package(module: str) -> None:
     assert loaded.isdisjoint(HEAVY), sorted(loaded.intersection(HEAVY))
 
 
+def test_the_package_itself_loads_nothing() -> None:
+    assert loaded_packages("lanenet").isdisjoint({*HEAVY, "numpy", "cv2", "typer", "pydantic", "datagen"})
+
+
 def test_the_check_for_heavy_packages_can_fail() -> None:
     assert "torch" in loaded_packages("lanenet.learn.network")
 

@@ -13,11 +13,10 @@ from typing import Annotated
 import typer
 
 from lanenet.errors import ConfigError
+from lanenet.geometry.lane import check_lane_width
 from lanenet.outputs import lock_output
 from lanenet.perception.registry import detector_names, listed
 
-#: Widths of lanes. Chosen: a tenth of the width of 1:10 cars, and a road of many lanes.
-_LANE_CM = (2.0, 1000.0)
 #: A length is at least this; chosen: the thinnest tape has ten times as much.
 _LEAST_CM = 0.1
 #: Units that may follow a length, in cm; without one it is in cm.
@@ -50,13 +49,10 @@ def length_cm(text: str) -> float:
 def lane_cm(text: str) -> float:
     """Read the width of a lane as :func:`length_cm` does, and refuse one in metres: another parser."""
     value_cm = length_cm(text)
-    least, most = _LANE_CM
-    if not least <= value_cm <= most:
-        metres = f"; {value_cm:g} m are {100.0 * value_cm:g} cm: type {100.0 * value_cm:g}"
-        raise typer.BadParameter(
-            f"{text}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}"
-            f"{metres if least <= 100.0 * value_cm <= most else ''}"
-        )
+    try:
+        check_lane_width(value_cm)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error)) from None
     return value_cm
 
 

@@ -126,6 +126,10 @@ class NetworkDetector:
         confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
         return self._estimate(points_cm, sigma_cm, presence, confirmed)
 
+    def __call__(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
+        """Find the lane in one frame, as :meth:`detect`."""
+        return self.detect(frame_bgr)
+
     def detect_raster(self, raster: UInt8[np.ndarray, "p r c"]) -> LaneEstimate:
         """Find the lane in a bird's-eye raster with all planes: the network alone, with the lane's width."""
         self._raster[:] = raster[: len(self._raster)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from dataclasses import replace
@@ -9,9 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+import lanenet
 from datagen.labels.label_map import label_map
 from datagen.settings import MapSettings
+from lanenet.cli.app import app
 from lanenet.config import dump_settings
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
@@ -31,7 +35,7 @@ from lanenet.data.maps.mapped_drive import (
     points_in_window,
     read_map_frames,
 )
-from lanenet.errors import CalibrationError, DriveFormatError, MapFormatError
+from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, MapFormatError
 from lanenet.evaluation.sources import open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
@@ -146,6 +150,19 @@ def test_labels_are_those_of_the_label_set(folder, tmp_path):
     np.testing.assert_array_equal(frames.points_cm[rows], labels.points_cm)
     left_out = np.delete(frames.points_cm, rows, axis=0)
     assert len(left_out) == 1 and np.isnan(left_out).all()
+
+
+def test_python_labels_as_the_command_does(folder, tmp_path):
+    report = lanenet.label(folder, str(tmp_path / "python.parquet"))
+    result = CliRunner().invoke(app, ["label", str(folder), "--out", str(tmp_path / "command.parquet")])
+    assert result.exit_code == 0 and report.lines[0] in result.stdout
+    assert json.loads((tmp_path / "python.json").read_text()) == report.figures
+    python, command = (tmp_path / f"{name}.parquet" for name in ("python", "command"))
+    assert python.read_bytes() == command.read_bytes()
+    with pytest.raises(ConfigError, match=r"\.parquet"):
+        lanenet.label(folder, tmp_path / "labels.csv")
+    with pytest.raises(ConfigError, match="is a file of"):
+        lanenet.label(folder, next(folder.glob("*.parquet")))
 
 
 def test_a_test_part_is_opened_with_its_own_frames_only(folder, tmp_path):

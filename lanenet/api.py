@@ -1,0 +1,213 @@
+"""The package in Python: a network as a function of an image, and three commands as functions.
+
+Each calls what its command calls. Imports stand in the functions, so that ``import lanenet`` costs nothing:
+the car has neither torch nor numba.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from datagen.pipeline import MapSettings, Report
+    from lanenet.config import Settings, SettingsT
+    from lanenet.geometry.camera import Camera
+    from lanenet.perception.network.detector import NetworkDetector
+
+
+def load(
+    model: str | Path,
+    *,
+    camera: Camera | str | Path | None = None,
+    lane_width_cm: int | float | None = None,
+    any_camera: bool = False,
+) -> NetworkDetector:
+    """Open a network for a camera: the detector that ``lanenet detect`` and ``lanenet drive`` use.
+
+    It keeps the lane from frame to frame, so give it the frames of one drive in their order, and call its
+    ``reset()`` before those of another.
+
+    Args:
+        model: Checkpoint folder or ONNX file.
+        camera: The camera of the images: a camera file, the folder of a map, or a camera. None takes the
+            ``camera.yaml`` beside the model, with a warning if the model is for other cameras as well.
+        lane_width_cm: Between the middles of the lane's two lines. None takes it from the frames that show
+            both.
+        any_camera: Accept a camera that the model was not trained with, if both are calibrated.
+
+    Returns:
+        A function of an image, BGR as OpenCV reads it, of the camera's size, that returns a
+        :class:`lanenet.perception.estimate.LaneEstimate`.
+
+    Raises:
+        CalibrationError: If the camera cannot be read, or none is given and none lies beside the model.
+        ConfigError: If the lane width is no centimetres.
+        ModelMismatchError: If there is no model, or it was made for another camera.
+    """
+    import logging
+
+    from lanenet.data.camera_file import read_camera
+    from lanenet.errors import CalibrationError
+    from lanenet.geometry.camera import Camera
+    from lanenet.geometry.lane import check_lane_width
+    from lanenet.perception.estimate import DetectorInputs
+    from lanenet.perception.network.detector import KIND, NetworkDetector
+    from lanenet.perception.network.model_file import find_model
+    from lanenet.perception.registry import build_detector
+
+    width_cm = _float(lane_width_cm)
+    if width_cm is not None:
+        check_lane_width(width_cm)
+    file = find_model(Path(model))
+    own = file.parent / "camera.yaml"
+    if camera is None and not own.is_file():
+        raise CalibrationError(f"{model}: expected a camera (camera=...), since none lies beside the model")
+    used = camera if isinstance(camera, Camera) else read_camera(own if camera is None else Path(camera))
+    inputs = DetectorInputs(camera=used, model=file, any_camera=any_camera, lane_width_cm=width_cm)
+    detector = build_detector(KIND.name, inputs)
+    assert isinstance(detector, NetworkDetector)
+    if camera is None and detector.meta.camera_hashes != (used.hash,):
+        detector.problems.append(f"camera not given: {own} is taken; images of another one need theirs")
+    for problem in detector.problems:
+        logging.getLogger(__name__).warning(problem)
+    return detector
+
+
+def map(
+    drive: str | Path,
+    out: str | Path,
+    *,
+    lane_width_cm: int | float,
+    camera: str | Path | None = None,
+    config: MapSettings | Mapping[str, Any] | str | Path | None = None,
+    refine_camera: bool = False,
+    wheelbase_cm: int | float | None = None,
+    camera_height_cm: int | float | None = None,
+    tape_width_cm: int | float | None = None,
+) -> Report:
+    """Find the poses of a drive and a map of its lane lines, as ``lanenet map``; without a camera, that too.
+
+    Shows its progress on stderr. Needs ``lanenet[data]``.
+
+    Args:
+        drive: Drive, tub or video.
+        out: Folder for the map, with ``report.html`` and ``camera.yaml`` in it.
+        lane_width_cm: Between the middles of the lane's two lines.
+        camera: Camera file, or an earlier map of the same car.
+        config: Settings of the mapping, or their file.
+        refine_camera: Adjust a known camera to this drive.
+        wheelbase_cm: Distance between the car's axles.
+        camera_height_cm: Height of the lens above the road: helps to find a camera that is not known.
+        tape_width_cm: Width of the tape: checks the lane width.
+
+    Returns:
+        ``lines`` for people, of which the first is the verdict, and ``figures`` for programs. The
+        grade, ``figures["verdict"]["grade"]``, is ``good``, ``usable`` or ``reject``; :func:`label` refuses
+        the last.
+
+    Raises:
+        CalibrationError: If the camera does not fit the images or the lane width.
+        ConfigError: If the lane width is no centimetres, or a setting is wrong.
+        LanenetError: If the drive cannot be read or mapped, or ``out`` cannot be written.
+    """
+    from datagen.pipeline import MapRequest, MapSettings, map_drive
+    from lanenet.cli.shared import console
+    from lanenet.geometry.lane import check_lane_width
+
+    check_lane_width(float(lane_width_cm))
+    settings = MapSettings() if config is None else _settings(MapSettings, config)
+    request = MapRequest(
+        Path(drive),
+        float(lane_width_cm),
+        None if camera is None else Path(camera),
+        refine_camera,
+        _float(wheelbase_cm),
+        _float(camera_height_cm),
+        _float(tape_width_cm),
+    )
+    with console.progress_bar("map") as progress:
+        return map_drive(request, settings, Path(out), progress)
+
+
+def label(
+    map_folder: str | Path,
+    out: str | Path,
+    *,
+    force: bool = False,
+    colour_weight: float | None = None,
+) -> Report:
+    """Project a map's lane lines into each frame: six labels per frame, as ``lanenet label``.
+
+    Shows its progress on stderr. Needs ``lanenet[data]``.
+
+    Args:
+        map_folder: What :func:`map` wrote.
+        out: Label set to write (``.parquet``), with a report (``.json``) and a picture (``.png``) beside it.
+        force: Label a rejected map, too.
+        colour_weight: Weight of colour beside brightness when edges are found, 0 to 1; None takes the usual.
+
+    Returns:
+        ``lines`` for people and ``figures`` for programs.
+
+    Raises:
+        ConfigError: If ``out`` is no Parquet file, or one of the map's own files.
+        TrackingLostError: If the map was rejected, or no frame can be labelled.
+        LanenetError: If the map cannot be read or ``out`` cannot be written.
+    """
+    from lanenet.cli import label as command
+    from lanenet.cli.shared.options import held_to_the_end
+
+    with held_to_the_end():
+        return command.label_set(Path(map_folder), Path(out), force, colour_weight)
+
+
+def train(
+    config: Settings | Mapping[str, Any] | str | Path,
+    *overrides: str,
+    marking_cm: int | float | None = None,
+) -> Path:
+    """Make the drives, maps and labels that a config needs, train, evaluate and export, as ``lanenet train``.
+
+    Shows its progress on stderr and prints the tables of the test. What is there already is used, and a run
+    that was interrupted resumes. Needs ``lanenet[train]``.
+
+    Args:
+        config: Settings of the run or their file, as ``configs/finetune.yaml``.
+        overrides: Settings that replace those of the config, as ``learn.epochs=5``.
+        marking_cm: Width of the tape for the detectors that it is compared with.
+
+    Returns:
+        The checkpoint's folder, which :func:`load` opens.
+
+    Raises:
+        ConfigError: If a setting is wrong.
+        LanenetError: If a drive cannot be mapped, or another run writes the checkpoint.
+    """
+    from lanenet.cli import train as command
+    from lanenet.cli.shared.options import held_to_the_end
+
+    settings = _settings(command.run_settings_schema(), config, overrides)
+    with held_to_the_end():
+        return command.train_run(settings, _float(marking_cm))
+
+
+def _float(value: int | float | None) -> float | None:
+    """A length as the package has it; people write 40 as well as 40.0."""
+    return None if value is None else float(value)
+
+
+def _settings(
+    schema: type[SettingsT],
+    config: Settings | Mapping[str, Any] | str | Path,
+    overrides: Sequence[str] = (),
+) -> SettingsT:
+    """Check settings, whether they are a file, plain values or settings already."""
+    from lanenet.config import Settings, apply_overrides, check_settings, load_settings
+
+    if isinstance(config, str | Path):
+        return load_settings(schema, Path(config), list(overrides))
+    plain = config.model_dump() if isinstance(config, Settings) else dict(config)
+    return check_settings(schema, apply_overrides(plain, list(overrides)), "config")

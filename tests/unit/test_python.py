@@ -1,0 +1,134 @@
+"""The package in Python: a model in three lines, and commands as functions."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+from typing import Any, assert_type
+
+import cv2
+import numpy as np
+import pytest
+
+import lanenet
+from datagen.pipeline import MapRequest, MapSettings
+from lanenet.cli import train as train_command
+from lanenet.data.camera_file import read_camera
+from lanenet.errors import CalibrationError, ConfigError, LanenetError, ModelMismatchError
+from lanenet.perception.estimate import DetectorInputs, LaneEstimate
+from lanenet.perception.network.detector import NetworkDetector
+from lanenet.perception.registry import build_detector
+
+CHECKPOINTS = Path(__file__).resolve().parents[2] / "checkpoints"
+SMALL, GENERAL = CHECKPOINTS / "small", CHECKPOINTS / "general"
+
+
+def example(checkpoint: Path) -> Any:
+    image = cv2.imread(str(checkpoint / "example.jpg"))
+    assert image is not None
+    return image
+
+
+def test_three_lines_give_the_lane_that_the_commands_see() -> None:
+    image = example(GENERAL)
+    model = lanenet.load(str(GENERAL), camera=str(GENERAL / "camera.yaml"), lane_width_cm=40)
+    lanes = model(image)
+    # What type checkers know: mypy looks at this file, too.
+    assert_type(model, NetworkDetector)
+    assert_type(lanes, LaneEstimate)
+    camera = read_camera(GENERAL / "camera.yaml")
+    detector = build_detector("network", DetectorInputs(camera=camera, model=GENERAL, lane_width_cm=40.0))
+    same = detector.detect(image)
+    assert np.isfinite(lanes.points_cm).all()
+    np.testing.assert_array_equal(lanes.points_cm, same.points_cm)
+    assert (lanes.steering_rad, lanes.confidence) == (same.steering_rad, same.confidence)
+    # As users of other libraries turn RGB around, without a copy.
+    model.reset()
+    np.testing.assert_array_equal(model(image[..., ::-1].copy()[..., ::-1]).points_cm, lanes.points_cm)
+
+
+@pytest.mark.parametrize("of", ["file", "camera", "map", "none", "onnx"])
+def test_a_camera_may_be_given_in_many_ways(
+    of: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = SMALL / "camera.yaml"
+    shutil.copy(path, tmp_path)
+    (tmp_path / "map.yaml").write_text("verdict: good\n")
+    given: Any = {"file": path, "camera": read_camera(path), "map": tmp_path}.get(of)
+    with caplog.at_level(logging.WARNING):
+        model = lanenet.load(SMALL / "model.onnx" if of == "onnx" else SMALL, camera=given)
+    assert np.isfinite(model(example(SMALL)).points_cm).all()
+    # The camera beside this model is the only one that it was trained with.
+    assert not model.problems and not caplog.records
+
+
+def test_one_of_many_cameras_is_not_taken_in_silence(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        model = lanenet.load(GENERAL, lane_width_cm=40)
+    (record,) = caplog.records
+    assert model.problems == [record.getMessage()]
+    assert "camera not given" in model.problems[0] and "general/camera.yaml" in model.problems[0]
+
+
+def test_what_cannot_be_loaded_says_why(tmp_path: Path) -> None:
+    shutil.copy(SMALL / "model.onnx", tmp_path)
+    with pytest.raises(CalibrationError, match=r"expected a camera \(camera=\.\.\.\)"):
+        lanenet.load(tmp_path)
+    with pytest.raises(ConfigError, match=r"0\.4 m are 40 cm"):
+        lanenet.load(SMALL, lane_width_cm=0.4)
+    with pytest.raises(ModelMismatchError, match="any_camera"):
+        lanenet.load(SMALL, camera=GENERAL / "camera.yaml")
+    lanenet.load(SMALL, camera=GENERAL / "camera.yaml", any_camera=True)
+    with pytest.raises(ModelMismatchError, match="no such file"):
+        lanenet.load(tmp_path / "none")
+
+
+def test_map_hands_on_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr("datagen.pipeline.map_drive", lambda *args: asked.append(args))
+    file = tmp_path / "map.yaml"
+    file.write_text("seed: 7\n")
+    settings = MapSettings(seed=7)
+    for config in (file, str(file), {"seed": 7}, settings):
+        lanenet.map("tub", "m", lane_width_cm=38.5, camera="c.yaml", config=config, tape_width_cm=1.9)
+        request = MapRequest(Path("tub"), 38.5, Path("c.yaml"), tape_width_cm=1.9)
+        assert asked.pop()[:3] == (request, settings, Path("m"))
+    lanenet.map("tub", "m", lane_width_cm=38.5)
+    assert asked.pop()[:2] == (MapRequest(Path("tub"), 38.5), MapSettings())
+    with pytest.raises(ConfigError, match="unknown key 'sed'"):
+        lanenet.map("tub", "m", lane_width_cm=38.5, config={"sed": 7})
+    with pytest.raises(ConfigError, match=r"0\.38 m are 38 cm"):
+        lanenet.map("tub", "m", lane_width_cm=0.38)
+    assert not asked
+
+
+def test_map_refuses_what_is_no_drive(tmp_path: Path) -> None:
+    with pytest.raises(LanenetError, match="nothing"):
+        lanenet.map(tmp_path / "nothing", tmp_path / "map", lane_width_cm=40)
+    assert not (tmp_path / "map").exists()
+
+
+def test_train_takes_a_config_as_a_file_or_as_values(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Any] = []
+
+    def train_run(settings: Any, marking: float | None) -> Path:
+        asked.append((settings, marking))
+        return Path(settings.checkpoints_dir / settings.name)
+
+    monkeypatch.setattr(train_command, "train_run", train_run)
+    file = tmp_path / "run.yaml"
+    file.write_text("name: mine\ndata: {synthetic: {train: 1, validation: 1}}\n")
+    values = {"name": "mine", "data": {"synthetic": {"train": 1, "validation": 1}}}
+    for config in (file, values):
+        assert lanenet.train(config, "learn.epochs=5", marking_cm=2.0) == Path("checkpoints/mine")
+    assert asked[0] == asked[1] and asked[0][0].learn.epochs == 5 and asked[0][1] == 2.0
+    assert lanenet.train(asked[0][0], "name=yours") == Path("checkpoints/yours")
+    with pytest.raises(ConfigError, match="unknown key 'nmae'"):
+        lanenet.train({"nmae": "mine"})
+
+
+def test_the_names_are_seen() -> None:
+    assert {"load", "map", "label", "train"} <= set(dir(lanenet))
+    for name in lanenet.__all__:
+        assert "Raises:" in (getattr(lanenet, name).__doc__ or "")
