@@ -1,12 +1,13 @@
 """The command ``lanenet``: puts the verbs together, and turns errors of the input into one line.
 
-A module of verbs has a Typer ``app`` and stands in ``_VERBS`` in the order of the help. Verbs import
-``datagen`` and ``lanenet.learn`` inside their functions, since the car has neither torch nor numba.
+A module of verbs has a Typer ``app`` and stands in ``_VERBS`` in the groups and the order of the help. Verbs
+import ``datagen`` and ``lanenet.learn`` inside their functions, since the car has neither torch nor numba.
 """
 
 from __future__ import annotations
 
 from importlib import metadata
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -15,14 +16,15 @@ from typer.core import TyperGroup
 from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
-from lanenet.cli.shared import console
+from lanenet.cli.shared import console, standing
 from lanenet.cli.shared.options import held_to_the_end
 from lanenet.errors import LanenetError
 
-_VERBS = (
-    *(simulate, map, label, train, sweep, calibrate, detect, bench, analyse, doctor, drive, stop, export),
-    *(localise, val, worlds, judge, reality),
-)
+_VERBS = {
+    "Your own drive": (map, label, train, val, detect, calibrate),
+    "On the car": (doctor, bench, drive, stop, export),
+    "Research": (simulate, sweep, judge, worlds, reality, localise, analyse),
+}
 #: The extra that brings a package, for the message when the package is missing.
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "torchvision", "onnx", "onnxscript", "safetensors", "tensorboard"), "train"),
@@ -34,12 +36,15 @@ _EXTRA_OF = {
 
 
 class _Group(TyperGroup):
-    """Turns errors of the input into one line and an exit code."""
+    """Says where the user stands if no verb is given; turns errors of the input into one line and a code."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
             with held_to_the_end():
-                return super().invoke(ctx)
+                answer = super().invoke(ctx)
+                if ctx.invoked_subcommand is None:
+                    standing.say_standing(Path())
+                return answer
         except (LanenetError, OSError) as error:
             message = str(error)
         except MemoryError as error:
@@ -62,12 +67,18 @@ class _Group(TyperGroup):
 
 app = typer.Typer(
     cls=_Group,
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_show_locals=False,
-    help="Drive two laps, get a lane network. Every command has --help with an example.",
+    help="Drive two laps, get a lane network. Every command has --help with an example; without one, lanenet "
+    "says what lies in this folder and what comes next.",
 )
-for _verb in _VERBS:
-    app.add_typer(_verb.app)
+for _panel, _verbs in _VERBS.items():
+    for _verb in _verbs:
+        # Those of a group, such as calibrate, stand in the help of the group.
+        if _verb is not calibrate:
+            for _command in _verb.app.registered_commands:
+                _command.rich_help_panel = _panel
+        app.add_typer(_verb.app, rich_help_panel=_panel)
 
 
 def main() -> None:

@@ -1,0 +1,83 @@
+"""``lanenet`` alone: what lies in a folder, and what comes next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from drives import record, write_drive, write_tub
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
+from lanenet.cli.shared.standing import look_around
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, which is the working folder."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def said() -> str:
+    result = CliRunner().invoke(app, [])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def add_map(folder: Path, drive: Path, name: str = "map", **content: str) -> None:
+    folder.mkdir(parents=True)
+    (folder / f"{name}.yaml").write_text(yaml.safe_dump({"drive": str(drive.resolve()), **content}))
+
+
+def test_it_goes_with_the_user_from_drive_to_network(here: Path) -> None:
+    assert "copy a drive here" in said() and "lanenet --help" in said()
+    (here / "mycar" / "data").mkdir(parents=True)
+    tub = write_tub(here / "mycar" / "data" / "tub_1", [record(0)])
+    assert "drives       mycar/data/tub_1" in said()
+    assert "next: lanenet map mycar/data/tub_1 --lane-width CM --out runs/tub_1" in said()
+    add_map(here / "runs" / "tub_1", tub, verdict="good")
+    assert "maps         runs/tub_1" in said()
+    assert "next: lanenet label runs/tub_1 --out runs/tub_1.parquet" in said()
+    for ending in ("parquet", "json"):
+        (here / "runs" / f"tub_1.{ending}").touch()
+    add_map(here / "checkpoints" / "general", tub, "checkpoint")
+    assert "label sets   runs/tub_1.parquet" in said() and "checkpoints  checkpoints/general" in said()
+    assert "next: lanenet val checkpoints/general runs/tub_1" in said()
+
+
+@pytest.mark.parametrize("name", ["map", "refused"])
+def test_a_drive_without_a_good_map_is_not_mapped_once_more(here: Path, name: str) -> None:
+    add_map(here / "runs" / "lap", write_drive(here / "lap", 2), name, verdict="reject")
+    assert "no good map  runs/lap" in said() and "in runs/lap/report.html" in said()
+    # The next drive is.
+    write_drive(here / "lap2", 2)
+    assert "next: lanenet map lap2 " in said()
+
+
+def test_what_is_damaged_hidden_or_part_of_something_is_no_drive(here: Path) -> None:
+    write_drive(here / "lap" / "images" / "inner", 2)
+    write_drive(here / ".cache" / "lap", 2)
+    (here / "lap" / "frames.csv").touch()
+    (here / "lanes.parquet").touch()
+    (here / "runs").mkdir()
+    for folder in ("runs", "."):
+        (here / folder / "clip.mp4").touch()
+    (here / "broken").mkdir()
+    (here / "broken" / "map.yaml").write_text("[")
+    found = look_around(Path())
+    # An annotated video of a run is no drive.
+    assert found.drives == (Path("clip.mp4"), Path("lap"))
+    assert list(found.refused) == [Path("broken")] and not found.maps and not found.label_sets
+
+
+def test_help_has_its_verbs_in_groups() -> None:
+    text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).stdout
+    at = [
+        text.index(word)
+        for word in ("Your own drive", " map ", "On the car", " stop ", "Research", " judge ")
+    ]
+    assert at == sorted(at)
