@@ -11,6 +11,7 @@ from datagen.assemble import AssembledMap, assemble
 from datagen.check import CheckedMap, check_map
 from datagen.compile_ahead import compile_ahead
 from datagen.labels.label_map import label_map
+from datagen.made import Output, fingerprint, key_of
 from datagen.prepare import MapRequest, prepare
 from datagen.quality.figures import Report, map_edges
 from datagen.quality.layout import PAGE_NAME
@@ -29,7 +30,7 @@ from lanenet.data.tables import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.outputs import lock_output
 
-__all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive"]
+__all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive", "map_key"]
 
 _SHOWN = 24  # frames on the contact sheet: six rows of four
 
@@ -63,7 +64,7 @@ def map_drive(
         check_replaceable(out, "map")
         attempt = Attempt(request, settings)
         try:
-            return _map_drive(attempt, out, progress, pictures)
+            return _map_drive(attempt, map_key(request, settings), out, progress, pictures)
         except (CalibrationError, DriveFormatError) as error:
             page = _refused(attempt, error, out) if pictures else ""
             raise type(error)(f"{error}{kept_map(out)}{page}") from error
@@ -71,6 +72,18 @@ def map_drive(
             where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
             page = _refused(attempt, error, out) if pictures else ""
             raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}{page}") from error
+
+
+def map_key(request: MapRequest, settings: MapSettings) -> str:
+    """Return the hash of all that a map is made from, by which a finished one is known again.
+
+    Raises:
+        DriveFormatError: If there is no such drive.
+    """
+    camera = request.camera_path
+    files = [request.drive_path, *([] if camera is None or not camera.exists() else [camera])]
+    known = {**vars(request), "drive_path": None, "camera_path": None}
+    return key_of(known, [str(path.resolve()) for path in files], settings, *map(fingerprint, files))
 
 
 def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
@@ -83,7 +96,7 @@ def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
         return f"; its report could not be written ({failed})"
 
 
-def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures: bool) -> Report:
+def _map_drive(attempt: Attempt, key: str, out: Path, progress: Progress | None, pictures: bool) -> Report:
     request = attempt.request
     prepared = attempt.prepared = prepare(request, attempt.settings)
     settings = prepared.settings
@@ -112,6 +125,7 @@ def _map_drive(attempt: Attempt, out: Path, progress: Progress | None, pictures:
         write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
         if pictures:
             _draw(folder, assembled, checked, figures, settings)
+        Output(folder / "map.yaml", key).mark()
     verdict = checked.verdict
     first = f"verdict: {verdict.grade}: {verdict.sentence}"
     return Report((first, *verdict.reasons, *notes, *verdict.remarks), figures)

@@ -55,6 +55,7 @@ class MapRequest:
         camera_height_cm: Height of the lens above the road, for a camera that is to be found: together with
             the lane width it determines the focal length. None if it was not measured.
         tape_width_cm: Width of the tape, with which the scale is checked. None if it was not measured.
+        frames: First and last number of the frames to map; None for the whole recording.
     """
 
     drive_path: Path
@@ -64,6 +65,16 @@ class MapRequest:
     wheelbase_cm: float | None = None
     camera_height_cm: float | None = None
     tape_width_cm: float | None = None
+    frames: tuple[int, int] | None = None
+
+    def open_drive(self) -> Drive:
+        """Open the frames of the recording that are to be mapped.
+
+        Raises:
+            DriveFormatError: If the recording cannot be read, or has none of them.
+        """
+        drive = open_drive(self.drive_path)
+        return drive if self.frames is None else drive.numbered(*self.frames)
 
 
 @dataclass(frozen=True)
@@ -101,10 +112,12 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
             if the images are those of a full-circle fisheye, and the camera is not known.
         DriveFormatError: If the recording cannot be read.
     """
-    recorded, unreadable = readable_frames(keep_images(open_drive(request.drive_path)))
+    recorded, unreadable = readable_frames(keep_images(request.open_drive()))
     check_count(recorded)
     check_moving(recorded)
     notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
+    if request.frames is not None:
+        notes.append(f"only the frames from {recorded.frames[0]} to {recorded.frames[-1]} were asked for")
     drive, found = following_frames(recorded)
     drive, deleted = without_deleted(drive)
     check_count(drive)

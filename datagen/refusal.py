@@ -21,7 +21,7 @@ from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
 from datagen.slam.commands import commands_of
 from datagen.slam.segment import SolvedSegment
 from datagen.slam.view import mapping_range
-from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives import Drive
 from lanenet.data.files import atomic_folder, write_text
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.geometry.camera import Camera
@@ -60,7 +60,7 @@ class Attempt:
     @property
     def drive(self) -> Drive:
         """The frames that were to be mapped; the whole recording if it was refused before."""
-        return open_drive(self.request.drive_path) if self.prepared is None else self.prepared.drive
+        return self.request.open_drive() if self.prepared is None else self.prepared.drive
 
     @property
     def known_camera(self) -> Camera | None:

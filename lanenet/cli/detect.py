@@ -11,13 +11,15 @@ import typer
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import (
     AnyCameraOption,
+    FramesOption,
     MarkingOption,
     ModelOption,
     check_not_source,
+    frame_range,
     lane_cm,
     lock_outputs,
 )
-from lanenet.errors import CalibrationError, ConfigError, counted
+from lanenet.errors import CalibrationError, counted
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
     KINDS,
@@ -75,9 +77,7 @@ def detect(
     ] = None,
     marking: MarkingOption = None,
     any_camera: AnyCameraOption = False,
-    frames: Annotated[
-        str | None, typer.Option(help="Only these frame numbers, FIRST:LAST.", metavar="FIRST:LAST")
-    ] = None,
+    frames: FramesOption = None,
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Give unreadable frames an empty row and continue.")
     ] = False,
@@ -105,7 +105,7 @@ def detect(
     lock_outputs(out, video)
     check_table_path(out)
     whole = open_source(source)
-    opened = whole if frames is None else whole.numbered(*_frame_range(frames))
+    opened = whole if frames is None else whole.numbered(*frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is not None:
         check_size(opened, used_camera, camera or source)
@@ -169,14 +169,3 @@ def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarra
     found, message = find_mask(source)
     console.say(message)
     return found
-
-
-def _frame_range(text: str) -> tuple[int, int]:
-    first, colon, last = text.partition(":")
-    if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
-        raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
-    if int(last) < int(first):
-        raise ConfigError(
-            f"--frames {text!r}: the last frame is before the first, expected FIRST:LAST, as in 700:999"
-        )
-    return int(first), int(last)

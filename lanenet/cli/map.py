@@ -9,14 +9,17 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import (
+    CameraHeightOption,
     CameraOption,
     DriveArgument,
+    FramesOption,
     MappingOption,
+    TapeWidthOption,
     WheelbaseOption,
+    frame_range,
     lane_cm,
-    length_cm,
 )
-from lanenet.config import load_settings
+from lanenet.config import load_settings, read_yaml
 from lanenet.errors import LanenetError
 
 app = typer.Typer()
@@ -36,25 +39,24 @@ def map_drive(
         bool, typer.Option("--refine-camera", help="Adjust a known camera to this drive.")
     ] = False,
     wheelbase: WheelbaseOption = None,
-    camera_height: Annotated[
-        float | None,
-        typer.Option(
-            parser=length_cm,
-            metavar="CM",
-            help="Height of the lens above the road, cm: helps to find a camera that is not known.",
-        ),
-    ] = None,
-    tape_width: Annotated[
-        float | None,
-        typer.Option(parser=length_cm, metavar="CM", help="Width of the tape, cm: checks the lane width."),
-    ] = None,
+    camera_height: CameraHeightOption = None,
+    tape_width: TapeWidthOption = None,
+    frames: FramesOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the map of another drive in this folder, too.")
+    ] = False,
 ) -> None:
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
     from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
-    request = MapRequest(drive, lane_width, camera, refine_camera, wheelbase, camera_height, tape_width)
+    if not force:
+        _check_same_drive(out, drive)
+    numbers = None if frames is None else frame_range(frames)
+    request = MapRequest(
+        drive, lane_width, camera, refine_camera, wheelbase, camera_height, tape_width, numbers
+    )
     with console.progress_bar("map") as progress:
         report = run(request, settings, out, progress)
     console.show_lines(report.lines)
@@ -62,3 +64,13 @@ def map_drive(
     if report.figures["verdict"]["grade"] == "reject":
         raise LanenetError(f"{out}: the map was rejected: it is kept for inspection, but gives no labels")
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
+
+
+def _check_same_drive(out: Path, drive: Path) -> None:
+    """Refuse to replace a map of another drive: it takes minutes to make, and the name may be a mistake."""
+    file = out / "map.yaml"
+    mapped = read_yaml(file).get("drive") if file.is_file() else None
+    if mapped is not None and Path(str(mapped)).resolve() != drive.resolve():
+        raise LanenetError(
+            f"{out}: holds the map of another drive, {mapped}; choose another --out, or replace it with --force"
+        )

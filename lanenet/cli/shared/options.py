@@ -56,6 +56,18 @@ def lane_cm(text: str) -> float:
     return value_cm
 
 
+def frame_range(text: str) -> tuple[int, int]:
+    """Read the numbers of a first and a last frame, ``FIRST:LAST``: the parser of such options."""
+    first, colon, last = text.partition(":")
+    if not (colon and first.strip().isdecimal() and last.strip().isdecimal()):
+        raise ConfigError(f"--frames {text!r}: expected FIRST:LAST, as in 700:999")
+    if int(last) < int(first):
+        raise ConfigError(
+            f"--frames {text!r}: the last frame is before the first, expected FIRST:LAST, as in 700:999"
+        )
+    return int(first), int(last)
+
+
 DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="Camera YAML, or an earlier map of the same car.")
@@ -63,6 +75,25 @@ CameraOption = Annotated[
 WheelbaseOption = Annotated[
     float | None,
     typer.Option("--wheelbase", parser=length_cm, metavar="CM", help="Distance between the car's axles, cm."),
+]
+CameraHeightOption = Annotated[
+    float | None,
+    typer.Option(
+        "--camera-height",
+        parser=length_cm,
+        metavar="CM",
+        help="Height of the lens above the road, cm: helps to find a camera that is not known.",
+    ),
+]
+TapeWidthOption = Annotated[
+    float | None,
+    typer.Option(
+        "--tape-width", parser=length_cm, metavar="CM", help="Width of the tape, cm: checks the lane width."
+    ),
+]
+FramesOption = Annotated[
+    str | None,
+    typer.Option("--frames", metavar="FIRST:LAST", help="Only the frames with these numbers, both included."),
 ]
 MappingOption = Annotated[
     Path | None, typer.Option("--config", help="YAML with the mapping's settings, or a map's settings.yaml.")

@@ -143,6 +143,19 @@ class Drive:
             )
         return image
 
+    def numbered(self, first: int, last: int) -> Drive:
+        """Return the frames numbered first to last, both included.
+
+        Raises:
+            DriveFormatError: If there is none.
+        """
+        rows = slice(*np.searchsorted(self.frames, (first, last + 1)).tolist())
+        if rows.start >= rows.stop:
+            raise DriveFormatError(
+                f"{self.path}: no frame from {first} to {last}; it has {self.frames[0]} to {self.frames[-1]}"
+            )
+        return self.subset(rows)
+
     def subset(self, keep: slice | Bool[np.ndarray, "_"] | Int[np.ndarray, "_"]) -> Drive:
         """Return some frames of the drive.
 

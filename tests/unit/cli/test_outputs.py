@@ -174,3 +174,17 @@ def test_a_full_disk_and_no_memory_are_one_line(monkeypatch: pytest.MonkeyPatch,
 
         monkeypatch.setattr("lanenet.data.camera_file.read_camera", fail)
         assert word in refused(tmp_path, "analyse", "nowhere.yaml")
+
+
+def test_the_map_of_another_drive_is_replaced_with_force_only(tmp_path):
+    """A map takes minutes; a drive that cannot be mapped ends the commands that are let through."""
+    for name in ("one", "other"):
+        with DriveWriter(tmp_path / name) as writer:
+            writer.add(np.zeros((48, 64, 3), np.uint8), 0.0)
+    drive_map = touched(tmp_path / "map", "map.yaml")
+    (drive_map / "map.yaml").write_text(f"format: lanenet-map/1\ndrive: {tmp_path / 'one'}\n")
+    words = ("map", tmp_path / "other", "--lane-width", "40", "--out", drive_map)
+    assert f"map of another drive, {tmp_path / 'one'}" in refused(tmp_path, *words)
+    for again in ((*words, "--force"), ("map", tmp_path / "one", *words[2:])):
+        result = CliRunner().invoke(app, [str(word) for word in again])
+        assert result.exit_code == 1 and "1 frame of a car that drives" in result.stderr

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from drives import CAMERA, edit, frame_image, write_drive
+from made_up_drive import made_up_drive
 
 from lanenet.data.drives import Drive, open_drive, read_truth
 from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
@@ -123,6 +124,16 @@ def test_pauses_are_breaks_and_short_gaps_are_not(tmp_path: Path) -> None:
     assert breaks_of(thinned) == [2]
     with pytest.raises(DriveFormatError, match="no frames"):
         drive.subset(slice(0, 0))
+
+
+def test_frames_are_chosen_by_their_numbers_both_ends_included() -> None:
+    drive = made_up_drive(20, [7], first_frame=100)
+    part = drive.numbered(105, 109)
+    assert part.frames.tolist() == [105, 106, 107, 108, 109] and breaks_of(part) == [2]
+    assert len(drive.numbered(0, 10_000)) == 20
+    for first, last in ((0, 99), (120, 130)):
+        with pytest.raises(DriveFormatError, match="it has 100 to 119"):
+            drive.numbered(first, last)
 
 
 def test_a_drive_that_numbers_every_third_frame_has_no_gaps(tmp_path: Path) -> None:

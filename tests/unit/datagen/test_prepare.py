@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import write_drive
 from made_up_drive import made_up_drive
 
+from datagen.pipeline import map_key
 from datagen.prepare import (
     KeptImages,
     MapRequest,
@@ -44,6 +46,44 @@ def test_a_handful_of_frames_is_refused_for_being_few(tmp_path, frames):
             writer.add(np.full((48, 64, 3), 20 * k, np.uint8), 0.05 * k)
     with pytest.raises(TrackingLostError, match=f"{frames} frame"):
         prepare(MapRequest(tmp_path / "drive", 40.0), MapSettings())
+
+
+def test_only_the_frames_that_were_asked_for_are_mapped(tmp_path):
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k in range(200):
+            writer.add(rng.integers(0, 255, (48, 64, 3)).astype(np.uint8), 0.05 * k, throttle=0.2)
+    prepared = prepare(MapRequest(tmp_path / "drive", 40.0, frames=(50, 149)), MapSettings())
+    assert (prepared.drive.frames[0], prepared.drive.frames[-1]) == (50, 149)
+    assert any("from 50 to 149" in note for note in prepared.notes)
+    with pytest.raises(TrackingLostError, match="50 frames"):
+        prepare(MapRequest(tmp_path / "drive", 40.0, frames=(100, 149)), MapSettings())
+
+
+def test_a_map_is_known_by_all_that_it_is_made_from(tmp_path, monkeypatch):
+    write_drive(tmp_path / "drive")
+    write_drive(tmp_path / "other")
+    drive = tmp_path / "drive"
+    settings = MapSettings()
+    keys = [
+        map_key(request, settings)
+        for request in (
+            MapRequest(drive, 40.0),
+            MapRequest(tmp_path / "other", 40.0),
+            MapRequest(drive, 41.0),
+            MapRequest(drive, 40.0, wheelbase_cm=17.0),
+            MapRequest(drive, 40.0, tape_width_cm=2.0),
+            MapRequest(drive, 40.0, frames=(0, 3)),
+            MapRequest(drive, 40.0, drive / "camera.yaml"),
+        )
+    ]
+    keys.append(map_key(MapRequest(drive, 40.0), MapSettings(held_out_every=0)))
+    assert len(set(keys)) == len(keys)
+    # Not by the folder from which it was made.
+    monkeypatch.chdir(tmp_path)
+    assert map_key(MapRequest(Path("drive"), 40.0), settings) == keys[0]
+    with pytest.raises(DriveFormatError, match="no such drive"):
+        map_key(MapRequest(tmp_path / "nowhere", 40.0), settings)
 
 
 def test_a_camera_of_another_size_is_refused():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.datasets.jobs import Output, fingerprint, key_of
+from datagen.made import Output, fingerprint, key_of
 from lanenet.config import Settings
 from lanenet.errors import DriveFormatError
 

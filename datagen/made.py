@@ -1,0 +1,89 @@
+"""What is made once: each output has a marker beside it, with a hash of everything it was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lanenet.config import Settings
+from lanenet.data.files import write_json
+from lanenet.errors import ConfigError, DriveFormatError
+from lanenet.outputs import lock_output
+from lanenet.reading import read_json
+
+_VERSION = 16  # of drives, maps and label sets; raise it when the same settings give others
+
+
+def key_of(*parts: object) -> str:
+    """Hash what an output is made from: settings, dataclasses and plain values; the order of keys is free."""
+    text = json.dumps([_VERSION, parts], sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _plain(value: Any) -> Any:
+    return value.model_dump(mode="json") if isinstance(value, Settings) else asdict(value)
+
+
+def fingerprint(path: Path) -> str:
+    """Hash name, size and time of a recording's files: cheap, and changes when the recording does.
+
+    Raises:
+        DriveFormatError: If the recording does not exist.
+    """
+    if not path.exists():
+        raise DriveFormatError(f"{path}: no such drive")
+    files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
+    return key_of(*((p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files))
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file that is made from something, and the :func:`key_of` that something.
+
+    A folder is represented by the file in it that is written last.
+    """
+
+    path: Path
+    key: str
+
+    @property
+    def _marker(self) -> Path:
+        return self.path.with_name(f"{self.path.stem}.done.json")
+
+    @property
+    def done(self) -> bool:
+        """Whether the file exists, is complete and was made from what the key stands for."""
+        try:
+            marked = read_json(self._marker, ConfigError) == {"key": self.key}
+        except ConfigError:  # missing, not text, or not JSON
+            return False
+        return marked and self.path.is_file()
+
+    def forget(self) -> None:
+        """Remove the marker before the file is made again."""
+        self._marker.unlink(missing_ok=True)
+
+    def mark(self) -> None:
+        """Mark the file as complete; a job that is killed before this is repeated."""
+        write_json(self._marker, {"key": self.key})
+
+    def make(self, make: Callable[[], object]) -> None:
+        """Call ``make`` unless the file is done."""
+        if not self.done:
+            self.forget()
+            make()
+            self.mark()
+
+    def make_alone(self, make: Callable[[], object]) -> None:
+        """As :meth:`make`, and keep other runs from making the file at the same time.
+
+        Raises:
+            LanenetError: If another run makes it.
+        """
+        if not self.done:
+            with lock_output(self.path):
+                self.make(make)
