@@ -17,7 +17,7 @@ from datagen.datasets.settings import DataSettings, RecordedSettings
 from datagen.datasets.splits import split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
-from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive, map_key
+from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive
 from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
 from datagen.world.world import SimulationSettings

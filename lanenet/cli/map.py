@@ -72,5 +72,5 @@ def _check_same_drive(out: Path, drive: Path) -> None:
     mapped = read_yaml(file).get("drive") if file.is_file() else None
     if mapped is not None and Path(str(mapped)).resolve() != drive.resolve():
         raise LanenetError(
-            f"{out}: holds the map of another drive, {mapped}; choose another --out, or replace it with --force"
+            f"{out}: holds the map of another drive, {mapped}; choose another --out, or add --force"
         )
