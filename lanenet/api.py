@@ -172,7 +172,8 @@ def train(
     """Make the drives, maps and labels that a config needs, train, evaluate and export, as ``lanenet train``.
 
     Shows its progress on stderr and prints the tables of the test. What is there already is used, and a run
-    that was interrupted resumes. Needs ``lanenet[train]``.
+    that was interrupted resumes. Starts processes, so a script calls it below ``if __name__ == "__main__":``,
+    as Python's ``multiprocessing`` asks for. Needs ``lanenet[train]``.
 
     Args:
         config: Settings of the run or their file, as ``configs/finetune.yaml``.

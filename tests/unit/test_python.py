@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import logging
+import re
 import shutil
 from pathlib import Path
 from typing import Any, assert_type
@@ -126,6 +129,18 @@ def test_train_takes_a_config_as_a_file_or_as_values(monkeypatch: pytest.MonkeyP
     assert lanenet.train(asked[0][0], "name=yours") == Path("checkpoints/yours")
     with pytest.raises(ConfigError, match="unknown key 'nmae'"):
         lanenet.train({"nmae": "mine"})
+
+
+def test_the_page_calls_what_exists() -> None:
+    blocks = re.findall(
+        r"```python\n(.*?)```", (CHECKPOINTS.parent / "docs/python.md").read_text(), re.DOTALL
+    )
+    calls = [node for block in blocks for node in ast.walk(ast.parse(block)) if isinstance(node, ast.Call)]
+    called = {node.func.attr: node for node in calls if isinstance(node.func, ast.Attribute)}
+    assert called.keys() == set(lanenet.__all__)
+    for name, call in called.items():
+        keywords = {word.arg: word.value for word in call.keywords if word.arg is not None}
+        inspect.signature(getattr(lanenet, name)).bind(*call.args, **keywords)
 
 
 def test_the_names_are_seen() -> None:
