@@ -87,6 +87,8 @@ def map(
     wheelbase_cm: int | float | None = None,
     camera_height_cm: int | float | None = None,
     tape_width_cm: int | float | None = None,
+    frames: tuple[int, int] | None = None,
+    force: bool = False,
 ) -> Report:
     """Find the poses of a drive and a map of its lane lines, as ``lanenet map``; without a camera, that too.
 
@@ -102,6 +104,8 @@ def map(
         wheelbase_cm: Distance between the car's axles.
         camera_height_cm: Height of the lens above the road: helps to find a camera that is not known.
         tape_width_cm: Width of the tape: checks the lane width.
+        frames: First and last number of the frames to map; None for all of them.
+        force: Replace the map of another drive in ``out``, too.
 
     Returns:
         ``lines`` for people, of which the first is the verdict, and ``figures`` for programs. The
@@ -111,9 +115,11 @@ def map(
     Raises:
         CalibrationError: If the camera does not fit the images or the lane width.
         ConfigError: If the lane width is no centimetres, or a setting is wrong.
-        LanenetError: If the drive cannot be read or mapped, or ``out`` cannot be written.
+        LanenetError: If the drive cannot be read or mapped, or ``out`` cannot be written or holds the map of
+            another drive.
     """
     from datagen.pipeline import MapRequest, MapSettings, map_drive
+    from lanenet.cli.map import check_same_drive
     from lanenet.cli.shared import console
     from lanenet.geometry.lane import check_lane_width
 
@@ -127,7 +133,10 @@ def map(
         _float(wheelbase_cm),
         _float(camera_height_cm),
         _float(tape_width_cm),
+        frames,
     )
+    if not force:
+        check_same_drive(Path(out), Path(drive))
     with console.progress_bar("map") as progress:
         return map_drive(request, settings, Path(out), progress)
 

@@ -52,7 +52,7 @@ def map_drive(
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     if not force:
-        _check_same_drive(out, drive)
+        check_same_drive(out, drive)
     numbers = None if frames is None else frame_range(frames)
     request = MapRequest(
         drive, lane_width, camera, refine_camera, wheelbase, camera_height, tape_width, numbers
@@ -66,8 +66,12 @@ def map_drive(
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 
 
-def _check_same_drive(out: Path, drive: Path) -> None:
-    """Refuse to replace a map of another drive: it takes minutes to make, and the name may be a mistake."""
+def check_same_drive(out: Path, drive: Path) -> None:
+    """Refuse to replace a map of another drive: it takes minutes to make, and the name may be a mistake.
+
+    Raises:
+        LanenetError: Names the other drive.
+    """
     file = out / "map.yaml"
     mapped = read_yaml(file).get("drive") if file.is_file() else None
     if mapped is not None and Path(str(mapped)).resolve() != drive.resolve():

@@ -99,6 +99,16 @@ def test_map_hands_on_what_it_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path:
         assert asked.pop()[:3] == (request, settings, Path("m"))
     lanenet.map("tub", "m", lane_width_cm=38.5)
     assert asked.pop()[:2] == (MapRequest(Path("tub"), 38.5), MapSettings())
+    lanenet.map("tub", "m", lane_width_cm=38.5, frames=(7, 9))
+    assert asked.pop()[0] == MapRequest(Path("tub"), 38.5, frames=(7, 9))
+    (tmp_path / "map.yaml").write_text("drive: other\n")
+    with pytest.raises(LanenetError, match="the map of another drive, other"):
+        lanenet.map("tub", tmp_path, lane_width_cm=38.5)
+    assert not asked
+    lanenet.map("tub", tmp_path, lane_width_cm=38.5, force=True)
+    lanenet.map("other", tmp_path, lane_width_cm=38.5)
+    assert len(asked) == 2
+    asked.clear()
     with pytest.raises(ConfigError, match="unknown key 'sed'"):
         lanenet.map("tub", "m", lane_width_cm=38.5, config={"sed": 7})
     with pytest.raises(ConfigError, match=r"0\.38 m are 38 cm"):
