@@ -85,7 +85,7 @@ def prepare(
         for role in ROLES
         for number in range(getattr(synthetic, role))
     ]
-    jobs += [RecordedJob(drive, settings, work_dir / "drives") for drive in settings.drives]
+    jobs += recorded_jobs(settings, work_dir)
     for role in ("train", "validation"):
         split = [drive for drive in settings.drives if role == "train" or drive.split != "none"]
         if not split and not getattr(synthetic, role):
@@ -120,6 +120,11 @@ def prepare(
     )
 
 
+def recorded_jobs(settings: DataSettings, work_dir: Path) -> list[RecordedJob]:
+    """Return the jobs of the recorded drives of a run, whose maps can be made before the rest."""
+    return [RecordedJob(drive, settings, work_dir / "drives") for drive in settings.drives]
+
+
 def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:
     """Return the camera file of the run's drives, if they share one: the simulation's, or a recording's.
 
@@ -131,7 +136,7 @@ def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:
     else:
         owner = None if recorded else _first_drive(jobs, "train")
     if len(recorded) == 1 and not any(isinstance(job, SyntheticJob) for job in jobs):
-        owner = recorded[0].frames
+        owner = None if recorded[0].is_labels else recorded[0].frames
     return None if owner is None else owner / "camera.yaml"
 
 

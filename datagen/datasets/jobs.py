@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from datagen.datasets.settings import DataSettings, RecordedSettings
-from datagen.datasets.splits import split_recording
+from datagen.datasets.splits import in_window, split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
-from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive
+from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive, map_key
 from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
 from datagen.world.world import SimulationSettings
@@ -26,6 +26,8 @@ from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import read_map
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
 
+#: Called with (done, total).
+MapProgress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
 ROLES: tuple[Role, ...] = ("train", "validation", "test")
 
@@ -199,30 +201,75 @@ class RecordedJob:
         return (self.recording.path / "map.yaml").is_file()
 
     @property
+    def is_labels(self) -> bool:
+        """Whether it has been labelled before."""
+        return self.recording.path.suffix == ".parquet"
+
+    @property
     def frames(self) -> Path:
-        """The map."""
-        return self.recording.path if self.is_map else self.folder / "maps" / self.name
+        """The map, or the label set of a drive that has been labelled before."""
+        given = self.is_map or self.is_labels
+        return self.recording.path if given else self.folder / "maps" / self.name
+
+    @property
+    def whole(self) -> Path:
+        """The labels of the whole drive."""
+        return self.recording.path if self.is_labels else self.folder / "labels" / f"{self.name}.parquet"
+
+    @property
+    def map_output(self) -> Output:
+        """The map that is made of a drive that has not been mapped before.
+
+        Raises:
+            DriveFormatError: If there is no such drive.
+        """
+        return Output(self.frames / "map.yaml", map_key(self._request, self.recording.map))
+
+    @property
+    def _request(self) -> MapRequest:
+        known = self.recording
+        return MapRequest(
+            known.path,
+            known.lane_width_cm,
+            known.camera,
+            wheelbase_cm=known.wheelbase_cm,
+            camera_height_cm=known.camera_height_cm,
+            tape_width_cm=known.tape_width_cm,
+            frames=known.frames,
+        )
+
+    def make_map(self, progress: MapProgress | None = None) -> None:
+        """Map the drive, unless it has been mapped before.
+
+        Args:
+            progress: Called with (done, total).
+
+        Raises:
+            LanenetError: If the drive cannot be read or mapped.
+            ConfigError: If it is a map of a lane of another width, or frames are to be chosen from a map.
+        """
+        settings = self.recording
+        if not (self.is_map or self.is_labels):
+            self.map_output.make(lambda: map_drive(self._request, settings.map, self.frames, progress))
+            return
+        if settings.frames is not None:
+            raise ConfigError(f"data.drives: {self.frames} is finished: frames are chosen before mapping")
+        if self.is_map:
+            self._check_width()
 
     def run(self) -> tuple[Part, ...]:
         """Make the three label sets, or the one to learn from.
 
         Raises:
             LanenetError: If the drive cannot be read, mapped or split.
-            ConfigError: If it is a map of a lane of another width.
+            ConfigError: As :meth:`make_map`.
         """
         settings, data = self.recording, self.data
-        if self.is_map:
-            self._check_width()
         files = [settings.path]
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
-        recording = [fingerprint(path) for path in files]
-        # A map takes minutes, and does not depend on the window, the colours or the split.
-        mapped = settings.model_dump(mode="json", include={"path", "lane_width_cm", "camera", "map"})
+        key = key_of(settings, data.window, data.colour_weight, *map(fingerprint, files))
         folder = self.folder / "labels"
-        whole = Output(
-            folder / f"{self.name}.parquet", key_of(settings, data.window, data.colour_weight, *recording)
-        )
         parts = tuple(
             Part(
                 role,
@@ -233,24 +280,24 @@ class RecordedJob:
             for role in ROLES
         )
         if settings.split == "none":
-            parts = (Part("train", whole.path, self.frames, settings.counts_as),)
-
-        request = MapRequest(settings.path, settings.lane_width_cm, settings.camera)
+            parts = (Part("train", self.whole, self.frames, settings.counts_as),)
+        # The last file that is written stands for all.
+        done = Output(parts[-1].labels, key)
 
         def make() -> None:
-            if not self.is_map:
-                Output(self.frames / "map.yaml", key_of(mapped, *recording)).make(
-                    lambda: map_drive(request, settings.map, self.frames)
-                )
-            label_map(self.frames, whole.path, window=data.window, colour_weight=data.colour_weight)
+            self.make_map()
+            if not self.is_labels:
+                window, weight = data.window, data.colour_weight
+                label_map(self.frames, self.whole, window=window, colour_weight=weight)
             if settings.split == "none":
                 return
-            for part, labels in zip(parts, split_recording(read_labels(whole.path), settings), strict=True):
-                write_labels(part.labels, labels)
+            labels = in_window(read_labels(self.whole), data.window)
+            for part, split in zip(parts, split_recording(labels, settings), strict=True):
+                write_labels(part.labels, split)
 
-        if not all(part.labels.is_file() for part in parts):
-            whole.forget()
-        whole.make_alone(make)
+        if not all(path.is_file() for path in (self.whole, *(part.labels for part in parts))):
+            done.forget()
+        done.make_alone(make)
         return parts
 
     def _check_width(self) -> None:

@@ -53,13 +53,16 @@ class RecordedSettings(Settings):
     """A recorded drive, split along its time or by its laps, or all of it to learn from.
 
     Attributes:
-        path: Drive folder, tub or video, or a finished map of one, relative to the folder in which the
-            command runs.
+        path: Drive folder, tub or video, a finished map of one, or its label set (``.parquet``); relative to
+            the folder in which the command runs.
         lane_width_cm: Between the middles of the lines of the driven lane.
         camera: Camera file; without it the camera is found from the drive.
+        wheelbase_cm, camera_height_cm, tape_width_cm: As for ``lanenet map``; None if not measured.
+        frames: First and last number of the frames to map; None for all. Not for a finished map.
         split: ``time`` cuts at the shares below; ``lap`` keeps the last lap for the test, the one before it
-            for the validation and all earlier ones for learning; ``none`` learns from all of it, so that
-            other drives must choose the epoch.
+            for the validation and all earlier ones for learning; ``auto`` is ``lap`` where there are three
+            complete laps, and else ``time``; ``none`` learns from all of it, so that other drives must
+            choose the epoch.
         train_share: Share of the labelled frames, from the start, to learn from. Chosen, like the next.
         validation_share: Share of the following frames to choose the epoch by; the rest is for the test.
         gap_frames: Frames left out between the parts, so that neighbours are never on both sides. Chosen: 2 s
@@ -73,7 +76,11 @@ class RecordedSettings(Settings):
     path: Path
     lane_width_cm: float = Field(gt=0.0)
     camera: Path | None = None
-    split: Literal["time", "lap", "none"] = "time"
+    wheelbase_cm: float | None = Field(default=None, gt=0.0)
+    camera_height_cm: float | None = Field(default=None, gt=0.0)
+    tape_width_cm: float | None = Field(default=None, gt=0.0)
+    frames: tuple[int, int] | None = None
+    split: Literal["time", "lap", "auto", "none"] = "time"
     train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     gap_frames: int = Field(default=40, ge=0)

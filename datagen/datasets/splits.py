@@ -6,6 +6,7 @@ neighbouring frames show the same road from almost the same place.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,9 +16,13 @@ from datagen.datasets.settings import RecordedSettings
 from lanenet.data.label_set import LabelSet
 from lanenet.data.segments import equal_runs, map_segments
 from lanenet.errors import ConfigError
+from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import rows_of_polyline
 
 #: A lap with less than this share of the median lap's frames was not completed. Chosen: half a lap.
 _WHOLE_LAP = 0.5
+#: One to learn from, one to choose the epoch by, one for the test.
+_LEAST_LAPS = 3
 
 
 def split_recording(labels: LabelSet, settings: RecordedSettings) -> list[LabelSet]:
@@ -26,10 +31,17 @@ def split_recording(labels: LabelSet, settings: RecordedSettings) -> list[LabelS
     Raises:
         ConfigError: As :func:`split_along_time` and :func:`split_by_lap`.
     """
-    if settings.split == "lap":
+    if chosen_split(labels, settings) == "lap":
         return split_by_lap(labels, settings.gap_frames, settings.gap_cm)
     shares = (settings.train_share, settings.validation_share)
     return split_along_time(labels, shares, settings.gap_frames, settings.gap_cm)
+
+
+def chosen_split(labels: LabelSet, settings: RecordedSettings) -> str:
+    """Return how a drive is split: what ``auto`` stands for with these labels, or the setting."""
+    if settings.split != "auto":
+        return settings.split
+    return "lap" if len(_lap_starts(labels)) >= _LEAST_LAPS else "time"
 
 
 def split_along_time(
@@ -69,14 +81,28 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
     Raises:
         ConfigError: If there are fewer than three complete laps, or a part would be empty.
     """
-    laps = equal_runs(labels.lap)
-    typical = np.median([len(lap) for lap in laps]) if laps else 0.0
-    starts = [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * typical]
-    if len(starts) < 3:
+    starts = _lap_starts(labels)
+    if len(starts) < _LEAST_LAPS:
         raise ConfigError(
-            f"split by lap: found {len(starts)} complete laps, expected at least 3; use split: time"
+            f"split by lap: found {len(starts)} complete laps, expected at least {_LEAST_LAPS}; use split: time"
         )
     return _cut(labels, np.array([0, *starts[-2:]]), gap_frames, gap_cm, "the laps")
+
+
+def _lap_starts(labels: LabelSet) -> list[int]:
+    """First rows of the complete laps."""
+    laps = equal_runs(labels.lap)
+    typical = np.median([len(lap) for lap in laps]) if laps else 0.0
+    return [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * typical]
+
+
+def in_window(labels: LabelSet, window: BirdseyeWindow) -> LabelSet:
+    """Return a label set for another bird's-eye window: its edge points and lines reach beyond the old one."""
+    if labels.meta.window == window:
+        return labels
+    found = np.array([np.concatenate([rows_of_polyline(line) for line in pair]) for pair in labels.lines])
+    points = window.labelled(np.where(np.isfinite(labels.points_cm), labels.points_cm, found))
+    return replace(labels, meta=replace(labels.meta, window=window), points_cm=points)
 
 
 def driven_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:

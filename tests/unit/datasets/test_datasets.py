@@ -278,7 +278,7 @@ def test_drives_have_names_for_people(tmp_path):
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):
     made: list[str] = []
 
-    def map_drive(request: MapRequest, map_settings: object, out: Path) -> None:
+    def map_drive(request: MapRequest, map_settings: object, out: Path, progress: None) -> None:
         made.append("map")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
