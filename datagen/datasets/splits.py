@@ -84,7 +84,7 @@ def split_by_lap(labels: LabelSet, gap_frames: int, gap_cm: float = 0.0) -> list
     starts = _lap_starts(labels)
     if len(starts) < _LEAST_LAPS:
         raise ConfigError(
-            f"split by lap: found {len(starts)} complete laps, expected at least {_LEAST_LAPS}; use split: time"
+            f"split by lap: {len(starts)} complete laps, expected {_LEAST_LAPS} at least; use split: time"
         )
     return _cut(labels, np.array([0, *starts[-2:]]), gap_frames, gap_cm, "the laps")
 
@@ -97,7 +97,7 @@ def _lap_starts(labels: LabelSet) -> list[int]:
 
 
 def in_window(labels: LabelSet, window: BirdseyeWindow) -> LabelSet:
-    """Return a label set for another bird's-eye window: its edge points and lines reach beyond the old one."""
+    """Return a label set for another bird's-eye window; its points and lines reach beyond the old one."""
     if labels.meta.window == window:
         return labels
     found = np.array([np.concatenate([rows_of_polyline(line) for line in pair]) for pair in labels.lines])

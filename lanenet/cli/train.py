@@ -116,13 +116,14 @@ def train_run(settings: Any, marking: float | None = None) -> Path:
             settings.data.processes,
             progress,
         )
-    val_cli.show(comparison)
+    val_cli.show(comparison, seen, "on the test drives", ["network"])
     robustness = _robustness(model, sources)
     card = model_card(
         settings.name,
         read_model_meta(model),
         read_json(run_folder / METRICS_NAME, CheckpointError),
         training,
+        [source.labels for source in sources if source.labels is not None],
         comparison,
         robustness,
     )

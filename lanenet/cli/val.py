@@ -11,8 +11,9 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source, lock_outputs
-from lanenet.errors import ConfigError
-from lanenet.evaluation.comparison import default_names, evaluate
+from lanenet.config import read_yaml
+from lanenet.errors import ConfigError, LanenetError
+from lanenet.evaluation.comparison import SeenSource, default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
 from lanenet.perception.network.model_file import find_model, is_model
 from lanenet.perception.registry import compared_names, kind_of, listed
@@ -42,10 +43,13 @@ def val(
     detectors: Annotated[
         str | None,
         typer.Option(
-            help=f"Which to compare, as in network,painter; all: {', '.join(compared_names())}. "
-            "Default: all that the sources allow."
+            help=f"Which to compare, as in network,painter; all: {', '.join(compared_names())}. Default: the "
+            "network; without a model, with --all or --out, all that the sources allow."
         ),
     ] = None,
+    show_all: Annotated[
+        bool, typer.Option("--all", help="Also run the other detectors, and print all tables.")
+    ] = False,
     no_baselines: Annotated[bool, typer.Option("--no-baselines", help="The network only.")] = False,
     marking: MarkingOption = None,
     any_camera: AnyCameraOption = False,
@@ -68,11 +72,11 @@ def val(
         ),
     ] = False,
 ) -> None:
-    """Show errors in cm of a model and of the other detectors on the same frames.
+    """Show errors in cm of a model, in a sentence and a table; with --all beside the other detectors.
 
-    Simulated drives are compared with their truth, maps and their label sets with the map. Label
-    sets hold no frames, so that only detectors that work on edge points can be run on them. Without the
-    network no MODEL is needed.
+    With --out the files hold all tables, with the other detectors. Simulated drives are compared with their
+    truth, maps and their label sets with the map. Label sets hold no frames, so that only detectors that work
+    on edge points can be run on them. Without the network no MODEL is needed.
     """
     from datagen.labels.truth import truth_labels
     from lanenet.data.files import json_text, write_bytes
@@ -91,8 +95,9 @@ def val(
     meta = None if model is None else read_model_meta(model)
     window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
     sources = [open_source(path, window, perception, truth_labels) for path in source_paths]
-    names = _chosen(detectors, no_baselines, model, sources)
-    if detectors is None and not no_baselines and any(source.frames is None for source in sources):
+    alone = model is not None and detectors is None and not show_all
+    names = _chosen(detectors, no_baselines or (alone and out is None), model, sources)
+    if detectors is None and names != ("network",) and any(source.frames is None for source in sources):
         left_out = listed(compared_names(lambda kind: not kind.on_label_sets))
         console.show_problems([f"label sets hold no frames: {left_out} are left out"])
     if robust:
@@ -109,7 +114,8 @@ def val(
             os.cpu_count() or 1,
             progress,
         )
-    show(comparison)
+    networks_only = [name for name in comparison.tables if name in networks] if alone else None
+    show(comparison, seen, _where(sources, model), networks_only, show_all)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
         files = {".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
@@ -123,15 +129,69 @@ def val(
             console.show_problems(["no plot of the errors without Matplotlib: pip install 'lanenet[viz]'"])
     best = min(comparison.tables.items(), key=lambda item: item[1].all.median_cm)[0]
     shown = "network" if "network" in names else best
+    if alone:
+        console.say("the other detectors and more tables: --all" if out is None else "all tables: --all")
     console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
 
 
-def show(comparison: Comparison) -> None:
-    """Print the tables of a comparison."""
-    from lanenet.evaluation.tables import lay_out
+def show(
+    comparison: Comparison,
+    seen: Sequence[SeenSource],
+    where: str,
+    names: Sequence[str] | None = None,
+    show_all: bool = False,
+) -> None:
+    """Print the verdict on the first detector, and the table of errors or all tables.
 
-    for table in lay_out(comparison):
+    Args:
+        comparison: The figures.
+        seen: What the first detector answers on frames.
+        where: On what it was measured.
+        names: The detectors of the one table; None for all.
+        show_all: Print all tables.
+    """
+    from lanenet.evaluation.tables import lay_out, main_table
+    from lanenet.evaluation.verdict import verdict_sentence
+
+    console.say(f"verdict: {verdict_sentence(comparison, seen, where)}")
+    chosen = list(comparison.tables) if names is None else names
+    for table in lay_out(comparison) if show_all else [main_table(comparison, chosen)]:
         console.show_rich(table.as_rich())
+
+
+def _where(sources: Sequence[Opened], model: Path | None) -> str:
+    """Say on what a model is measured, and whether it has learned from that."""
+    where = f"on {sources[0].path}" if len(sources) == 1 else f"on {len(sources)} sources"
+    file = None if model is None else model.parent / "run.yaml"
+    if file is None or not file.is_file():
+        return where
+    learned = drives_of(file)
+    known = [source for source in sources if str(source.drive.resolve()) in learned]
+    if not known:
+        return where
+    each = "" if len(known) == len(sources) else f"{len(known)} of "
+    return f"{where}, {each}which it has learned from in part,"
+
+
+def drives_of(config: Path) -> set[str]:
+    """Return the recorded drives that a training's config names, by their full paths.
+
+    A map stands for its drive. Simulated drives have no path, and an unreadable config names none.
+    """
+    try:
+        drives = read_yaml(config)["data"]["drives"]
+        paths = [Path(str(drive["path"])) for drive in drives]
+    except (ConfigError, KeyError, TypeError):
+        return set()
+    return {str(drive_behind(path)) for path in paths}
+
+
+def drive_behind(path: Path) -> Path:
+    """Return the full path of a recording, or of the one that a map was made from."""
+    try:
+        return Opened(path).drive.resolve()
+    except (LanenetError, KeyError):  # a map that cannot be read stands for itself
+        return path.resolve()
 
 
 def _next_words(

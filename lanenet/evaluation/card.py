@@ -12,15 +12,14 @@ from lanenet.errors import counted
 from lanenet.evaluation.comparison import Comparison
 from lanenet.evaluation.errors import GROUPS
 from lanenet.evaluation.robustness import RobustRow, robust_table
-from lanenet.evaluation.tables import show_cm, show_share
+from lanenet.evaluation.sources import of_one_map
+from lanenet.evaluation.tables import LARGE_CM, show_cm, show_share
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.perception.network.model_file import ModelMeta
 
 CARD_NAME = "MODEL_CARD.md"
 #: A group whose RMSE is this many times that of the whole is a weakness. Chosen.
 _WORSE = 1.5
-#: Larger errors make a lane hard to follow. Chosen: a tenth of a 40 cm lane.
-_LARGE_CM = 4.0
 #: Worst sources that are looked at. Chosen.
 _N_SOURCES = 3
 
@@ -30,6 +29,7 @@ def model_card(
     meta: ModelMeta,
     metrics: Mapping[str, Any],
     training: Sequence[LabelSet],
+    tests: Sequence[LabelSet],
     comparison: Comparison,
     robustness: Sequence[RobustRow],
 ) -> str:
@@ -40,13 +40,14 @@ def model_card(
         meta: Description in the model's file.
         metrics: Content of ``metrics.json``.
         training: The label sets that it learned from, each once.
+        tests: The label sets of the test.
         comparison: Its errors on the test drives; the network is the first detector.
         robustness: Its errors when something is wrong; may be empty.
     """
     parts = [
         f"# {name}\n\n{_what(meta, metrics)}",
         f"## What it was trained on\n\n{_training(meta, metrics, training)}",
-        f"## How good it is\n\n{_errors(comparison)}",
+        f"## How good it is\n\n{_errors(comparison)}{_one_recording(training, tests)}",
         f"## Where it fails\n\n{_failures(meta, comparison)}",
     ]
     if robustness:
@@ -107,12 +108,26 @@ def _errors(comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
+def _one_recording(training: Sequence[LabelSet], tests: Sequence[LabelSet]) -> str:
+    """Say how many of the tests are parts of a recording that was also learned from; a paragraph."""
+    shared = sum(any(of_one_map(test, labels) for labels in training) for test in tests)
+    if not shared:
+        return ""
+    which = (
+        "Test and training" if shared == len(tests) else f"{shared} of the {len(tests)} tests and training"
+    )
+    return (
+        f"\n\n{which} are parts of one recording and come from one map. A mistake of the map is in both and "
+        "does not show here; other light, another day or another road were not tried."
+    )
+
+
 def _failures(meta: ModelMeta, comparison: Comparison) -> str:
     errors = comparison.errors_cm[comparison.first]
     known = np.isfinite(errors)
-    share = float((errors[known] > _LARGE_CM).mean()) if known.any() else 0.0
+    share = float((errors[known] > LARGE_CM).mean()) if known.any() else 0.0
     lines = [
-        f"{100.0 * share:.2f} % of the points are off by more than {_LARGE_CM:g} cm; the worst frames are in "
+        f"{100.0 * share:.2f} % of the points are off by more than {LARGE_CM:g} cm; the worst frames are in "
         "`results-worst.jpg`."
     ]
     weak = _weak_spots(comparison)

@@ -148,19 +148,13 @@ def lines_seen(labels: LabelSet) -> Float[np.ndarray, "n 2"]:
 def distance_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> Float[np.ndarray, "n"]:
     """Return the distance of each frame to the nearest training frame of the same map, [cm].
 
-    Two label sets are of one map if their drives have the same name, their cameras are the same and both take
-    their labels from a map: parts of one recorded drive. NaN where no training frame is of this map, or of
+    Two label sets are of one map, see :func:`of_one_map`, if their drives have the same name, their cameras
+    are the same and both take their labels from a map. NaN where no training frame is of this map, or of
     this segment of it.
     """
     from lanenet.data.segments import map_segments
 
-    same = [
-        other
-        for other in training
-        if labels.meta.source == other.meta.source == "map"
-        and labels.meta.camera_hash == other.meta.camera_hash
-        and labels.drive[:1] == other.drive[:1]
-    ]
+    same = [other for other in training if of_one_map(labels, other)]
     parts = [*same, labels]
     frames, poses = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "poses"))
     learned = np.arange(len(frames)) < len(frames) - len(labels)
@@ -172,6 +166,15 @@ def distance_to_training_cm(labels: LabelSet, training: Sequence[LabelSet]) -> F
         mine = segments[~learned] == segment
         result[mine] = nearest_pose_cm(labels.poses[mine], poses[learned & (segments == segment)])
     return result
+
+
+def of_one_map(labels: LabelSet, other: LabelSet) -> bool:
+    """Tell whether two label sets are parts of one recording and its map."""
+    return (
+        labels.meta.source == other.meta.source == "map"
+        and labels.meta.camera_hash == other.meta.camera_hash
+        and labels.drive[:1] == other.drive[:1]
+    )
 
 
 def nearest_pose_cm(

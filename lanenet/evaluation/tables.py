@@ -16,6 +16,8 @@ from lanenet.evaluation.errors import GROUPS, INTERVALS, ErrorStats
 from lanenet.evaluation.plain_sight import OFF_CM
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
 
+#: Larger errors make a lane hard to follow. Chosen: a tenth of a 40 cm lane.
+LARGE_CM = 4.0
 _STATS = ("RMSE", "median", "p95", "worst")
 _PRESENCE = ("line precision", "line recall", "absent recall")
 
@@ -86,14 +88,21 @@ def lay_out(comparison: Comparison) -> list[TextTable]:
     return tables
 
 
+def main_table(comparison: Comparison, names: Sequence[str]) -> TextTable:
+    """Lay out the errors by point of some of the detectors."""
+    return _by_point(comparison, names)
+
+
 def as_markdown(comparison: Comparison) -> str:
     """Return all tables of a comparison as Markdown."""
     return "\n".join(table.as_markdown() for table in lay_out(comparison))
 
 
-def _by_point(comparison: Comparison) -> TextTable:
+def _by_point(comparison: Comparison, names: Sequence[str] | None = None) -> TextTable:
     lines = []
-    for name, table in comparison.tables.items():
+    chosen = list(comparison.tables) if names is None else names
+    for name in chosen:
+        table = comparison.tables[name]
         groups = [table.groups[group] for group in ("all", *POINT_NAMES)]
         values = zip(*(_values(stats) for stats in groups), strict=True)
         rows = [[label, *map(show_cm, row)] for label, row in zip(_STATS, values, strict=True)]
@@ -108,7 +117,7 @@ def _by_point(comparison: Comparison) -> TextTable:
     intervals = [
         f"{name} {show_cm(ends[0])} to {show_cm(ends[1])}"
         for name, ends in comparison.breakdown.interval_cm.items()
-        if ends is not None
+        if ends is not None and name in chosen
     ]
     if intervals:
         over = comparison.breakdown.interval_over

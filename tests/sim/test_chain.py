@@ -67,8 +67,11 @@ def test_train_leaves_a_checkpoint_that_is_complete(finished):
     assert names >= {"model.onnx", "weights.safetensors", "metrics.json", "run.yaml", "camera.yaml"}
     assert names >= {"results.json", "results.md", "checkpoint.yaml", "curve.csv", "example.jpg"}
     assert "last.pt" not in names
+    assert "verdict: on the test drives it" in output and "against the truth" in output
+    assert "painter" not in output
+    tables = (folder / "ck" / "tiny" / "results.md").read_text()
     for name in ("network", "lane-filter", "hough-value", "painter", "against the truth"):
-        assert name in output
+        assert name in tables
     # A network of two epochs is unsure of most points, and does not answer them.
     assert "results.png" in names
     results = json.loads((folder / "ck" / "tiny" / "results.json").read_text())

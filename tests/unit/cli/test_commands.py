@@ -341,8 +341,22 @@ def test_val_puts_the_lane_filter_beside_the_model(tmp_path: Path, monkeypatch: 
     # A label set holds no frames: nothing to draw, and nothing for the others to look at.
     assert not (tmp_path / "table-worst.jpg").exists()
     assert list(detectors) == ["network", "lane-filter"] and "hold no frames" in result.stderr
-    alone = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--no-baselines")
-    assert alone.exit_code == 0 and "lane-filter" not in alone.output
+    # The files hold everything; the terminal a sentence and the network's own table.
+    assert "it lies 1.00 cm from the truth (median;" in result.output and "lane-filter" not in result.stdout
+    alone = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet")
+    assert alone.exit_code == 0 and "lane-filter" not in alone.output and "--all" in alone.stdout
+    beside = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet", "--all")
+    assert beside.exit_code == 0 and beside.stdout.count("lane-filter") > 1
+
+
+def test_val_owns_up_to_what_the_model_has_learned_from(tmp_path, monkeypatch):
+    tiny_labels(tmp_path / "l.parquet")
+    fake_checkpoint(tmp_path / "checkpoint", monkeypatch)
+    for path, owned in (("l.parquet", True), ("other.parquet", False)):
+        config = {"data": {"drives": [{"path": str(tmp_path / path)}]}}
+        (tmp_path / "checkpoint" / "run.yaml").write_text(json.dumps(config))
+        result = run("val", tmp_path / "checkpoint", tmp_path / "l.parquet")
+        assert result.exit_code == 0 and ("which it has learned from" in result.output) == owned
 
 
 def test_val_compares_models_and_changes_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,7 +95,7 @@ def test_a_map_in_two_pieces_starts_its_laps_again():
 
 
 def test_too_few_laps_are_refused():
-    with pytest.raises(ConfigError, match="found 2 complete laps, expected at least 3"):
+    with pytest.raises(ConfigError, match="2 complete laps, expected 3 at least"):
         split_by_lap(drive(np.repeat([0, 1, 2], [200, 200, 30])), 10)
     with pytest.raises(ConfigError, match="400 frames and 0 cm leave a part empty"):
         split_by_lap(drive(np.repeat([0, 1, 2], 200)), 400)

@@ -10,14 +10,14 @@ TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (50, 1))
 METRICS = {"parameters": 97310, "epochs": 8, "best_epoch": 7, "val_frames": 12, "val_rmse_cm": 0.5}
 
 
-def card(*errors_cm, meta=None, conditions=None):
+def card(*errors_cm, meta=None, conditions=None, tests=()):
     answers = [
         SourceAnswers(f"d/t{k}", "map", "map", TRUTH, {"n": TRUTH + e}, conditions=conditions or {})
         for k, e in enumerate(errors_cm)
     ]
     training = [make_label_set(4, 0), make_label_set(5, 1, camera_hash="cam1")]
     meta = meta or model_meta()
-    return model_card("mine", meta, METRICS, training, compare_detectors(answers), [])
+    return model_card("mine", meta, METRICS, training, tests, compare_detectors(answers), [])
 
 
 def model_meta(**changes):
@@ -40,6 +40,14 @@ def test_it_says_what_it_learned_from_and_how_good_it_is():
     assert "100 frames of 2 test drives" in text and "RMSE 1.00 cm" in text
     assert "No group of frames, point or drive has an RMSE of 1.5 times" in text
     assert "0.00 % of the points are off by more than 4 cm" in text
+
+
+def test_a_test_on_the_map_that_was_learned_from_is_owned_up_to():
+    same, other = make_label_set(6, 2), make_label_set(6, 3, camera_hash="cam9")
+    truth = make_label_set(6, 2, source="truth")
+    assert "Test and training are parts of one recording" in card(1.0, tests=[same])
+    assert "1 of the 2 tests and training are parts" in card(1.0, tests=[same, other])
+    assert "one recording" not in card(1.0, tests=[other, truth])
 
 
 def test_weak_spots_are_named_the_worst_drive_first():
