@@ -28,9 +28,12 @@ OverridesArgument = Annotated[
 ]
 
 
-def length_cm(text: str) -> float:
-    """Read a length in cm, or with its unit (``40``, ``40cm``, ``0.4 m``): the parser of such options."""
-    found = re.fullmatch(r"([+-]?[\d.,]+)\s*([a-z]*)", text.strip().lower(), re.ASCII)
+def length_cm(text: str | float) -> float:
+    """Read a length in cm, or with its unit (``40``, ``40cm``, ``0.4 m``): the parser of such options.
+
+    Typer calls it with an option's default as well, which is a number.
+    """
+    found = re.fullmatch(r"([+-]?[\d.,]+)\s*([a-z]*)", str(text).strip().lower(), re.ASCII)
     number, unit = found.groups() if found is not None else ("", "")
     try:
         value_cm = float(number) * _UNITS_CM[unit]
