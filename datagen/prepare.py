@@ -13,7 +13,7 @@ from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Commands, Drive, open_drive
-from lanenet.data.drives.recording import MAX_PAUSE_S, ImageSource
+from lanenet.data.drives.recording import COMMAND_NAMES, MAX_PAUSE_S, ImageSource
 from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
@@ -115,7 +115,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
     recorded, unreadable = readable_frames(keep_images(request.open_drive()))
     check_count(recorded)
     check_moving(recorded)
-    notes = [*recorded.problems, *unreadable, *_throttle_notes(recorded.commands)]
+    notes = [*recorded.problems, *unreadable, *_command_notes(recorded)]
     if request.frames is not None:
         notes.append(f"only the frames from {recorded.frames[0]} to {recorded.frames[-1]} were asked for")
     drive, found = following_frames(recorded)
@@ -225,6 +225,19 @@ def _throttle_notes(commands: Commands) -> list[str]:
     ]
 
 
+def _command_notes(drive: Drive) -> list[str]:
+    """Say that a drive has no commands, and where they are expected if it is a single file."""
+    commands = drive.commands
+    if any(getattr(commands, name) is not None for name in COMMAND_NAMES):
+        return _throttle_notes(commands)
+    table = drive.path.with_suffix(".csv")
+    expected = "" if drive.path.is_dir() else f" (expected in {table}, with frame and t_s)"
+    return [
+        f"the drive has neither speed nor steering{expected}: the images alone decide, and pauses of the "
+        "recording or a reversed steering are not seen"
+    ]
+
+
 def check_lens(drive: Drive) -> None:
     """Refuse a full-circle fisheye where the camera is to be found: its lens is beyond the search.
 
@@ -249,7 +262,8 @@ def check_count(drive: Drive) -> None:
     """
     if len(drive) < LEAST_FRAMES:
         raise TrackingLostError(
-            f"{drive.path}: {counted(len(drive), 'frame')} of a car that drives, mapping needs {LEAST_FRAMES}"
+            f"{drive.path}: found {counted(len(drive), 'frame')} of a car that drives, expected "
+            f"{LEAST_FRAMES} at least"
         )
 
 
@@ -289,7 +303,8 @@ def check_size(camera: Camera, drive: Drive, camera_path: Path | None) -> None:
     if (camera.width, camera.height) != (drive.width, drive.height):
         raise CalibrationError(
             f"{camera_path or drive.path}: the camera is for {camera.width}x{camera.height} px, "
-            f"the images of {drive.path} have {drive.width}x{drive.height}"
+            f"the images of {drive.path} have {drive.width}x{drive.height}: expected the camera that took "
+            "them, at this size; without --camera it is found from the drive"
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import refused
-from drives import edit, write_tub
+from drives import edit, write_drive, write_tub, write_video
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
@@ -157,6 +157,31 @@ BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, 
         folders("v.mp4"),
         ("detect", "@drive", *HOUGH, "--video", "@v.mp4"),
         ("v.mp4", "is a folder"),
+    ),
+    "map: the folder above the tub": (
+        empty_tub,
+        ("map", "@", *MAP),
+        ("not a drive", "drives in it: type ", "/drive", "/tub"),
+    ),
+    "detect: the folder of a car": (
+        lambda folder: write_tub(folder / "car" / "data", [{}]),
+        ("detect", "@car", *HOUGH),
+        ("found none of them", "a drive in it: type ", "car/data"),
+    ),
+    "map: the images of a drive": (
+        None,
+        ("map", "@drive/images", *MAP),
+        ("not a drive", "the drive is the folder above it: type ", "/drive"),
+    ),
+    "map: three frames": (
+        lambda folder: write_drive(folder / "short", 3),
+        ("map", "@short", *MAP),
+        ("found 3 frames", "expected 60", "two laps"),
+    ),
+    "detect: a table that a video would be given": (
+        lambda folder: write_video(folder / "clip.avi"),
+        ("detect", "@clip.avi", "--detector", "hough", "--out", "@clip.csv"),
+        ("recorded", "choose another name", "clip_out.csv"),
     ),
     "label: no map": (folders("m"), ("label", "@m", "--out", "@l.parquet"), ("map.yaml",)),
     "map: a drive that shows nothing": (

@@ -49,7 +49,7 @@ def length_cm(text: str | float) -> float:
     return value_cm
 
 
-def lane_cm(text: str) -> float:
+def lane_cm(text: str | float) -> float:
     """Read the width of a lane as :func:`length_cm` does, and refuse one in metres: another parser."""
     value_cm = length_cm(text)
     try:
@@ -170,10 +170,12 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
     """
     for out in outs:
         if out is not None and _belongs_to(source, source.resolve(), out.resolve()):
-            raise ConfigError(
-                f"{out}: is a file of {source}, which this command reads, or would be taken for one; choose "
-                "another name"
+            found = (
+                f"is a file of {source}, which this command reads"
+                if out.exists()
+                else f"would be taken for a file of {source}, for what was recorded with it"
             )
+            raise ConfigError(f"{out}: {found}; choose another name: {out.with_stem(f'{out.stem}_out')}")
 
 
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:

@@ -5,6 +5,9 @@ A format is a module with a :class:`DriveFormat`, and one entry in :data:`FORMAT
 
 from __future__ import annotations
 
+import itertools
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
 from lanenet.data.drives import folder, tub, video
@@ -14,8 +17,21 @@ from lanenet.errors import DriveFormatError
 from lanenet.outputs import restore_output
 from lanenet.reading import is_folder
 
-__all__ = ["FORMATS", "Commands", "Drive", "find_format", "formats_text", "open_drive", "read_truth"]
+__all__ = [
+    "FORMATS",
+    "Commands",
+    "Drive",
+    "drive_above",
+    "find_format",
+    "formats_text",
+    "meant_instead",
+    "open_drive",
+    "read_truth",
+]
 
+#: Folders deep in which drives are looked for, and how many are named. Chosen: a Donkeycar's folder holds its
+#: tubs as ``data/tub_1``.
+_HINT_DEPTH, _HINT_COUNT = 2, 3
 #: Tried in this order; a folder that is both a drive folder and a tub is read as the former.
 FORMATS: tuple[DriveFormat, ...] = (folder.FORMAT, tub.FORMAT, video.FORMAT)
 
@@ -33,24 +49,44 @@ def open_drive(path: Path) -> Drive:
         raise DriveFormatError(f"{path}: no such drive")
     found = find_format(path)
     if found is None:
-        old = "; a version 1 tub has to be converted by Donkeycar first"
-        hint = old if tub.is_old(path) else _nearby(path)
-        raise DriveFormatError(f"{path}: not a drive: expected {formats_text()}{hint}")
+        raise DriveFormatError(f"{path}: not a drive: expected {formats_text()}{meant_instead(path)}")
     return assemble_drive(path, found.read(path))
 
 
-def _nearby(path: Path) -> str:
-    """Name the drive that a folder belongs to, or those in it; the end of a sentence."""
-    try:
-        if not is_folder(path):
-            return ""
-        if find_format(above := path.resolve().parent) is not None:
-            return f"; the drive is the folder above it, {above}"
-        inside = [each for each in sorted(path.iterdir()) if find_format(each) is not None]
-    except OSError:  # a folder that cannot be read has no hint
+def meant_instead(path: Path) -> str:
+    """Name the drive that a path that is none belongs to, or those in it; the end of a sentence."""
+    if tub.is_old(path):
+        return "; a version 1 tub has to be converted by Donkeycar first"
+    if (above := drive_above(path)) is not None:
+        return f"; the drive is the folder above it: type {shlex.quote(str(above))}"
+    inside = list(itertools.islice(_drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))
+    if not inside:
         return ""
-    more = f" and {len(inside) - 1} more" if len(inside) > 1 else ""
-    return f"; there is a drive in it, {inside[0]}{more}" if inside else ""
+    names = ", ".join(shlex.quote(str(each)) for each in inside[:_HINT_COUNT])
+    more = " or another" if len(inside) > _HINT_COUNT else ""
+    return f"; {'there is a drive' if len(inside) == 1 else 'there are drives'} in it: type {names}{more}"
+
+
+def drive_above(path: Path) -> Path | None:
+    """Return the drive whose folder of images, or of other files, a folder is; None if it is of none."""
+    if not is_folder(path):
+        return None
+    # As it was typed, unless that has no folder above it.
+    above = path.parent if path.name not in ("", "..") else path.resolve().parent
+    return above if find_format(above) is not None else None
+
+
+def _drives_in(path: Path, depth: int) -> Iterator[Path]:
+    """Yield the drives in a folder and those in it."""
+    try:
+        entries = sorted(path.iterdir()) if is_folder(path) else []
+    except OSError:  # a folder that cannot be read has no hint
+        return
+    yield from (entry for entry in entries if find_format(entry) is not None)
+    if depth > 1:
+        for entry in entries:
+            if find_format(entry) is None:
+                yield from _drives_in(entry, depth - 1)
 
 
 def find_format(path: Path) -> DriveFormat | None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drives import find_format, formats_text, open_drive
+from lanenet.data.drives import drive_above, find_format, formats_text, meant_instead, open_drive
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.static import find_static, spread_frames
@@ -96,6 +96,7 @@ def open_source(path: Path) -> Source:
     if not photos:
         raise DriveFormatError(
             f"{path}: expected {formats_text()}, or photos ({', '.join(PHOTO_ENDINGS)}), found none of them"
+            f"{meant_instead(path)}"
         )
     return _photos(path, photos)
 
@@ -135,8 +136,13 @@ def _photos(path: Path, files: list[Path]) -> Source:
 
     count = len(files)
     times = np.full(count, np.nan)
+    problems: tuple[str, ...] = ()
+    if (drive := drive_above(path)) is not None:
+        whole = f"to have them in order and with their times, type {shlex.quote(str(drive))}"
+        problems = (f"{path}: the images of a drive, each taken by itself; {whole}",)
     # No photo continues the one before it.
-    return Source(str(path), np.arange(count), times, np.ones(count, bool), PHOTO_RATE_HZ, image)
+    starts = np.ones(count, bool)
+    return Source(str(path), np.arange(count), times, starts, PHOTO_RATE_HZ, image, problems=problems)
 
 
 def _recorded(path: Path) -> Source:

@@ -5,9 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drives import record, write_drive, write_tub
 
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.drives.sources import open_source
+from lanenet.errors import DriveFormatError
 from lanenet.onboard.bench import example_camera
 
 
@@ -22,6 +24,17 @@ def test_one_photo(tmp_path: Path) -> None:
     assert len(source) == 1 and source.starts.all()
     assert np.isnan(source.t_s).all()
     assert (source.image(0) == 7).all()
+
+
+def test_images_of_a_drive_are_photos_with_a_word(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "lap", 3)
+    photos = open_source(drive / "images")
+    assert len(photos) == 3 and photos.starts.all()
+    assert len(photos.problems) == 1 and photos.problems[0].endswith(f"type {drive}")
+    (tmp_path / "mycar" / "data").mkdir(parents=True)
+    tub = write_tub(tmp_path / "mycar" / "data" / "tub_1", [record(0)])
+    with pytest.raises(DriveFormatError, match=f"found none of them; there is a drive in it: type {tub}"):
+        open_source(tmp_path / "mycar")
 
 
 def test_folder_of_photos_in_order_of_names(tmp_path: Path) -> None:

@@ -198,7 +198,16 @@ def test_real_tubs(shared_data: Path, name: str, n: int, n_deleted: int, first: 
 
 def test_a_path_beside_the_tub_is_answered_with_the_tub(tmp_path):
     write_tub(tmp_path / "tubs" / "mine", [record(k) for k in range(3)])
-    with pytest.raises(DriveFormatError, match=r"folder above it, .*mine"):
+    with pytest.raises(DriveFormatError, match=r"folder above it: type .*mine"):
         open_drive(tmp_path / "tubs" / "mine" / "images")
-    with pytest.raises(DriveFormatError, match=r"a drive in it, .*mine"):
+    with pytest.raises(DriveFormatError, match=r"a drive in it: type .*mine"):
         open_drive(tmp_path / "tubs")
+    # A Donkeycar's folder is two above its tubs.
+    with pytest.raises(DriveFormatError, match=r"a drive in it: type .*mine"):
+        open_drive(tmp_path)
+    for k in range(4):
+        write_tub(tmp_path / "tubs" / f"new {k}", [record(0)])
+    with pytest.raises(
+        DriveFormatError, match=r"drives in it: type .*mine, '.*new 0', '.*new 1' or another$"
+    ):
+        open_drive(tmp_path)

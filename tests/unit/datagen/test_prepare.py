@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from drives import write_drive
@@ -84,6 +85,25 @@ def test_a_map_is_known_by_all_that_it_is_made_from(tmp_path, monkeypatch):
     assert map_key(MapRequest(Path("drive"), 40.0), settings) == keys[0]
     with pytest.raises(DriveFormatError, match="no such drive"):
         map_key(MapRequest(tmp_path / "nowhere", 40.0), settings)
+
+
+def test_a_video_without_commands_is_mapped_with_a_word(tmp_path):
+    video = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+    rng = np.random.default_rng(0)
+    for _ in range(70):
+        writer.write(cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (64, 48)))
+    writer.release()
+
+    def words() -> list[str]:
+        notes = prepare(MapRequest(video, 40.0), MapSettings()).notes
+        return [note for note in notes if "neither speed nor steering" in note]
+
+    (note,) = words()
+    assert f"expected in {tmp_path / 'clip.csv'}" in note
+    rows = "".join(f"{k},{0.05 * k},50\n" for k in range(70))
+    (tmp_path / "clip.csv").write_text(f"frame,t_s,speed_cm_s\n{rows}")
+    assert not words()
 
 
 def test_a_camera_of_another_size_is_refused():

@@ -93,6 +93,28 @@ def test_a_height_or_a_tape_that_was_measured_checks_the_lane_width(given, bound
         assert bound in found.reasons[0] and all(f"{v:g} cm" in found.sentence for v in given.values())
 
 
+@pytest.mark.parametrize(
+    ("height_cm", "tape_cm", "instead"),
+    [
+        # Three recorded drives with the width assumed for them, with twice and with half as much.
+        *((17.6, 4.8, ""), (35.2, 9.6, "20"), (8.8, 2.4, "80")),
+        *((12.5, 1.7, ""), (25.0, 3.4, "20"), (6.3, 0.85, "80")),
+        *((18.5, 2.9, ""), (37.0, 5.8, "20"), (9.3, 1.45, "80")),
+        # Neither half nor twice as much would help.
+        (15.0, 0.5, ""),
+    ],
+)
+def test_a_lane_width_of_the_whole_road_or_half_a_lane_is_asked_about(height_cm, tape_cm, instead):
+    anything = VerdictSettings(height_cm=(0.1, 100.0), tape_cm=(0.1, 100.0))
+    found = judge(replace(GOOD, height_cm=height_cm, tape_cm=tape_cm), anything)
+    assert found.grade == "good" and ("--lane-width" in found.sentence) == bool(instead)
+    assert f"--lane-width {instead} " in f"{found.sentence} --lane-width  "
+    # What was measured, and a camera that sets the scale, leave nothing to ask.
+    for known in ({"given_tape_cm": tape_cm}, {"given_height_cm": height_cm}, {"found_lane_cm": 40.0}):
+        told = judge(replace(GOOD, height_cm=height_cm, tape_cm=tape_cm, **known), anything)
+        assert "--lane-width" not in told.sentence
+
+
 @pytest.mark.parametrize(("sigma", "grade"), [(0.04, "usable"), (0.08, "usable"), (0.12, "reject")])
 def test_a_height_stands_in_for_a_loop_but_not_for_a_check(sigma, grade):
     found = graded(GOOD, **OPEN, height_given=True, sigma={"focal": sigma})
@@ -103,7 +125,7 @@ def test_a_height_stands_in_for_a_loop_but_not_for_a_check(sigma, grade):
 def test_steering_of_the_wrong_sign_is_named(steering, remarks):
     found = graded(KNOWN, steering=steering)
     assert found.grade == "good" and len(found.remarks) == remarks
-    assert all("-0.90" in remark for remark in found.remarks)
+    assert all("-0.90" in remark and "STEERING_LEFT_PWM" in remark for remark in found.remarks)
 
 
 @pytest.mark.parametrize(
