@@ -200,7 +200,7 @@ _LOOP_OR_CAMERA = (
 _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 
 
-#: Height of the camera and width of the tape of most cars, [cm]; other cars are asked about, not graded.
+#: Height of the camera and width of the tape of most cars, [cm]; others are asked about if that would help.
 #: Measured: three recorded drives have 12 to 19 and 1.7 to 4.8 cm; a sixth is left on either side.
 _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 
@@ -222,9 +222,7 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
         return Verdict(worst.grade, sentence, tuple(figures), remarks)
     sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
     labelled = f"{_percent(evidence.labelled_share)} of the frames have labels"
-    question = _width_question(evidence)
-    if_right = f", if the lane width is right: {question}" if question else ""
-    sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is{if_right}"
+    sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is"
     if withheld:
         # A map with a wrong section is good only without that section.
         sentence = f"labels good; {withheld}; elsewhere {sentence}"
@@ -257,26 +255,6 @@ def _open_text(e: MapEvidence) -> str:
             "the map stays open: no place was seen twice, so distant parts of it may lie askew; a second lap "
             "along the same path would close it"
         )
-    return ""
-
-
-def _width_question(e: MapEvidence) -> str:
-    """Ask about a lane width if half of it, or twice as much, would make a usual car; empty if not."""
-
-    def usual(share: float) -> bool:
-        sizes_cm = ((e.height_cm, _USUAL_HEIGHT_CM), (e.tape_cm, _USUAL_TAPE_CM))
-        return all(low <= share * size <= high for size, (low, high) in sizes_cm)
-
-    measured = e.found_lane_cm is not None or e.given_height_cm is not None or e.given_tape_cm is not None
-    if measured or usual(1.0):
-        return ""
-    for share, what in ((0.5, "of the whole road"), (2.0, "of half a lane")):
-        if usual(share):
-            return (
-                f"is {e.given_lane_cm:g} cm the width {what}? It makes the camera {e.height_cm:.1f} cm high "
-                f"and the tape {e.tape_cm:.1f} cm wide; --lane-width {share * e.given_lane_cm:g} would make "
-                f"them {share * e.height_cm:.1f} and {share * e.tape_cm:.1f} cm, as on most cars"
-            )
     return ""
 
 
@@ -538,6 +516,9 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
             f"the narrowest tenth of the lane is {low:.1f} cm wide, the widest {high:.1f} cm, and no "
             "straight is as long as the lane is wide (open_cm)",
         )
+    if asked := list(_other_width(e)):
+        yield from asked
+        return
     for name, value, (least, most) in (
         ("height_cm", e.height_cm, s.height_cm),
         ("tape_cm", e.tape_cm, s.tape_cm),
@@ -551,5 +532,32 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
                 "the driven lane, in cm",
                 f"{'camera height' if name == 'height_cm' else 'tape width'} {value:.1f} cm, expected "
                 f"{least:g} to {most:g} cm on a 1:10 car ({name})",
+            )
+            return
+
+
+def _other_width(e: MapEvidence) -> _Findings:
+    """Ask about a lane width if half of it, or twice as much, would make a usual car."""
+
+    def usual(share: float) -> bool:
+        sizes_cm = ((e.height_cm, _USUAL_HEIGHT_CM), (e.tape_cm, _USUAL_TAPE_CM))
+        return all(low <= share * size <= high for size, (low, high) in sizes_cm)
+
+    if e.given_height_cm is not None or e.given_tape_cm is not None or usual(1.0):
+        return
+    for share, what in ((0.5, "of the whole road"), (2.0, "of half a lane")):
+        if usual(share):
+            made = f"camera {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide"
+            instead = f"{share * e.height_cm:.1f} and {share * e.tape_cm:.1f} cm"
+            ranges = " and ".join(
+                f"{low:g} to {high:g} cm" for low, high in (_USUAL_HEIGHT_CM, _USUAL_TAPE_CM)
+            )
+            yield Finding(
+                "usable",
+                f"is {e.given_lane_cm:g} cm the width {what}? It makes the {made}; --lane-width "
+                f"{share * e.given_lane_cm:g} would make them {instead}, as on most cars",
+                "measure the lane between the middles of its two lines; if it is right, give the width of "
+                "the tape or the height of the camera as well (--tape-width, --camera-height)",
+                f"the {made}, usual are {ranges}, which {share:g} of the lane width gives",
             )
             return

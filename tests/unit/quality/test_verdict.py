@@ -63,7 +63,7 @@ def test_what_sets_the_scale_is_named_with_what_follows_from_it():
 
 @pytest.mark.parametrize(
     ("height_cm", "tape_cm", "bound"),
-    [(60.0, 9.0, "height_cm"), (20.0, 9.0, "tape_cm"), (1.7, 0.2, "height_cm"), (17.0, 1.9, None)],
+    [(60.0, 9.0, "height_cm"), (20.0, 12.0, "tape_cm"), (1.7, 0.2, "height_cm"), (17.0, 1.9, None)],
 )
 def test_a_lane_width_that_makes_another_car_of_it_is_questioned(height_cm, tape_cm, bound):
     """The width of the whole road, or one in metres or millimetres."""
@@ -107,12 +107,13 @@ def test_a_height_or_a_tape_that_was_measured_checks_the_lane_width(given, bound
 def test_a_lane_width_of_the_whole_road_or_half_a_lane_is_asked_about(height_cm, tape_cm, instead):
     anything = VerdictSettings(height_cm=(0.1, 100.0), tape_cm=(0.1, 100.0))
     found = judge(replace(GOOD, height_cm=height_cm, tape_cm=tape_cm), anything)
-    assert found.grade == "good" and ("--lane-width" in found.sentence) == bool(instead)
+    assert found.grade == ("usable" if instead else "good")
+    assert ("is 40 cm the width of" in found.sentence) == ("--lane-width" in found.sentence) == bool(instead)
     assert f"--lane-width {instead} " in f"{found.sentence} --lane-width  "
     # What was measured, and a camera that sets the scale, leave nothing to ask.
     for known in ({"given_tape_cm": tape_cm}, {"given_height_cm": height_cm}, {"found_lane_cm": 40.0}):
         told = judge(replace(GOOD, height_cm=height_cm, tape_cm=tape_cm, **known), anything)
-        assert "--lane-width" not in told.sentence
+        assert told.grade == "good" and "--lane-width" not in told.sentence
 
 
 @pytest.mark.parametrize(("sigma", "grade"), [(0.04, "usable"), (0.08, "usable"), (0.12, "reject")])
