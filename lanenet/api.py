@@ -33,7 +33,7 @@ def load(
     Args:
         model: Checkpoint folder or ONNX file.
         camera: The camera of the images: a camera file, the folder of a map, or a camera. None takes the
-            ``camera.yaml`` beside the model, with a warning if the model is for other cameras as well.
+            ``camera.yaml`` beside a model that was trained with that camera alone.
         lane_width_cm: Between the middles of the lane's two lines. None takes it from the frames that show
             both.
         any_camera: Accept a camera that the model was not trained with, if both are calibrated.
@@ -43,7 +43,8 @@ def load(
         :class:`lanenet.perception.estimate.LaneEstimate`.
 
     Raises:
-        CalibrationError: If the camera cannot be read, or none is given and none lies beside the model.
+        CalibrationError: If the camera cannot be read, or none is given and the model is for several cameras
+            or has none beside it.
         ConfigError: If the lane width is no centimetres.
         ModelMismatchError: If there is no model, or it was made for another camera.
     """
@@ -70,7 +71,10 @@ def load(
     detector = build_detector(KIND.name, inputs)
     assert isinstance(detector, NetworkDetector)
     if camera is None and detector.meta.camera_hashes != (used.hash,):
-        detector.problems.append(f"camera not given: {own} is taken; images of another one need theirs")
+        raise CalibrationError(
+            f"{model}: is a network for several cameras, so it has to be told which one took the images: "
+            "expected camera=... with a camera file or a map; lanenet map finds the camera of a drive"
+        )
     for problem in detector.problems:
         logging.getLogger(__name__).warning(problem)
     return detector

@@ -13,6 +13,7 @@ from datagen.world.car.camera import CameraSettings
 from datagen.world.world import SimulationSettings
 from lanenet.config import Settings
 from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.lane import LaneWidthCm
 from lanenet.perception.edges.road import COLOUR_WEIGHT, PerceptionSettings
 
 
@@ -74,7 +75,7 @@ class RecordedSettings(Settings):
     """
 
     path: Path
-    lane_width_cm: float = Field(gt=0.0)
+    lane_width_cm: LaneWidthCm
     camera: Path | None = None
     wheelbase_cm: float | None = Field(default=None, gt=0.0)
     camera_height_cm: float | None = Field(default=None, gt=0.0)

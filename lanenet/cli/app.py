@@ -6,9 +6,10 @@ import ``datagen`` and ``lanenet.learn`` inside their functions, since the car h
 
 from __future__ import annotations
 
+import re
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -35,8 +36,19 @@ _EXTRA_OF = {
 }
 
 
+#: Errors of the command line itself; Typer brings the class along, or takes that of the package click.
+_UsageError: type[Any] = typer.BadParameter.__mro__[1]
+_USAGE_CODE = 2
+
+
 class _Group(TyperGroup):
     """Says where the user stands if no verb is given; turns errors of the input into one line and a code."""
+
+    def make_context(self, *words: Any, **more: Any) -> Any:
+        try:
+            return super().make_context(*words, **more)
+        except _UsageError as error:
+            _refuse_usage(error)
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -45,6 +57,8 @@ class _Group(TyperGroup):
                 if ctx.invoked_subcommand is None:
                     standing.say_standing(Path())
                 return answer
+        except _UsageError as error:
+            _refuse_usage(error)
         except (LanenetError, OSError) as error:
             message = str(error)
         except MemoryError as error:
@@ -84,6 +98,23 @@ for _panel, _verbs in _VERBS.items():
 def main() -> None:
     """Run the command line; ``lanenet.__main__`` is the entry point of the package."""
     app()
+
+
+def _refuse_usage(error: Any) -> NoReturn:
+    """Say an error of the command line in the form of all others, and where its help is.
+
+    A group of verbs without a verb, such as ``lanenet calibrate``, shows its help instead.
+    """
+    if type(error).__name__ == "NoArgsIsHelpError":
+        raise error
+    message = error.format_message().strip().removesuffix(".")
+    # Typer says so of values that Python's own types refuse.
+    message = message.replace("Value error, ", "").removeprefix("Invalid value for ")
+    if option := re.match("'(-[^']+)': ", message):
+        message = f"{option[1]}: {message[option.end() :]}"
+    known = f"; see {error.ctx.command_path} --help" if error.ctx is not None else ""
+    console.say(f"error: {message[:1].lower()}{message[1:]}{known}".replace("\n", "\\n"), err=True)
+    raise SystemExit(_USAGE_CODE)
 
 
 def _show_version(wanted: bool) -> bool:

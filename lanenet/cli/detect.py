@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,7 +56,7 @@ _WITH_MASK = listed(detector_names(lambda kind: kind.takes_mask))
 def detect(
     source: Annotated[
         Path,
-        typer.Argument(metavar="SOURCE", help="Photo, folder of photos, video, drive or tub."),
+        typer.Argument(metavar="SOURCE", help="Photo, folder of photos, video, drive, tub, or a map of one."),
     ],
     out: Annotated[Path, typer.Option(help="Table to write (.parquet or .csv).")],
     model: ModelOption = None,
@@ -97,14 +98,15 @@ def detect(
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
     from lanenet.data.detections import check_table_path
-    from lanenet.data.drives.sources import check_size, open_source
+    from lanenet.data.drives.sources import check_size
     from lanenet.evaluation.detect import run_detector
 
     name = detector_for(detector, model)
     check_not_source(source, out, video)
     lock_outputs(out, video)
     check_table_path(out)
-    whole = open_source(source)
+    whole, of_map = _open(source, out, video)
+    camera = camera or of_map
     opened = whole if frames is None else whole.numbered(*frame_range(frames))
     used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is not None:
@@ -155,6 +157,26 @@ def detect(
         console.next_command("detect", source, *console.given(again))
     else:
         console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
+
+
+def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:
+    """Open the frames; of a map those of its drive with its lane width, and the map, which has the camera."""
+    from lanenet.data.drives.sources import open_source
+    from lanenet.data.maps.folder import read_map_meta
+    from lanenet.errors import DriveFormatError
+
+    if not any((source / name).is_file() for name in ("map.yaml", "refused.yaml")):
+        return open_source(source), None
+    meta = read_map_meta(source)
+    drive = Path(meta.drive)
+    if not drive.exists():
+        raise DriveFormatError(
+            f"{source}: the drive of this map, {drive}, is not there: type where it is now, with "
+            f"--camera {source}"
+        )
+    check_not_source(drive, *outs)
+    console.say(f"{source} is a map: its drive {drive} is read, with its camera and lane width")
+    return replace(open_source(drive), lane_width_cm=meta.lane_cm), source
 
 
 def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarray, "h w"] | None:

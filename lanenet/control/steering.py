@@ -10,7 +10,13 @@ from jaxtyping import Float
 from pydantic import Field
 
 from lanenet.config import Settings
-from lanenet.geometry.lane import ROWS_CM, parabola_through, proportional_angle_rad, pure_pursuit_angle_rad
+from lanenet.geometry.lane import (
+    ROWS_CM,
+    LaneWidthCm,
+    parabola_through,
+    proportional_angle_rad,
+    pure_pursuit_angle_rad,
+)
 from lanenet.perception.estimate import LaneEstimate
 
 
@@ -31,7 +37,7 @@ class SteeringSettings(Settings):
     look_ahead_cm: float = Field(default=15.0, gt=0.0)
     wheelbase_cm: float = Field(gt=0.0)
     max_steering_rad: float = Field(default=0.45, gt=0.0, lt=math.pi / 2.0)
-    lane_width_cm: float | None = Field(default=None, gt=0.0)
+    lane_width_cm: LaneWidthCm | None = None
 
 
 def steering_target_rad(

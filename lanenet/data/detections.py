@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 
 from lanenet.data.files import check_destination, require
-from lanenet.data.tables import float_array, write_csv, write_parquet
+from lanenet.data.tables import VERSION_NAME, float_array, write_csv, write_parquet
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 from lanenet.perception.estimate import LaneEstimate
 
 FORMAT_VERSION = 1
 FORMAT = f"lanenet-detections/{FORMAT_VERSION}"
-#: Column of a CSV, which has no other place for it.
-VERSION_NAME = "format_version"
 
 SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for name in POINT_NAMES)
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")

@@ -45,6 +45,8 @@ _BATCH_ROWS = 64
 #: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares
 #: of more would lose the centimetres.
 MAX_PLACE = 1e6
+#: Column of a detector's answers as CSV, which has no other place for their version; no recording has it.
+VERSION_NAME = "format_version"
 #: Key of the schema metadata that holds what the table is, as JSON.
 META_KEY = b"lanenet"
 
@@ -182,6 +184,17 @@ def is_torn(path: Path, error: type[LanenetError] = DriveFormatError) -> bool:
         stream.seek(max(len(head) + 1, size - _MAX_RECORD))
         last = stream.read().rpartition(b"\n")[2]
     return bool(last.strip()) and (last.count(b",") < head.count(b",") or last.endswith(b","))
+
+
+def is_answers(path: Path) -> bool:
+    """Tell by its header whether a CSV file holds a detector's answers (``lanenet detect``), not a recording.
+
+    Raises:
+        DriveFormatError: If it cannot be read.
+    """
+    with open_regular(path, DriveFormatError, _MAX_CSV) as stream:
+        header = stream.readline(_MAX_RECORD)
+    return VERSION_NAME.encode() in header.strip().split(b",")
 
 
 def write_csv(

@@ -11,9 +11,11 @@ lane follows the angle of the front wheels, [rad], positive to the left.
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import AfterValidator
 
 from lanenet.errors import ConfigError
 
@@ -51,6 +53,18 @@ def check_lane_width(width_cm: float) -> None:
             f"{width_cm:g}: expected the distance of the lane's two lines in cm, {least:g} to {most:g}"
             f"{metres if least <= 100.0 * width_cm <= most else ''}"
         )
+
+
+def _checked_setting(width_cm: float) -> float:
+    try:
+        check_lane_width(width_cm)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    return width_cm
+
+
+#: Type of a lane's width in settings, which are held to the same bounds as the options.
+LaneWidthCm = Annotated[float, AfterValidator(_checked_setting)]
 
 
 def parabolas_from_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 2 3"]:

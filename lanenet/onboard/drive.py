@@ -19,6 +19,7 @@ from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_d
 from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import LaneWidthCm
 from lanenet.onboard.actuators import ActuatorSettings, first_writes, make_actuator
 from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.arming import ArmCheck, ArmGate, HoldFile
@@ -58,7 +59,7 @@ class DriveDetectorSettings(Settings):
     config: Path | None = None
     mask: Path | None = None
     any_camera: bool = False
-    lane_width_cm: float | None = Field(default=None, gt=0.0)
+    lane_width_cm: LaneWidthCm | None = None
 
 
 class DriveSettings(Settings):

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from lanenet.config import Settings, check_settings
 from lanenet.errors import CalibrationError, ConfigError
-from lanenet.geometry.lane import N_POINTS, ROWS_CM, proportional_angle_rad
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, LaneWidthCm, proportional_angle_rad
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, DetectorKind, LaneEstimate
 
@@ -71,7 +71,7 @@ class LaneFilterSettings(Settings):
             paper; null switches it off.
     """
 
-    lane_width_cm: float = Field(gt=0.0)
+    lane_width_cm: LaneWidthCm
     lane_width_tolerance_cm: float = Field(default=4.0, gt=0.0)
     marking_cm: float = Field(default=2.0, gt=0.0)
     marking_tolerance_cm: float = Field(default=0.8, gt=0.0)

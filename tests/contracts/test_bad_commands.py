@@ -178,10 +178,13 @@ BAD: dict[str, tuple[Callable[[Path], None] | None, tuple[str, ...], tuple[str, 
         ("map", "@short", *MAP),
         ("found 3 frames", "expected 60", "two laps"),
     ),
-    "detect: a table that a video would be given": (
-        lambda folder: write_video(folder / "clip.avi"),
+    "detect: the table of a video": (
+        lambda folder: (
+            write_video(folder / "clip.avi"),
+            (folder / "clip.csv").write_text("frame,t_s\n0,0\n"),
+        ),
         ("detect", "@clip.avi", "--detector", "hough", "--out", "@clip.csv"),
-        ("recorded", "choose another name", "clip_out.csv"),
+        ("is a file of", "choose another name", "clip_out.csv"),
     ),
     "label: no map": (folders("m"), ("label", "@m", "--out", "@l.parquet"), ("map.yaml",)),
     "map: a drive that shows nothing": (

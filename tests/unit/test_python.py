@@ -66,12 +66,9 @@ def test_a_camera_may_be_given_in_many_ways(
     assert not model.problems and not caplog.records
 
 
-def test_one_of_many_cameras_is_not_taken_in_silence(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        model = lanenet.load(GENERAL, lane_width_cm=40)
-    (record,) = caplog.records
-    assert model.problems == [record.getMessage()]
-    assert "camera not given" in model.problems[0] and "general/camera.yaml" in model.problems[0]
+def test_a_network_for_many_cameras_has_to_be_told_which() -> None:
+    with pytest.raises(CalibrationError, match=r"general: .*several cameras.*expected camera=\.\.\. with"):
+        lanenet.load(GENERAL, lane_width_cm=40)
 
 
 def test_what_cannot_be_loaded_says_why(tmp_path: Path) -> None:

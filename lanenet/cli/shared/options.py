@@ -161,6 +161,8 @@ def check_ending(path: Path, *endings: str) -> None:
 def check_not_source(source: Path, *outs: Path | None) -> None:
     """Refuse an output that would replace a file of the source, or be read as part of it next time.
 
+    A table of answers (``.csv``) may have a video's name: readers tell it from the recording's own.
+
     Args:
         source: Photo, video, folder of photos, drive, tub, map or label set.
         outs: Files to write; None for none.
@@ -182,6 +184,7 @@ def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
     # Imported here: commands that read no drive need not wait for OpenCV.
     from lanenet.data.drives import FORMATS, find_format
     from lanenet.data.drives.sources import PHOTO_ENDINGS
+    from lanenet.data.tables import is_answers
 
     if not resolved.is_dir():
         # A link may lead elsewhere, but the files beside a source are found by the name that was given.
@@ -190,7 +193,10 @@ def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
         files = ["{stem}.json", "{stem}.png"] if ending == ".parquet" else files
         files = [] if ending in PHOTO_ENDINGS else files
         folder = source.parent.resolve()
-        return out == resolved or out in {folder / name.format(stem=source.stem) for name in files}
+        beside = {folder / name.format(stem=source.stem) for name in files}
+        if out not in beside:
+            return out == resolved
+        return out.suffix.lower() != ".csv" or (out.is_file() and not is_answers(out))
     if resolved not in out.parents:
         return False
     if (resolved / "map.yaml").is_file():

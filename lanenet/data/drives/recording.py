@@ -24,6 +24,7 @@ from lanenet.data.files import write_text
 from lanenet.data.tables import ColumnSpec, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import LaneWidthCm
 from lanenet.reading import FolderFiles, read_image
 
 #: A longer pause is a break: even a slow car has left the road that its last frame showed.
@@ -296,7 +297,7 @@ class DriveFile(Settings):
 
     format: Literal["lanenet-drive/1"]
     camera: str | None = None
-    lane_width_cm: float | None = Field(default=None, gt=0.0)
+    lane_width_cm: LaneWidthCm | None = None
     max_steering_rad: float | None = Field(default=None, gt=0.0, lt=0.5 * math.pi)
     notes: str = ""
 

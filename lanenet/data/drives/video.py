@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.data.drives.recording import Commands, DriveFormat, RecordedFrames, read_times
+from lanenet.data.tables import is_answers
 from lanenet.errors import DriveFormatError
 from lanenet.reading import MAX_PIXELS, is_regular, open_regular
 
@@ -149,6 +150,8 @@ class VideoImages:
 def read_video(path: Path) -> RecordedFrames:
     """Read a video; ``<name>.csv`` beside it may give times and commands of its frames, counted from 0.
 
+    A detector's answers of that name are not the recording's, and are passed over.
+
     Raises:
         DriveFormatError: If the video or its CSV cannot be read, or it has no frame.
     """
@@ -160,7 +163,7 @@ def read_video(path: Path) -> RecordedFrames:
     if n < images.listed_frames:
         problems.append(f"{path}: the video is cut off: {n} of {images.listed_frames} frames can be decoded")
     table = path.with_suffix(".csv")
-    if table.is_file():
+    if table.is_file() and not is_answers(table):
         columns, commands = read_times(table)
         frames, t_s, trusted = columns["frame"], columns["t_s"], True
         inside = np.flatnonzero(frames < n)

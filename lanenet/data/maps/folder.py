@@ -189,26 +189,35 @@ def write_map(
     write_text(folder / "map.yaml", yaml.safe_dump(meta, sort_keys=False))
 
 
-def read_map(folder: Path) -> DriveMap:
-    """Read a map folder.
+def read_map_meta(folder: Path) -> MapMeta:
+    """Read what ``map.yaml`` says: all that the car's installation can read of a map.
 
     Raises:
-        MapFormatError: If it is not a map, is of another version, or a file is damaged.
+        MapFormatError: If it is not a map, is of another version, or the file is damaged.
     """
     restore_output(folder)
     if not (folder / "map.yaml").is_file():
         refused = (folder / "refused.yaml").is_file()
         why = f"its drive was refused, see {folder / 'report.html'}" if refused else "no map.yaml in it"
         raise MapFormatError(f"{folder}: is not a map ({why})")
-    inside = FolderFiles(folder)
-    path = inside.file("map.yaml", folder, MapFormatError)
+    path = FolderFiles(folder).file("map.yaml", folder, MapFormatError)
     plain = read_yaml(path, MapFormatError)
     if plain.get("format") != FORMAT:
         raise MapFormatError(f"{path}: format is {plain.get('format')!r}, expected {FORMAT!r}")
     try:
-        meta = check_settings(MapMeta, plain, str(path))
+        return check_settings(MapMeta, plain, str(path))
     except ConfigError as error:
         raise MapFormatError(str(error)) from None
+
+
+def read_map(folder: Path) -> DriveMap:
+    """Read a map folder.
+
+    Raises:
+        MapFormatError: If it is not a map, is of another version, or a file is damaged.
+    """
+    meta = read_map_meta(folder)
+    inside = FolderFiles(folder)
     place = ColumnSpec(low=-MAX_PLACE, high=MAX_PLACE)
     poses = inside.file("poses.csv", folder, MapFormatError)
     table = read_csv(

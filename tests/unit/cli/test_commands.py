@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -22,7 +23,9 @@ from lanenet.cli import app as cli
 from lanenet.cli.shared.options import lane_cm, length_cm
 from lanenet.config import Settings
 from lanenet.data.camera_file import write_camera
+from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+from lanenet.data.maps.folder import FORMAT
 from lanenet.errors import TrackingLostError
 from lanenet.evaluation.answers import RasterAnswers, RasterModel
 from lanenet.geometry.birdseye import BirdseyeWindow
@@ -65,6 +68,32 @@ def test_detect_writes_table_and_video_and_says_so(tmp_path: Path, photos: Path)
         assert text in result.stdout
 
 
+def test_detect_of_a_map_reads_its_drive(tmp_path: Path) -> None:
+    """The pictures in its folder are no photos of a road."""
+    frames = example_frames(example_camera(), 3, np.random.default_rng(1))
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k, frame in enumerate(frames):
+            writer.add(frame, 0.05 * k)
+    a_map = tmp_path / "map"
+    a_map.mkdir()
+    write_camera(a_map / "camera.yaml", example_camera(), "nominal values")
+    cv2.imwrite(str(a_map / "map.png"), frames[0])
+    meta = {"format": FORMAT, "drive": str(tmp_path / "drive"), "lane_width_cm": 40.0, "mapped_lane_cm": 41.0}
+    meta |= {"tape_cm": 2.0, "scale_from": "lane width", "laps": 2, "verdict": "good"}
+    (a_map / "map.yaml").write_text(json.dumps(meta))
+    words = ("detect", a_map, "--detector", "lane-filter", "--out", tmp_path / "l.csv")
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    assert f"{a_map} is a map: its drive {tmp_path / 'drive'} is read" in result.stdout.replace("\n", "")
+    assert "3 frames, 3 with all six points" in result.stdout
+    inside = tmp_path / "drive" / "frames.csv"
+    assert "is a file of" in error_of(run(*words[:-1], inside))
+    (tmp_path / "drive").rename(tmp_path / "moved")
+    assert f"is not there: type where it is now, with --camera {a_map}" in error_of(run(*words))
+    (a_map / "map.yaml").rename(a_map / "refused.yaml")
+    assert "its drive was refused" in error_of(run(*words))
+
+
 def test_detect_says_what_is_missing(tmp_path: Path, photos: Path) -> None:
     camera = tmp_path / "camera.yaml"
     always = ("--out", tmp_path / "l.csv")
@@ -83,6 +112,33 @@ def test_detect_says_what_is_missing(tmp_path: Path, photos: Path) -> None:
 def test_unknown_detector_is_a_usage_error(tmp_path: Path) -> None:
     result = run("detect", tmp_path, "--detector", "eagle", "--out", "l.csv")
     assert result.exit_code == 2 and "eagle" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            "detect d --detector eagle --out l.csv",
+            "--detector: 'eagle' is not one of .*; see .* detect --help",
+        ),
+        ("map d --lane-width 0.4 --out m", "--lane-width: 0.4: expected .* type 40; see .* map --help"),
+        ("map d", "missing option '--lane-width'; see .* map --help"),
+        ("map d --lane-widht 40 --out m", "no such option: --lane-widht .*--lane-width.*"),
+        ("map d e --lane-width 40 --out m", r"got unexpected extra argument.*\(e\).*"),
+        ("calibrate eagle", "no such command 'eagle'; see .* calibrate --help"),
+        ("eagle", "no such command 'eagle'; see .* --help"),
+        ("--vesion", r"no such option: --vesion .*--version.*; see .* --help"),
+    ],
+)
+def test_a_wrong_command_line_is_told_in_the_form_of_all_errors(words: str, said: str) -> None:
+    result = run(*words.split())
+    assert result.exit_code == 2 and result.stdout == ""
+    assert re.fullmatch(f"error: {said}\n", result.stderr), result.stderr
+
+
+def test_a_group_without_a_verb_shows_its_help() -> None:
+    result = run("calibrate")
+    assert "chessboard" in result.output and "error" not in result.output
 
 
 def test_bench_writes_json(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from lanenet.cli.app import app
 from lanenet.cli.shared.options import check_ending, check_not_source
+from lanenet.data.detections import DetectionTable
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import ConfigError
 from lanenet.outputs import lock_output
@@ -39,13 +40,13 @@ def test_a_drive_keeps_its_files(tmp_path, name):
 def test_a_tub_a_video_a_map_and_a_label_set_keep_theirs(tmp_path):
     tub = touched(tmp_path / "tub", "manifest.json", "catalog_0.catalog")
     a_map = touched(tmp_path / "map", "map.yaml", "edges.parquet")
-    touched(tmp_path, "a.mp4", "b.parquet", "photo.jpg")
+    touched(tmp_path, "a.mp4", "a.csv", "b.parquet", "photo.jpg")
     refused = [
         (tub, tub / "manifest.json"),
         (tub, tub / "catalog_0.catalog"),
         (a_map, a_map / "edges.parquet"),
         (tmp_path / "a.mp4", tmp_path / "a.mp4"),
-        # Not there yet, but then the video would have these commands; the message says what to type.
+        # What was recorded with it; the message says what to type.
         (tmp_path / "a.mp4", tmp_path / "a.csv"),
         (tmp_path / "b.parquet", tmp_path / "b.json"),
         (tmp_path / "photo.jpg", tmp_path / "photo.jpg"),
@@ -73,6 +74,14 @@ def test_other_files_beside_and_within_are_fine(tmp_path):
     check_not_source(photos, photos / "frames.csv", photos / "a.csv")
     check_not_source(photos / "a.jpg", photos / "a.csv")
     check_not_source(tmp_path / "a.mp4", tmp_path / "a.parquet", tmp_path / "a_lanes.csv")
+
+
+def test_answers_may_have_the_name_of_their_video(tmp_path):
+    """The name that everybody chooses; readers pass such a table over."""
+    video, out = touched(tmp_path, "a.mp4") / "a.mp4", tmp_path / "a.csv"
+    check_not_source(video, out)
+    DetectionTable().write(out)
+    check_not_source(video, out)
 
 
 def test_endings(tmp_path):

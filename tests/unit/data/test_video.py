@@ -8,9 +8,11 @@ import pytest
 from drives import VIDEO_FRAMES as N
 from drives import write_video
 
+from lanenet.data.detections import DetectionTable
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.video import VideoImages
 from lanenet.errors import DriveFormatError
+from lanenet.perception.estimate import LaneEstimate
 
 
 def number_of(image: np.ndarray) -> int:
@@ -43,6 +45,16 @@ def test_drawing_on_a_frame_does_not_change_it(tmp_path: Path) -> None:
     drive = open_drive(write_video(tmp_path / "lap.avi"))
     drive.image(3)[:] = 255
     assert number_of(drive.image(3)) == 3
+
+
+def test_answers_beside_it_are_not_its_commands(tmp_path: Path) -> None:
+    """Their steering is a detector's, not the driver's."""
+    video = write_video(tmp_path / "lap.avi")
+    answers = DetectionTable()
+    answers.add(4, 0.5, LaneEstimate(*(np.full(6, np.nan),) * 2, steering_rad=0.1, confidence=0.5))
+    answers.write(tmp_path / "lap.csv")
+    drive = open_drive(video)
+    assert len(drive) == N and drive.commands.steering_rad is None and not drive.problems
 
 
 def test_the_csv_beside_it_gives_times_and_commands(tmp_path: Path) -> None:

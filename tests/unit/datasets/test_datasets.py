@@ -19,6 +19,7 @@ from datagen.datasets.settings import DataSettings, RecordedSettings, SyntheticS
 from datagen.datasets.splits import split_along_time
 from datagen.prepare import MapRequest
 from datagen.world.world import SimulationSettings
+from lanenet.config import check_settings
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.data.maps.folder import read_map, write_map
 from lanenet.errors import ConfigError, TrackingLostError
@@ -97,6 +98,11 @@ def test_without_a_gap_every_frame_is_used():
 def test_an_empty_part_is_refused(count, shares, gap):
     with pytest.raises(ConfigError, match="empty"):
         split_along_time(_labels(np.arange(count)), shares, gap)
+
+
+def test_a_lane_width_in_metres_is_refused_in_a_config_as_in_an_option():
+    with pytest.raises(ConfigError, match=r"'lane_width_cm'.*0\.4 m are 40 cm: type 40"):
+        check_settings(RecordedSettings, {"path": "drive", "lane_width_cm": 0.4}, "config")
 
 
 def test_shares_that_leave_nothing_for_the_test_are_refused_before_any_work():
