@@ -14,7 +14,6 @@ from datagen.labels.label_map import label_map
 from datagen.made import Output, fingerprint, key_of
 from datagen.prepare import MapRequest, prepare
 from datagen.quality.figures import Report, map_edges
-from datagen.quality.layout import PAGE_NAME
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.refusal import Attempt, report_refusal
@@ -29,6 +28,7 @@ from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, w
 from lanenet.data.tables import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.outputs import lock_output
+from lanenet.page import PAGE_NAME
 
 __all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive", "map_key"]
 

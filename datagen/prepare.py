@@ -249,7 +249,7 @@ def check_lens(drive: Drive) -> None:
     if radius_px is not None:
         raise CalibrationError(
             f"{drive.path}: the images show a circle with a radius of {radius_px:.0f} px in black, as a "
-            "fisheye of about 180 degrees does. Such a lens is not found from a drive: calibrate it with "
+            "fisheye of about 180 degrees does, and such a lens is not found from a drive; calibrate it with "
             "photos of a chessboard (lanenet calibrate chessboard) and give it with --camera"
         )
 

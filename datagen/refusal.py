@@ -11,10 +11,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float, UInt8
 
-from datagen.assemble import near_points
 from datagen.prepare import MapRequest, PreparedDrive
-from datagen.quality.layout import PAGE_NAME, Row, bullets, jpeg, note, page_of, section, table
-from datagen.quality.pictures import tiled
 from datagen.segments import CameraOfDrive, SolvedDrive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
@@ -23,8 +20,23 @@ from datagen.slam.segment import SolvedSegment
 from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive
 from lanenet.data.files import atomic_folder, write_text
-from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
+from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+from lanenet.page import (
+    PAGE_NAME,
+    Picture,
+    Row,
+    bullets,
+    details,
+    gallery,
+    note,
+    page_of,
+    photo,
+    remedy,
+    section,
+    table,
+)
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 
@@ -34,9 +46,11 @@ BESIDE_MAP_NAME = "report-refused.html"
 _FORMAT = "lanenet-refused/1"
 #: Frames that are shown, evenly over the drive; width of one, and of the path from above, [px]. Chosen: two
 #: rows of four on a page.
-_SHOWN, _TILE_PX, _PATH_PX = 8, 320, 900
+_SHOWN, _SHOWN_PX, _PATH_PX = 8, 320, 900
 #: BGR: edges on the road that are mapped, and those elsewhere.
 _ON_ROAD, _ELSEWHERE = (80, 255, 80), (60, 60, 255)
+#: BGR: edges on the path from above.
+_EDGE = (230, 170, 90)
 
 
 @dataclass
@@ -98,29 +112,40 @@ def report_refusal(attempt: Attempt, error: LanenetError, out: Path) -> Path:
 def refusal_page(attempt: Attempt, error: LanenetError) -> str:
     """Return the page: why there is no map, what to do, what was tried, and what the frames show."""
     drive = attempt.drive
-    reason = str(error).removeprefix(f"{drive.path}: ")
-    sentence = f"{reason}: {DRIVE_INSTEAD}" if isinstance(error, TrackingLostError) else reason
-    raw, edges = _sheets(attempt, drive)
+    cause, what_to_do = _cause_and_remedy(error, drive)
+    raw, edges = _pictures(attempt, drive)
     camera = "" if attempt.known_camera is None else " Green: on the road that is mapped; red: elsewhere."
-    body = [
-        section("What was tried"),
-        table(tried_rows(attempt, drive)),
-        bullets(_notes(attempt, drive)),
-        section("Frames"),
-        note("Are both lines of the lane in view, sharp and brighter or darker than the floor?"),
-        jpeg(raw),
-        section("Edges"),
-        note(f"What the mapping sees of the same frames: the borders of both lines should be there.{camera}"),
-        jpeg(edges),
-    ]
     segments = () if attempt.solved is None else attempt.solved.segments
-    if segments:
-        body += [
-            section("Path"),
-            note("Path of the car (white) and edge points (gray) from above, each segment by itself."),
-            *(jpeg(draw_path(segment)) for segment in segments),
-        ]
-    return page_of(f"No map of {drive.name}", "refused", sentence, body)
+    body = [
+        remedy(what_to_do),
+        section("What the camera saw"),
+        note(
+            "Frames from all over the drive. Are both lines of the lane in view, sharp, and brighter or "
+            "darker than the floor?"
+        ),
+        gallery(raw),
+        section("What the mapping saw"),
+        note(f"The edges in the same frames. The borders of both lines should be among them.{camera}"),
+        gallery(edges),
+        section("What was tried"),
+        table(tried_rows(attempt, drive), texts=2),
+        section("Path") if segments else "",
+        *(photo(draw_path(segment, drive)) for segment in segments),
+        details("What else was noted", bullets(_notes(attempt, drive))),
+    ]
+    return page_of(f"No map of {drive.name}", "refused", cause, body)
+
+
+def _cause_and_remedy(error: LanenetError, drive: Drive) -> tuple[str, str]:
+    """Tell what an error found from what it advises, which is "" where it advises nothing by itself."""
+    reason = str(error).removeprefix(f"{drive.path}: ")
+    if isinstance(error, TrackingLostError):
+        return reason, DRIVE_INSTEAD
+    if isinstance(error, CalibrationError):
+        # Where it advises something, that is what its last semicolon is for.
+        cause, semicolon, advice = reason.rpartition("; ")
+        return (cause, advice) if semicolon else (reason, "")
+    return reason, ""
 
 
 def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
@@ -130,7 +155,8 @@ def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
     if attempt.prepared is None:
         return [*rows, ("read the recording", f"{len(drive)} frames"), ("check it", "refused")]
     sizes = np.bincount(commands_of(drive, attempt.settings.guess.wheelbase_cm).part)
-    found = f"{len(drive)} frames in {len(sizes)} part(s) between long gaps, the longest of {sizes.max()}"
+    parts = counted(len(sizes), "part")
+    found = f"{len(drive)} frames in {parts} between long gaps, the longest of {sizes.max()}"
     rows.append(("check it", found))
     if attempt.camera is None:
         return [*rows, ("find the camera", "refused")]
@@ -141,7 +167,7 @@ def tried_rows(attempt: Attempt, drive: Drive) -> list[Row]:
         return [*rows, ("track the car", "refused")]
     for one in attempt.solved.segments:
         length = f"{one.path_cm[-1] / m.height_cm:.0f} camera heights"
-        at = f"{len(one.poses)} frames, {length} long, {len(one.revisits)} places seen twice"
+        at = f"{len(one.poses)} frames, {length} long, {counted(len(one.revisits), 'place')} seen twice"
         rows.append((f"track frames from {drive.frames[one.rows[0]]} on", at))
     rows += [
         (f"track frames from {drive.frames[one.rows[0]]} on", "refused") for one in attempt.solved.refused
@@ -159,7 +185,7 @@ def _notes(attempt: Attempt, drive: Drive) -> Sequence[str]:
     return notes
 
 
-def _sheets(attempt: Attempt, drive: Drive) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+def _pictures(attempt: Attempt, drive: Drive) -> tuple[list[Picture], list[Picture]]:
     """Draw some frames as they are, and with their edges."""
     perception = (
         attempt.settings.perception if attempt.prepared is None else attempt.prepared.settings.perception
@@ -180,24 +206,27 @@ def _sheets(attempt: Attempt, drive: Drive) -> tuple[UInt8[np.ndarray, "h w 3"],
         u, v = np.clip(uv, 0, [drive.width - 1, drive.height - 1]).T
         marked = image // 2
         marked[v, u] = np.where(keep[v, u, None] > 0, _ON_ROAD, _ELSEWHERE)
-        raw.append(_titled(image, f"frame {drive.frames[k]}"))
-        edges.append(_titled(marked, f"frame {drive.frames[k]}: {len(uv)} edge points"))
-    return tiled(raw, background=255), tiled(edges, background=255)
+        raw.append(_enlarged(image, f"frame {drive.frames[k]}"))
+        edges.append(_enlarged(marked, f"frame {drive.frames[k]}: {len(uv)} edge points"))
+    return raw, edges
 
 
-def _titled(image: UInt8[np.ndarray, "h w 3"], title: str) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Bring a frame to the width of a tile, under a title."""
-    size = (_TILE_PX, round(image.shape[0] * _TILE_PX / image.shape[1]))
-    shrinks = image.shape[1] > _TILE_PX
-    big = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
-    head = np.full((22, _TILE_PX, 3), 255, np.uint8)
-    cv2.putText(head, title, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.vstack([head, big])
+def _enlarged(image: UInt8[np.ndarray, "h w 3"], caption: str) -> Picture:
+    """Enlarge a small frame without smoothing, so that single pixels can be told apart."""
+    zoom = max(1, round(_SHOWN_PX / image.shape[1]))
+    return Picture(np.repeat(np.repeat(image, zoom, axis=0), zoom, axis=1), caption)
 
 
-def draw_path(segment: SolvedSegment) -> UInt8[np.ndarray, "h w 3"]:
+def draw_path(segment: SolvedSegment, drive: Drive) -> Picture:
     """Draw the path of a segment with its edge points, from above; its scale is that of its camera."""
-    cloud = np.concatenate([*near_points(segment), segment.poses[:, :2]])
+    scans, wheelbase_cm = segment.scans, segment.camera.wheelbase_cm
+    # All that is mapped, near or not: of a narrow lens nothing is near.
+    seen = (
+        map_from_car(scans.points_cm[scans.frame(k)], pose, wheelbase_cm)
+        for k, pose in enumerate(segment.poses)
+    )
+    edges = np.concatenate([*seen, np.empty((0, 2))])
+    cloud = np.concatenate([edges, segment.poses[:, :2]])
     low, extent = cloud.min(axis=0), np.maximum(np.ptp(cloud, axis=0), 1.0)
     scale = _PATH_PX / float(extent.max())
     width, height = (extent * scale).astype(int) + 1
@@ -207,7 +236,11 @@ def draw_path(segment: SolvedSegment) -> UInt8[np.ndarray, "h w 3"]:
         at = ((points - low) * scale).astype(np.int32)
         return np.stack([at[:, 0], height - 1 - at[:, 1]], axis=1)
 
-    u, v = pixels(cloud).T
-    image[v, u] = (150, 150, 150)
+    u, v = pixels(edges).T
+    image[v, u] = _EDGE
     cv2.polylines(image, [pixels(segment.poses[:, :2])], False, (255, 255, 255), 2, cv2.LINE_AA)
-    return image
+    caption = (
+        f"The path from frame {drive.frames[segment.rows[0]]} on (white) and the edges that were seen along "
+        "it (blue), from above. Two lines beside the path are what a map is made of."
+    )
+    return Picture(image, caption)

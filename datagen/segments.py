@@ -119,8 +119,7 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
     if found.strain > MAX_STRAIN:
         doubt = (
             "the drive does not show the camera: the one that fits best has its principal point or roll "
-            f"{found.strain:.1f} standard deviations from those of ordinary cameras; calibrate it with "
-            "photos of a chessboard (lanenet calibrate chessboard) and give it with --camera"
+            f"{found.strain:.1f} standard deviations from those of ordinary cameras"
         )
     notes = (found.note, *notes)
     return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
@@ -265,7 +264,10 @@ def fit_lanes(
         reason = max(left_out, key=lambda one: len(one.rows)).reason
         if doubt:
             why = str(reason).removeprefix(f"{drive.path}: ")
-            raise CalibrationError(f"{drive.path}: {doubt}. With the one that was found: {why}") from reason
+            raise CalibrationError(
+                f"{drive.path}: {doubt}, and with that one {why}; calibrate it with photos of a chessboard "
+                "(lanenet calibrate chessboard) and give it with --camera"
+            ) from reason
         raise reason
     mapped.sort(key=lambda one: int(one.rows[0]))
     return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in left_out))

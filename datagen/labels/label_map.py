@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.quality.figures import Report
-from datagen.quality.layout import PAGE_NAME
 from datagen.quality.pictures import draw_contact_sheet
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
@@ -32,6 +31,7 @@ from lanenet.data.maps.mapped_drive import (
 from lanenet.errors import MapFormatError, TrackingLostError, counted
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
+from lanenet.page import PAGE_NAME
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
 from lanenet.reading import read_json
 

@@ -166,7 +166,7 @@ def other_lane(given_cm: float, found_cm: float) -> CalibrationError:
     """Return the error for a lane of another width than the given one."""
     return CalibrationError(
         f"no two lines {given_cm:g} cm apart run along the drive, but two that are {found_cm:.0f} cm apart "
-        "with this camera: check the lane width and the camera's height"
+        "with this camera; check the lane width and the camera's height"
     )
 
 

@@ -1,37 +1,45 @@
-"""The report page of a map: one self-contained HTML file, readable on a phone.
-
-The plots are PNG images; without Matplotlib they raise ImportError.
-"""
+"""The report page of a map."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from datagen.quality.layout import Row, bullets, jpeg, note, page_of, plot, section, table
-from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
-from datagen.quality.pictures import contact_sheets, withheld_sheet
-from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
+from datagen.quality.measure import MapQuality
+from datagen.quality.pictures import held_out_pictures, withheld_pictures
+from datagen.quality.plots import frames_plot, residual_plot, speed_plot, steering_plot, trajectory_plot
+from datagen.quality.residuals import REFERENCE_WIDTH
 from datagen.quality.verdict import Verdict, VerdictSettings
-from datagen.slam.commands import SteeringFit, commands_of, delayed
+from datagen.slam.commands import SteeringFit
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap, MapMeta
-from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
-from lanenet.evaluation.report import new_figure, png_bytes
+from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
+from lanenet.page import (
+    Picture,
+    Row,
+    bullets,
+    details,
+    gallery,
+    note,
+    page_of,
+    photo,
+    plot,
+    section,
+    table,
+)
 
-#: Colours of the lines, as in the pictures.
-_COLOURS = {"left": "#2e9e2e", "right": "#c832c8"}
-#: Distance bins of the residuals. Chosen: three per label row.
-_BIN_CM = 5.0
 #: Frames that are named for each section that is withheld.
 _FRAMES_NAMED = 6
+#: Longer side of the map on the page, [px]. Chosen: it fills a screen.
+_MAP_PX = 1200
+#: What one sees on a frame.
+_LINES_DRAWN = "Green: left line, magenta: right line, red circles: the six points of a label."
 
 
 def report_page(
@@ -55,52 +63,126 @@ def report_page(
         settings: Bounds of the verdict, drawn in the residual plot.
     """
     drive, drive_map = mapped.drive, mapped.drive_map
-    fits = [
-        None if s["steering"] is None else SteeringFit(**s["steering"]) for s in figures["segments_mapped"]
-    ]
-    held = figures["held_out"]
-    chance = held["coverage_by_chance"]
+    held, pictures = figures["held_out"], held_out_pictures(mapped, quality)
+    worst = pictures.pop("worst", [])
     body = [
-        section("What the verdict rests on"),
         bullets([*verdict.reasons, *verdict.remarks]),
-        section("The drive"),
-        bullets(figures["notes"]),
-        section("Held-out frames"),
+        table(summary_rows(figures, drive_map)),
+        section("Map"),
+        photo(_shown_map(map_png, drive_map)),
+        *withheld_section(mapped, quality, figures["withheld"]["places"]),
+        section("Worst held-out frames") if worst else "",
+        note(
+            "Of the frames that had no say in the lines, those whose edges lie furthest from them, in pixels "
+            f"of an image {REFERENCE_WIDTH:g} px wide. If the lines lie on the tape here, too, the map is "
+            f"right. {_LINES_DRAWN}"
+        )
+        if worst
+        else "",
+        gallery(worst),
+        section("More"),
+        details("What was done", bullets(figures["notes"])),
+        details(
+            "Best and median held-out frames",
+            *(part for title, shown in pictures.items() for part in (f"<h3>{title}</h3>", gallery(shown))),
+        ),
+        details("Distance of the lines from the edges", *_residuals(quality, held, drive, settings)),
+        details(
+            "Labels",
+            table(share_rows(figures["labelled"])),
+            plot(
+                "Along the drive: above, how far each held-out frame lies from the map; below, which frames "
+                "have labels, and why others get none.",
+                frames_plot,
+                *(quality, drive, drive_map, drive.width),
+            ),
+        ),
+        details(
+            "Path and loops",
+            plot(
+                "The driven path before (dashed) and after the places that were passed twice were brought "
+                "together. The dot is the start.",
+                trajectory_plot,
+                *(mapped, opened_poses),
+            ),
+            table(loop_rows(figures["segments_mapped"])),
+        ),
+        details(
+            "Camera and scale",
+            table(camera_rows(drive_map.camera, figures.get("calibration"))),
+            table(scale_rows(drive_map.meta), texts=2),
+        ),
+        details("Steering and speed", *_commands(mapped, figures["segments_mapped"])),
+    ]
+    return page_of(f"Map of {drive.name}", verdict.grade, verdict.sentence, body)
+
+
+def summary_rows(figures: dict[str, Any], drive_map: DriveMap) -> list[Row]:
+    """What most readers ask of a map."""
+    held, labelled, meta = figures["held_out"], figures["labelled"], drive_map.meta
+    metres = 0.01 * sum(segment["path_cm"] for segment in figures["segments_mapped"])
+    laps = "1 lap" if meta.laps == 1 else f"{meta.laps} laps"
+    mounting = drive_map.camera.mounting
+    return [
+        ("The drive in figures", ""),
+        ("frames mapped", f"{len(drive_map.frames)} of {figures['frames']}"),
+        ("driven", f"{metres:.1f} m, {laps}"),
+        ("frames with labels", _percent(labelled["share"])),
+        ("edges from the lines, 95 % within", f"{_number(held['both_lines']['p95_px_at_160'])} px"),
+        ("borders of the lines found", _percent(held["both_lines"]["coverage"])),
+        ("lane width", f"{meta.mapped_lane_cm:.1f} cm"),
+        ("tape width", f"{meta.tape_cm:.1f} cm"),
+        ("camera height", f"{mounting.height_cm:.1f} cm"),
+        ("camera pitch down", f"{math.degrees(mounting.pitch_down_rad):.1f} degrees"),
+    ]
+
+
+def _shown_map(map_png: bytes, drive_map: DriveMap) -> Picture:
+    image = np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
+    factor = _MAP_PX / max(image.shape)
+    caption = (
+        "The road from above, put together from all frames. White: the driven path; green: left line, "
+        "magenta: right line; dots: edges seen by the camera, coloured by time."
+    )
+    if any(len(line.contradicted_cm) for lines in drive_map.lines.values() for line in lines):
+        caption += " Red: withheld, since the images show something else there."
+    return Picture(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), caption)
+
+
+def _residuals(
+    quality: MapQuality, held: dict[str, Any], drive: Drive, settings: VerdictSettings
+) -> list[str]:
+    return [
         note(
             "Distance in pixels between the projected borders of the driven lane's two lines and the edges "
             f"in {held['frames']} held-out frames, whose edges were used for their own poses but not for the "
             f"lines. An edge counts if it lies within {held['gate_px_at_160']:g} px (of an image 160 px "
             "wide) and brightens in the same direction. “Found” is the share of the borders in view that met "
-            f"an edge. In the middle of the lane it is {_percent(chance)}: by chance, or because of paint."
+            f"an edge. In the middle of the lane it is {_percent(held['coverage_by_chance'])}: by chance, or "
+            "because of paint."
+        ),
+        plot(
+            "Above: distance of edges from the lines by how far ahead they are; dotted: the bounds of a good "
+            "map. Below: how much of the lines' borders met an edge.",
+            residual_plot,
+            *(quality, drive.width, settings.max_sd_px, settings.max_p95_px),
         ),
         table(residual_rows(held, drive.width)),
-        plot(residual_plot, quality, drive.width, settings.max_sd_px, settings.max_p95_px),
-        *(
-            f"<h3>{title.capitalize()} held-out frames</h3>{jpeg(sheet)}"
-            for title, sheet in contact_sheets(mapped, quality).items()
-        ),
-        *withheld_section(mapped, quality, figures["withheld"]["places"]),
-        section("Labels"),
-        table(share_rows(figures["labelled"])),
-        plot(frames_plot, quality, drive, drive_map, drive.width),
-        section("Map"),
-        note(
-            "Edge points (hue: time), driven path (white), left line (green), right line (magenta); red: "
-            "withheld."
-        ),
-        jpeg(np.asarray(cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)),
-        section("Path and loops"),
-        table(loop_rows(figures["segments_mapped"])),
-        plot(trajectory_plot, mapped, opened_poses),
-        section("Camera and scale"),
-        table(camera_rows(drive_map.camera, figures.get("calibration"))),
-        table(scale_rows(drive_map.meta)),
-        section("Steering and speed"),
-        plot(steering_plot, mapped, fits)
-        or note("There is no steering command, or it does not explain the path."),
-        plot(speed_plot, mapped),
     ]
-    return page_of(f"Map of {drive.name}", verdict.grade, verdict.sentence, body)
+
+
+def _commands(mapped: MappedDrive, segments: list[dict[str, Any]]) -> list[str]:
+    fits = [None if one["steering"] is None else SteeringFit(**one["steering"]) for one in segments]
+    steering = plot(
+        "Each dot is a frame: how the car was steered, and how the path bends there. On a line, the steering "
+        "explains the path.",
+        steering_plot,
+        *(mapped, fits),
+    )
+    return [
+        steering or note("There is no steering command, or it does not explain the path."),
+        plot("Distance between neighbouring frames, and the command.", speed_plot, mapped),
+    ]
 
 
 def _percent(share: float) -> str:
@@ -134,8 +216,8 @@ def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
 
 def withheld_section(mapped: MappedDrive, quality: MapQuality, places: list[dict[str, Any]]) -> list[str]:
     """The worst places: sections of the lines that the images contradict, and frames that show them."""
-    sheet = withheld_sheet(mapped, quality.wrong)
-    if sheet is None:
+    pictures = withheld_pictures(mapped, quality.wrong)
+    if not pictures:
         return []
     rows: list[Row] = [("line", "along the path, cm", "border seen, cm to the right", "frames")]
     for place in places:
@@ -145,11 +227,11 @@ def withheld_section(mapped: MappedDrive, quality: MapQuality, places: list[dict
     return [
         section("Withheld"),
         note(
-            "Along these sections most frames do not see the line where the map has it, but a border beside "
+            "Red: most frames that pass here do not see the line where the map has it, but a border beside "
             "it, or none. No frame gets labels of a line there."
         ),
-        table(rows),
-        jpeg(sheet),
+        gallery(pictures),
+        details("Where that is", table(rows)),
     ]
 
 
@@ -229,134 +311,3 @@ def scale_rows(meta: MapMeta) -> list[Row]:
         ("lane width on the map, cm", f"{meta.mapped_lane_cm:.1f}"),
         ("marking on the map, cm", f"{meta.tape_cm:.1f}"),
     ]
-
-
-def _figure(width: float, height: float, panels: int = 1) -> tuple[Any, list[Any]]:
-    """Make a figure with panels one below the other."""
-    figure = new_figure(width, height, dpi=110)
-    if figure is None:
-        raise ImportError("Matplotlib is not installed")
-    axes = figure.subplots(panels, 1, sharex=panels > 1, squeeze=False)[:, 0]
-    for ax in axes:
-        ax.grid(True, alpha=0.3)
-    return figure, list(axes)
-
-
-def _interrupted(values: Float[np.ndarray, "n d"], starts: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "m d"]:
-    """Insert a row of NaN before each row that does not continue the one before: no line is drawn there."""
-    return np.insert(values, np.flatnonzero(starts[1:]) + 1, np.nan, axis=0)
-
-
-def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"]) -> bytes:
-    """Driven path before and after the loops were closed."""
-    figure, (axes,) = _figure(6.5, 5.0)
-    drive_map = mapped.drive_map
-    for poses, style, name in (
-        (opened_poses, {"color": "#d08020", "lw": 1.0, "ls": "--"}, "open loop"),
-        (drive_map.poses, {"color": "#2060c0", "lw": 1.3}, "closed"),
-    ):
-        axes.plot(*_interrupted(0.01 * poses[:, :2], mapped.starts).T, label=name, **style)
-    axes.plot(*(0.01 * drive_map.poses[0, :2]), "ko", ms=4)
-    axes.annotate(" start", 0.01 * drive_map.poses[0, :2], fontsize=8)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x, m", ylabel="y, m")
-    axes.legend(fontsize=8)
-    return png_bytes(figure)
-
-
-def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes:
-    """Residuals and coverage over the distance ahead, by line."""
-    figure, (axes, below) = _figure(6.5, 4.6, 2)
-    every = join_samples(quality.samples)
-    scale = REFERENCE_WIDTH / width
-    edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
-    centres = 0.5 * (edges[:-1] + edges[1:])
-    for side in SIDES:
-        part = every.select(every.right == (side == "right"))
-        bins = [
-            summarise(part.select((part.ahead_cm >= a) & (part.ahead_cm < b)))
-            for a, b in pairwise(edges.tolist())
-        ]
-        for name, style, values in (
-            ("p95", ".--", [scale * b.p95_px for b in bins]),
-            ("robust sd", "o-", [scale * b.robust_sd_px for b in bins]),
-        ):
-            axes.plot(centres, values, style, color=_COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
-        below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=_COLOURS[side], label=side, ms=3)
-    for bound in (max_sd_px, max_p95_px):
-        axes.axhline(bound, color="gray", lw=0.8, ls=":")
-    for ax in (axes, below):
-        ax.axvline(VERDICT_REACH_CM, color="gray", lw=0.8, ls=":")
-    axes.set(ylim=(0.0, None), ylabel="px at 160 px width")
-    axes.legend(fontsize=7, ncol=2)
-    below.set(ylim=(0.0, 105.0), ylabel="edge found, %", xlabel="ahead of the front axle, cm")
-    return png_bytes(figure)
-
-
-def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
-    """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
-    figure, (axes, strip) = _figure(6.5, 3.8, 2)
-    median_px = quality.frame_median_px * REFERENCE_WIDTH / width
-    axes.plot(drive_map.frames[quality.held_out], median_px, ".", color="#2060c0", ms=4)
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("median residual\nof held-out frame, px", fontsize=8)
-    status = np.array(quality.status)
-    names = [LABELLED, *(reason for reason in quality.not_labelled)]
-    for i, name in enumerate(names):
-        colour = "#2e9e2e" if name == LABELLED else "#999999" if name == DELETED else f"C{(i + 2) % 10}"
-        at = drive.frames[status == name]
-        strip.plot(at, np.full(len(at), i), "|", color=colour, ms=9)
-    strip.set_yticks(range(len(names)), [f"{n} ({int((status == n).sum())})" for n in names], fontsize=8)
-    strip.set(ylim=(len(names) - 0.5, -0.5), xlabel="frame")
-    return png_bytes(figure)
-
-
-def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
-    """Curvature of the driven path over the steering command, with a fitted line; None without a fit."""
-    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
-    turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
-    if turn is None or not any(fits):
-        return None
-    figure, (axes,) = _figure(6.5, 3.6)
-    for segment, fit in enumerate(fits):
-        part = np.flatnonzero(drive_map.segment == segment)
-        if fit is None or len(part) < 3:
-            continue
-        delta = np.diff(drive_map.poses[part], axis=0)
-        step = np.hypot(delta[:, 0], delta[:, 1])
-        moving = (step > 0.3 * np.median(step)) & ~mapped.starts[part[1:]]
-        command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
-        curvature = 100.0 * delta[moving, 2] / step[moving]
-        axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
-        if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
-            continue
-        # Fitted again: the filter's own fit preceded the adjustment of camera and poses.
-        gain, trim = np.polyfit(command, curvature, 1)
-        r = float(np.corrcoef(command, curvature)[0, 1])
-        ends = np.array([command.min(), command.max()])
-        label = f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}"
-        axes.plot(ends, gain * ends + trim, "k-", lw=1.0, label=label)
-    axes.set(xlabel="steering command, positive left", ylabel="curvature, 1/m")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8)
-    return png_bytes(figure)
-
-
-def speed_plot(mapped: MappedDrive) -> bytes:
-    """Step length of each frame, with the commanded speed or throttle."""
-    drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
-    figure, (axes,) = _figure(6.5, 2.8)
-    step = np.hypot(*np.diff(drive_map.poses[:, :2], axis=0).T)
-    # A step across a break was not driven by the car.
-    step[mapped.starts[1:]] = np.nan
-    axes.plot(drive_map.frames[1:], step, "-", color="#2060c0", lw=0.8)
-    axes.set(ylim=(0.0, None), xlabel="frame")
-    axes.set_ylabel("step length, cm", color="#2060c0")
-    commands = drive.commands
-    for values, name in ((commands.speed_cm_s, "commanded speed, cm/s"), (commands.throttle, "throttle")):
-        if values is not None:
-            other = axes.twinx()
-            other.plot(drive.frames[rows], values[rows], "-", color="#d08020", lw=0.6, alpha=0.7)
-            other.set_ylabel(name, color="#d08020")
-            break
-    return png_bytes(figure)

@@ -19,16 +19,15 @@ from lanenet.data.segments import true_runs
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.page import Picture
 
 #: Colours, BGR.
 _LEFT, _RIGHT, _ADJACENT, _POINT = (80, 220, 80), (220, 80, 220), (200, 200, 80), (60, 60, 255)
 _WITHHELD = (40, 40, 255)
-#: Least width of an enlarged frame, and width of a frame on the report's sheets with the height of its title,
-#: [px]. Chosen: four frames side by side fit a page.
+#: Least width of an enlarged frame, [px]. Chosen: a phone shows it at half its size.
 _TILE_WIDTH = 400
-_SHEET_TILE_WIDTH, _TITLE_HEIGHT = 320, 22
-#: Frames in a row of a sheet, and frames on a sheet.
-_COLUMNS, _TILES = 4, 8
+#: Frames in a row of a sheet, and frames of a kind on the report's page.
+_COLUMNS, _PICTURES = 4, 8
 #: Distance between segments on the picture of a map, relative to their size. Chosen.
 _BETWEEN = 0.08
 
@@ -60,8 +59,8 @@ def draw_map(
             colour = _ADJACENT if line.rank else _LEFT if line.side == "left" else _RIGHT
             at_cm = line.with_corners(np.arange(s.min(), end, 2.0))
             points, withheld = line.points(at_cm), line.contradicted(at_cm)
-            lanes.append((segment, points, colour, 1))
-            lanes.append((segment, np.where(withheld[:, None], points, np.nan), _WITHHELD, 5))
+            lanes.append((segment, points, colour, 3))
+            lanes.append((segment, np.where(withheld[:, None], points, np.nan), _WITHHELD, 7))
     of_cloud = np.sort(drive_map.segment, kind="stable")
     # A line of an adjacent lane may lie beyond all edge points that are drawn.
     known = [(segment, points[np.isfinite(points[:, 0])]) for segment, points, _, _ in lanes]
@@ -89,7 +88,7 @@ def draw_map(
     for segment, points, colour, thickness in lanes:
         _polyline(image, pixels, points + moved[segment], colour, thickness)
     for driven in np.split(driven_cm, np.flatnonzero(starts[1:]) + 1):
-        _polyline(image, pixels, driven, (255, 255, 255))
+        _polyline(image, pixels, driven, (255, 255, 255), 2)
     draw_metre(image, scale)
     write_png(path, image)
 
@@ -116,7 +115,7 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
 
 
 def _polyline(  # type: ignore[no-untyped-def]
-    image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour, thickness: int = 1
+    image: UInt8[np.ndarray, "h w 3"], pixels, points: Float[np.ndarray, "m 2"], colour, thickness: int
 ) -> None:
     for run in true_runs(np.isfinite(points[:, 0])):
         if len(run) > 1:
@@ -129,14 +128,14 @@ def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, 
     drive_map = mapped.drive_map
     tiles = [
         draw_lines(
-            mapped.drive.image(int(mapped.rows[k])),
+            _frame(mapped, k),
             lines_at(drive_map, k),
             drive_map.camera,
             f"{drive_map.frames[k]}",
         )
         for k in map(int, chosen)
     ]
-    write_png(path, tiled(tiles, background=0))
+    write_png(path, _tiled(tiles))
 
 
 def draw_lines(
@@ -161,7 +160,7 @@ def draw_lines(
         inside = (
             np.isfinite(at).all(axis=1) & (np.abs(at) < 4 * big.shape[1]).all(axis=1) & (line[:, 1] > -5.0)
         )
-        _polyline(big, np.rint, np.where(inside[:, None], at, np.nan), colour)
+        _polyline(big, np.rint, np.where(inside[:, None], at, np.nan), colour, 2)
     rows = np.tile(ROWS_CM, 2)
     for u, v in pixels(np.stack([lines.points_cm, rows], axis=1)):
         if np.isfinite(u) and np.isfinite(v) and abs(u) < 9999 and abs(v) < 9999:
@@ -183,8 +182,8 @@ def write_png(path: Path, image: UInt8[np.ndarray, "h w *c"]) -> None:
     path.write_bytes(data.tobytes())
 
 
-def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
-    """Draw sheets of the best, median and worst held-out frames, with their lines and median residuals.
+def held_out_pictures(mapped: MappedDrive, quality: MapQuality) -> dict[str, list[Picture]]:
+    """Draw the best, median and worst held-out frames, with their lines and median residuals.
 
     A frame without residuals counts as worst: the map expects a line there that is not seen.
     """
@@ -192,20 +191,29 @@ def contact_sheets(mapped: MappedDrive, quality: MapQuality) -> dict[str, UInt8[
     order = np.argsort(np.nan_to_num(medians, nan=np.inf), kind="stable")
     if not order.size:
         return {}
-    count = min(_TILES, max(1, len(order) // 3))
+    count = min(_PICTURES, max(1, len(order) // 3))
     middle = (len(order) - count) // 2
     picks = {
-        "best": order[:count],
-        "median": order[middle : middle + count],
         "worst": order[::-1][:count],
+        "median": order[middle : middle + count],
+        "best": order[:count],
     }
-    return {title: _sheet(mapped, quality, medians, rows) for title, rows in picks.items()}
+    return {title: _held_out(mapped, quality, rows) for title, rows in picks.items()}
 
 
-def withheld_sheet(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> UInt8[np.ndarray, "_ _ 3"] | None:
-    """Draw frames that show the longest sections that are withheld, in red; None where there is none."""
-    if not wrong:
-        return None
+def _held_out(mapped: MappedDrive, quality: MapQuality, picks: np.ndarray) -> list[Picture]:
+    drive_map, scale = mapped.drive_map, REFERENCE_WIDTH / mapped.drive.width
+    pictures = []
+    for i in picks:
+        k, median_px = int(quality.held_out[i]), quality.frame_median_px[i]
+        found = f"{median_px * scale:.2f} px" if np.isfinite(median_px) else "nothing found"
+        drawn = draw_lines(_frame(mapped, k), lines_at(drive_map, k), drive_map.camera_at(k), "")
+        pictures.append(Picture(drawn, f"frame {drive_map.frames[k]}: {found}"))
+    return pictures
+
+
+def withheld_pictures(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> list[Picture]:
+    """Draw frames that show the longest sections that are withheld, in red."""
     drive_map = mapped.drive_map
     as_mapped = replace(
         drive_map,
@@ -214,43 +222,22 @@ def withheld_sheet(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> UInt8[
             for segment, lines in drive_map.lines.items()
         },
     )
-    tiles = []
-    for place in wrong[:_TILES]:
+    pictures = []
+    for place in wrong[:_PICTURES]:
         k = place.frames[0]
-        image, camera = mapped.drive.image(int(mapped.rows[k])), drive_map.camera_at(k)
-        tile = draw_lines(image, lines_at(drive_map, k), camera, "", lines_at(as_mapped, k))
-        tiles.append(_titled(tile, f"frame {drive_map.frames[k]}: {place.name}"))
-    return tiled(tiles, background=255)
-
-
-def _titled(tile: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h2 w2 3"]:
-    height = round(tile.shape[0] * _SHEET_TILE_WIDTH / tile.shape[1])
-    title = np.full((_TITLE_HEIGHT, _SHEET_TILE_WIDTH, 3), 255, np.uint8)
-    cv2.putText(title, text, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-    small = cv2.resize(tile, (_SHEET_TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(np.vstack([title, small]), dtype=np.uint8)
-
-
-def _sheet(
-    mapped: MappedDrive, quality: MapQuality, medians: np.ndarray, picks: np.ndarray
-) -> UInt8[np.ndarray, "h w 3"]:
-    drive_map, scale = mapped.drive_map, REFERENCE_WIDTH / mapped.drive.width
-    tiles = []
-    for i in picks:
-        k = int(quality.held_out[i])
-        known = np.isfinite(medians[i])
-        text = f"frame {drive_map.frames[k]}: " + (
-            f"{medians[i] * scale:.2f} px" if known else "nothing found"
+        drawn = draw_lines(
+            _frame(mapped, k), lines_at(drive_map, k), drive_map.camera_at(k), "", lines_at(as_mapped, k)
         )
-        image = mapped.drive.image(int(mapped.rows[k]))
-        tile = draw_lines(image, lines_at(drive_map, k), drive_map.camera_at(k), "")
-        tiles.append(_titled(tile, text))
-    return tiled(tiles, background=255)
+        pictures.append(Picture(drawn, f"frame {drive_map.frames[k]}: {place.name}"))
+    return pictures
 
 
-def tiled(tiles: list[UInt8[np.ndarray, "h w 3"]], background: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _frame(mapped: MappedDrive, k: int) -> UInt8[np.ndarray, "h w *c"]:
+    return mapped.drive.image(int(mapped.rows[k]))
+
+
+def _tiled(tiles: list[UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Lay out pictures of one size in rows."""
-    empty = [np.full_like(tiles[0], background)] * (-len(tiles) % _COLUMNS)
-    tiles = [*tiles, *empty]
+    tiles = [*tiles, *[np.zeros_like(tiles[0])] * (-len(tiles) % _COLUMNS)]
     rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
     return np.asarray(np.vstack(rows), dtype=np.uint8)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datagen.quality import page
+from datagen.quality import plots
 from datagen.quality.figures import steering_correlation
 from datagen.quality.pictures import draw_map
 from datagen.slam.camera.coarse import guessed_camera
@@ -88,7 +88,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         figures.append(figure)
         return b""
 
-    monkeypatch.setattr(page, "png_bytes", keep)
+    monkeypatch.setattr(plots, "png_bytes", keep)
     return figures
 
 
@@ -115,7 +115,7 @@ def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
 
 
 def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):
-    page.trajectory_plot(mapped, mapped.drive_map.poses)
+    plots.trajectory_plot(mapped, mapped.drive_map.poses)
     (axes,) = drawn[0].axes
     for line in axes.lines[:2]:
         x, y = (np.asarray(values, dtype=float) for values in line.get_data())
@@ -125,11 +125,11 @@ def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):
 
 
 def test_steps_and_curvature_across_a_break_are_left_out(mapped, drawn):
-    page.speed_plot(mapped)
+    plots.speed_plot(mapped)
     step = np.asarray(drawn[0].axes[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(step)) + 1, STARTS[1:])
     np.testing.assert_allclose(step[np.isfinite(step)], 2.0)
-    page.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
+    plots.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
     # Of the first segment's 25 frames, two begin a run.
     assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23
 

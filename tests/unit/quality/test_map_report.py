@@ -119,9 +119,9 @@ def test_the_page_stands_alone(mapped):
     assert not re.search(r"https?://|<script|<link", text)
     for words in (
         "good",
-        "Held-out frames",
         "left line, 0-15 cm",
         "Worst held-out",
+        "Path and loops",
         "focal length",
         "viewport",
     ):

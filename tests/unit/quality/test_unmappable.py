@@ -60,8 +60,9 @@ def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0) -> str:
     assert str(drive) in message and INSTEAD in message and str(out / "report.html") in message
     page = (out / "report.html").read_text(encoding="utf-8")
     assert message.split(": ", 1)[1].split(";")[0][1:] in html.unescape(page)
+    assert f"What to do:</strong> {INSTEAD.capitalize()}" in page
     # Raw frames, and the same with their edges.
-    assert page.count("data:image/jpeg") >= 2
+    assert page.count("data:image/jpeg") >= 16
     with pytest.raises(MapFormatError, match=r"refused.*report\.html"):
         read_map(out)
     return message
@@ -247,4 +248,5 @@ def test_a_lane_width_wrong_by_two_is_found_where_the_camera_is_known(tmp_path, 
         CalibrationError, match=rf"{given_cm:g} cm apart .* (39|40|41) cm apart .*camera's height"
     ):
         map_drive(MapRequest(both_lines, given_cm), SETTINGS, tmp_path / "map")
-    assert (tmp_path / "map" / "report.html").is_file()
+    page = (tmp_path / "map" / "report.html").read_text(encoding="utf-8")
+    assert "with this camera.</p>" in page and "What to do:</strong> Check the lane width and the" in page
