@@ -21,9 +21,10 @@ HEAVY = (
     *("onnx", "onnxscript", "safetensors", "tensorboard"),
 )
 #: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
-#: written, and a device of the car opened, only if its package is there.
+#: written, a bag read, and a device of the car opened, only if its package is there.
 NAMED_IMPORTS = {
     "lanenet/data/": {"pyarrow"},
+    "lanenet/data/drives/bag/": {"mcap", "rosbags"},
     "lanenet/learn/sweep.py": {"optuna"},
     "lanenet/onboard/actuators/": {"serial", "termios"},
     "lanenet/onboard/cameras/": {"picamera2"},

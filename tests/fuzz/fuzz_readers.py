@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from bags import usual, write_bag, write_foxglove
 from cameras import ROS_FILE, make_camera
 from drives import CAMERA, frame_image, record, write_drive, write_tub, write_video
 from synthetic_labels import WINDOW, make_label_set
@@ -229,6 +230,9 @@ READERS: dict[str, Reader] = {
         lambda f: images(f / "tub"),
     ),
     "video": Reader(make_video, lambda f: images(f / "lap.avi")),
+    "bag": Reader(lambda f: write_bag(f / "lap", usual(4)), lambda f: images(f / "lap")),
+    "bag of mcap": Reader(lambda f: write_bag(f / "lap", usual(4), "mcap"), lambda f: images(f / "lap")),
+    "mcap": Reader(lambda f: write_foxglove(f / "lap.mcap", 4), lambda f: images(f / "lap.mcap")),
     "photo": Reader(photo("a.jpg"), lambda f: open_source(f / "a.jpg").image(0)),
     "tiff": Reader(photo("a.tiff"), lambda f: open_source(f / "a.tiff").image(0)),
     "webp": Reader(photo("a.webp"), lambda f: read_picture(f / "a.webp")),

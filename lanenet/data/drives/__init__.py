@@ -1,4 +1,4 @@
-"""Recorded drives in every format: a folder with ``frames.csv``, a Donkeycar tub, or a video.
+"""Recorded drives in every format: a folder with ``frames.csv``, a Donkeycar tub, a video, or a ROS 2 bag.
 
 A format is a module with a :class:`DriveFormat`, and one entry in :data:`FORMATS`.
 """
@@ -10,7 +10,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lanenet.data.drives import folder, tub, video
+from lanenet.data.drives import bag, folder, tub, video
 from lanenet.data.drives.folder import read_truth
 from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
 from lanenet.errors import DriveFormatError
@@ -33,7 +33,7 @@ __all__ = [
 #: tubs as ``data/tub_1``.
 _HINT_DEPTH, _HINT_COUNT = 2, 3
 #: Tried in this order; a folder that is both a drive folder and a tub is read as the former.
-FORMATS: tuple[DriveFormat, ...] = (folder.FORMAT, tub.FORMAT, video.FORMAT)
+FORMATS: tuple[DriveFormat, ...] = (folder.FORMAT, tub.FORMAT, video.FORMAT, bag.FORMAT)
 
 
 def open_drive(path: Path) -> Drive:
@@ -57,6 +57,9 @@ def meant_instead(path: Path) -> str:
     """Name the drive that a path that is none belongs to, or those in it; the end of a sentence."""
     if tub.is_old(path):
         return "; a version 1 tub has to be converted by Donkeycar first"
+    if path.suffix == ".bag":
+        instead = f"rosbags-convert --src {shlex.quote(str(path))} --dst {shlex.quote(path.stem)}"
+        return f"; a bag of ROS 1 has to be converted first: {instead}"
     if (above := drive_above(path)) is not None:
         return f"; the drive is the folder above it: type {shlex.quote(str(above))}"
     inside = list(itertools.islice(_drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))

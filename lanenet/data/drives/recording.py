@@ -246,7 +246,7 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
     """Combine what a reader found with the ``drive.yaml`` in the drive's folder.
 
     Args:
-        path: The drive: a folder, or a single file, which has no ``drive.yaml``.
+        path: The drive: a folder or a single file.
         recorded: What the reader found.
 
     Raises:
@@ -292,6 +292,7 @@ class DriveFile(Settings):
         camera: Camera file in the folder.
         lane_width_cm: Distance between the middles of the two lines of the driven lane.
         max_steering_rad: Steering angle at Donkeycar's angle -1.
+        topics: Of a ROS 2 bag, those of the images and the commands to use; all if empty.
         notes: Free text.
     """
 
@@ -299,18 +300,25 @@ class DriveFile(Settings):
     camera: str | None = None
     lane_width_cm: LaneWidthCm | None = None
     max_steering_rad: float | None = Field(default=None, gt=0.0, lt=0.5 * math.pi)
+    topics: tuple[str, ...] = ()
     notes: str = ""
 
 
-def read_drive_file(folder: Path) -> tuple[DriveFile, Camera | None]:
-    """Read a folder's ``drive.yaml`` and the camera that it names; defaults if there is no such file.
+def drive_file_of(drive: Path) -> Path:
+    """Return where ``drive.yaml`` is: in a drive's folder; beside a single file as ``<name>.drive.yaml``."""
+    return drive / DRIVE_FILE if drive.is_dir() else drive.with_name(f"{drive.stem}.{DRIVE_FILE}")
+
+
+def read_drive_file(drive: Path) -> tuple[DriveFile, Camera | None]:
+    """Read a drive's ``drive.yaml`` and the camera that it names; defaults if there is no such file.
 
     Raises:
         DriveFormatError: If the file is of an unknown version, or a key is misspelt or out of range.
         CalibrationError: If the camera file cannot be used.
     """
-    inside = FolderFiles(folder)
-    path = inside.file(DRIVE_FILE, folder, DriveFormatError)
+    path = drive_file_of(drive)
+    inside = FolderFiles(path.parent)
+    inside.file(path.name, drive, DriveFormatError)
     # A link that leads nowhere is there, too.
     if not os.path.lexists(path):
         return DriveFile(format="lanenet-drive/1"), None
@@ -325,14 +333,14 @@ def read_drive_file(folder: Path) -> tuple[DriveFile, Camera | None]:
 
 def write_drive_file(folder: Path, file: DriveFile) -> None:
     """Write a folder's ``drive.yaml``, without keys that are empty."""
-    kept = {key: value for key, value in file.model_dump().items() if value not in (None, "")}
+    kept = {key: value for key, value in file.model_dump().items() if value not in (None, "", ())}
     write_text(folder / DRIVE_FILE, yaml.safe_dump(kept, sort_keys=False, allow_unicode=True))
 
 
 #: Bounds of what a recording may hold. Chosen: far above any car and clock, so that sums of them stay finite:
 #: Unix time in the year 5138, 360 km/h, and 16 turns a second.
 MAX_TIME_S, _MAX_SPEED_CM_S, _MAX_YAW_RATE_RAD_S = 1e11, 1e4, 100.0
-_COMMAND_SPECS: dict[str, ColumnSpec] = {
+COMMAND_SPECS: dict[str, ColumnSpec] = {
     "speed_cm_s": ColumnSpec(required=False, low=-_MAX_SPEED_CM_S, high=_MAX_SPEED_CM_S),
     "throttle": ColumnSpec(required=False, low=-1.0, high=1.0),
     # No car steers by a right angle: such a value is in degrees.
@@ -361,7 +369,7 @@ def read_times(path: Path, **more: ColumnSpec) -> tuple[dict[str, np.ndarray], C
     specs: dict[str, Any] = {
         "frame": ColumnSpec("int", low=0.0, increasing=True),
         "t_s": ColumnSpec(increasing=True, low=-MAX_TIME_S, high=MAX_TIME_S),
-        **_COMMAND_SPECS,
+        **COMMAND_SPECS,
         **more,
     }
     columns = read_csv(path, specs, skip_torn=True)

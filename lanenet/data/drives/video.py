@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.drives.recording import Commands, DriveFormat, RecordedFrames, read_times
+from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, RecordedFrames, read_times
 from lanenet.data.tables import is_answers
 from lanenet.errors import DriveFormatError
 from lanenet.reading import MAX_PIXELS, is_regular, open_regular
@@ -189,5 +189,5 @@ FORMAT = DriveFormat(
     described=f"a video ({', '.join(VIDEO_ENDINGS)})",
     recognises=lambda path: is_regular(path) and path.suffix.lower() in VIDEO_ENDINGS,
     read=read_video,
-    files=("{stem}.csv",),
+    files=("{stem}.csv", f"{{stem}}.{DRIVE_FILE}"),
 )

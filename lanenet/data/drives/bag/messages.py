@@ -1,0 +1,149 @@
+"""Messages of ROS 2 and Foxglove: what an image or a command says.
+
+Messages of ROS are CDR, those of Foxglove JSON. Only types of fixed standards are read, so that definitions
+that a bag may hold of its own are not needed, and not trusted.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from lanenet.data.drives.bag.storage import Topic, reading
+from lanenet.data.files import require
+from lanenet.errors import DriveFormatError
+from lanenet.reading import MAX_PIXELS, decode_image
+
+_NS_PER_S = 1_000_000_000
+
+IMAGE_TYPES = (
+    *("sensor_msgs/msg/Image", "foxglove.RawImage"),
+    *("sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"),
+)
+#: The first of these that a bag holds gives the commands: a steering angle says more than a yaw rate.
+COMMAND_TYPES = (
+    *("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive"),
+    *("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"),
+)
+#: Not among the types that rosbags knows. Source: ackermann_msgs 2.0.2.
+_ACKERMANN = {
+    "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\nfloat32 steering_angle_velocity\n"
+    "float32 speed\nfloat32 acceleration\nfloat32 jerk\n",
+    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\n"
+    "ackermann_msgs/AckermannDrive drive\n",
+}
+#: Channels of an encoding, and OpenCV's code that makes it BGR. OpenCV names a Bayer pattern by the second
+#: row and column.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    **dict.fromkeys(("bgr8", "8UC3"), (3, None)),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2BGR)),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    **dict.fromkeys(("mono8", "8UC1"), (1, cv2.COLOR_GRAY2BGR)),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2BGR_YUY2)),
+}
+
+
+class Decoder:
+    """Decodes the messages of a topic."""
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic
+        self._store: Any = None
+
+    def message(self, data: bytes) -> Any:
+        """Return a message with its fields as attributes.
+
+        Raises:
+            DriveFormatError: If it cannot be decoded.
+        """
+        with reading(Path(self.topic.name)):
+            if self.topic.encoding == "json":
+                return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+            if self._store is None:
+                self._store = _typestore()
+            return self._store.deserialize_cdr(data, self.topic.type)
+
+    def stamp_ns(self, message: Any) -> int:
+        """Return the time that a message gives itself, [ns]; 0 if it has none."""
+        if (header := getattr(message, "header", None)) is not None:
+            return int(header.stamp.sec) * _NS_PER_S + int(header.stamp.nanosec)
+        stamp = getattr(message, "timestamp", None)
+        return 0 if stamp is None else int(stamp.sec) * _NS_PER_S + int(stamp.nsec)
+
+    def image(self, data: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the image in a message, BGR.
+
+        Raises:
+            DriveFormatError: If it is damaged, or its encoding is not known; names ``where``.
+        """
+        message = self.message(data)
+        with reading(Path(str(where))):
+            pixels = message.data
+            pixels = base64.b64decode(pixels) if isinstance(pixels, str) else bytes(pixels)
+            if not self.topic.type.endswith("CompressedImage"):
+                return _raw_image(message, pixels, where)
+        return decode_image(pixels, where, DriveFormatError)
+
+    def command(self, data: bytes) -> tuple[int, float, float, float]:
+        """Return stamp, [ns], speed, [cm/s], steering angle and yaw rate, [rad] and [rad/s], positive left.
+
+        The signs are those of REP 103, which are this project's. What the type does not hold is NaN.
+        """
+        message = self.message(data)
+        stamp_ns = self.stamp_ns(message)
+        if self.topic.type.startswith("ackermann_msgs"):
+            drive = getattr(message, "drive", message)
+            return stamp_ns, 100.0 * float(drive.speed), float(drive.steering_angle), math.nan
+        twist = getattr(message, "twist", message)
+        return stamp_ns, 100.0 * float(twist.linear.x), math.nan, float(twist.angular.z)
+
+    def is_picture(self, data: bytes) -> bool:
+        """Tell whether an image message holds light, not a depth, which some cameras give as an image."""
+        try:
+            message = self.message(data)
+            if self.topic.type.endswith("CompressedImage"):
+                return "compressedDepth" not in str(message.format)
+            return message.encoding in _ENCODINGS
+        except (DriveFormatError, AttributeError):
+            return False
+
+
+def _typestore() -> Any:
+    typesys = require("rosbags.typesys", "bags")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    types: dict[str, Any] = {}
+    for name, text in _ACKERMANN.items():
+        types |= typesys.get_types_from_msg(text, name)
+    store.register(types)
+    return store
+
+
+def _raw_image(message: Any, pixels: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if message.encoding not in _ENCODINGS:
+        raise DriveFormatError(
+            f"{where}: images in {str(message.encoding)!r}, expected one of {', '.join(_ENCODINGS)}"
+        )
+    channels, code = _ENCODINGS[message.encoding]
+    if not (0 < height * width <= MAX_PIXELS and width * channels <= step and len(pixels) == step * height):
+        raise DriveFormatError(
+            f"{where}: image of {width}x{height} px with {step} bytes a row and {len(pixels)} in all, "
+            f"expected {width * channels} a row or more, and {step * height} in all"
+        )
+    rows = np.frombuffer(pixels, np.uint8).reshape(height, step)[:, : width * channels]
+    image = np.ascontiguousarray(rows).reshape(height, width, channels)
+    return image if code is None else np.asarray(cv2.cvtColor(image, code))
