@@ -21,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm wheels neutral check format format-check lint types imports bench clean
+.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm wheels neutral check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -37,6 +37,9 @@ help:
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
 	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
+	@echo "make docs         the documentation as a site into site/; any broken link or warning fails it"
+	@echo "make figures      draw frames, windows and lengths anew into docs/images/frames"
+	@echo "make links        ask for every address that the documents name (needs the network)"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
 	@echo "make bench        time the stages that run on the car, on this machine"
@@ -117,12 +120,22 @@ types: $(VENV)/.stamp-dev
 imports: $(VENV)/.stamp-dev
 	$(BIN)/lint-imports
 
+# Nothing is fetched. The warning that is switched off advertises another generator.
+docs: $(VENV)/.stamp-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+figures: $(VENV)/.stamp-dev
+	$(BIN)/python contrib/docs/figures.py docs/images/frames
+
+links: $(VENV)/.stamp-dev
+	$(BIN)/python contrib/docs/links.py
+
 bench: $(VENV)/.stamp-train
 	mkdir -p runs
 	$(BIN)/lanenet bench --model checkpoints/small --out runs/bench.json
 
 clean:
-	rm -rf runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf runs site build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find lanenet datagen tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is written only when pip has finished, so that an interrupted installation is taken up again.

@@ -6,14 +6,12 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
+from documents import VERBS as COMMANDS
 from typer.testing import CliRunner
 
 import lanenet
@@ -27,21 +25,6 @@ VERBS = (
 )
 #: Wide enough that help texts are not wrapped inside an option's name.
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
-
-
-def commands(group: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Walk through all verbs, those of groups (``calibrate chessboard``) by their full names.
-
-    By attribute and not by class: typer stands on click or on a copy of it, by its version.
-    """
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from commands(command, (*prefix, name))
-        else:
-            yield (*prefix, name), command
-
-
-COMMANDS = dict(commands(typer.main.get_command(app)))
 
 
 #: Documents whose command lines are checked.
@@ -112,17 +95,6 @@ def test_the_documents_show_every_verb() -> None:
 
 def test_the_readme_fits_on_a_few_screens() -> None:
     assert len((REPO / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
-
-
-@pytest.mark.parametrize("line", readme_lines(), ids=lambda line: line.split()[1])
-def test_every_line_of_the_readme_names_what_exists(line: str) -> None:
-    words = shlex.split(line, comments=True)[1:]
-    names = tuple(words[:2]) if tuple(words[:2]) in COMMANDS else tuple(words[:1])
-    assert names in COMMANDS, f"no such verb: {line}"
-    known = {option for parameter in COMMANDS[names].params for option in parameter.opts}
-    for word in words:
-        if word.startswith("--"):
-            assert word.partition("=")[0] in known, f"{word} is no option of {' '.join(names)}"
 
 
 def outputs(line: str) -> list[str]:

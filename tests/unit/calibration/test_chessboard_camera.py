@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from boards import fisheye_of, views_of
+from chessboards import fisheye_of, views_of
 
 from lanenet.calibration.bundle import LensFit
 from lanenet.calibration.chessboard import BoardView

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from boards import BOARD, board_poses, fisheye_of, painted
+from chessboards import BOARD, board_poses, fisheye_of, painted
 from typer.testing import CliRunner
 
 from lanenet.calibration.chessboard import BoardView, find_view, find_views, list_pictures, parse_board

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from boards import BOARD, MOUNTING, fisheye_of
+from chessboards import BOARD, MOUNTING, fisheye_of
 
 from lanenet.calibration.chessboard import BoardView
 from lanenet.calibration.ground import calibrate_ground, points_of_floor_board

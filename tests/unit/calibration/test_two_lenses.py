@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from boards import BOARD, fisheye_of, views_of
+from chessboards import BOARD, fisheye_of, views_of
 
 from lanenet.calibration.bundle import LensFit, free_numbers, poses_of_views, refine
 from lanenet.calibration.chessboard import BoardView, find_views, list_pictures

@@ -1,0 +1,232 @@
+"""The command lines of the documents run as they stand, in a folder that holds a small one of all they read.
+
+Where a command takes minutes, options that make it small are added to its end: the last one of a name counts.
+What is not run is named in ``NOT_RUN`` with the reason; its verbs, options, targets and files are checked.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from chessboards import board_poses, fisheye_of, painted
+from documents import DOCUMENTS, REPO, VERBS, Command, commands_of, inline_commands, unmarked_blocks
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
+from lanenet.data.camera_file import read_camera
+
+CONFIGS = sorted((REPO / "configs").glob("*.yaml"))
+COMMANDS = [command for document in DOCUMENTS for command in commands_of(document)]
+#: Fewer give no map.
+FRAMES = 60
+#: What is not run, and why.
+NOT_RUN = {
+    r"(?!lanenet )": "not a command of lanenet: installs packages, changes the computer or takes minutes",
+    r"lanenet (drive|stop|doctor) .*(picamera|\bcar\.yaml)": "needs a car",
+}
+#: What stands in ``slow`` takes longer than the gate has time for; the chain trains by `train` in the gate.
+SLOW = r"lanenet (train|sweep|judge|reality|calibrate drive|val .*--robust|sheets \w)\b"
+#: A file's time may be that of the clock's last tick. Chosen: ten ticks of a slow one.
+CLOCK_STEP_NS = 10**8
+#: What makes a command small.
+SMALLER = {
+    "simulate": f"frames={FRAMES}",
+    "train": "learn.epochs=1 learn.threads=1 data.workers=1",
+    "sweep": "--trials 1 --minutes 2",
+    "bench": "--rounds 10",
+    "judge": "--count 1 --laps 1 --out runs/judge",
+    "reality": "--count 2",
+    "sheets": "paper",
+}
+
+
+def check_options(line: str) -> None:
+    """Refuse a command line with a verb or an option that does not exist."""
+    words = shlex.split(line)[1:]
+    if words and words[0].startswith("-"):
+        assert words[0] in ("--help", "--version", "--install-completion"), line
+        return
+    names = tuple(words[:2]) if tuple(words[:2]) in VERBS else tuple(words[:1])
+    groups = {name[0] for name in VERBS if len(name) > 1}
+    assert names in VERBS or (len(words) == 1 and words[0] in groups), f"no such verb: {line}"
+    known = (
+        {option for parameter in VERBS[names].params for option in parameter.opts}
+        if names in VERBS
+        else set()
+    )
+    for word in words:
+        if word.startswith("--"):
+            assert word.partition("=")[0] in {*known, "--help"}, f"{word} is no option of {' '.join(names)}"
+
+
+def why_not_run(line: str) -> str:
+    return next((reason for pattern, reason in NOT_RUN.items() if re.match(pattern, line)), "")
+
+
+RUN = list(dict.fromkeys(command.line for command in COMMANDS if not why_not_run(command.line)))
+LEFT_OUT = [command for command in COMMANDS if why_not_run(command.line)]
+
+
+def tiny(config: dict[str, Any]) -> dict[str, Any]:
+    """A training config of the same keys with next to no data."""
+    data = config["data"]
+    if "synthetic" in data:
+        simulation = {**data["synthetic"].get("simulation", {}), "frames": FRAMES}
+        data["synthetic"] |= {"train": 1, "validation": 1, "test": 1, "simulation": simulation}
+    for drive in data.get("drives", ()):
+        drive.pop("map", None)
+        drive.pop("gap_cm", None)
+        drive |= {"split": "time", "gap_frames": 2}
+    return config
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project folder with a small drive, its map, its labels, photos of a board and small configs."""
+    project = tmp_path_factory.mktemp("documents") / "project"
+    documents = "".join(document.read_text(encoding="utf-8") for document in (*DOCUMENTS, *CONFIGS))
+    shutil.copytree(REPO / "configs", project / "configs")
+    shutil.copytree(REPO / "checkpoints", project / "checkpoints")
+    example = "lanenet simulate configs/drives/example.yaml"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(project)
+        invoke(f"{example} frames={FRAMES} --out runs/drive7")
+        invoke("lanenet map runs/drive7 --lane-width 40 --out runs/my_map")
+        invoke("lanenet label runs/my_map --out runs/my_labels.parquet")
+        for path in (project / "configs").glob("*.yaml"):
+            config = yaml.safe_load(path.read_text(encoding="utf-8"))
+            if "data" in config:
+                path.write_text(yaml.safe_dump(tiny(config)), encoding="utf-8")
+            for shown in config.get("data", {}).get("drives", ()):
+                if shown["path"] in documents and not Path(shown["path"]).exists():
+                    width = f"track.lane_width_cm={shown['lane_width_cm']}"
+                    invoke(f"{example} frames={FRAMES} {width} --out {shown['path']}")
+    drive = project / "runs" / "drive7"
+    count_from(940, project.parent / "shared" / "data" / "donkey_circuit" / "frames.csv")
+    shutil.copytree(drive, project / "my_tub")
+    shutil.copytree(drive, project / "runs" / "drive8")
+    shutil.copytree(project / "runs" / "my_map", project / "runs" / "donkey_map")
+    shutil.copytree(project / "checkpoints" / "general", project / "checkpoints" / "donkey_circuit")
+    for copy in (project / "runs", project / "checkpoints" / "donkey_circuit"):
+        shutil.copy(drive / "camera.yaml", copy / "camera.yaml")
+    shutil.copy(project / "checkpoints" / "small" / "model.onnx", project / "alexnet.onnx")
+    shutil.copytree(project / "runs", project.parent / "runs")
+    write_video(project / "road.mp4", sorted(drive.rglob("*.jpg")))
+    write_floor_points(project / "floor_points.csv", drive / "camera.yaml")
+    write_photos(project / "photos")
+    return project
+
+
+def count_from(first: int, table: Path) -> None:
+    """Number the frames of a drive from another one on, as in a part of a recording."""
+    head, *rows = table.read_text(encoding="utf-8").splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    numbered = [f"{first + int(frame)},{rest}" for frame, rest in cells]
+    table.write_text("\n".join([head, *numbered]) + "\n", encoding="utf-8")
+
+
+def write_video(path: Path, images: list[Path]) -> None:
+    frames = [cv2.imread(str(image)) for image in images]
+    height, width = frames[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20.0, (width, height))
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+
+
+def write_floor_points(path: Path, camera_file: Path) -> None:
+    x_cm, y_cm = np.meshgrid([-20.0, 0.0, 20.0], [25.0, 35.0, 50.0])
+    points_cm = np.stack([x_cm.ravel(), y_cm.ravel()], axis=1)
+    table = np.hstack([points_cm, read_camera(camera_file).project_ground(points_cm)])
+    np.savetxt(path, table, fmt="%.2f", delimiter=",", header="x_cm,y_cm,u_px,v_px", comments="")
+
+
+def write_photos(path: Path) -> None:
+    path.mkdir()
+    rng = np.random.default_rng(2)
+    camera = fisheye_of(120.0, rng)
+    for number, (rotation, centre) in enumerate(board_poses(camera, rng, 8)):
+        cv2.imwrite(str(path / f"{number}.jpg"), painted(camera, rotation, centre, rng))
+
+
+def invoke(line: str) -> str:
+    result = CliRunner().invoke(app, shlex.split(line)[1:])
+    assert result.exit_code == 0, f"{line}\n{result.output}\n{result.exception!r}"
+    return result.output
+
+
+@pytest.mark.parametrize(
+    "line", [pytest.param(line, marks=pytest.mark.slow if re.match(SLOW, line) else ()) for line in RUN]
+)
+def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No line needs what another one has left.
+    shutil.rmtree(folder / "runs")
+    shutil.copytree(folder.parent / "runs", folder / "runs")
+    monkeypatch.chdir(folder)
+    verb = line.split()[1]
+    written = re.findall(r"--(?:out|video) (\S+)", line)
+    if verb == "map":
+        # The map of another drive would not be replaced.
+        shutil.rmtree(written[0], ignore_errors=True)
+    made_before = time.time_ns()
+    assert invoke(" ".join([line, SMALLER.get(verb, "")]))
+    for path in written:
+        # Some write several files that begin with the name.
+        newest = max((made.stat().st_mtime_ns for made in Path().glob(f"{path}*")), default=0)
+        assert newest > made_before - CLOCK_STEP_NS, f"{line}: did not write {path}"
+
+
+@pytest.mark.parametrize("command", LEFT_OUT, ids=lambda command: command.line)
+def test_what_is_not_run_names_what_exists(command: Command) -> None:
+    targets = set(re.findall(r"^([\w-]+):", (REPO / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for part in command.line.split("&&"):
+        words = [word for word in shlex.split(part) if word != "sudo"]
+        program = Path(words[0]).name
+        if program == "lanenet":
+            check_options(shlex.join(["lanenet", *words[1:]]))
+        elif program == "make":
+            named = [word for word in words[1:] if "=" not in word]
+            assert set(named) <= targets, part
+        elif program in ("python", "python3") and words[1].endswith(".py"):
+            assert (REPO / words[1]).is_file(), part
+        for word in words:
+            if word.startswith("contrib/"):
+                assert (REPO / word).exists(), part
+
+
+def test_every_reason_is_needed() -> None:
+    lines = [command.line for command in COMMANDS]
+    for pattern in (*NOT_RUN, SLOW):
+        assert [line for line in lines if re.match(pattern, line)], pattern
+    assert {line.split()[1] for line in RUN} >= SMALLER.keys()
+
+
+def test_most_commands_of_lanenet_are_run() -> None:
+    verbs = {line.split()[1] for line in RUN}
+    assert {names[0] for names in VERBS} - verbs == {"stop"}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(REPO).as_posix())
+def test_commands_in_the_text_name_what_exists(document: Path) -> None:
+    for line in inline_commands(document):
+        check_options(line)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(REPO).as_posix())
+def test_command_lines_stand_in_blocks_that_are_run(document: Path) -> None:
+    assert not unmarked_blocks(document)
+
+
+@pytest.mark.parametrize("line", ["lanenet trian x", "lanenet map my_tub --width 40"])
+def test_what_does_not_exist_is_found(line: str) -> None:
+    with pytest.raises(AssertionError, match=r"no such verb|is no option"):
+        check_options(line)
