@@ -50,8 +50,9 @@ def in_plain_sight(
         label_cm: The six labels; a line without all three is not in plain sight.
     """
     borders = RoadBorders(RoadEdges(edges_cm, normals))
-    section = np.floor((borders.y - _NEAR_CM) / _SECTION_CM)
-    looked_at = (borders.y >= _NEAR_CM) & (borders.y < _FAR_CM)
+    y = borders.near.y
+    section = np.floor((y - _NEAR_CM) / _SECTION_CM)
+    looked_at = (y >= _NEAR_CM) & (y < _FAR_CM)
     wanted = _SHOWN * (_FAR_CM - _NEAR_CM) / _SECTION_CM
     if not np.isfinite(label_cm).all():
         return False

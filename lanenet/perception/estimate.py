@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +16,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, SIDES, lane_width_cm, parabolas_from_points, parallel_points
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.lane_width import WidthBelief
+from lanenet.perception.rolling_median import RollingMedian
 
 
 @dataclass(frozen=True)
@@ -194,7 +193,7 @@ class LaneMemory:
         """
         self.given_cm = given_cm
         self.belief = WidthBelief(common_cm)
-        self._widths_cm: deque[float] = deque(maxlen=_LENGTH)
+        self._widths_cm = RollingMedian(_LENGTH)
 
     @property
     def width_cm(self) -> float | None:
@@ -216,7 +215,7 @@ class LaneMemory:
         """What the frames say against the given width; empty if they do not, or there is none."""
         if self.given_cm is None or len(self._widths_cm) < _CERTAIN:
             return ""
-        seen_cm = statistics.median(self._widths_cm)
+        seen_cm = self._widths_cm.median
         if abs(seen_cm / self.given_cm - 1.0) < _WRONG:
             return ""
         return f"lane width {self.given_cm:g} cm: the lines that are seen lie {seen_cm:.0f} cm apart"

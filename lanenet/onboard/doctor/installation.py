@@ -18,6 +18,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RangeSettings, RoadTable
+from lanenet.perception.network import compiled as network_compiled
 
 State = Literal["ok", "note", "problem"]
 
@@ -185,7 +186,7 @@ def _opencv() -> Check:
 
 
 def _kernels() -> Check:
-    if compiled.is_here():
+    if compiled.is_here() and network_compiled.is_here():
         return Check("edges", "ok", "by compiled loops")
     text = (
         "by NumPy and OpenCV, the same but slower: install g++ and the headers of Python, then lanenet again"

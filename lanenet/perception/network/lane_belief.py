@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+
+from lanenet.perception.rolling_median import RollingMedian
 
 #: Side of the road on which cars drive; None where nobody said.
 Keep = Literal["right", "left"]
@@ -27,6 +30,24 @@ _PLAIN, _KEPT = 0.3, 0.95
 _HUE_SIGMA = 0.25
 
 
+def _last() -> RollingMedian:
+    return RollingMedian(_LENGTH)
+
+
+@dataclass
+class _Line:
+    """What the last frames show of one line."""
+
+    yellow: RollingMedian = field(default_factory=_last)
+    red: RollingMedian = field(default_factory=_last)
+    gaps: deque[float] = field(default_factory=lambda: deque(maxlen=_LENGTH))
+
+    @property
+    def known(self) -> bool:
+        """Enough frames showed it."""
+        return len(self.gaps) >= _ENOUGH
+
+
 class LineLooks:
     """What the lane's two lines look like, remembered from frame to frame, and which lane that makes it.
 
@@ -39,7 +60,7 @@ class LineLooks:
 
     def __init__(self, keep: Keep | None = None) -> None:
         self.keep = keep
-        self._looks = self._new()
+        self._lines = [_Line(), _Line()]
         self._log_odds = 0.0
 
     @property
@@ -54,22 +75,27 @@ class LineLooks:
             side: 0 for the left line, 1 for the right one.
             look: See :class:`lanenet.perception.network.refinement.RefinedLines`.
         """
-        self._looks[side].append((float(look[0]), float(look[1]), float(look[2])))
+        line, (yellow, red, gaps) = self._lines[side], look.tolist()
+        line.yellow.append(yellow)
+        line.red.append(red)
+        line.gaps.append(gaps)
 
     def judge(self) -> None:
         """Weigh what both lines look like, once per frame."""
-        left, right = (self._usual(side) for side in (0, 1))
+        left, right = self._lines
         self._log_odds *= _KEPT
-        if self.keep is None or left is None or right is None:
+        if self.keep is None or not left.known or not right.known:
             return
-        like_own = (left[0] - right[0]) / _YELLOWER + (left[2] - right[2]) / _MORE_GAPS
+        gaps = statistics.fmean(left.gaps) - statistics.fmean(right.gaps)
+        like_own = (left.yellow.median - right.yellow.median) / _YELLOWER + gaps / _MORE_GAPS
         sign = 1.0 if self.keep == "right" else -1.0
         self._log_odds += sign * _PLAIN * max(-1.0, min(1.0, like_own))
 
     def hues(self, side: int | None) -> tuple[float, float]:
         """Return by how much a line is yellower and redder than the floor; NaN while unknown, or of none."""
-        usual = None if side is None else self._usual(side)
-        return (math.nan, math.nan) if usual is None else usual[:2]
+        if side is None or not self._lines[side].known:
+            return math.nan, math.nan
+        return self._lines[side].yellow.median, self._lines[side].red.median
 
     def unlike(self, side: int | None, look: Float[np.ndarray, "3"]) -> float:
         """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""
@@ -79,22 +105,10 @@ class LineLooks:
 
     def cross(self, side: int) -> None:
         """Go to the lane beyond the left line, 0, or the right one, 1: it is now on the other side."""
-        self._looks[1 - side] = self._looks[side]
-        self._looks[side] = deque(maxlen=_LENGTH)
+        self._lines[1 - side] = self._lines[side]
+        self._lines[side] = _Line()
         self._log_odds = -self._log_odds
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._looks, self._log_odds = self._new(), 0.0
-
-    @staticmethod
-    def _new() -> list[deque[tuple[float, float, float]]]:
-        return [deque(maxlen=_LENGTH), deque(maxlen=_LENGTH)]
-
-    def _usual(self, side: int) -> tuple[float, float, float] | None:
-        """Median hues and mean gaps of a line; None while too few frames showed it."""
-        looks = self._looks[side]
-        if len(looks) < _ENOUGH:
-            return None
-        yellow, red, gaps = zip(*looks, strict=True)
-        return statistics.median(yellow), statistics.median(red), statistics.fmean(gaps)
+        self._lines, self._log_odds = [_Line(), _Line()], 0.0

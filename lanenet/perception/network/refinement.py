@@ -7,13 +7,15 @@ network's answer, and says that nothing of it was seen.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lanenet.geometry.lane import PARABOLA_FROM_POINTS, ROWS_CM
+from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.network import compiled
 
 #: Edge points that count, ahead of the front axle. Chosen: beyond the label rows by half a row, where the
 #: parabola through them still holds.
@@ -32,8 +34,9 @@ _EDGE_CM, _EDGE_GROWTH, _CAUCHY_CM, _INDEPENDENT = 0.5, 0.02, 0.5, 40.0
 #: Difference of hues that takes three quarters of an edge point's weight. Tried from 0.2 to 0.4, and with the
 #: square: on 24 simulated drives 29 of 1000 points lie more than 3 cm off with it, 33 without.
 _HUE = 0.3
-#: Correlation of the errors of neighbouring label rows in a network's answer, as tried.
-_CORRELATION = 0.5
+#: Correlation of the errors of neighbouring label rows in a network's answer, and their least variance, as
+#: tried.
+_CORRELATION, _LEAST_VARIANCE = 0.5, 0.05
 #: Least and largest number of edge points of a line, and width of markings.
 _LEAST, _MOST, _MARKING_CM = 6, 128, (0.8, 9.0)
 #: A line is seen in a bin along the road that has a border within this of its place, and length of a bin.
@@ -52,13 +55,37 @@ _ROUGHLY, _GOLDEN = 0.6, 0.6180339887
 
 #: Bins within 6 cm of each label row: none where a line's place is a guess.
 _BESIDE = np.stack(
-    [np.floor((np.arange(-2, 2) * _BIN_CM + y - _NEAR_CM) / _BIN_CM).astype(np.int64) for y in ROWS_CM]
+    [
+        np.floor((np.arange(-2, 2) * _BIN_CM + y - _NEAR_CM) / _BIN_CM).clip(0.0).astype(np.int64)
+        for y in ROWS_CM
+    ]
 )
 
+#: (a, b, c) = x at the label rows @ BASIS, by Lagrange: the same bits on all machines.
+BASIS = np.array(
+    [
+        [1.0 / ((y - p) * (y - q)), -(p + q) / ((y - p) * (y - q)), p * q / ((y - p) * (y - q))]
+        for y, p, q in (np.roll(ROWS_CM, -i).tolist() for i in range(3))
+    ]
+)
 _ROW_CORRELATION = _CORRELATION ** np.abs(np.subtract.outer(range(3), range(3)))
 _THIRD = np.diff(np.eye(len(_NODES_CM)), n=3, axis=0)
 _SMOOTH = _THIRD.T @ _THIRD / _THIRD_CM**2
-_TO_ROWS = np.eye(len(_NODES_CM))[_ROWS_AT]
+#: Gates and Cauchy distances of the parabola's steps.
+_GATES_CM = [_FIRST_CM * _SHRINK**step for step in range(_STEPS)]
+_CAUCHIES_CM = [0.5 * _FIRST_CM, *[_CAUCHY_CM] * (_STEPS - 1)]
+#: All of the above, as ``Numbers`` of ``_kernels.cpp`` has them.
+_NUMBERS = np.concatenate(
+    [
+        np.ravel(values)
+        for values in (
+            *(BASIS, _ROW_CORRELATION, _SMOOTH, _NODES_CM, _ROWS_AT, _BESIDE, _GATES_CM, _CAUCHIES_CM),
+            *(_NEAR_CM, _FAR_CM, _FIRST_CM, _LAST_CM, _BENT_FIRST_CM, _BENT_CM, _BENT_SIGMAS, _LOOSE_CM),
+            *(_COSINE, _ROUGHLY, _EDGE_CM, _EDGE_GROWTH, _CAUCHY_CM, _INDEPENDENT, _HUE, _LEAST, _MOST),
+            *(_MARKING_CM, _SEEN_CM, _BIN_CM, _NODE_CM, _GOLDEN, _LEAST_VARIANCE, _BENT_STEPS),
+        )
+    ]
+).astype(np.float64)
 
 
 class RefinedLines(NamedTuple):
@@ -83,37 +110,56 @@ class RefinedLines(NamedTuple):
     look: Float[np.ndarray, "m 3"]
 
 
+class _NearEdges(NamedTuple):
+    """Edge points of a frame that may be borders of a line within the label rows."""
+
+    x: Float[np.ndarray, "n"]
+    y: Float[np.ndarray, "n"]
+    normal_x: Float[np.ndarray, "n"]
+    normal_y: Float[np.ndarray, "n"]
+    hues: Float[np.ndarray, "n 2"]
+    key: Float[np.ndarray, "n"]
+
+
 class RoadBorders:
-    """Edge points of a frame that may be borders of a line within the label rows, ready to be compared."""
+    """Edge points of a frame, for lines to be compared with.
+
+    Attributes:
+        edges: In double precision.
+    """
 
     def __init__(self, edges: RoadEdges) -> None:
-        y = edges.points_cm[:, 1]
+        hues = np.zeros_like(edges.points_cm) if edges.hues is None else edges.hues
+        looks = (np.ascontiguousarray(x, np.float64) for x in (edges.points_cm, edges.normals, hues))
+        self.edges = RoadEdges(*looks)
+
+    @cached_property
+    def near(self) -> _NearEdges:
+        """The edge points within the label rows; ``key`` puts them in an order that is spread evenly."""
+        y = self.edges.points_cm[:, 1]
         near = (y > _NEAR_CM) & (y < _FAR_CM)
-        self.x, self.y = edges.points_cm[near].T.astype(np.float64)
-        self.normal_x, self.normal_y = edges.normals[near].T.astype(np.float64)
-        self.hues = np.zeros((len(self.x), 2)) if edges.hues is None else edges.hues[near].astype(np.float64)
-        ones = np.ones_like(self.y)
-        # x of a line and its slope at these y, from its points at the label rows.
-        self.at = np.stack([self.y * self.y, self.y, ones], axis=1) @ PARABOLA_FROM_POINTS
-        self.slope = np.stack([2.0 * self.y, ones, 0.0 * ones], axis=1) @ PARABOLA_FROM_POINTS
-        self._shuffled = (np.arange(len(self.x)) * _GOLDEN) % 1.0
+        (x, y), (normal_x, normal_y) = self.edges.points_cm[near].T, self.edges.normals[near].T
+        assert self.edges.hues is not None
+        key = (np.arange(len(x)) * _GOLDEN) % 1.0
+        return _NearEdges(x, y, normal_x, normal_y, self.edges.hues[near], key)
 
     def off_cm(
         self, points_cm: Float[np.ndarray, "m 3"]
     ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n"]]:
-        """Distance of each edge point to the right of each line, and cosine of the normals."""
-        slope = points_cm @ self.slope.T
+        """Distance of each edge point of ``near`` to the right of each line, and cosine of the normals."""
+        edges = self.near
+        x_cm, slope = line_at(points_cm, edges.y)
         across = 1.0 / np.sqrt(1.0 + slope * slope)
-        return (self.x - points_cm @ self.at.T) * across, (self.normal_x - self.normal_y * slope) * across
+        return (edges.x - x_cm) * across, (edges.normal_x - edges.normal_y * slope) * across
 
     def beside(
         self, points_cm: Float[np.ndarray, "m 3"], reach_cm: float
     ) -> tuple[Int[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
         """Indices of the edge points near each line, at most ``_MOST`` of them; false beyond their number."""
         off_cm, agree = self.off_cm(points_cm)
-        key = np.where((np.abs(off_cm) < reach_cm) & (np.abs(agree) > _ROUGHLY), self._shuffled, 2.0)
+        key = np.where((np.abs(off_cm) < reach_cm) & (np.abs(agree) > _ROUGHLY), self.near.key, 2.0)
         most = min(_MOST, key.shape[1])
-        index = np.argpartition(key, most - 1, axis=1)[:, :most]
+        index = np.sort(np.argpartition(key, most - 1, axis=1)[:, :most], axis=1)
         return index, np.take_along_axis(key, index, axis=1) < 1.5
 
 
@@ -148,87 +194,108 @@ def refine_lines(
         Iteratively reweighted least squares with Cauchy weights (Holland and Welsch 1977), gated; then the
         same for a smoothing spline. The numbers were tried on nine drives, eight of them simulated.
     """
-    m = len(points_cm)
-    prior = sigma_cm[:, :, None] * sigma_cm[:, None, :] * _ROW_CORRELATION + 0.05 * np.eye(3)
-    by_prior = np.linalg.inv(prior)
+    if hues is None:
+        hues = np.full((len(points_cm), 2), np.nan)
+    lines = points_cm, sigma_cm, marking_cm, marking_sigma_cm, hues
+    if not compiled.is_here():
+        return _refine(*lines, borders)
+    found = compiled.refine(lines, borders.edges, _NUMBERS)
+    return RefinedLines(
+        found[:, :3], found[:, 3:6], found[:, 6], found[:, 7], found[:, 8:11] > 0.0, found[:, 11:]
+    )
+
+
+def _refine(
+    points_cm: Float[np.ndarray, "m 3"],
+    sigma_cm: Float[np.ndarray, "m 3"],
+    marking_cm: Float[np.ndarray, "m"],
+    marking_sigma_cm: Float[np.ndarray, "m"],
+    hues: Float[np.ndarray, "m 2"],
+    borders: RoadBorders,
+) -> RefinedLines:
+    """Do :func:`refine_lines` without compiled loops; every sum is taken in the order in which they do."""
+    edges, m = borders.near, len(points_cm)
+    prior = sigma_cm[:, :, None] * sigma_cm[:, None, :] * _ROW_CORRELATION + _LEAST_VARIANCE * np.eye(3)
+    by_prior = _inverse(prior)
     start = np.concatenate([points_cm, marking_cm[:, None]], axis=1)
-    if len(borders.x) < _LEAST:
+    if len(edges.x) < _LEAST:
         return _unseen(start, prior)
     index, there = borders.beside(points_cm, _FIRST_CM + _BENT_CM + float(np.abs(marking_cm).max()))
-    x, y, normal_x, normal_y = (
-        borders.x[index],
-        borders.y[index],
-        borders.normal_x[index],
-        borders.normal_y[index],
-    )
-    at, slope_at = borders.at[index], borders.slope[index]
-    certain = there / (_EDGE_CM + _EDGE_GROWTH * np.maximum(y, 0.0)) ** 2
-    if hues is not None:
-        off = np.sign(marking_cm)[:, None, None] * borders.hues[index] - hues[:, None]
-        certain /= np.nan_to_num(1.0 + (off * off).sum(axis=2) / _HUE**2, nan=1.0) ** 2
+    x, y, normal_x, normal_y = (each[index] for each in edges[:4])
+    spread_cm = _EDGE_CM + _EDGE_GROWTH * np.maximum(y, 0.0)
+    certain = there / (spread_cm * spread_cm)
+    off = np.sign(marking_cm)[:, None, None] * edges.hues[index] - hues[:, None]
+    unlike = 1.0 + (off[..., 0] * off[..., 0] + off[..., 1] * off[..., 1]) / (_HUE * _HUE)
+    certain /= np.where(np.isnan(unlike), 1.0, unlike * unlike)
 
     # 1. The parabola and the width of the marking.
     information = np.zeros((m, 4, 4))
     information[:, :3, :3] = by_prior
-    information[:, 3, 3] = marking_sigma_cm**-2
+    information[:, 3, 3] = 1.0 / (marking_sigma_cm * marking_sigma_cm)
     sign, (least, most) = np.sign(marking_cm), _MARKING_CM
     found, enough = start.copy(), np.zeros(m, dtype=bool)
     change = np.empty((*y.shape, 4))
-    for step in range(_STEPS):
-        slope = (slope_at @ found[:, :3, None])[..., 0]
+    at = (y[..., None] * BASIS[:, 0] + BASIS[:, 1]) * y[..., None] + BASIS[:, 2]
+    for most_cm, cauchy_cm in zip(_GATES_CM, _CAUCHIES_CM, strict=True):
+        line_cm, slope = line_at(found[:, :3], y)
         across = 1.0 / np.sqrt(1.0 + slope * slope)
         agree = (normal_x - normal_y * slope) * across
         side = np.sign(agree)
-        gap_cm = (x - (at @ found[:, :3, None])[..., 0]) * across + 0.5 * side * found[:, 3:]
-        most_cm = _FIRST_CM * _SHRINK**step
+        gap_cm = (x - line_cm) * across + 0.5 * side * found[:, 3:]
         near = there & (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < most_cm)
         count = near.sum(axis=1)
         enough = count >= _LEAST
-        weight = near * certain / (1.0 + (gap_cm / (_CAUCHY_CM if step else 0.5 * most_cm)) ** 2)
+        share = gap_cm / cauchy_cm
+        weight = near * certain / (1.0 + share * share)
         weight /= np.maximum(1.0, count / _INDEPENDENT)[:, None]
         # Change of the gap with the line's points and with the width.
         np.multiply(at, -across[:, :, None], out=change[..., :3])
         np.multiply(side, 0.5, out=change[..., 3])
-        weighted = (change * weight[:, :, None]).transpose(0, 2, 1)
-        pull = information @ (start - found)[:, :, None] - weighted @ gap_cm[:, :, None]
-        moved = found + np.linalg.solve(information + weighted @ change, pull)[:, :, 0]
+        weighted = change * weight[:, :, None]
+        pull = _times(information, start - found) - _sum(weighted * gap_cm[:, :, None], 1)
+        told = _sum(weighted[:, :, :, None] * change[:, :, None], 1)
+        moved = found + _times(_inverse(information + told), pull)
         moved[:, 3] = sign * np.clip(sign * moved[:, 3], least, most)
         found = np.where(enough[:, None], moved, start)
-    if not enough.any():
-        return _unseen(start, prior)
 
     # 2. What it has beyond the parabola, linear between nodes along the road.
-    slope, beyond_cm = (slope_at @ found[:, :3, None])[..., 0], x - (at @ found[:, :3, None])[..., 0]
+    line_cm, slope = line_at(found[:, :3], y)
+    beyond_cm = x - line_cm
     ahead = (_NODES_CM - y[..., None]) / _NODE_CM
     share = np.maximum(1.0 - np.abs(ahead), 0.0)
     lean = np.sign(ahead) * (share > 0.0) / _NODE_CM
 
-    def beside(extra_cm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance of the edge points from their borders, cosine of the normals, and of the slope."""
-        steep = slope + (lean @ extra_cm)[..., 0]
+    def beside(extra_cm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Distance of the edge points from their borders, cosines of normals and slope, and the bend."""
+        steep = slope + _sum(lean * extra_cm[:, None], 2)
         across = 1.0 / np.sqrt(1.0 + steep * steep)
         agree = (normal_x - normal_y * steep) * across
-        off_cm = (beyond_cm - (share @ extra_cm)[..., 0]) * across
-        return off_cm + 0.5 * np.sign(agree) * found[:, 3:], agree, across
+        bent_cm = _sum(share * extra_cm[:, None], 2)
+        off_cm = (beyond_cm - bent_cm) * across
+        return off_cm + 0.5 * np.sign(agree) * found[:, 3:], agree, across, bent_cm
 
-    information = _SMOOTH + _TO_ROWS.T @ by_prior @ _TO_ROWS
-    wanted = _TO_ROWS.T @ by_prior @ (points_cm - found[:, :3])[:, :, None]
-    extra_cm, covariance = np.zeros((m, len(_NODES_CM), 1)), information
+    information = np.repeat(_SMOOTH[None], m, axis=0)
+    information[:, _ROWS_AT[:, None], _ROWS_AT] += by_prior
+    wanted = np.zeros((m, len(_NODES_CM)))
+    wanted[:, _ROWS_AT] = _times(by_prior, points_cm - found[:, :3])
+    extra_cm, covariance = np.zeros((m, len(_NODES_CM))), information
     gate_cm = np.full(y.shape, _BENT_FIRST_CM)
     for _ in range(_BENT_STEPS):
-        gap_cm, agree, across = beside(extra_cm)
+        gap_cm, agree, across, bent_cm = beside(extra_cm)
         cosine = np.where(gate_cm > _LOOSE_CM, _ROUGHLY, _COSINE)
         near = there & (np.abs(agree) > cosine) & (np.abs(gap_cm) < gate_cm)
-        weight = near * certain / (1.0 + (gap_cm / _CAUCHY_CM) ** 2)
+        far = gap_cm / _CAUCHY_CM
+        weight = near * certain / (1.0 + far * far)
         weight /= np.maximum(1.0, near.sum(axis=1) / _INDEPENDENT)[:, None]
-        weighted = (share * (weight * across)[:, :, None]).transpose(0, 2, 1)
-        covariance = np.linalg.inv(information + (weighted * across[:, None]) @ share)
-        pull = weighted @ (gap_cm + (share @ extra_cm)[..., 0] * across)[:, :, None]
-        extra_cm = covariance @ (pull + wanted)
+        weighted = share * (weight * across)[:, :, None]
+        told = _sum((weighted * across[:, :, None])[:, :, :, None] * share[:, :, None], 1)
+        covariance = _inverse(information + told)
+        pull = _sum(weighted * (gap_cm + bent_cm * across)[:, :, None], 1)
+        extra_cm = _times(covariance, pull + wanted)
         # Where the line is known the next border is near; beyond, it may be anywhere that tape may bend to.
         reach_cm = _BENT_SIGMAS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        gate_cm = (share @ np.clip(reach_cm, _LAST_CM, _BENT_CM)[:, :, None])[..., 0]
-    gap_cm, agree, _ = beside(extra_cm)
+        gate_cm = _sum(share * np.clip(reach_cm, _LAST_CM, _BENT_CM)[:, None], 2)
+    gap_cm, agree, _, _ = beside(extra_cm)
     met = there & (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < _SEEN_CM) & enough[:, None]
     # The two borders apart: on a marking of the other polarity, a line meets only one of them.
     seen = np.zeros((m, 2, _BINS), dtype=bool)
@@ -238,7 +305,7 @@ def refine_lines(
         (agree[row, column] > 0.0).astype(np.int64),
         ((y[row, column] - _NEAR_CM) / _BIN_CM).astype(np.int64),
     ] = True
-    points = np.where(enough[:, None], found[:, :3] + extra_cm[:, _ROWS_AT, 0], start[:, :3])
+    points = np.where(enough[:, None], found[:, :3] + extra_cm[:, _ROWS_AT], start[:, :3])
     variance = np.diagonal(covariance, axis1=1, axis2=2)[:, _ROWS_AT]
     variance = np.where(enough[:, None], variance, np.diagonal(prior, axis1=1, axis2=2))
     return RefinedLines(
@@ -248,11 +315,44 @@ def refine_lines(
         0.5 * _BIN_CM * seen.sum(axis=(1, 2)),
         np.any(seen[:, :, _BESIDE], axis=(1, 3)),
         _look(
-            sign[:, None] * (met[:, None] @ borders.hues[index])[:, 0],
+            sign[:, None] * _sum(met[:, :, None] * edges.hues[index], 1),
             met.sum(axis=1),
             np.asarray(seen.any(axis=1)),
         ),
     )
+
+
+def line_at(
+    points_cm: Float[np.ndarray, "m 3"], y: Float[np.ndarray, "*m n"]
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n"]]:
+    """Return x of lines at y, and their slopes dx/dy."""
+    a, b, c = (_sum(points_cm * column, 1)[:, None] for column in BASIS.T)
+    return (a * y + b) * y + c, 2.0 * a * y + b
+
+
+def _sum(terms: Float[np.ndarray, "*shape"], axis: int) -> Float[np.ndarray, "*left"]:
+    """Return the sum from first to last, without the partial sums of ``numpy.sum``."""
+    # Not -0.
+    return np.add.accumulate(terms, axis=axis).take(-1, axis=axis) + 0.0
+
+
+def _times(
+    matrices: Float[np.ndarray, "m n n"], vectors: Float[np.ndarray, "m n"]
+) -> Float[np.ndarray, "m n"]:
+    return _sum(matrices * vectors[:, None], 2)
+
+
+def _inverse(matrices: Float[np.ndarray, "m n n"]) -> Float[np.ndarray, "m n n"]:
+    """Return the inverses of symmetric, positive definite matrices, by Gauss and Jordan."""
+    inverse = matrices.copy()
+    for i in range(inverse.shape[1]):
+        scale = 1.0 / inverse[:, i, i]
+        row, column = inverse[:, i] * scale[:, None], inverse[:, :, i].copy()
+        row[:, i] = scale
+        inverse[:, :, i] = 0.0
+        inverse -= column[:, :, None] * row[:, None]
+        inverse[:, i] = row
+    return inverse
 
 
 def _look(

@@ -1,0 +1,489 @@
+// Lines on the edge points of their markings, and the distances of lines: refinement.py and tracker.py, compiled.
+// What a step means and where its numbers come from stands there. Every sum is taken in the order of the Python
+// code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays come as contiguous
+// buffers, whose types compiled.py sees to.
+
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <limits>
+#include <vector>
+
+// On x86-64 the loops over edge points exist twice, and the processor chooses.
+#if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE
+#endif
+
+namespace {
+
+constexpr int kRows = 3, kNodes = 8, kSteps = 2, kPlaces = 4;  // label rows, nodes, steps, bins beside a row
+constexpr int kMost = 128, kMostBins = 64;                     // edge points of a line, bins along it
+constexpr int kPerLine = 14;
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+
+// The settings, as _NUMBERS of refinement.py has them.
+struct Numbers {
+  double basis[kRows][3], correlation[kRows][kRows], smooth[kNodes][kNodes], nodes_cm[kNodes];
+  double rows_at[kRows], beside[kRows][kPlaces], gates_cm[kSteps], cauchies_cm[kSteps];
+  double near_cm, far_cm, first_cm, last_cm, bent_first_cm, bent_cm, bent_sigmas, loose_cm;
+  double cosine, roughly, edge_cm, edge_growth, cauchy_cm, independent, hue, least, most;
+  double marking_cm[2], seen_cm, bin_cm, node_cm, golden, least_variance, bent_steps;
+};
+
+// Edge points within the label rows.
+struct Near {
+  std::vector<double> x, y, normal_x, normal_y, yellow, red;
+  std::vector<double> off, agree;
+  std::vector<int> index;
+};
+
+// Edge points of one line.
+struct Beside {
+  double x[kMost], y[kMost], normal_x[kMost], normal_y[kMost], yellow[kMost], red[kMost], certain[kMost];
+  double at[kRows][kMost], slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
+  double weight[kMost], gate[kMost], share[2][kMost], lean[2][kMost], bent[kMost];
+  int node[kMost], n;
+};
+
+struct Parabola {
+  double a, b, c;
+};
+
+// x of lines at y, as _line_at().
+inline Parabola parabola_of(const Numbers& s, const double* points) {
+  double out[3];
+  for (int k = 0; k < 3; ++k) {
+    out[k] = 0.0;
+    for (int j = 0; j < kRows; ++j) out[k] += points[j] * s.basis[j][k];
+  }
+  return {out[0], out[1], out[2]};
+}
+
+inline double sign_of(double x) { return (x > 0.0) - (x < 0.0); }
+
+// _inverse() of one matrix.
+template <int n>
+void invert(double (*m)[n]) {
+  for (int i = 0; i < n; ++i) {
+    double row[n], column[n];
+    const double scale = 1.0 / m[i][i];
+    for (int j = 0; j < n; ++j) row[j] = m[i][j] * scale, column[j] = m[j][i];
+    row[i] = scale;
+    for (int k = 0; k < n; ++k) m[k][i] = 0.0;
+    for (int k = 0; k < n; ++k)
+      for (int j = 0; j < n; ++j) m[k][j] -= column[k] * row[j];
+    for (int j = 0; j < n; ++j) m[i][j] = row[j];
+  }
+}
+
+template <int n>
+inline void times(const double (*matrix)[n], const double* vector, double* out) {
+  for (int i = 0; i < n; ++i) {
+    out[i] = 0.0;
+    for (int j = 0; j < n; ++j) out[i] += matrix[i][j] * vector[j];
+  }
+}
+
+void take_near(const Numbers& s, const double* points, const double* normals, const double* hues, size_t n,
+               Near& out) {
+  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red}) values->clear();
+  for (size_t i = 0; i < n; ++i) {
+    const double y = points[2 * i + 1];
+    if (!(y > s.near_cm && y < s.far_cm)) continue;
+    out.x.push_back(points[2 * i]);
+    out.y.push_back(y);
+    out.normal_x.push_back(normals[2 * i]);
+    out.normal_y.push_back(normals[2 * i + 1]);
+    out.yellow.push_back(hues[2 * i]);
+    out.red.push_back(hues[2 * i + 1]);
+  }
+  out.off.resize(out.x.size());
+  out.agree.resize(out.x.size());
+}
+
+WIDE void measure_off(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
+                      double a, double b, double c, double* off, double* agree) {
+  const double a2 = 2.0 * a;
+  for (int i = 0; i < n; ++i) {
+    const double slope = a2 * y[i] + b, across = 1.0 / std::sqrt(1.0 + slope * slope);
+    off[i] = (x[i] - ((a * y[i] + b) * y[i] + c)) * across;
+    agree[i] = (normal_x[i] - normal_y[i] * slope) * across;
+  }
+}
+
+// RoadBorders.beside() of one line.
+void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near, Beside& out) {
+  const int n = static_cast<int>(near.x.size());
+  measure_off(near.x.data(), near.y.data(), near.normal_x.data(), near.normal_y.data(), n, line.a, line.b, line.c,
+              near.off.data(), near.agree.data());
+  auto& index = near.index;
+  index.clear();
+  for (int i = 0; i < n; ++i)
+    if (std::abs(near.off[i]) < reach_cm && std::abs(near.agree[i]) > s.roughly) index.push_back(i);
+  if (index.size() > kMost) {
+    const auto key = [&](int i) {
+      const double spread = i * s.golden;
+      return spread - std::floor(spread);
+    };
+    std::nth_element(index.begin(), index.begin() + kMost, index.end(),
+                     [&](int i, int j) { return key(i) < key(j); });
+    index.resize(kMost);
+    std::sort(index.begin(), index.end());
+  }
+  out.n = static_cast<int>(index.size());
+  for (int k = 0; k < out.n; ++k) {
+    const int i = index[k];
+    out.x[k] = near.x[i];
+    out.y[k] = near.y[i];
+    out.normal_x[k] = near.normal_x[i];
+    out.normal_y[k] = near.normal_y[i];
+    out.yellow[k] = near.yellow[i];
+    out.red[k] = near.red[i];
+  }
+}
+
+WIDE void weigh_looks(const Numbers& s, double sign, double yellow, double red, Beside& e) {
+  const bool known = !std::isnan(yellow) && !std::isnan(red);
+  for (int i = 0; i < e.n; ++i) {
+    const double spread = s.edge_cm + s.edge_growth * (e.y[i] > 0.0 ? e.y[i] : 0.0);
+    e.certain[i] = 1.0 / (spread * spread);
+  }
+  for (int i = 0; known && i < e.n; ++i) {
+    const double off_yellow = sign * e.yellow[i] - yellow, off_red = sign * e.red[i] - red;
+    const double unlike = 1.0 + (off_yellow * off_yellow + off_red * off_red) / (s.hue * s.hue);
+    e.certain[i] /= unlike * unlike;
+  }
+  for (int k = 0; k < kRows; ++k)
+    for (int i = 0; i < e.n; ++i) e.at[k][i] = (e.y[i] * s.basis[k][0] + s.basis[k][1]) * e.y[i] + s.basis[k][2];
+}
+
+// Gaps to the borders of a marking along a parabola, and the weights of those within the gate.
+WIDE int weigh_parabola(const Numbers& s, const Parabola& line, double marking, double gate, double cauchy,
+                        Beside& e) {
+  const double a2 = 2.0 * line.a;
+  int count = 0;
+  for (int i = 0; i < e.n; ++i) {
+    const double y = e.y[i], slope = a2 * y + line.b, across = 1.0 / std::sqrt(1.0 + slope * slope);
+    const double agree = (e.normal_x[i] - e.normal_y[i] * slope) * across;
+    const double side = agree > 0.0 ? 1.0 : agree < 0.0 ? -1.0 : 0.0;
+    const double gap = (e.x[i] - ((line.a * y + line.b) * y + line.c)) * across + 0.5 * side * marking;
+    const bool near = (std::abs(agree) > s.cosine) & (std::abs(gap) < gate);
+    const double share = gap / cauchy;
+    e.across[i] = across;
+    e.agree[i] = side;
+    e.gap[i] = gap;
+    e.weight[i] = near ? e.certain[i] / (1.0 + share * share) : 0.0;
+    count += near;
+  }
+  return count;
+}
+
+// The same along a line that bends.
+WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, double* gate, Beside& e) {
+  for (int i = 0; i < e.n; ++i) {
+    const double *here = extra + e.node[i];
+    e.bent[i] = e.share[0][i] * here[0] + e.share[1][i] * here[1];
+    e.weight[i] = e.lean[0][i] * here[0] + e.lean[1][i] * here[1];
+  }
+  int count = 0;
+  for (int i = 0; i < e.n; ++i) {
+    const double steep = e.slope[i] + e.weight[i], across = 1.0 / std::sqrt(1.0 + steep * steep);
+    const double agree = (e.normal_x[i] - e.normal_y[i] * steep) * across;
+    const double side = agree > 0.0 ? 1.0 : agree < 0.0 ? -1.0 : 0.0;
+    const double gap = (e.beyond[i] - e.bent[i]) * across + 0.5 * side * marking;
+    const double cosine = gate[i] > s.loose_cm ? s.roughly : s.cosine;
+    const bool near = (std::abs(agree) > cosine) & (std::abs(gap) < gate[i]);
+    const double far = gap / s.cauchy_cm;
+    e.across[i] = across;
+    e.agree[i] = agree;
+    e.gap[i] = gap;
+    e.weight[i] = near ? e.certain[i] / (1.0 + far * far) : 0.0;
+    count += near;
+  }
+  return count;
+}
+
+// _refine() of one line, whose edge points are in `e`.
+void refine_line(const Numbers& s, const double* points, const double* sigma, double marking, double marking_sigma,
+                 bool any, Beside& e, double* out) {
+  double prior[kRows][kRows], by_prior[kRows][kRows];
+  for (int i = 0; i < kRows; ++i)
+    for (int j = 0; j < kRows; ++j)
+      prior[i][j] = sigma[i] * sigma[j] * s.correlation[i][j] + (i == j ? s.least_variance : 0.0);
+  std::memcpy(by_prior, prior, sizeof prior);
+  invert(by_prior);
+  double start[4] = {points[0], points[1], points[2], marking}, found[4];
+  std::memcpy(found, start, sizeof start);
+  const double sign = sign_of(marking);
+  bool enough = false;
+
+  double information[4][4] = {};
+  for (int i = 0; i < kRows; ++i)
+    for (int j = 0; j < kRows; ++j) information[i][j] = by_prior[i][j];
+  information[3][3] = 1.0 / (marking_sigma * marking_sigma);
+  for (int step = 0; any && step < kSteps; ++step) {
+    const int count =
+        weigh_parabola(s, parabola_of(s, found), found[3], s.gates_cm[step], s.cauchies_cm[step], e);
+    enough = count >= s.least;
+    if (!enough) {
+      std::memcpy(found, start, sizeof start);
+      continue;
+    }
+    const double crowd = std::max(1.0, count / s.independent);
+    double told[4][4] = {}, gaps[4] = {};
+    for (int i = 0; i < e.n; ++i) {
+      if (e.weight[i] == 0.0) continue;
+      const double weight = e.weight[i] / crowd;
+      const double change[4] = {e.at[0][i] * -e.across[i], e.at[1][i] * -e.across[i], e.at[2][i] * -e.across[i],
+                                0.5 * e.agree[i]};
+      for (int k = 0; k < 4; ++k) {
+        const double weighted = change[k] * weight;
+        gaps[k] += weighted * e.gap[i];
+        for (int j = 0; j < 4; ++j) told[k][j] += weighted * change[j];
+      }
+    }
+    double off[4], pull[4], moved[4];
+    for (int k = 0; k < 4; ++k) off[k] = start[k] - found[k];
+    times(information, off, pull);
+    for (int k = 0; k < 4; ++k) {
+      pull[k] -= gaps[k];
+      for (int j = 0; j < 4; ++j) told[k][j] = information[k][j] + told[k][j];
+    }
+    invert(told);
+    times(told, pull, moved);
+    for (int k = 0; k < 4; ++k) found[k] += moved[k];
+    found[3] = sign * std::min(std::max(sign * found[3], s.marking_cm[0]), s.marking_cm[1]);
+  }
+  double *place = out, *deviation = out + 3, *look = out + 11;
+  out[6] = found[3];
+  out[7] = 0.0;
+  for (int k = 0; k < kRows; ++k) {
+    place[k] = start[k];
+    deviation[k] = std::sqrt(prior[k][k]);
+    out[8 + k] = 0.0;
+    look[k] = kNaN;
+  }
+  if (!enough) return;
+
+  const Parabola line = parabola_of(s, found);
+  const double a2 = 2.0 * line.a;
+  for (int i = 0; i < e.n; ++i) {
+    const double y = e.y[i];
+    e.slope[i] = a2 * y + line.b;
+    e.beyond[i] = e.x[i] - ((line.a * y + line.b) * y + line.c);
+    e.node[i] = std::clamp(static_cast<int>((y - s.nodes_cm[0]) / s.node_cm), 0, kNodes - 2);
+    for (int k = 0; k < 2; ++k) {
+      const double ahead = (s.nodes_cm[e.node[i] + k] - y) / s.node_cm;
+      e.share[k][i] = std::max(1.0 - std::abs(ahead), 0.0);
+      e.lean[k][i] = e.share[k][i] > 0.0 ? sign_of(ahead) / s.node_cm : 0.0;
+    }
+    e.gate[i] = s.bent_first_cm;
+  }
+  double bent_information[kNodes][kNodes], covariance[kNodes][kNodes], off[kRows], pulled[kRows];
+  double wanted[kNodes] = {}, extra[kNodes] = {}, reach[kNodes];
+  std::memcpy(bent_information, s.smooth, sizeof bent_information);
+  for (int k = 0; k < kRows; ++k) off[k] = points[k] - found[k];
+  times(by_prior, off, pulled);
+  for (int i = 0; i < kRows; ++i) {
+    wanted[static_cast<int>(s.rows_at[i])] = pulled[i];
+    for (int j = 0; j < kRows; ++j)
+      bent_information[static_cast<int>(s.rows_at[i])][static_cast<int>(s.rows_at[j])] += by_prior[i][j];
+  }
+  for (int step = 0; step < s.bent_steps; ++step) {
+    const int count = weigh_bent(s, found[3], extra, e.gate, e);
+    const double crowd = std::max(1.0, count / s.independent);
+    double pull[kNodes] = {};
+    std::memset(covariance, 0, sizeof covariance);
+    for (int i = 0; i < e.n; ++i) {
+      if (e.weight[i] == 0.0) continue;
+      const double across = e.across[i], weight = e.weight[i] / crowd * across;
+      const double gap = e.gap[i] + e.bent[i] * across;
+      const int node = e.node[i];
+      for (int k = 0; k < 2; ++k) {
+        const double weighted = e.share[k][i] * weight, again = weighted * across;
+        pull[node + k] += weighted * gap;
+        for (int j = 0; j < 2; ++j) covariance[node + k][node + j] += again * e.share[j][i];
+      }
+    }
+    for (int i = 0; i < kNodes; ++i) {
+      pull[i] += wanted[i];
+      for (int j = 0; j < kNodes; ++j) covariance[i][j] = bent_information[i][j] + covariance[i][j];
+    }
+    invert(covariance);
+    times(covariance, pull, extra);
+    for (int i = 0; i < kNodes; ++i)
+      reach[i] = std::min(std::max(s.bent_sigmas * std::sqrt(covariance[i][i]), s.last_cm), s.bent_cm);
+    for (int i = 0; i < e.n; ++i)
+      e.gate[i] = e.share[0][i] * reach[e.node[i]] + e.share[1][i] * reach[e.node[i] + 1];
+  }
+  weigh_bent(s, found[3], extra, e.gate, e);
+  bool seen[2][kMostBins] = {};
+  const int bins = static_cast<int>((s.far_cm - s.near_cm) / s.bin_cm) + 1;
+  int met = 0, total = 0, filled = 0, first = bins, last = 0;
+  double yellow = 0.0, red = 0.0;
+  for (int i = 0; i < e.n; ++i) {
+    if (!(std::abs(e.agree[i]) > s.cosine && std::abs(e.gap[i]) < s.seen_cm)) continue;
+    ++met;
+    yellow += e.yellow[i];
+    red += e.red[i];
+    seen[e.agree[i] > 0.0][static_cast<int>((e.y[i] - s.near_cm) / s.bin_cm)] = true;
+  }
+  for (int i = 0; i < bins; ++i) {
+    total += seen[0][i] + seen[1][i];
+    if (!seen[0][i] && !seen[1][i]) continue;
+    ++filled;
+    first = std::min(first, i);
+    last = i + 1;
+  }
+  out[7] = 0.5 * s.bin_cm * total;
+  for (int k = 0; k < kRows; ++k) {
+    const int node = static_cast<int>(s.rows_at[k]);
+    place[k] = found[k] + extra[node];
+    deviation[k] = std::sqrt(covariance[node][node]);
+    for (const double bin : s.beside[k])
+      if (seen[0][static_cast<int>(bin)] || seen[1][static_cast<int>(bin)]) out[8 + k] = 1.0;
+  }
+  if (met == 0) return;
+  look[0] = sign * yellow / met;
+  look[1] = sign * red / met;
+  look[2] = 1.0 - static_cast<double>(filled) / (last - first);
+}
+
+// distances_cm() of two lines given at n places.
+double distance_of(const double* left, const double* right, const double* y, int n, int begin, int end,
+                   std::vector<double>& nearest) {
+  const double inf = std::numeric_limits<double>::infinity();
+  nearest.clear();
+  for (int side = 0; side < 2; ++side) {
+    const double *own = side ? right : left, *other = side ? left : right;
+    for (int i = begin; i < end; ++i) {
+      double least = inf;
+      for (int j = 0; j < n; ++j) {
+        const double across = other[j] - own[i], ahead = y[j] - y[i];
+        least = std::min(least, across * across + ahead * ahead);
+      }
+      nearest.push_back(least);
+    }
+  }
+  const auto middle = nearest.begin() + nearest.size() / 2;
+  std::nth_element(nearest.begin(), middle, nearest.end());
+  const double upper = *middle, lower = *std::max_element(nearest.begin(), middle);
+  return std::sqrt((lower + upper) / 2.0);
+}
+
+// --- Python ---
+
+// The memory of an argument; released at the end.
+struct Buffer {
+  Py_buffer view{};
+  ~Buffer() { PyBuffer_Release(&view); }
+  const double* data() const { return static_cast<const double*>(view.buf); }
+  size_t size() const { return view.len / sizeof(double); }
+};
+
+PyObject* refuse(const char* what) {
+  PyErr_SetString(PyExc_ValueError, what);
+  return nullptr;
+}
+
+PyObject* refine(PyObject*, PyObject* args) {
+  Buffer points, sigma, marking, marking_sigma, hues, edges, normals, edge_hues, numbers;
+  if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*y*y*y*", &points.view, &sigma.view, &marking.view, &marking_sigma.view,
+                        &hues.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view))
+    return nullptr;
+  const size_t m = marking.size();
+  if (points.size() != 3 * m || sigma.size() != 3 * m || marking_sigma.size() != m || hues.size() != 2 * m)
+    return refuse("lines: points, sigmas, markings and hues differ in number");
+  if (edges.size() % 2 || normals.size() != edges.size() || edge_hues.size() != edges.size())
+    return refuse("edges: points, normals and hues differ in number");
+  if (numbers.view.len != sizeof(Numbers)) return refuse("numbers: not of this size");
+  Numbers s;
+  std::memcpy(&s, numbers.view.buf, sizeof s);
+  const auto within = [](double value, int count) { return value >= 0.0 && value < count; };
+  bool sound = s.most == kMost && s.bin_cm > 0.0 && within((s.far_cm - s.near_cm) / s.bin_cm, kMostBins - 1);
+  for (int i = 0; i < kRows; ++i) {
+    sound &= within(s.rows_at[i], kNodes);
+    for (const double bin : s.beside[i]) sound &= within(bin, kMostBins);
+  }
+  if (!sound) return refuse("numbers: not those that this was compiled for");
+  try {
+    static Near near;  // one caller at a time: the interpreter's lock is held
+    static Beside beside;
+    PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerLine * sizeof(double));
+    if (!result) return nullptr;
+    double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
+    take_near(s, edges.data(), normals.data(), edge_hues.data(), edges.size() / 2, near);
+    double widest = 0.0;
+    for (size_t i = 0; i < m; ++i) widest = std::max(widest, std::abs(marking.data()[i]));
+    const bool any = near.x.size() >= s.least;
+    for (size_t i = 0; i < m; ++i) {
+      if (any) {
+        choose(s, parabola_of(s, points.data() + 3 * i), s.first_cm + s.bent_cm + widest, near, beside);
+        weigh_looks(s, sign_of(marking.data()[i]), hues.data()[2 * i], hues.data()[2 * i + 1], beside);
+      }
+      refine_line(s, points.data() + 3 * i, sigma.data() + 3 * i, marking.data()[i], marking_sigma.data()[i], any,
+                  beside, out + kPerLine * i);
+    }
+    return result;
+  } catch (const std::exception&) {
+    return PyErr_NoMemory();
+  }
+}
+
+PyObject* distances(PyObject*, PyObject* args) {
+  Buffer lefts, rights, basis, compared;
+  int begin, end;
+  if (!PyArg_ParseTuple(args, "y*y*y*y*ii", &lefts.view, &rights.view, &basis.view, &compared.view, &begin, &end))
+    return nullptr;
+  if (lefts.size() % 3 || rights.size() % 3 || basis.size() != 9) return refuse("lines: expected three points each");
+  const int n = static_cast<int>(compared.size());
+  if (begin < 0 || end <= begin || end > n) return refuse("compared: nothing lies between");
+  try {
+    const size_t l = lefts.size() / 3, r = rights.size() / 3;
+    std::vector<double> x((l + r) * n), nearest;
+    for (size_t i = 0; i < l + r; ++i) {
+      const double* points = i < l ? lefts.data() + 3 * i : rights.data() + 3 * (i - l);
+      double curve[3];
+      for (int k = 0; k < 3; ++k) {
+        curve[k] = 0.0;
+        for (int j = 0; j < 3; ++j) curve[k] += points[j] * basis.data()[3 * j + k];
+      }
+      for (int k = 0; k < n; ++k) {
+        const double y = compared.data()[k];
+        x[i * n + k] = (curve[0] * y + curve[1]) * y + curve[2];
+      }
+    }
+    PyObject* result = PyByteArray_FromStringAndSize(nullptr, l * r * sizeof(double));
+    if (!result) return nullptr;
+    double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
+    for (size_t i = 0; i < l; ++i)
+      for (size_t j = 0; j < r; ++j) {
+        const double gap = rights.data()[3 * j + 1] - lefts.data()[3 * i + 1];
+        *out++ = distance_of(&x[i * n], &x[(l + j) * n], compared.data(), n, begin, end, nearest) * sign_of(gap);
+      }
+    return result;
+  } catch (const std::exception&) {
+    return PyErr_NoMemory();
+  }
+}
+
+PyMethodDef methods[] = {
+    {"refine", refine, METH_VARARGS, nullptr},
+    {"distances", distances, METH_VARARGS, nullptr},
+    {nullptr, nullptr, 0, nullptr},
+};
+
+PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_kernels", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__kernels() { return PyModuleDef_Init(&module); }

@@ -1,0 +1,65 @@
+"""The compiled loops of the network's detector, where they are: the bytes of NumPy in a fraction of the time.
+
+As :mod:`lanenet.perception.edges.compiled`; the callers explain each step, and do it where there are none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from lanenet.perception.edges.road import RoadEdges
+
+try:
+    from lanenet.perception.network import _kernels  # type: ignore[attr-defined]
+except ImportError:
+    _kernels = None
+
+#: Numbers per line that :func:`refine` returns.
+_PER_LINE = 14
+
+
+def is_here() -> bool:
+    """Tell whether the compiled loops are installed."""
+    return _kernels is not None
+
+
+def refine(
+    lines: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    edges: RoadEdges,
+    numbers: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "m 14"]:
+    """Fit lines to edge points as :func:`lanenet.perception.network.refinement.refine_lines` does.
+
+    Args:
+        lines: Points, their sigmas, widths of the markings, their sigmas, and hues.
+        edges: The frame's edge points, contiguous and in double precision, with hues.
+        numbers: The settings, in the order of ``Numbers`` in ``_kernels.cpp``.
+
+    Returns:
+        Of each line the points, their sigmas, the width, the length seen, where it is seen, and its look.
+    """
+    given = (np.ascontiguousarray(x, np.float64) for x in lines)
+    found = _kernels.refine(*given, edges.points_cm, edges.normals, edges.hues, numbers)
+    return np.frombuffer(found).reshape(-1, _PER_LINE)
+
+
+def distances(
+    lefts_cm: Float[np.ndarray, "l 3"],
+    rights_cm: Float[np.ndarray, "r 3"],
+    basis: Float[np.ndarray, "3 3"],
+    compared: Float[np.ndarray, "k"],
+    between: tuple[int, int],
+) -> Float[np.ndarray, "l r"]:
+    """Compare lines as :func:`lanenet.perception.network.tracker.distances_cm` does.
+
+    Args:
+        lefts_cm: x at the label rows.
+        rights_cm: Likewise.
+        basis: (a, b, c) = x at the label rows @ basis.
+        compared: y at which the lines are compared.
+        between: The first of these that counts, and the one after the last.
+    """
+    lefts, rights = (np.ascontiguousarray(x, np.float64) for x in (lefts_cm, rights_cm))
+    found = _kernels.distances(lefts, rights, basis, compared, *between)
+    return np.frombuffer(found).reshape(len(lefts), -1)
