@@ -24,7 +24,7 @@ PLOT_WIDTH_IN, PLOT_DPI = 4.6, 160
 #: Of a photograph; above it the bytes grow and the look does not. Chosen.
 _JPEG_QUALITY = 85
 #: Most pixels across a small picture. Chosen: two of them side by side fill a phone.
-_SMALL_PX = 480
+SMALL_PX = 480
 #: What a verdict may say in one word; any other word is a refusal. Without a word it only tells.
 _GRADES = ("good", "usable", "")
 
@@ -61,11 +61,12 @@ figcaption,.note{color:var(--soft);font-size:.9rem;margin:.35rem 0}
 .frames{display:grid;grid-template-columns:repeat(auto-fill,minmax(9.5rem,1fr));gap:.6rem}
 .frames figure{margin:0}.frames img{width:100%}
 .frames figcaption{font-size:.8rem;line-height:1.3;margin:.2rem 0}
-.scroll{overflow-x:auto}table{border-collapse:collapse;font-size:.9rem}
-td,th{padding:.3rem .5rem;border-bottom:1px solid var(--edge);text-align:right;white-space:nowrap;
+.scroll{overflow-x:auto;margin:.8rem 0}table{border-collapse:collapse;font-size:.9rem}
+td,th{padding:.3rem .4rem;border-bottom:1px solid var(--edge);text-align:right;white-space:nowrap;
 vertical-align:top}
-th{font-weight:600}.text{text-align:left;white-space:normal;min-width:7rem}
+th{font-weight:600}.text{text-align:left;white-space:normal;min-width:6rem}
 td:first-child,th:first-child{padding-left:0}
+@media (max-width:30rem){table{font-size:.8rem}td,th{padding:.3rem}.text{min-width:5rem}}
 details{border-top:1px solid var(--edge);padding:.2rem 0}
 details:last-of-type{border-bottom:1px solid var(--edge)}
 summary{font-weight:600;cursor:pointer;padding:.5rem 0}
@@ -122,6 +123,11 @@ def as_sentence(text: str) -> str:
 def section(title: str) -> str:
     """Head a section."""
     return f"<h2>{html.escape(title)}</h2>"
+
+
+def subsection(title: str) -> str:
+    """Head a part of a section."""
+    return f"<h3>{html.escape(title)}</h3>"
 
 
 def details(title: str, *parts: str) -> str:
@@ -195,7 +201,7 @@ def gallery(pictures: Sequence[Picture]) -> str:
 
 
 def _small(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    factor = _SMALL_PX / image.shape[1]
+    factor = SMALL_PX / image.shape[1]
     if factor >= 1.0:
         return image
     return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))

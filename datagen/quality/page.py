@@ -31,6 +31,7 @@ from lanenet.page import (
     photo,
     plot,
     section,
+    subsection,
     table,
 )
 
@@ -84,7 +85,7 @@ def report_page(
         details("What was done", bullets(figures["notes"])),
         details(
             "Best and median held-out frames",
-            *(part for title, shown in pictures.items() for part in (f"<h3>{title}</h3>", gallery(shown))),
+            *(subsection(title.capitalize()) + gallery(shown) for title, shown in pictures.items()),
         ),
         details("Distance of the lines from the edges", *_residuals(quality, held, drive, settings)),
         details(

@@ -81,11 +81,13 @@ def train_run(settings: Any, marking: float | None = None) -> Path:
     from lanenet.evaluation.answers import Compared
     from lanenet.evaluation.card import CARD_NAME, model_card
     from lanenet.evaluation.comparison import default_names, evaluate
+    from lanenet.evaluation.model_page import model_page
     from lanenet.evaluation.report import report_files
     from lanenet.evaluation.robustness import as_dict
     from lanenet.evaluation.sources import open_tests
     from lanenet.learn.checkpoint import METRICS_NAME, check_start, hash_run, publish
     from lanenet.learn.train import train as train_network
+    from lanenet.page import PAGE_NAME
     from lanenet.perception.network.model_file import read_model_meta
     from lanenet.samples.dataset import compile_kernels
 
@@ -127,7 +129,8 @@ def train_run(settings: Any, marking: float | None = None) -> Path:
         comparison,
         robustness,
     )
-    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card}
+    page = model_page(f"How good {settings.name} is", comparison, seen, "on the test drives")
+    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card, PAGE_NAME: page}
     files |= {f"results{ending}": content for ending, content in report_files(comparison, seen).items()}
     if robustness:
         files["robustness.json"] = json_text(as_dict(robustness))

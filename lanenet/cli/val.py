@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+#: Of files that --out may write, and that may be a source as well.
+_ENDINGS = (".html", ".json", ".md", ".png", "-worst.jpg")
+
 
 @app.command(epilog="Example: lanenet val checkpoints/small runs/drive7 runs/my_map --out runs/errors")
 def val(
@@ -36,8 +39,8 @@ def val(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Also write the report under this name: .md, .json, .png, -breakdown.png, -worst.jpg, "
-            "-plain.jpg."
+            help="Also write the report under this name: .html, .md, .json, .png, -breakdown.png, "
+            "-worst.jpg, -plain.jpg."
         ),
     ] = None,
     detectors: Annotated[
@@ -82,6 +85,7 @@ def val(
     from lanenet.data.files import json_text, write_bytes
     from lanenet.data.label_set import read_labels
     from lanenet.evaluation.answers import Compared
+    from lanenet.evaluation.model_page import model_page
     from lanenet.evaluation.report import report_files
     from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network.model_file import read_model_meta
@@ -90,7 +94,7 @@ def val(
     more = _more_models(also or [])
     if out is not None:
         for source in source_paths:
-            check_not_source(source, *(Path(f"{out}{end}") for end in (".json", ".md", ".png", "-worst.jpg")))
+            check_not_source(source, *(Path(f"{out}{end}") for end in _ENDINGS))
     lock_outputs(out)
     meta = None if model is None else read_model_meta(model)
     window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
@@ -115,10 +119,13 @@ def val(
             progress,
         )
     networks_only = [name for name in comparison.tables if name in networks] if alone else None
-    show(comparison, seen, _where(sources, model), networks_only, show_all)
+    where = _where(sources, model)
+    show(comparison, seen, where, networks_only, show_all)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
-        files = {".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
+        judged = comparison.first if model is None else model.resolve().parent.name
+        page = model_page(f"How good {judged} is", comparison, seen, where)
+        files = {".html": page, ".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
         if robustness is not None:
             files |= {"-robust.md": robustness[0], "-robust.json": json_text(robustness[1])}
         for ending, content in files.items():

@@ -18,6 +18,7 @@ from lanenet.evaluation.comparison import Comparison, SeenSource
 from lanenet.evaluation.errors import GROUPS, RELIABILITY_SHARES
 from lanenet.evaluation.tables import as_markdown
 from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.page import PLOT_DPI, PLOT_WIDTH_IN, jpeg_bytes
 from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR, draw_estimate
 from lanenet.perception.estimate import LaneEstimate
 
@@ -30,8 +31,6 @@ _TILE_WIDTH_PX, _COLUMNS, _LEGEND_PX = 400, 4, 24
 _APART_FRAMES = 15
 #: Frames at most with an answer off a marking in plain sight. Chosen: as many as a person looks at.
 _OFF_FRAMES = 20
-#: A sheet of photographs takes a tenth of its size as PNG.
-_JPEG_QUALITY = 88
 
 
 def report_files(comparison: Comparison, seen: Sequence[SeenSource]) -> dict[str, str | bytes]:
@@ -81,15 +80,19 @@ def png_bytes(figure: Any) -> bytes:
     return png.getvalue()
 
 
-def plot_errors(comparison: Comparison) -> bytes | None:
+def plot_errors(comparison: Comparison, on_page: bool = False) -> bytes | None:
     """Draw a box per detector and row: quartiles and median of the error, whiskers at 5 and 95 %.
 
     Below each box stands the share of the labelled points that were answered.
 
+    Args:
+        comparison: The figures.
+        on_page: For a page that fits a phone, and has a caption in place of the title.
+
     Returns:
         A PNG, or None where Matplotlib is not installed.
     """
-    figure = new_figure(9.0, 5.0)
+    figure = new_figure(PLOT_WIDTH_IN, 4.0, PLOT_DPI) if on_page else new_figure(9.0, 5.0)
     if figure is None:
         return None
     from matplotlib.patches import Patch
@@ -114,22 +117,27 @@ def plot_errors(comparison: Comparison) -> bytes | None:
             stats = comparison.tables[name].groups[f"y = {ROWS_CM[k]:.0f} cm"]
             share = "-" if np.isnan(stats.coverage) else f"{100.0 * stats.coverage:.0f}%"
             axes.annotate(
-                share, (x, 0.01), xycoords=("data", "axes fraction"), ha="center", fontsize=8, color=f"C{i}"
+                share,
+                (x, 0.01),
+                xycoords=("data", "axes fraction"),
+                ha="center",
+                fontsize=5 if on_page else 8,
+                color=f"C{i}",
             )
     axes.set(yscale="log", xlim=(-0.5, len(ROWS_CM) - 0.5), ylabel="error, cm")
     axes.set_xticks(range(len(ROWS_CM)), [f"y = {row:.0f} cm" for row in ROWS_CM])
-    axes.set_title(
-        f"Against the {comparison.reference}. Quartiles, whiskers at 5 and 95 %; below: points answered",
-        fontsize=10,
-    )
+    if not on_page:
+        title = "Quartiles, whiskers at 5 and 95 %; below: points answered"
+        axes.set_title(f"Against the {comparison.reference}. {title}", fontsize=10)
     axes.grid(True, axis="y", which="major", alpha=0.3)
     # Room for the shares below the boxes.
     low, high = axes.get_ylim()
     axes.set_ylim(low * (low / high) ** 0.08, high)
     handles = [Patch(facecolor=f"C{i}", label=name) for i, name in enumerate(names)]
     # Below the axes, where no box is covered.
+    size, columns = (7, 3) if on_page else (9, len(names))
     axes.legend(
-        handles=handles, fontsize=9, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, -0.07)
+        handles=handles, fontsize=size, ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.07)
     )
     return png_bytes(figure)
 
@@ -140,16 +148,21 @@ def _row_errors(errors_cm: Float[np.ndarray, "n 6"], row: int) -> Float[np.ndarr
     return np.maximum(found[np.isfinite(found)], _LEAST_CM)
 
 
-def plot_breakdown(comparison: Comparison) -> bytes | None:
+def plot_breakdown(comparison: Comparison, on_page: bool = False) -> bytes | None:
     """Draw the RMSE by curvature of the lane, and the reliability diagram of the sigmas.
+
+    Args:
+        comparison: The figures.
+        on_page: As for :func:`plot_errors`.
 
     Returns:
         A PNG, or None where Matplotlib is not installed.
     """
-    figure = new_figure(10.0, 4.5)
+    figure = new_figure(PLOT_WIDTH_IN, 7.0, PLOT_DPI) if on_page else new_figure(10.0, 4.5)
     if figure is None:
         return None
-    bend, coverage = figure.subplots(1, 2)
+    bend, coverage = figure.subplots(*((2, 1) if on_page else (1, 2)))
+    figure.subplots_adjust(hspace=0.35)
     names = list(comparison.tables)
     groups = [name for name, _ in GROUPS["bend"][1]]
     width = 0.8 / len(names)
@@ -240,15 +253,8 @@ def draw_worst(
     tiles: list[UInt8[np.ndarray, "h w 3"]] = []
     for item in worst:
         source = sources[item.source]
-        answer = answers_cm[item.source][item.row]
-        image = draw_estimate(
-            source.image(item.row),
-            LaneEstimate(points_cm=answer),
-            source.camera,
-            max(1, round(_TILE_WIDTH_PX / source.camera.width)),
-            f"{Path(source.name).name} {source.frames[item.row]}: {item.error_cm:.1f} cm",
-            truth_cm=source.points_cm[item.row],
-        )
+        text = f"{Path(source.name).name} {source.frames[item.row]}: {item.error_cm:.1f} cm"
+        image = draw_answer(source, item.row, answers_cm[item.source][item.row], text=text)
         if tiles and image.shape != tiles[0].shape:
             # Cameras of different sources may differ in size.
             height, width = tiles[0].shape[:2]
@@ -261,6 +267,28 @@ def draw_worst(
     return np.vstack([*rows, _legend(rows[0].shape[1])])
 
 
+def draw_answer(
+    source: LabelledFrames,
+    row: int,
+    answer_cm: Float[np.ndarray, "6"],
+    width_px: int = _TILE_WIDTH_PX,
+    text: str = "",
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw a frame, enlarged to about this width, with its labels, an answer to it, and a text in the corner.
+
+    Raises:
+        DriveFormatError: If the frame cannot be read.
+    """
+    return draw_estimate(
+        source.image(row),
+        LaneEstimate(points_cm=answer_cm),
+        source.camera,
+        max(1, round(width_px / source.camera.width)),
+        text,
+        truth_cm=source.points_cm[row],
+    )
+
+
 def _legend(width_px: int) -> UInt8[np.ndarray, "h w 3"]:
     strip = np.zeros((_LEGEND_PX, width_px, 3), dtype=np.uint8)
     x = y = _LEGEND_PX // 3
@@ -269,9 +297,3 @@ def _legend(width_px: int) -> UInt8[np.ndarray, "h w 3"]:
         cv2.putText(strip, text, (x, _LEGEND_PX - y), font, size, colour, 1, cv2.LINE_AA)
         x += cv2.getTextSize(text, font, size, 1)[0][0] + _LEGEND_PX // 2
     return strip
-
-
-def jpeg_bytes(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Encode a image as JPEG."""
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return bytes(data.tobytes())

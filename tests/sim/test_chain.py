@@ -65,7 +65,14 @@ def test_train_leaves_a_checkpoint_that_is_complete(finished):
     folder, _, output = finished
     names = {path.name for path in (folder / "ck" / "tiny").iterdir()}
     assert names >= {"model.onnx", "weights.safetensors", "metrics.json", "run.yaml", "camera.yaml"}
-    assert names >= {"results.json", "results.md", "checkpoint.yaml", "curve.csv", "example.jpg"}
+    assert names >= {
+        "results.json",
+        "results.md",
+        "report.html",
+        "checkpoint.yaml",
+        "curve.csv",
+        "example.jpg",
+    }
     assert "last.pt" not in names
     assert "verdict: on the test drives it" in output and "against the truth" in output
     assert "painter" not in output

@@ -439,6 +439,7 @@ def test_val_compares_models_and_changes_the_frames(tmp_path: Path, monkeypatch:
     assert {row["model"] for row in robust["rows"]} == {"network", "alexnet"}
     assert "| one line missing | alexnet |" in (tmp_path / "table-robust.md").read_text()
     assert (tmp_path / "table-breakdown.png").stat().st_size > 1000
+    assert "How good checkpoint is" in (tmp_path / "table.html").read_text(encoding="utf-8")
     twice = run(*words, "--also", tmp_path / "alexnet" / "model.onnx")
     assert "the name 'alexnet' is taken" in error_of(twice)
     assert "expected a model (.onnx)" in error_of(run(*words, "--also", tmp_path / "l.parquet"))

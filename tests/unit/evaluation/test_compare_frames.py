@@ -9,10 +9,11 @@ from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import Compared, answer_frames, choose_names
 from lanenet.evaluation.errors import GROUPS
-from lanenet.evaluation.report import WorstFrame, draw_worst, find_worst, jpeg_bytes
+from lanenet.evaluation.report import WorstFrame, draw_worst, find_worst
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.onboard.safety import SafetySettings
+from lanenet.page import jpeg_bytes
 from lanenet.perception.draw import LEFT_BGR, RIGHT_BGR, TRUTH_BGR
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 from lanenet.perception.estimate import LaneEstimate
