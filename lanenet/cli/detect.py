@@ -162,11 +162,13 @@ def detect(
 def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:
     """Open the frames; of a map those of its drive with its lane width, and the map, which has the camera."""
     from lanenet.data.drives.sources import open_source
-    from lanenet.data.maps.folder import read_map_meta
     from lanenet.errors import DriveFormatError
 
     if not any((source / name).is_file() for name in ("map.yaml", "refused.yaml")):
         return open_source(source), None
+    # Not before: maps need SciPy, which the car does not have.
+    from lanenet.data.maps.folder import read_map_meta
+
     meta = read_map_meta(source)
     drive = Path(meta.drive)
     if not drive.exists():

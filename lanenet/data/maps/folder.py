@@ -190,7 +190,7 @@ def write_map(
 
 
 def read_map_meta(folder: Path) -> MapMeta:
-    """Read what ``map.yaml`` says: all that the car's installation can read of a map.
+    """Read what ``map.yaml`` says.
 
     Raises:
         MapFormatError: If it is not a map, is of another version, or the file is damaged.
