@@ -21,10 +21,11 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train env test test-slow test-base-install chain traps left-out judge golden golden-renew arm wheels neutral check format format-check lint types imports docs figures links bench clean
+.PHONY: help train install env test test-slow test-base-install chain traps left-out judge golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
+	@echo "make install      environment for mapping and training in $(VENV)"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  detection in an environment with the base installation only"
@@ -35,6 +36,8 @@ help:
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
+	@echo "make pictures     the moving picture of the README, from a recorded drive (DRIVE, LANE_WIDTH, SHOWN)"
+	@echo "make release      source archive and wheel of this version into dist/ (needs g++)"
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
 	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
 	@echo "make docs         the documentation as a site into site/; any broken link or warning fails it"
@@ -48,6 +51,8 @@ help:
 
 train: $(VENV)/.stamp-train
 	$(BIN)/lanenet train $(CONFIG)
+
+install: $(VENV)/.stamp-train
 
 env: $(VENV)/.stamp-dev
 
@@ -89,6 +94,18 @@ golden: $(VENV)/.stamp-dev
 
 golden-renew: $(VENV)/.stamp-dev
 	$(BIN)/python tests/golden/renew.py
+
+# Maps the drive first, which takes some minutes, unless that was done before.
+DRIVE ?= $(LANENET_SHARED_DATA)/donkey_circuit
+LANE_WIDTH ?= 59
+SHOWN ?= 700:859
+pictures: $(VENV)/.stamp-train
+	test -e runs/pictures/$(notdir $(DRIVE))/map.yaml || \
+	  $(BIN)/lanenet map $(DRIVE) --lane-width $(LANE_WIDTH) --out runs/pictures/$(notdir $(DRIVE))
+	$(BIN)/python contrib/pictures.py runs/pictures/$(notdir $(DRIVE)) docs/images/drive.webp --frames $(SHOWN)
+
+release: $(VENV)/.stamp-dev
+	PYTHON=$(abspath $(BIN)/python) contrib/release dist
 
 wheels: $(VENV)/.stamp-train
 	PYTHON=$(abspath $(BIN)/python) contrib/wheel x86_64 dist

@@ -8,4 +8,4 @@ from lanenet.api import label, load, map, train
 
 __all__ = ["label", "load", "map", "train"]
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"

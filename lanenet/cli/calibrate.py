@@ -64,9 +64,13 @@ def chessboard(
     ] = LensModel.AUTO,
     height: Annotated[
         float | None,
-        typer.Option(parser=length_cm, metavar="CM", help="Height of the lens above the ground, cm."),
+        typer.Option(
+            parser=length_cm, metavar="CM", help="Height of the lens above the ground, cm; default 20."
+        ),
     ] = None,
-    pitch: Annotated[float | None, typer.Option(help="Downward tilt of the camera, degrees.")] = None,
+    pitch: Annotated[
+        float | None, typer.Option(help="Downward tilt of the camera, degrees; default 0.")
+    ] = None,
     wheelbase: WheelbaseOption = None,
     ros: Annotated[Path | None, typer.Option(help="Also write a ROS camera_info file (.yaml).")] = None,
 ) -> None:

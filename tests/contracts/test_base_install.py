@@ -1,16 +1,23 @@
 """What the car installs: detection works, there is no torch, it is small, and Arm has wheels for it."""
 
 import json
+import os
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 from pathlib import Path
 
 import pytest
 
+import lanenet
+
 ROOT = Path(__file__).resolve().parents[2]
 CHECKPOINT = ROOT / "checkpoints" / "small"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+COMPILED = PROJECT["tool"]["setuptools"]["ext-modules"]
 
 
 def pinned(version=f"3.{sys.version_info.minor}"):
@@ -18,15 +25,43 @@ def pinned(version=f"3.{sys.version_info.minor}"):
     return ROOT / "contrib" / "car" / f"requirements-{version}.txt"
 
 
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """Folder with what ``make release`` builds."""
+    folder = tmp_path_factory.mktemp("dist")
+    environment = os.environ | {"PYTHON": sys.executable}
+    subprocess.run([ROOT / "contrib" / "release", folder], check=True, timeout=600, env=environment)
+    return folder
+
+
+def interpreter(version):
+    """A Python of this version on this machine, also one of pyenv that is not switched on; None if none."""
+    if version == f"3.{sys.version_info.minor}":
+        return sys.executable
+    of_pyenv = Path(os.environ.get("PYENV_ROOT", "~/.pyenv")).expanduser() / "versions"
+    named = [shutil.which(f"python{version}"), *sorted(of_pyenv.glob(f"{version}.*/bin/python{version}"))]
+    works = (p for p in named if p and not subprocess.run([p, "-c", ""], capture_output=True).returncode)
+    return next(works, None)
+
+
 @pytest.mark.slow
-def test_detect_in_an_empty_environment(tmp_path):
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_the_wheel_detects_in_an_empty_environment(tmp_path, release, version, monkeypatch):
+    """One wheel for each kind of processor, and all versions of Python."""
+    if (found := interpreter(version)) is None:
+        pytest.skip(f"this machine has no Python {version}")
     environment = tmp_path / "env"
-    subprocess.run([sys.executable, "-m", "venv", environment], check=True)
-    python = environment / "bin" / "python"
-    for words in (["--require-hashes", "-r", pinned()], ["--no-deps", "--no-build-isolation", ROOT]):
+    subprocess.run([found, "-m", "venv", environment], check=True)
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # the clone would count as installed
+    python, (wheel,) = environment / "bin" / "python", release.glob("lanenet-*.whl")
+    for words in (["--require-hashes", "-r", pinned(version)], ["--no-deps", wheel]):
         subprocess.run([python, "-m", "pip", "install", "-q", *words], check=True, timeout=300)
+    said = subprocess.run([environment / "bin" / "lanenet", "--version"], capture_output=True, cwd=tmp_path)
+    assert said.stdout.decode().strip() == f"lanenet {lanenet.__version__}"
+    compiled = "; ".join(f"import {module['name']}" for module in COMPILED)
+    subprocess.run([python, "-c", compiled], check=True, cwd=tmp_path)
     out = tmp_path / "lanes.csv"
-    words = ["detect", CHECKPOINT / "example.jpg", "--detector", "network", "--out", out]
+    words = ["detect", CHECKPOINT / "example.jpg", "--out", out]
     words += ["--model", CHECKPOINT / "model.onnx", "--camera", CHECKPOINT / "camera.yaml"]
     subprocess.run([environment / "bin" / "lanenet", *words], check=True, timeout=60, cwd=tmp_path)
     header, row = out.read_text().splitlines()
@@ -40,6 +75,34 @@ def test_detect_in_an_empty_environment(tmp_path):
     for package in ("torch", "numba", "scipy", "matplotlib"):
         found = subprocess.run([python, "-c", f"import {package}"], capture_output=True, cwd=tmp_path)
         assert found.returncode != 0, f"{package} is part of the base installation"
+
+
+@pytest.mark.slow
+def test_the_source_archive_installs(tmp_path, release):
+    (archive,) = release.glob("lanenet-*.tar.gz")
+    assert archive.name == f"lanenet-{lanenet.__version__}.tar.gz"
+    with tarfile.open(archive) as opened:
+        names = {Path(*Path(name).parts[1:]).as_posix() for name in opened.getnames()}
+    assert {
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+        *(s for module in COMPILED for s in module["sources"]),
+    } <= names
+    words = ["install", "-q", "--no-deps", "--target", tmp_path / "there", archive]
+    subprocess.run([sys.executable, "-m", "pip", *words], check=True, timeout=300)
+    # The copy that was installed, with the packages of this environment.
+    run = "import lanenet.__main__, datagen.pipeline, sys; print(lanenet.__file__); lanenet.__main__.main()"
+    said = subprocess.run(
+        [sys.executable, "-c", run, "--version"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "there")},
+    )
+    place, version = said.stdout.splitlines()
+    assert place.startswith(str(tmp_path / "there")) and version == f"lanenet {lanenet.__version__}"
 
 
 @pytest.mark.slow
@@ -67,8 +130,7 @@ def pins(path):
 
 @pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
 def test_the_car_installs_the_versions_of_the_constraints(version):
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    project = [*project["project"]["dependencies"], *project["project"]["optional-dependencies"]["car"]]
+    project = [*PROJECT["project"]["dependencies"], *PROJECT["project"]["optional-dependencies"]["car"]]
     car, all_pins = pins(pinned(version)), pins(ROOT / "constraints.txt")
     assert {re.split("[<>=]", wanted)[0].lower() for wanted in project} < set(car)
     # Bookworm's picamera2 and Donkeycar need NumPy 1, and OpenCV 5 does not work with it.

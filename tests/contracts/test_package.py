@@ -56,7 +56,7 @@ def test_small_systems_are_solved_by_one_thread_unless_given(monkeypatch, given,
 
 def test_the_version_stands_once() -> None:
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
-    assert lanenet.__version__ == project["version"] == version("lanenet")
+    assert lanenet.__version__ == version("lanenet") and "version" in project["dynamic"]
 
 
 def test_the_installed_command_answers() -> None:

@@ -59,7 +59,8 @@ def judge(
     tracks: Annotated[
         str | None,
         typer.Option(
-            help="random (loops), open, varied, presets or track files (.yaml), separated by commas."
+            help="random (loops), open, varied, presets or track files (.yaml), separated by commas; default "
+            "random."
         ),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Roads of each kind; default 20.")] = None,
@@ -67,7 +68,9 @@ def judge(
     speed: Annotated[float | None, typer.Option(min=1.0, help="Speed, cm/s; default 60.")] = None,
     across: Annotated[
         float | None,
-        typer.Option(help="Degrees by which each car starts turned, to the left and right in turns."),
+        typer.Option(
+            help="Degrees by which each car starts turned, to the left and right in turns; default 0."
+        ),
     ] = None,
     law: Annotated[
         str | None,
@@ -79,7 +82,7 @@ def judge(
             "--put-back/--no-put-back", help="Put a car that left the road back (default), or end its run."
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of roads, looks and cars.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of roads, looks and cars; default 0.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path("runs/judge"),
     any_camera: AnyCameraOption = False,

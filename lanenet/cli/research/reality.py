@@ -48,7 +48,7 @@ def reality(
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Synthetic drives; default 60.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames of each of them; default 40.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all synthetic drives.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all synthetic drives; default 0.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Compare the network's input on synthetic and on real drives: statistics, histograms, sheets."""

@@ -77,7 +77,12 @@ CameraOption = Annotated[
 ]
 WheelbaseOption = Annotated[
     float | None,
-    typer.Option("--wheelbase", parser=length_cm, metavar="CM", help="Distance between the car's axles, cm."),
+    typer.Option(
+        "--wheelbase",
+        parser=length_cm,
+        metavar="CM",
+        help="Distance between the car's axles, cm; default: nominally 17, of a chessboard's camera 26.",
+    ),
 ]
 CameraHeightOption = Annotated[
     float | None,
@@ -96,10 +101,18 @@ TapeWidthOption = Annotated[
 ]
 FramesOption = Annotated[
     str | None,
-    typer.Option("--frames", metavar="FIRST:LAST", help="Only the frames with these numbers, both included."),
+    typer.Option(
+        "--frames",
+        metavar="FIRST:LAST",
+        help="Only the frames with these numbers, both included; default: all.",
+    ),
 ]
 MappingOption = Annotated[
-    Path | None, typer.Option("--config", help="YAML with the mapping's settings, or a map's settings.yaml.")
+    Path | None,
+    typer.Option(
+        "--config",
+        help="YAML with the mapping's settings, or a map's settings.yaml; default: the usual ones.",
+    ),
 ]
 MarkingOption = Annotated[
     float | None,
