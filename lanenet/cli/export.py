@@ -1,25 +1,39 @@
-"""``lanenet export``: the files that the car runs."""
+"""``lanenet export``: the files that the car runs, and labels for other tools."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending, lock_outputs
-from lanenet.errors import ConfigError
+from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
+from lanenet.errors import ConfigError, counted
+
+#: Those of lanenet.data.exports, which needs more than the car has.
+_FORMATS = ("huggingface", "tusimple", "coco")
+if TYPE_CHECKING:
+    FormatName = str
+else:
+    FormatName = StrEnum("FormatName", {name: name for name in _FORMATS})
 
 app = typer.Typer()
 
 
 @app.command(epilog="Example: lanenet export checkpoints/small --out runs/small.onnx")
 def export(
-    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder.")],
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="SOURCE", help="Checkpoint folder; with --format a label set (.parquet)."),
+    ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Model to write; default CHECKPOINT/model.onnx, with --int8 model-int8.onnx."),
+        typer.Option(
+            help="Model to write; default CHECKPOINT/model.onnx, with --int8 model-int8.onnx. With --format "
+            "the folder to write."
+        ),
     ] = None,
     check: Annotated[
         list[Path] | None,
@@ -32,8 +46,50 @@ def export(
             help="Quantise CHECKPOINT/model.onnx to INT8, and show what it costs in cm and saves in time.",
         ),
     ] = False,
+    format: Annotated[
+        FormatName | None, typer.Option("--format", help="Write labels and their pictures for other tools.")
+    ] = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", metavar="MAP", help="The map, or the simulated drive, that the labels were made from."
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --format: replace an earlier export in the folder.")
+    ] = False,
 ) -> None:
-    """Write a checkpoint as one ONNX file, checked against PyTorch."""
+    """Write a checkpoint as one ONNX file, checked against PyTorch; or labels in other tools' formats."""
+    if format is not None:
+        if int8 or check:
+            raise ConfigError("--format writes labels: it cannot be combined with --int8 or --check")
+        _export_labels(source, str(format), frames, out, force)
+        return
+    if frames is not None or force or source.suffix == ".parquet":
+        raise ConfigError(f"{source}: to export labels expected --format {'|'.join(_FORMATS)}")
+    _export_model(source, out, check or [], int8)
+
+
+def _export_labels(labels: Path, name: str, frames: Path | None, out: Path | None, force: bool) -> None:
+    from lanenet.data.exports import check_export, export_labels
+
+    if frames is None or out is None:
+        missing = (
+            "--out with a folder to write" if out is None else "--map with the map that the labels are of"
+        )
+        raise ConfigError(f"--format {name}: expected {missing}")
+    check_not_source(frames, out)
+    lock_outputs(out)
+    check_export(out, force)
+    with console.progress_bar(f"export ({name})") as progress:
+        report = export_labels(labels, frames, name, out, force, progress)
+    console.show_problems(report.problems)
+    console.say(f"{counted(report.frames, 'frame')} with {counted(report.points, 'point')}")
+    console.wrote(out)
+    console.say(f"how to read it: {out / 'README.md'}")
+
+
+def _export_model(checkpoint: Path, out: Path | None, check: list[Path], int8: bool) -> None:
     if out is not None:
         check_ending(out, ".onnx")
     if int8 and check:
@@ -50,7 +106,7 @@ def export(
     else:
         from lanenet.learn.export import export_checkpoint
 
-        path, rasters, difference = export_checkpoint(checkpoint, out, check or ())
+        path, rasters, difference = export_checkpoint(checkpoint, out, check)
         console.say(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
         console.wrote(path)
     console.next_command("bench", "--model", path)

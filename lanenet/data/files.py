@@ -31,6 +31,7 @@ FOLDER_KINDS: dict[str, tuple[str, ...]] = {
     ),
     # Of a drive that gave no map; a map replaces it.
     "refused": ("refused.yaml", "report.html"),
+    "export": ("export.yaml", "README.md", "camera.yaml"),
     "checkpoint": ("checkpoint.yaml", "config.yaml", "metrics.json", "weights.safetensors", "model.onnx"),
 }
 

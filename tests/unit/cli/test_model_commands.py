@@ -146,6 +146,14 @@ def test_a_model_in_the_place_of_a_source_is_told_where_it_belongs(drive: Path) 
         assert f"{words[-1]}: is a model" in line and "lanenet val MODEL SOURCE" in line
 
 
+def test_export_of_labels_says_what_it_lacks(tmp_path: Path) -> None:
+    labels = tmp_path / "a.parquet"
+    assert "expected --format huggingface|tusimple|coco" in error_of(run("export", labels))
+    assert "expected --out with a folder" in error_of(run("export", labels, "--format", "coco", "--map", "m"))
+    assert "expected --map" in error_of(run("export", labels, "--format", "coco", "--out", tmp_path / "o"))
+    assert "cannot be combined" in error_of(run("export", labels, "--format", "coco", "--int8"))
+
+
 def test_export_says_what_is_no_checkpoint(tmp_path: Path) -> None:
     file = CHECKPOINT / "model.onnx"
     assert f"{file}: is a file, expected a checkpoint folder" in error_of(run("export", file))
