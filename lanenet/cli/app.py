@@ -32,6 +32,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("scipy", "numba", "pyarrow"), "data"),
     "matplotlib": "viz",
     "optuna": "sweep",
+    **dict.fromkeys(("rerun", "mcap"), "viewers"),
     **dict.fromkeys(("smbus2", "serial"), "car"),
 }
 

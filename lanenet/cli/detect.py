@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +22,10 @@ from lanenet.cli.shared.options import (
     lane_cm,
     lock_outputs,
 )
+from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
+from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, counted
+from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
     KINDS,
@@ -37,6 +42,10 @@ if TYPE_CHECKING:
     from jaxtyping import UInt8
 
     from lanenet.data.drives.sources import Source
+    from lanenet.evaluation.detect import SeenFrame
+    from lanenet.geometry.camera import Camera
+    from lanenet.perception.estimate import Detector
+    from lanenet.viewers.mapped import MapToSee
 
     DetectorName = str
 else:
@@ -53,6 +62,7 @@ _WITH_MASK = listed(detector_names(lambda kind: kind.takes_mask))
 @app.command(
     epilog="Example: lanenet detect tub --model checkpoints/general --camera runs/my_map --out runs/lanes.csv"
 )
+@with_viewers
 def detect(
     source: Annotated[
         Path,
@@ -94,6 +104,7 @@ def detect(
             metavar="auto|FILE.png",
         ),
     ] = None,
+    views: Views = NO_VIEWS,
 ) -> None:
     """Run a detector over a photo, a video, a drive or a tub."""
     from lanenet.data.camera_file import read_camera
@@ -104,6 +115,7 @@ def detect(
     name = detector_for(detector, model)
     check_not_source(source, out, video)
     lock_outputs(out, video)
+    views.check(source)
     check_table_path(out)
     whole, of_map = _open(source, out, video)
     camera = camera or of_map
@@ -127,9 +139,15 @@ def detect(
     )
     chosen = build_detector(name, inputs)
     console.show_problems(getattr(chosen, "problems", ()))
-    with console.progress_bar(f"detect ({name})") as progress:
+    with ExitStack() as stack:
+        watch = (
+            _watch(views, stack, opened, chosen, used_camera, _map_of(camera, Path(opened.name)))
+            if views
+            else None
+        )
+        progress = stack.enter_context(console.progress_bar(f"detect ({name})"))
         report = run_detector(
-            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable
+            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable, watch=watch
         )
     console.show_problems(report.problems)
     console.say(
@@ -138,7 +156,7 @@ def detect(
     )
     if hint := getattr(chosen, "hint", ""):
         console.say(f"hint: {hint}")
-    console.wrote(report.out, report.video)
+    console.wrote(report.out, report.video, *views.files)
     if report.video is None:
         again = {
             "--detector": detector,
@@ -179,6 +197,51 @@ def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:
     check_not_source(drive, *outs)
     console.say(f"{source} is a map: its drive {drive} is read, with its camera and lane width")
     return replace(open_source(drive), lane_width_cm=meta.lane_cm), source
+
+
+def _map_of(camera: Path | None, drive: Path) -> MapToSee | None:
+    """Open the map of a drive, where the camera was given as that map; None otherwise."""
+    file = None if camera is None else camera / "map.yaml"
+    if camera is None or file is None or not file.is_file():
+        return None
+    if Path(str(read_yaml(file).get("drive"))).resolve() != drive.resolve():
+        return None
+    from lanenet.viewers.mapped import MapToSee
+
+    return MapToSee(camera)
+
+
+def _watch(
+    views: Views,
+    stack: ExitStack,
+    source: Source,
+    detector: Detector,
+    camera: Camera | None,
+    mapped: MapToSee | None,
+) -> Callable[[SeenFrame], None]:
+    """Open the viewers, until the stack ends; returns what shows them a frame, in its place on the map."""
+    from lanenet.evaluation.detect import ONE
+    from lanenet.viewers.seen import Scene, Seen, error_cm, lane_of, values_of
+
+    meta = getattr(detector, "meta", None)
+    perception = PerceptionSettings() if meta is None else meta.perception
+    plain = Scene(source.name, camera, perception)
+    scene = plain if mapped is None else replace(mapped.scene, name=source.name, perception=perception)
+    recording = stack.enter_context(views.record(scene))
+
+    def watch(found: SeenFrame) -> None:
+        estimate, i = found.estimates[ONE], found.index
+        lane = lane_of(estimate, getattr(detector, "last", None) if found.image is not None else None)
+        frame, t_s = int(source.frames[i]), float(source.t_s[i])
+        seen = Seen(frame, t_s, found.image, {"detected": lane}, values_of(estimate))
+        if mapped is not None:
+            seen = mapped.add_to(seen)
+            if "reference" in seen.lanes:
+                off_cm = error_cm(estimate.points_cm, seen.lanes["reference"].points_cm)
+                seen = replace(seen, values={**seen.values, "error_cm": off_cm})
+        recording.add(seen)
+
+    return watch
 
 
 def _mask_of(mask: str | None, source: Source, detector: str) -> UInt8[np.ndarray, "h w"] | None:

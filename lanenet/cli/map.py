@@ -19,6 +19,7 @@ from lanenet.cli.shared.options import (
     frame_range,
     lane_cm,
 )
+from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
 from lanenet.config import load_settings, read_yaml
 from lanenet.errors import LanenetError
 
@@ -26,6 +27,7 @@ app = typer.Typer()
 
 
 @app.command("map", epilog="Example: lanenet map data/tub --lane-width 40 --out runs/tub")
+@with_viewers
 def map_drive(
     drive: DriveArgument,
     lane_width: Annotated[
@@ -45,12 +47,14 @@ def map_drive(
     force: Annotated[
         bool, typer.Option("--force", help="Replace the map of another drive in this folder, too.")
     ] = False,
+    views: Views = NO_VIEWS,
 ) -> None:
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
     from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
+    views.check(drive)
     if not force:
         check_same_drive(out, drive)
     numbers = None if frames is None else frame_range(frames)
@@ -60,10 +64,23 @@ def map_drive(
     with console.progress_bar("map") as progress:
         report = run(request, settings, out, progress)
     console.show_lines(report.lines)
-    console.wrote(out, out / "report.html")
+    if views:
+        view_map(views, out)
+    console.wrote(out, out / "report.html", *views.files)
     if report.figures["verdict"]["grade"] == "reject":
         raise LanenetError(f"{out}: the map was rejected: it is kept for inspection, but gives no labels")
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
+
+
+def view_map(views: Views, folder: Path) -> None:
+    """Show a map and its frames in viewers."""
+    from lanenet.viewers.mapped import MapToSee
+
+    seen = MapToSee(folder)
+    with views.record(seen.scene) as recording, console.progress_bar("viewers") as progress:
+        for done, frame in enumerate(seen.frames(), start=1):
+            recording.add(frame)
+            progress(done, len(seen.mapped.rows))
 
 
 def check_same_drive(out: Path, drive: Path) -> None:

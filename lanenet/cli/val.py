@@ -11,6 +11,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source, lock_outputs
+from lanenet.cli.shared.viewing import NO_VIEWS, Views, view_answers, with_viewers
 from lanenet.config import read_yaml
 from lanenet.errors import ConfigError, LanenetError
 from lanenet.evaluation.comparison import SeenSource, default_names, evaluate
@@ -28,6 +29,7 @@ _ENDINGS = (".html", ".json", ".md", ".png", "-worst.jpg")
 
 
 @app.command(epilog="Example: lanenet val checkpoints/small runs/drive7 runs/my_map --out runs/errors")
+@with_viewers
 def val(
     paths: Annotated[
         list[Path],
@@ -74,6 +76,7 @@ def val(
             help="Also change the frames: lines missing, clutter, unknown objects, a wrong calibration.",
         ),
     ] = False,
+    views: Views = NO_VIEWS,
 ) -> None:
     """Show errors in cm of a model, in a sentence and a table; with --all beside the other detectors.
 
@@ -96,6 +99,7 @@ def val(
         for source in source_paths:
             check_not_source(source, *(Path(f"{out}{end}") for end in _ENDINGS))
     lock_outputs(out)
+    views.check(source_paths[0] if len(source_paths) == 1 else None)
     meta = None if model is None else read_model_meta(model)
     window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
     sources = [open_source(path, window, perception, truth_labels) for path in source_paths]
@@ -121,6 +125,8 @@ def val(
     networks_only = [name for name in comparison.tables if name in networks] if alone else None
     where = _where(sources, model)
     show(comparison, seen, where, networks_only, show_all)
+    if views:
+        view_answers(views, sources, seen)
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
         judged = comparison.first if model is None else model.resolve().parent.name

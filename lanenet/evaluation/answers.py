@@ -41,6 +41,7 @@ class Answers:
         sigma_cm: Sigma of each point; a detector that predicts none is left out or has NaN.
         presence: Probability that the left and the right line can be seen; likewise.
         confidence: Of each frame; empty for label sets.
+        steering_rad: Steering target of each frame, positive left; empty for label sets.
         brightness: Mean grey level of each frame, 0 to 255; None for label sets.
         plain: Frames with both markings in plain sight; None for label sets.
     """
@@ -49,6 +50,7 @@ class Answers:
     sigma_cm: dict[str, Float[np.ndarray, "n 6"]] = field(default_factory=dict)
     presence: dict[str, Float[np.ndarray, "n 2"]] = field(default_factory=dict)
     confidence: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
+    steering_rad: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
     brightness: Float[np.ndarray, "n"] | None = None
     plain: Bool[np.ndarray, "n"] | None = None
 
@@ -76,6 +78,7 @@ def answer_frames(
         {name: np.full((n, N_POINTS), np.nan) for name in detectors},
         {name: np.full((n, len(SIDES)), np.nan) for name in detectors},
         {name: np.full(n, np.nan) for name in detectors},
+        {name: np.full(n, np.nan) for name in detectors},
         brightness,
         plain,
     )
@@ -92,6 +95,7 @@ def answer_frames(
             answers.sigma_cm[name][i] = found.sigma_cm
             answers.presence[name][i] = found.presence
             answers.confidence[name][i] = found.confidence
+            answers.steering_rad[name][i] = found.steering_rad
         if progress is not None:
             progress(i + 1, n)
     return answers

@@ -62,6 +62,7 @@ class SourceAnswers:
         presence: By detector, its probability that the left and the right line can be seen; likewise.
         visible: Whether each line can be seen: 1, 0, or NaN for unknown; None if unknown throughout.
         plain: Frames with both markings in plain sight; None where there are no frames.
+        steering_rad: By detector, its steering target for each frame; empty where there are no frames.
         conditions: By name (see :data:`lanenet.evaluation.errors.GROUPS`) its value for each frame.
     """
 
@@ -76,6 +77,7 @@ class SourceAnswers:
     conditions: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
     all_cm: Float[np.ndarray, "n 6"] | None = None
     plain: Bool[np.ndarray, "n"] | None = None
+    steering_rad: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -196,11 +198,13 @@ class SeenSource:
         frames: The source.
         answers_cm: Six points for each frame; NaN where it has no answer.
         plain: Frames with both markings in plain sight.
+        values: Its other answers for each frame: ``steering_rad`` and ``confidence``.
     """
 
     frames: LabelledFrames
     answers_cm: Float[np.ndarray, "n 6"]
     plain: Bool[np.ndarray, "n"]
+    values: Mapping[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
 
     @property
     def off_cm(self) -> Float[np.ndarray, "n 6"]:
@@ -248,7 +252,15 @@ def evaluate(
     answered = [_describe(source, compared, answers, training) for source in sources]
     comparison = compare_detectors(answered)
     seen = [
-        SeenSource(source.frames, answer.answers_cm[comparison.first], answer.plain)
+        SeenSource(
+            source.frames,
+            answer.answers_cm[comparison.first],
+            answer.plain,
+            {
+                "steering_rad": answer.steering_rad[comparison.first],
+                "confidence": answer.conditions["confidence"],
+            },
+        )
         for source, answer in zip(sources, answered, strict=True)
         if source.frames is not None and answer.plain is not None
     ]
@@ -369,6 +381,7 @@ def _describe(
         conditions=conditions,
         all_cm=all_cm,
         plain=answer.plain,
+        steering_rad=answer.steering_rad,
     )
 
 

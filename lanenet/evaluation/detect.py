@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Annotated frames are enlarged to at least this width. Chosen: the text can be read.
 VIDEO_WIDTH_PX = 640
+#: Name of the detector where there is one only.
+ONE = "it"
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
 Progress = Callable[[int, int], None]
 
@@ -123,6 +125,7 @@ def run_detector(
     progress: Progress | None = None,
     *,
     skip_unreadable: bool = False,
+    watch: Callable[[SeenFrame], None] | None = None,
 ) -> DetectReport:
     """Run a detector over every frame of a source and write what it finds.
 
@@ -136,6 +139,7 @@ def run_detector(
         video: Annotated video (mp4v), or None.
         progress: Called with (frames done, frames).
         skip_unreadable: Give a frame that cannot be read an empty row and name it in the report.
+        watch: Called with each frame and, under :data:`ONE`, the detector's answer.
 
     Returns:
         Counts, timings and problems.
@@ -156,11 +160,11 @@ def run_detector(
     times_s: list[float] = []
     problems: list[str] = []
     complete = steered = 0
-    running = run_detectors(source, {"it": detector}, skip_unreadable=skip_unreadable)
+    running = run_detectors(source, {ONE: detector}, skip_unreadable=skip_unreadable)
     with ExitStack() as stack:
         writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None
         for seen in running:
-            i, estimate = seen.index, seen.estimates["it"]
+            i, estimate = seen.index, seen.estimates[ONE]
             times_s += seen.seconds.values()
             if seen.problem is not None:
                 problems.append(seen.problem)
@@ -171,6 +175,8 @@ def run_detector(
                 rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
                 lane = getattr(detector, "last", None) if seen.image is not None else None
                 writer.add(seen.image, estimate, f"{source.frames[i]}{rate}", lane)
+            if watch is not None:
+                watch(seen)
             if progress is not None:
                 progress(i + 1, len(source))
         if not times_s:

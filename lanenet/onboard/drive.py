@@ -25,11 +25,12 @@ from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.arming import ArmCheck, ArmGate, HoldFile
 from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.replay import ReplaySettings
+from lanenet.onboard.devices import Frame
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, Step
 from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.camera_check import CameraCheck
-from lanenet.perception.estimate import Detector, DetectorInputs
+from lanenet.perception.estimate import Detector, DetectorInputs, LaneEstimate
 from lanenet.perception.registry import KINDS, build_detector
 
 #: In a dry run a fault stops the car but does not end the drive: this is longer than any dry run.
@@ -117,6 +118,7 @@ def build_loop(
     dry_run: bool = False,
     hold: HoldFile | None = None,
     watch: Callable[[Step], None] | None = None,
+    show: Callable[[Frame, LaneEstimate, Step], None] | None = None,
 ) -> DriveLoop:
     """Put a car together; a recording's folder is made here, devices are opened when the loop runs.
 
@@ -127,6 +129,7 @@ def build_loop(
         dry_run: Send nothing; the loop behaves as that of an armed car.
         hold: File that the operator of an armed car holds.
         watch: Called after every turn of the loop.
+        show: Called with each frame, what was seen in it and its turn, after the command.
 
     Raises:
         ConfigError: If the options contradict each other, the car has no actuator and this is no dry run, or
@@ -163,7 +166,7 @@ def build_loop(
         hold,
     )
     mode = DriveMode(arm or dry_run, steering_only, record_commands=not dry_run)
-    return DriveLoop(parts, safety, settings.limits, settings.control.speed, mode, watch)
+    return DriveLoop(parts, safety, settings.limits, settings.control.speed, mode, watch, show=show)
 
 
 def build_drive_detector(settings: DriveSettings, camera: Camera | None) -> Detector:

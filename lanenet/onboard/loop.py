@@ -114,6 +114,7 @@ class DriveLoop:
         mode: DriveMode,
         watch: Callable[[Step], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        show: Callable[[Frame, LaneEstimate, Step], None] | None = None,
     ) -> None:
         """Connect the parts; nothing is opened.
 
@@ -125,11 +126,12 @@ class DriveLoop:
             mode: What the car is allowed to do.
             watch: Called after every turn of the loop.
             clock: The clock of the frames' times, [s].
+            show: Called with each frame, what was seen in it and its turn, after the command.
         """
         self.report = DriveReport()
         self.problems: Sequence[str] = getattr(parts.detector, "problems", ())
         self._parts, self._mode, self._safety, self._speed = parts, mode, safety, speed
-        self._watch, self._clock = watch, clock
+        self._watch, self._clock, self._show = watch, clock, show
         self._limiter = CommandLimiter(limits)
         self._judge, self._check = SafetyJudge(safety, mode.armed), FrameCheck(safety)
         self._until_s = -math.inf
@@ -228,7 +230,7 @@ class DriveLoop:
             # The wheels stay as they are: a car that still rolls stays in its bend.
             self._limiter.neutral(now_s)
             self._send(self._limiter.steering_rad, 0.0, now_s + self._safety.watchdog_s)
-        return self._finish(frame, verdict, estimate.confidence)
+        return self._finish(frame, verdict, estimate)
 
     def _keeps_from_driving(
         self, frame: Frame | None, frame_fault: str, confidence: float, now_s: float
@@ -266,7 +268,7 @@ class DriveLoop:
         self._number = frame.number
         self.report.frames += 1
 
-    def _finish(self, frame: Frame | None, verdict: Verdict, confidence: float) -> Step:
+    def _finish(self, frame: Frame | None, verdict: Verdict, estimate: LaneEstimate) -> Step:
         steering_rad, throttle = self._limiter.steering_rad, self._limiter.throttle
         recorder = self._parts.recorder
         if frame is not None and recorder is not None:
@@ -279,13 +281,15 @@ class DriveLoop:
             self._look_at_camera(frame)
         self.report.states[verdict.state] += 1
         number = -1 if frame is None else frame.number
-        step = Step(number, verdict.state, verdict.reason, steering_rad, throttle, confidence)
+        step = Step(number, verdict.state, verdict.reason, steering_rad, throttle, estimate.confidence)
         self._verdict, self._step = verdict, step
         self._log(verdict)
         if verdict.state is State.ENDED:
             self.report.ended, self.report.by_fault = verdict.reason, True
         if self._watch is not None:
             self._watch(step)
+        if self._show is not None and frame is not None:
+            self._show(frame, estimate, step)
         return step
 
     def _look_at_camera(self, frame: Frame) -> None:

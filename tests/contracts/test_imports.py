@@ -28,6 +28,7 @@ NAMED_IMPORTS = {
     "lanenet/learn/sweep.py": {"optuna"},
     "lanenet/onboard/actuators/": {"serial", "termios"},
     "lanenet/onboard/cameras/": {"picamera2"},
+    "lanenet/viewers/": {"rerun", "mcap"},
 }
 #: The one function that does it.
 IMPORTER = "lanenet/data/files.py"

@@ -19,7 +19,15 @@ from lanenet.data.drives.recording import MAX_TIME_S
 from lanenet.data.files import require, write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
 from lanenet.data.maps.line import LaneLine
-from lanenet.data.tables import MAX_PLACE, ColumnSpec, read_csv, write_columns, write_csv, write_tum
+from lanenet.data.tables import (
+    MAX_PLACE,
+    ColumnSpec,
+    ParquetTable,
+    read_csv,
+    write_columns,
+    write_csv,
+    write_tum,
+)
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
@@ -272,6 +280,17 @@ def check_map_files(folder: Path) -> None:
     """
     read_map(folder)
     require("pyarrow.parquet", "data").read_table(folder / "edges.parquet")
+
+
+def read_edges(folder: Path) -> Float[np.ndarray, "n 2"]:
+    """Return the edge points of a map, [cm], frame map.
+
+    Raises:
+        LabelFormatError: If there is no such file, it cannot be read, or lacks a column.
+        MissingExtraError: If pyarrow is not installed.
+    """
+    table = ParquetTable(FolderFiles(folder).file("edges.parquet", folder, MapFormatError))
+    return np.column_stack([table.floats(name) for name in ("x_cm", "y_cm")])
 
 
 def kept_map(out: Path) -> str:

@@ -281,6 +281,7 @@ class LabelledFrames:
         image: Reads frame i (by position); DriveFormatError naming the file if it cannot.
         all_cm: As ``points_cm``, with the points that a simulator knows although they are no labels; None
             where the labels are all that is known.
+        t_s: Time of each frame; None if unknown.
     """
 
     name: str
@@ -294,6 +295,7 @@ class LabelledFrames:
     points_cm: Float[np.ndarray, "n 6"]
     image: Callable[[int], UInt8[np.ndarray, "h w 3"]] = field(repr=False)
     all_cm: Float[np.ndarray, "n 6"] | None = None
+    t_s: Float[np.ndarray, "n"] | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -313,6 +315,7 @@ class LabelledFrames:
             starts=self.starts[rows],
             points_cm=self.points_cm[rows],
             all_cm=None if self.all_cm is None else self.all_cm[rows],
+            t_s=None if self.t_s is None else self.t_s[rows],
             image=partial(_image_at, self.image, rows),
         )
 
@@ -363,6 +366,7 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
         points_cm=window.labelled(all_cm),
         image=drive.image,
         all_cm=all_cm,
+        t_s=drive.t_s,
     )
 
 
@@ -395,4 +399,5 @@ def read_map_frames(
         starts=mapped.starts,
         points_cm=label_frames(mapped, window).points_cm,
         image=partial(_image_at, drive.image, rows),
+        t_s=drive_map.t_s,
     )

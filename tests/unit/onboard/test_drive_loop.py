@@ -19,6 +19,7 @@ from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import LaneEstimate
 
 RATE_HZ = 30.0
+CONTROL = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
 LANE = LaneEstimate(np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0]), confidence=1.0)
 
 
@@ -112,12 +113,11 @@ class Car:
         self.camera = Camera(self.clock, count, faults or {})
         self.wire = Wire(self.clock)
         self.steps: list[Step] = []
-        control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
         self.loop = DriveLoop(
-            CarParts(self.camera, Eye(answer), LaneController(control), self.wire, None, check, None, hold),
+            CarParts(self.camera, Eye(answer), LaneController(CONTROL), self.wire, None, check, None, hold),
             SafetySettings(countdown_s=countdown_s),
             LimitSettings(),
-            control.speed,
+            CONTROL.speed,
             DriveMode(**options),
             self.steps.append,
             self.clock,
@@ -389,3 +389,27 @@ def test_an_error_before_the_first_frame_says_so(caplog: pytest.LogCaptureFixtur
 def test_the_report_counts_in_words(frames: int, word: str) -> None:
     first = DriveReport(frames=frames).lines()[0]
     assert first.startswith(f"{frames} {word} ")
+
+
+def test_each_frame_is_shown_once_with_what_was_seen_after_its_command() -> None:
+    car = Car(count=5, armed=True, faults={2: lambda: None})
+    shown: list[tuple[int, LaneEstimate, Step, int]] = []
+
+    def show(frame: Frame, estimate: LaneEstimate, step: Step) -> None:
+        shown.append((frame.number, estimate, step, len(car.wire.log)))
+
+    car.loop = DriveLoop(
+        CarParts(car.camera, Eye(lambda _: LANE), LaneController(CONTROL), car.wire),
+        SafetySettings(countdown_s=0.0),
+        LimitSettings(),
+        CONTROL.speed,
+        DriveMode(armed=True),
+        car.steps.append,
+        car.clock,
+        show,
+    )
+    car.loop.run()
+    assert [number for number, *_ in shown] == [0, 1, 3, 4]
+    assert all(estimate is LANE and step.frame == number for number, estimate, step, _ in shown)
+    sent = [k for k, (_, kind, *_) in enumerate(car.wire.log) if kind == "send"]
+    assert all(logged > sent[k] for k, (*_, logged) in enumerate(shown))
