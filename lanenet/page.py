@@ -64,7 +64,7 @@ figcaption,.note{color:var(--soft);font-size:.9rem;margin:.35rem 0}
 .scroll{overflow-x:auto;margin:.8rem 0}table{border-collapse:collapse;font-size:.9rem}
 td,th{padding:.3rem .4rem;border-bottom:1px solid var(--edge);text-align:right;white-space:nowrap;
 vertical-align:top}
-th{font-weight:600}.text{text-align:left;white-space:normal;min-width:6rem}
+th{font-weight:600;white-space:normal;vertical-align:bottom}.text{text-align:left;white-space:normal;min-width:6rem}
 td:first-child,th:first-child{padding-left:0}
 @media (max-width:30rem){table{font-size:.8rem}td,th{padding:.3rem}.text{min-width:5rem}}
 details{border-top:1px solid var(--edge);padding:.2rem 0}

@@ -17,6 +17,7 @@ from datagen.world.road.track import Track
 from datagen.world.road.track_picture import FIXED_BITS, box_corners_cm, paint_track, painted_bounds_cm
 from lanenet.data.files import write_json, write_text
 from lanenet.data.tables import write_csv
+from lanenet.errors import counted
 
 FORMAT = "lanenet-judge/1"
 
@@ -105,13 +106,14 @@ def tables(results: Sequence[RunResult]) -> dict[str, list[list[str]]]:
 
 def table_title(settings: JudgeSettings, kind: str) -> str:
     """Return a line that says what was driven."""
-    far = f"{settings.laps} laps"
+    far = counted(settings.laps, "lap")
     if settings.distance_cm is not None:
         far += f", at most {settings.distance_cm:g} cm,"
     if settings.start_across_deg:
         far = f"started {settings.start_across_deg:g} degrees across, {far}"
+    roads = counted(settings.counts.get(kind, settings.count), "road")
     return (
-        f"{kind}: {settings.counts.get(kind, settings.count)} roads, {far} at {settings.speed_cm_s:g} cm/s, "
+        f"{kind}: {roads}, {far} at {settings.speed_cm_s:g} cm/s, "
         f"{settings.simulation.rate_hz:g} frames/s, {settings.pilot.law}, seed {settings.seed}; "
         "mean/worst over the runs"
     )
@@ -141,6 +143,39 @@ def write_report(out: Path, settings: JudgeSettings, results: Sequence[RunResult
 def draw_top_view(
     track: Track, runs: Sequence[tuple[RunResult, Trajectory]], title: str
 ) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw a road and the runs on it, as :func:`draw_runs` does, below a line for each run.
+
+    Args:
+        track: The road.
+        runs: Results and trajectories, in the order of their colours.
+        title: For the top left corner.
+    """
+    road = draw_runs(track, runs)
+    header = np.full((_ROW_PX * (len(runs) + 1) + 12, max(760, road.shape[1]), 3), _GROUND_BGR, np.uint8)
+    _write(header, title, 0, _TEXT_BGR)
+    for index, (result, _) in enumerate(runs):
+        _write(header, f"{result.entrant}: {run_text(result)}", index + 1, colour_of(index))
+    beside = np.full((len(road), header.shape[1] - road.shape[1], 3), _GROUND_BGR, np.uint8)
+    return np.vstack([header, np.hstack([road, beside])])
+
+
+def run_text(result: RunResult) -> str:
+    """Say how a run went."""
+    text = (
+        f"{result.laps:.2f} laps, {counted(result.departures, 'departure')}, {result.put_backs} put back, "
+        f"offset {result.mean_offset_cm:.2f} cm mean, {result.worst_offset_cm:.1f} cm worst"
+    )
+    if result.across_deg:
+        text += f", back after {result.back_after_s:.1f} s" if result.back else ", not back"
+    return text
+
+
+def colour_of(index: int) -> tuple[int, int, int]:
+    """Return the colour of an entrant's path, BGR."""
+    return COLOURS_BGR[index % len(COLOURS_BGR)]
+
+
+def draw_runs(track: Track, runs: Sequence[tuple[RunResult, Trajectory]]) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a road and the runs on it.
 
     A filled dot marks where a departure begins, a cross where the car was put back.
@@ -148,7 +183,6 @@ def draw_top_view(
     Args:
         track: The road.
         runs: Results and trajectories, in the order of their colours.
-        title: For the top left corner.
     """
     # Markings reach beyond the driven lane where the road has another one.
     half_cm = 0.5 * track.lane_width_cm
@@ -156,13 +190,12 @@ def draw_top_view(
     low_cm, high_cm = painted_bounds_cm(track, _MARGIN_CM)
     size_cm = high_cm - low_cm
     scale = _SIDE_PX / float(size_cm.max())
-    header_px = _ROW_PX * (len(runs) + 1) + 12
-    width, height = max(760, round(size_cm[0] * scale)), round(size_cm[1] * scale) + header_px
+    width, height = np.rint(size_cm * scale).astype(int).tolist()
     image = np.full((height, width, 3), _GROUND_BGR, np.uint8)
 
     def fixed(xy_cm: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Points in OpenCV's fixed point; y of the map is up."""
-        px = (xy_cm - [low_cm[0], high_cm[1]]) * [scale, -scale] + [0.0, header_px]
+        px = (xy_cm - [low_cm[0], high_cm[1]]) * [scale, -scale]
         return np.rint(px * (1 << FIXED_BITS)).astype(np.int32)
 
     road_px = max(1, round(scale * (max(sides_cm) - min(sides_cm) + 6.0)))
@@ -174,18 +207,8 @@ def draw_top_view(
     for index, (_, trajectory) in enumerate(runs):
         # Later ones are thinner, so that equal paths below stay visible.
         thickness = min(2 + len(runs) - 1 - index, 7)
-        _draw_run(image, trajectory, COLOURS_BGR[index % len(COLOURS_BGR)], thickness, fixed)
+        _draw_run(image, trajectory, colour_of(index), thickness, fixed)
     _draw_start(image, track, max(sides_cm) + 18.0, fixed)
-    _write(image, title, 0, _TEXT_BGR)
-    for index, (result, _) in enumerate(runs):
-        text = (
-            f"{result.entrant}: {result.laps:.2f} laps, {result.departures} departures, "
-            f"{result.put_backs} put back, offset {result.mean_offset_cm:.2f} cm mean, "
-            f"{result.worst_offset_cm:.1f} cm worst"
-        )
-        if result.across_deg:
-            text += f", back after {result.back_after_s:.1f} s" if result.back else ", not back"
-        _write(image, text, index + 1, COLOURS_BGR[index % len(COLOURS_BGR)])
     return image
 
 

@@ -92,6 +92,7 @@ def judge(
 ) -> None:
     """Let detectors drive synthetic roads in closed loop and show how they do; finished runs are kept."""
     from datagen.judge.contest import judge as run_contest
+    from datagen.judge.page import write_page
     from datagen.judge.report import table_title, tables, write_report
     from datagen.judge.settings import JudgeSettings, contest_roads
 
@@ -130,7 +131,7 @@ def judge(
         for first in range(0, len(table), _BESIDE):
             headers, *rows = zip(measures, *table[first : first + _BESIDE], strict=True)
             console.show_table(table_title(settings, kind), headers, rows)
-    paths = write_report(out, settings, results)
+    paths = [write_page(out, settings, entrants, results), *write_report(out, settings, results)]
     console.wrote(*paths, _draw_pictures(settings, entrants, results, out))
     again = {
         "--detectors": detectors,
