@@ -39,8 +39,8 @@ class AugmentSettings(Settings):
     """How a sample is changed before it becomes a raster; all of it in cm, on the edge points.
 
     The defaults are for a network that meets other cars and roads; they were chosen, and what some of them
-    bring was measured in docs/learning.md. ``preset: own_road`` stands for less, for one car on its own road;
-    keys beside it change that. Once read, only the values are left.
+    bring was measured in docs/learning.md. ``preset: own_road`` stands for less, for one car on its own road,
+    ``preset: none`` for frames as they are; keys beside it change that. Once read, only the values are left.
 
     Attributes:
         mirror: Probability that left and right are swapped.
@@ -110,9 +110,10 @@ class AugmentSettings(Settings):
             return data
         changes = dict(data)
         name = changes.pop("preset")
-        if not isinstance(name, str) or name not in _PRESETS:
-            raise ValueError(f"no preset {name!r}, expected one of {', '.join(_PRESETS)}")
-        return {**_PRESETS[name], **changes}
+        presets = {**_PRESETS, "none": {field: 0 for field in cls.model_fields if field != "draw"}}
+        if not isinstance(name, str) or name not in presets:
+            raise ValueError(f"no preset {name!r}, expected one of {', '.join(presets)}")
+        return {**presets[name], **changes}
 
     @model_validator(mode="after")
     def _lines_missing_at_most_always(self) -> AugmentSettings:
@@ -123,5 +124,4 @@ class AugmentSettings(Settings):
     @classmethod
     def only(cls, **changes: object) -> AugmentSettings:
         """Return settings that change nothing but what is named."""
-        nothing: dict[str, object] = {name: 0 for name in cls.model_fields if name != "draw"}
-        return cls.model_validate(nothing | changes)
+        return cls.model_validate({"preset": "none"} | changes)

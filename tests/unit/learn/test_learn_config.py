@@ -61,9 +61,14 @@ def test_a_preset_is_changed_by_the_keys_beside_it_and_written_out_as_values():
     assert data == {"augment": {"preset": "own_road", "objects": 3, "shift_cm": 1.0}}
 
 
+def test_the_preset_none_changes_nothing():
+    found = AugmentSettings.model_validate({"preset": "none", "mirror": 0.5}).model_dump(exclude={"draw"})
+    assert {name for name, value in found.items() if value} == {"mirror"}
+
+
 @pytest.mark.parametrize("name", ["own_raod", None, ["own_road"]])
 def test_an_unknown_preset_is_named_with_those_that_there_are(name):
-    with pytest.raises(ConfigError, match=r"x\.yaml: key 'augment': .*no preset .*expected one of own_road"):
+    with pytest.raises(ConfigError, match=r"x\.yaml: key 'augment': .*no preset .*expected one of own_road, none"):
         check_settings(LearnSettings, {"augment": {"preset": name}}, "x.yaml")
 
 
