@@ -110,7 +110,8 @@ class AugmentSettings(Settings):
             return data
         changes = dict(data)
         name = changes.pop("preset")
-        presets = {**_PRESETS, "none": {field: 0 for field in cls.model_fields if field != "draw"}}
+        nothing: dict[str, object] = {field: 0 for field in cls.model_fields if field != "draw"}
+        presets = {**_PRESETS, "none": nothing}
         if not isinstance(name, str) or name not in presets:
             raise ValueError(f"no preset {name!r}, expected one of {', '.join(presets)}")
         return {**presets[name], **changes}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -72,22 +72,30 @@ class AlexNetTrunk(Trunk):
         """
         if not path.is_file():
             raise CheckpointError(f"{path}: no such file, expected weights of torchvision's AlexNet")
+        state: Any
         try:
             if path.suffix == ".safetensors":
                 state = load_file(path)
             else:
                 state = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # the unpickler raises whatever damaged bytes lead it to
-            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            raise CheckpointError(f"{path}: cannot be read as weights ({reason})") from None
-        if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+            # The first sentence: torch goes on with advice to trust the file.
+            reason = str(error).splitlines()[0].split(". ")[0][:200] if str(error) else type(error).__name__
+            raise CheckpointError(
+                f"{path}: cannot be read as weights, expected a state dict ({reason})"
+            ) from None
+        if not isinstance(state, dict):
             raise CheckpointError(f"{path}: expected a dict of tensors, found {type(state).__name__}")
+        for name, value in state.items():
+            if not isinstance(value, Tensor):
+                found = f"{type(value).__name__} under {name!r}"
+                raise CheckpointError(f"{path}: expected a dict of tensors, found {found}")
         own = {name: value for name, value in self.state_dict().items() if not name.startswith("colour_")}
         for name, value in own.items():
-            found = state.get(name)
-            if found is None or found.shape != value.shape:
-                what = "nothing" if found is None else f"shape {tuple(found.shape)}"
+            given = state.get(name)
+            if given is None or given.shape != value.shape:
+                found = "nothing" if given is None else f"shape {tuple(given.shape)}"
                 raise CheckpointError(
-                    f"{path}: expected AlexNet's {name!r} of shape {tuple(value.shape)}, found {what}"
+                    f"{path}: expected AlexNet's {name!r} of shape {tuple(value.shape)}, found {found}"
                 )
         self.load_state_dict({name: state[name] for name in own}, strict=False)

@@ -68,7 +68,9 @@ def test_the_preset_none_changes_nothing():
 
 @pytest.mark.parametrize("name", ["own_raod", None, ["own_road"]])
 def test_an_unknown_preset_is_named_with_those_that_there_are(name):
-    with pytest.raises(ConfigError, match=r"x\.yaml: key 'augment': .*no preset .*expected one of own_road, none"):
+    with pytest.raises(
+        ConfigError, match=r"x\.yaml: key 'augment': .*no preset .*expected one of own_road, none"
+    ):
         check_settings(LearnSettings, {"augment": {"preset": name}}, "x.yaml")
 
 

@@ -82,6 +82,8 @@ def test_pretrained_weights_are_taken_up_but_for_the_last_layer(alexnet, tmp_pat
         ({}, r"expected AlexNet's 'features\.0\.weight' of shape \(64, 3, 11, 11\), found nothing"),
         ({"features.0.weight": torch.zeros(2)}, r"found shape \(2,\)"),
         ([1], "expected a dict of tensors, found list"),
+        ({"state_dict": {}}, "expected a dict of tensors, found dict under 'state_dict'"),
+        (torch.nn.Linear(1, 1), r"expected a state dict \(Weights only load failed\)"),
     ],
 )
 def test_faulty_pretrained_weights_are_refused(alexnet, tmp_path, content, message):
