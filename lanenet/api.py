@@ -181,10 +181,11 @@ def train(
     config: Settings | Mapping[str, Any] | str | Path,
     *overrides: str,
     marking_cm: int | float | None = None,
+    force: bool = False,
 ) -> Path:
     """Make the drives, maps and labels that a config needs, train, evaluate and export, as ``lanenet train``.
 
-    Shows its progress on stderr and prints the tables of the test. What is there already is used, and a run
+    Shows its progress on stderr and prints verdicts and a table. What is there already is used, and a run
     that was interrupted resumes. Starts processes, so a script calls it below ``if __name__ == "__main__":``,
     as Python's ``multiprocessing`` asks for. Needs ``lanenet[train]``.
 
@@ -192,20 +193,22 @@ def train(
         config: Settings of the run or their file, as ``configs/finetune.yaml``.
         overrides: Settings that replace those of the config, as ``learn.epochs=5``.
         marking_cm: Width of the tape for the detectors that it is compared with.
+        force: Replace a network of that name that was trained on other drives, too.
 
     Returns:
         The checkpoint's folder, which :func:`load` opens.
 
     Raises:
         ConfigError: If a setting is wrong.
-        LanenetError: If a drive cannot be mapped, or another run writes the checkpoint.
+        LanenetError: If a drive cannot be mapped or its map was rejected, or if the checkpoint was trained
+            on other drives or is being written by another run.
     """
     from lanenet.cli import train as command
     from lanenet.cli.shared.options import held_to_the_end
 
     settings = _settings(command.run_settings_schema(), config, overrides)
     with held_to_the_end():
-        return command.train_run(settings, _float(marking_cm))
+        return command.train_run(settings, _float(marking_cm), force)
 
 
 def _float(value: int | float | None) -> float | None:

@@ -212,7 +212,12 @@ def check_settings(schema: type[SettingsT], data: dict[str, Any], where: str) ->
 
 def dump_settings(settings: Settings) -> str:
     """Return the settings as YAML, with every key."""
-    return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    return to_yaml(settings.model_dump(mode="json"))
+
+
+def to_yaml(data: dict[str, Any]) -> str:
+    """Return plain values as YAML, in their order."""
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
 def _describe(schema: type[BaseModel], error: Any) -> str:

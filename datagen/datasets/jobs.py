@@ -238,6 +238,25 @@ class RecordedJob:
             frames=known.frames,
         )
 
+    @property
+    def is_mapped(self) -> bool:
+        """Whether nothing is left to be mapped.
+
+        Raises:
+            DriveFormatError: If there is no such drive.
+        """
+        return self.is_map or self.is_labels or self.map_output.done
+
+    def count_frames(self) -> int:
+        """Return the number of frames, in a map or a label set only those with poses or labels.
+
+        Raises:
+            LanenetError: If the drive, the map or the label set cannot be read.
+        """
+        if self.is_labels:
+            return len(read_labels(self.recording.path))
+        return len(read_map(self.frames).frames) if self.is_map else len(self._request.open_drive())
+
     def make_map(self, progress: MapProgress | None = None) -> None:
         """Map the drive, unless it has been mapped before.
 

@@ -14,7 +14,7 @@ from datagen.quality.pictures import draw_contact_sheet
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
-from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.folder import DriveMap, verdict_of
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import (
     AWAY,
@@ -33,7 +33,6 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 from lanenet.page import PAGE_NAME
 from lanenet.perception.edges.road import COLOUR_WEIGHT, RoadEdgeExtractor
-from lanenet.reading import read_json
 
 _REPORT_FORMAT = "lanenet-label-report/1"
 #: Edge points up to this distance ahead count for the residual of a frame. Chosen: twice the farthest label
@@ -229,12 +228,13 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     if drive_map.meta.verdict != "reject":
         return
     try:
-        reason = str(read_json(map_folder / "report.json", MapFormatError)["verdict"]["sentence"])
-    except (MapFormatError, LookupError, TypeError):  # the verdict stands without its reasons
+        reason = verdict_of(map_folder).sentence
+    except MapFormatError:  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
     # A map without pictures has no page.
     details = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
-        f"{map_folder}: the map was rejected: {reason}; see {details}; --force labels it all the same"
+        f"{map_folder}: the map was rejected: {reason}; see {details}; lanenet label --force labels it all "
+        "the same"
     )

@@ -6,22 +6,48 @@ Imports ``datagen`` and ``lanenet.learn`` inside the commands, since the car has
 from __future__ import annotations
 
 import functools
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import Field
 
 from lanenet.cli import val as val_cli
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import ConfigArgument, MarkingOption, OverridesArgument, lock_outputs
-from lanenet.config import Settings, dump_settings, load_settings
-from lanenet.errors import CheckpointError
+from lanenet.cli.shared.options import (
+    CameraHeightOption,
+    CameraOption,
+    FramesOption,
+    MarkingOption,
+    TapeWidthOption,
+    WheelbaseOption,
+    frame_range,
+    lane_cm,
+    lock_outputs,
+)
+from lanenet.cli.shared.own_drive import (
+    TRAIN_SHARE,
+    Measured,
+    check_name,
+    check_paths,
+    is_config,
+    own_config,
+    parts_of,
+)
+from lanenet.cli.shared.stages import Stages, stopped_in
+from lanenet.config import Settings, check_settings, dump_settings, load_settings, to_yaml
+from lanenet.data.files import write_text
+from lanenet.errors import CheckpointError, ConfigError, counted
+from lanenet.outputs import make_folder
 from lanenet.reading import read_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from datagen.datasets.build import PreparedData
+    from datagen.datasets.jobs import Part, RecordedJob
+    from lanenet.data.label_set import LabelSet
     from lanenet.evaluation.robustness import RobustRow
     from lanenet.evaluation.sources import Opened
 
@@ -59,96 +85,419 @@ def run_settings_schema() -> type[Settings]:
     return RunSettings
 
 
-@app.command(epilog="Example: lanenet train configs/small.yaml learn.epochs=5")
+@app.command(epilog="Example: lanenet train my_tub --lane-width 40 --name mycar")
 def train(
-    config: ConfigArgument,
-    overrides: OverridesArgument = None,
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE... [KEY=VALUE]...",
+            help="Drives, tubs or videos, a folder of them, maps, or label sets; or one config (.yaml). "
+            "KEY=VALUE replaces a setting of the config, given or made.",
+        ),
+    ],
+    lane_width: Annotated[
+        float | None,
+        typer.Option(
+            parser=lane_cm,
+            metavar="CM",
+            help="Between the middles of the lane's two lines, cm, for a drive that is to be mapped.",
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Of the network: it is written to checkpoints/NAME.")
+    ] = None,
+    camera: CameraOption = None,
+    wheelbase: WheelbaseOption = None,
+    camera_height: CameraHeightOption = None,
+    tape_width: TapeWidthOption = None,
+    frames: FramesOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a network of that name that was trained on other drives.")
+    ] = False,
+    show_all: Annotated[
+        bool, typer.Option("--all", help="Print all tables, with the other detectors.")
+    ] = False,
     marking: MarkingOption = None,
 ) -> None:
-    """Make the drives, maps and labels that CONFIG needs, then train, evaluate and export."""
-    train_run(load_settings(run_settings_schema(), config, overrides), marking)
+    """Train a network on your own drives: map and label them, learn, test on what was held out, export.
+
+    The training starts from checkpoints/general and is written down as a config, runs/NAME/NAME.yaml, which
+    does the same again. Given a config, the command makes all that the config needs. What is there already is
+    used; a run that was stopped resumes.
+    """
+    numbers = None if frames is None else frame_range(frames)
+    measured = Measured(lane_width, camera, wheelbase, camera_height, tape_width, numbers)
+    paths, overrides = parts_of(sources)
+    if paths and is_config(paths[0]):
+        for option in [*measured.options, *(["--name"] if name is not None else [])]:
+            raise ConfigError(f"{option}: is for drives, but {paths[0]} is a config, which has a key for it")
+        words = [*map(str, paths[1:]), *overrides]
+        settings: Any = load_settings(run_settings_schema(), paths[0], words)
+        check_paths(paths[0], [*(drive.path for drive in settings.data.drives), settings.learn.start_from])
+        train_run(settings, marking, force, show_all)
+        return
+    if not paths:
+        raise ConfigError(
+            f"{sources[0]}: expected a drive, a map, a label set or a config before the settings"
+        )
+    if name is None:
+        raise ConfigError(f"expected a name for the network, as in --name {paths[0].resolve().stem}")
+    plain = own_config(name, paths, measured, overrides, Path("runs"))
+    settings = check_settings(run_settings_schema(), plain, shlex.join(["lanenet", "train", *sources]))
+    check_taken(settings, force)
+    _write_config(plain, settings)
+    train_run(settings, marking, force, show_all)
 
 
-def train_run(settings: Any, marking: float | None = None) -> Path:
+def _write_config(plain: dict[str, Any], settings: Any) -> None:
+    """Write down what was chosen, so that it can be read, changed and run again from any folder."""
+    config = settings.work_folder / f"{settings.name}.yaml"
+    folders = {key: str(getattr(settings, key).resolve()) for key in ("work_folder", "checkpoints_dir")}
+    plain = {**plain, "work_dir": folders["work_folder"], "checkpoints_dir": folders["checkpoints_dir"]}
+    again = shlex.join(["lanenet", "train", str(config)])
+    lock_outputs(settings.checkpoints_dir / settings.name)
+    make_folder(settings.work_folder)
+    write_text(config, f"# Made by lanenet train; this does the same again: {again}\n{to_yaml(plain)}")
+    console.wrote(config)
+
+
+def check_taken(settings: Any, force: bool) -> None:
+    """Refuse to replace a network of other drives without force.
+
+    Raises:
+        LanenetError: Names the other drives.
+    """
+    if not force:
+        drives = [drive.path for drive in settings.data.drives]
+        check_name(settings.checkpoints_dir / settings.name, drives)
+
+
+def train_run(
+    settings: Any, marking: float | None = None, force: bool = False, show_all: bool = False
+) -> Path:
     """Do what the command does with the settings of its config, see :func:`run_settings_schema`.
 
     Returns:
         The checkpoint's folder.
     """
-    from datagen.datasets.build import prepare
-    from lanenet.data.files import json_text
-    from lanenet.data.label_set import read_labels
-    from lanenet.evaluation.answers import Compared
-    from lanenet.evaluation.card import CARD_NAME, model_card
-    from lanenet.evaluation.comparison import default_names, evaluate
-    from lanenet.evaluation.model_page import model_page
-    from lanenet.evaluation.report import report_files
-    from lanenet.evaluation.robustness import as_dict
-    from lanenet.evaluation.sources import open_tests
-    from lanenet.learn.checkpoint import METRICS_NAME, check_start, hash_run, publish
-    from lanenet.learn.train import train as train_network
-    from lanenet.page import PAGE_NAME
-    from lanenet.perception.network.model_file import read_model_meta
-    from lanenet.samples.dataset import compile_kernels
+    from lanenet.learn.checkpoint import check_start
 
-    checkpoint = settings.checkpoints_dir / settings.name
-    lock_outputs(checkpoint)
+    check_taken(settings, force)
+    lock_outputs(settings.checkpoints_dir / settings.name)
     check_start(settings.learn, settings.data.window, settings.data.perceptions)
-    with console.progress_bar("data") as progress:
-        data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
-    if data.left_out:
-        console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
-    # One folder per settings and data, so that a stopped run finds its own state.
-    run_hash = hash_run(settings.learn, data.train, data.validation)
-    run_folder = settings.work_folder / f"train-{run_hash}"
-    with console.training_bar() as progress:
-        model = train_network(settings.learn, data.train, data.validation, run_folder, progress).model_path
-    judged = data.of("test")
-    if not judged:
-        console.show_problems(["the data has no test part: the tables use the validation labels"])
-        judged = data.of("validation")
-    sources = open_tests([part.labels for part in judged], [part.frames for part in judged])
-    training = [read_labels(path) for path in dict.fromkeys(data.train)]
-    with console.progress_bar("test") as progress:
-        comparison, seen = evaluate(
-            sources,
-            # The config decides which camera made which test drive.
-            Compared(default_names(sources, with_model=True), {"network": model}, marking, any_camera=True),
+    make_folder(settings.work_folder)
+    log = settings.work_folder / "train.log"
+    stopped = stopped_in(log)
+    with console.log_file(log):
+        if stopped is not None:
+            console.say(f"resumes: the last run stopped in the stage {stopped}; what it finished is used")
+        return _Run(settings, marking, show_all).run()
+
+
+class _Run:
+    """The stages of a training.
+
+    Attributes:
+        settings: Of the run.
+        checkpoint: Its folder.
+        jobs: The recorded drives.
+    """
+
+    def __init__(self, settings: Any, marking: float | None, show_all: bool) -> None:
+        from datagen.datasets.build import recorded_jobs
+
+        self.settings, self._marking, self._show_all = settings, marking, show_all
+        self.checkpoint = settings.checkpoints_dir / settings.name
+        self.jobs = recorded_jobs(settings.data, settings.work_folder)
+        self._stages = Stages(expected_s(settings, self.jobs))
+
+    def run(self) -> Path:
+        """Do all stages; returns the checkpoint's folder."""
+        begin = self._stages.begin
+        if self.jobs:
+            with begin("map"):
+                for job in self.jobs:
+                    self._map(job)
+        with begin("label"):
+            data = self._label()
+        with begin("train"):
+            run_folder = self._train(data)
+        with begin("test"):
+            files, results, judged = self._test(data, run_folder)
+        with begin("export"):
+            self._export(data, run_folder, files, results)
+        if self.jobs:
+            with begin("video"):
+                self._video(judged)
+        self._stages.finish()
+        self._say_next(data)
+        return self.checkpoint
+
+    def _map(self, job: RecordedJob) -> None:
+        """Map a drive unless there is a map, and say what the map is worth.
+
+        Raises:
+            TrackingLostError: If the map was rejected; names the cause, the remedy and the report.
+        """
+        from datagen.labels.label_map import refuse_rejected
+        from lanenet.data.maps.folder import read_map, verdict_of
+
+        if job.is_labels:
+            job.make_map()
+            console.show_lines([f"{job.recording.path}: has labels already, which are used"])
+            return
+        finished = job.is_mapped
+        with console.progress_bar("map") as progress:
+            job.make_map(progress)
+        if finished:
+            console.show_lines([f"{job.frames}: a finished map, which is used"])
+        refuse_rejected(job.frames, read_map(job.frames))
+        verdict = verdict_of(job.frames)
+        console.show_lines([f"verdict: {verdict.grade}: {verdict.sentence}", *verdict.remarks])
+        console.show_lines([f"report: {job.frames / 'report.html'}"])
+
+    def _label(self) -> PreparedData:
+        from datagen.datasets.build import prepare
+        from datagen.datasets.splits import chosen_split
+        from lanenet.data.label_set import read_labels
+        from lanenet.samples.dataset import compile_kernels
+
+        settings = self.settings
+        with console.progress_bar("label" if self.jobs else "data") as progress:
+            data = prepare(settings.data, settings.work_folder, progress, last=compile_kernels)
+        if data.left_out:
+            console.show_problems([f"{len(data.left_out)} synthetic drives are left out", *data.left_out[:5]])
+        for job in self.jobs:
+            parts: dict[str, LabelSet] = {
+                p.role: read_labels(p.labels) for p in data.parts if p.frames == job.frames
+            }
+            how = chosen_split(read_labels(job.whole), job.recording)
+            console.show_lines(split_lines(parts, how, job.recording.split))
+        return data
+
+    def _train(self, data: PreparedData) -> Path:
+        """Train, or go on with it; returns the folder of the finished run."""
+        from lanenet.learn.checkpoint import STATE_NAME, hash_run, read_finished, read_state
+        from lanenet.learn.train import train as train_network
+
+        # One folder per settings and data, so that a stopped run finds its own state.
+        learn = self.settings.learn
+        run_hash = hash_run(learn, data.train, data.validation)
+        folder: Path = self.settings.work_folder / f"train-{run_hash}"
+        if read_finished(folder, run_hash) is not None:
+            console.show_lines(["the network was trained before with these labels and settings: it is used"])
+        elif (state := read_state(folder / STATE_NAME, run_hash)) is not None:
+            console.show_lines([f"goes on after epoch {len(state.history)} of {learn.epochs}"])
+        with console.training_bar() as progress:
+            train_network(learn, data.train, data.validation, folder, progress)
+        return folder
+
+    def _test(
+        self, data: PreparedData, run_folder: Path
+    ) -> tuple[dict[str, str | bytes], dict[str, object], list[Part]]:
+        """Measure the network on what was held out; returns the checkpoint's files, figures and the parts."""
+        from lanenet.data.files import json_text
+        from lanenet.data.label_set import read_labels
+        from lanenet.evaluation.answers import Compared
+        from lanenet.evaluation.card import CARD_NAME, model_card
+        from lanenet.evaluation.comparison import default_names, evaluate
+        from lanenet.evaluation.model_page import model_page
+        from lanenet.evaluation.report import report_files
+        from lanenet.evaluation.robustness import as_dict
+        from lanenet.evaluation.sources import open_tests
+        from lanenet.learn.checkpoint import METRICS_NAME
+        from lanenet.page import PAGE_NAME
+        from lanenet.perception.network.model_file import MODEL_NAME, read_model_meta
+
+        settings, model = self.settings, run_folder / MODEL_NAME
+        judged = data.of("test")
+        if not judged:
+            console.show_problems(["the data has no test part: the tables use the validation labels"])
+            judged = data.of("validation")
+        sources = open_tests([part.labels for part in judged], [part.frames for part in judged])
+        training = [read_labels(path) for path in dict.fromkeys(data.train)]
+        with console.progress_bar("test") as progress:
+            comparison, seen = evaluate(
+                sources,
+                # The config decides which camera made which test drive.
+                Compared(
+                    default_names(sources, with_model=True),
+                    {"network": model},
+                    self._marking,
+                    any_camera=True,
+                ),
+                training,
+                settings.data.processes,
+                progress,
+            )
+        where = self._where(judged)
+        val_cli.show(comparison, seen, where, ["network"], self._show_all)
+        robustness = _robustness(model, sources)
+        card = model_card(
+            settings.name,
+            read_model_meta(model),
+            read_json(run_folder / METRICS_NAME, CheckpointError),
             training,
-            settings.data.processes,
-            progress,
+            [source.labels for source in sources if source.labels is not None],
+            comparison,
+            robustness,
         )
-    val_cli.show(comparison, seen, "on the test drives", ["network"])
-    robustness = _robustness(model, sources)
-    card = model_card(
-        settings.name,
-        read_model_meta(model),
-        read_json(run_folder / METRICS_NAME, CheckpointError),
-        training,
-        [source.labels for source in sources if source.labels is not None],
-        comparison,
-        robustness,
-    )
-    page = model_page(f"How good {settings.name} is", comparison, seen, "on the test drives")
-    files: dict[str, str | bytes] = {"run.yaml": dump_settings(settings), CARD_NAME: card, PAGE_NAME: page}
-    files |= {f"results{ending}": content for ending, content in report_files(comparison, seen).items()}
-    if robustness:
-        files["robustness.json"] = json_text(as_dict(robustness))
-    if data.camera is not None:
-        files["camera.yaml"] = data.camera.read_bytes()
-    if data.example is not None:
-        files[f"example{data.example.suffix}"] = data.example.read_bytes()
-    publish(run_folder, checkpoint, settings.name, files, comparison.as_dict())
-    console.wrote(checkpoint)
-    options = {
-        "--detector": "network",
-        "--model": checkpoint,
-        "--camera": checkpoint / "camera.yaml" if data.camera is not None else None,
-        "--out": "runs/lanes.csv",
+        page = model_page(f"How good {settings.name} is", comparison, seen, where)
+        files: dict[str, str | bytes] = {
+            "run.yaml": dump_settings(settings),
+            CARD_NAME: card,
+            PAGE_NAME: page,
+        }
+        files |= {f"results{ending}": content for ending, content in report_files(comparison, seen).items()}
+        if robustness:
+            files["robustness.json"] = json_text(as_dict(robustness))
+        return files, comparison.as_dict(), judged
+
+    def _where(self, judged: Sequence[Part]) -> str:
+        """Say on what the network is measured."""
+        from datagen.datasets.splits import chosen_split
+        from lanenet.data.label_set import read_labels
+
+        frames = {part.frames for part in judged}
+        jobs = [job for job in self.jobs if job.frames in frames]
+        if len(jobs) < len(judged) or any(part.role != "test" for part in judged):
+            return "on the test drives" if judged[0].role == "test" else "on the validation drives"
+        splits = {chosen_split(read_labels(job.whole), job.recording) for job in jobs}
+        each = "" if len(jobs) == 1 else f" of each of the {len(jobs)} drives"
+        what = "the last lap" if splits == {"lap"} else "the later part"
+        return f"on {what}{each}, which it had not seen,"
+
+    def _export(
+        self,
+        data: PreparedData,
+        run_folder: Path,
+        files: dict[str, str | bytes],
+        results: dict[str, object],
+    ) -> None:
+        from lanenet.learn.checkpoint import publish
+        from lanenet.page import PAGE_NAME
+
+        if data.camera is not None:
+            files["camera.yaml"] = data.camera.read_bytes()
+        if data.example is not None:
+            files[f"example{data.example.suffix}"] = data.example.read_bytes()
+        publish(run_folder, self.checkpoint, self.settings.name, files, results)
+        console.wrote(self.checkpoint, self.checkpoint / PAGE_NAME)
+
+    def _video(self, judged: Sequence[Part]) -> None:
+        """Draw what the network sees on the held-out part of each recording that has frames."""
+        from lanenet.data.camera_file import read_camera
+        from lanenet.data.drives.sources import open_source
+        from lanenet.data.label_set import read_labels
+        from lanenet.evaluation.detect import run_detector
+        from lanenet.evaluation.sources import Opened
+        from lanenet.perception.estimate import DetectorInputs
+        from lanenet.perception.network.detector import KIND
+        from lanenet.perception.registry import build_detector
+
+        for job in self.jobs:
+            part = next((part for part in judged if part.frames == job.frames), None)
+            if part is None or job.is_labels:
+                console.show_lines([f"{job.title}: no video, since it has no frames that were held out"])
+                continue
+            numbers = read_labels(part.labels).frame
+            camera = read_camera(job.frames / "camera.yaml")
+            inputs = DetectorInputs(
+                camera=camera,
+                model=self.checkpoint,
+                any_camera=True,
+                lane_width_cm=job.recording.lane_width_cm,
+            )
+            source = open_source(Opened(job.frames).drive).numbered(int(numbers[0]), int(numbers[-1]))
+            each = "" if len(self.jobs) == 1 else f"-{job.name}"
+            out = self.settings.work_folder / f"test{each}.csv"
+            with console.progress_bar("video") as progress:
+                report = run_detector(
+                    source,
+                    build_detector(KIND.name, inputs),
+                    camera,
+                    out,
+                    out.with_suffix(".mp4"),
+                    progress,
+                    skip_unreadable=True,
+                )
+            console.wrote(report.out, report.video)
+
+    def _say_next(self, data: PreparedData) -> None:
+        from lanenet.evaluation.sources import Opened
+
+        camera = self.checkpoint / "camera.yaml" if data.camera is not None else None
+        source: Path | str = "SOURCE"
+        if data.example is not None:
+            source = self.checkpoint / f"example{data.example.suffix}"
+        elif camera is not None:
+            source = Opened(self.jobs[0].frames).drive
+        known = self.jobs and not self.jobs[0].is_labels
+        options = {
+            "--model": self.checkpoint,
+            "--camera": camera,
+            "--lane-width": self.jobs[0].recording.lane_width_cm if known else None,
+            "--out": "runs/lanes.csv",
+        }
+        console.next_command("detect", source, *console.given(options))
+
+
+#: Seconds that the stages take, measured on donkey_circuit with two cores of 2.4 GHz: for each frame to map
+#: (with the search for the camera), to label, to test and to draw, and for each sample of the training.
+_MAP_S, _LABEL_S, _TEST_S, _DRAW_S, _SAMPLE_S = 0.06, 0.003, 0.01, 0.01, 1.0 / 1300.0
+#: Of each stage before its first frame: processes start, and numba compiles.
+_START_S = 5.0
+#: Share of the frames that is tested on.
+_TEST_SHARE = 0.25
+
+
+def expected_s(settings: Any, jobs: Sequence[RecordedJob]) -> dict[str, float]:
+    """Return the stages of a run, each with the seconds that it may take; 0 for all with simulated drives.
+
+    Raises:
+        LanenetError: If a drive cannot be read.
+    """
+    synthetic, names = settings.data.synthetic, ["label", "train", "test", "export"]
+    if not jobs:
+        return dict.fromkeys(names, 0.0)
+    if synthetic.train or synthetic.validation or synthetic.test:
+        return dict.fromkeys(["map", *names, "video"], 0.0)
+    frames = sum(job.count_frames() for job in jobs)
+    new = sum(job.count_frames() for job in jobs if not job.is_mapped)
+    learned, tested = settings.learn.epochs * TRAIN_SHARE * frames, _TEST_SHARE * frames
+    return {
+        "map": _START_S + _MAP_S * new if new else 0.0,
+        "label": _START_S + _LABEL_S * frames,
+        "train": _START_S + _SAMPLE_S * learned,
+        "test": _START_S + _TEST_S * tested,
+        "export": _START_S,
+        "video": _START_S + _DRAW_S * tested,
     }
-    source = checkpoint / f"example{data.example.suffix}" if data.example is not None else "SOURCE"
-    console.next_command("detect", source, *console.given(options))
-    return checkpoint
+
+
+def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[str]:
+    """Say how a drive's labels were split.
+
+    Args:
+        parts: Its label sets by their role.
+        how: ``lap``, ``time`` or ``none``.
+        wanted: The setting, which ``how`` stands for.
+    """
+
+    def said(role: str) -> str:
+        labels = parts[role]
+        first, last = int(labels.lap[0]) + 1, int(labels.lap[-1]) + 1
+        laps = f"lap {first}" if first == last else f"laps {first} to {last}"
+        return f"{counted(len(labels), 'frame')}, {laps}"
+
+    if how == "none":
+        return [f"learns from all of it ({said('train')})"]
+    lines = [
+        f"learns from {said('train')}; chooses the epoch by {said('validation')}; tests on {said('test')}"
+    ]
+    if how != wanted and how == "time":
+        lines.append("there are no three complete laps: the drive is split along its time instead of by laps")
+    return lines
 
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:

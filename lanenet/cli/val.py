@@ -11,9 +11,9 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source, lock_outputs
+from lanenet.cli.shared.own_drive import learned_from
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, view_answers, with_viewers
-from lanenet.config import read_yaml
-from lanenet.errors import ConfigError, LanenetError
+from lanenet.errors import ConfigError
 from lanenet.evaluation.comparison import SeenSource, default_names, evaluate
 from lanenet.evaluation.sources import Opened, open_source
 from lanenet.perception.network.model_file import find_model, is_model
@@ -178,33 +178,12 @@ def _where(sources: Sequence[Opened], model: Path | None) -> str:
     file = None if model is None else model.parent / "run.yaml"
     if file is None or not file.is_file():
         return where
-    learned = drives_of(file)
-    known = [source for source in sources if str(source.drive.resolve()) in learned]
+    learned = learned_from(file)
+    known = [source for source in sources if source.drive.resolve() in learned]
     if not known:
         return where
     each = "" if len(known) == len(sources) else f"{len(known)} of "
     return f"{where}, {each}which it has learned from in part,"
-
-
-def drives_of(config: Path) -> set[str]:
-    """Return the recorded drives that a training's config names, by their full paths.
-
-    A map stands for its drive. Simulated drives have no path, and an unreadable config names none.
-    """
-    try:
-        drives = read_yaml(config)["data"]["drives"]
-        paths = [Path(str(drive["path"])) for drive in drives]
-    except (ConfigError, KeyError, TypeError):
-        return set()
-    return {str(drive_behind(path)) for path in paths}
-
-
-def drive_behind(path: Path) -> Path:
-    """Return the full path of a recording, or of the one that a map was made from."""
-    try:
-        return Opened(path).drive.resolve()
-    except (LanenetError, KeyError):  # a map that cannot be read stands for itself
-        return path.resolve()
 
 
 def _next_words(

@@ -122,8 +122,8 @@ def test_map_refuses_what_is_no_drive(tmp_path: Path) -> None:
 def test_train_takes_a_config_as_a_file_or_as_values(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: list[Any] = []
 
-    def train_run(settings: Any, marking: float | None) -> Path:
-        asked.append((settings, marking))
+    def train_run(settings: Any, marking: float | None, force: bool) -> Path:
+        asked.append((settings, marking, force))
         return Path(settings.checkpoints_dir / settings.name)
 
     monkeypatch.setattr(train_command, "train_run", train_run)
@@ -133,7 +133,8 @@ def test_train_takes_a_config_as_a_file_or_as_values(monkeypatch: pytest.MonkeyP
     for config in (file, values):
         assert lanenet.train(config, "learn.epochs=5", marking_cm=2.0) == Path("checkpoints/mine")
     assert asked[0] == asked[1] and asked[0][0].learn.epochs == 5 and asked[0][1] == 2.0
-    assert lanenet.train(asked[0][0], "name=yours") == Path("checkpoints/yours")
+    assert lanenet.train(asked[0][0], "name=yours", force=True) == Path("checkpoints/yours")
+    assert [force for *_, force in asked] == [False, False, True]
     with pytest.raises(ConfigError, match="unknown key 'nmae'"):
         lanenet.train({"nmae": "mine"})
 

@@ -6,12 +6,15 @@ a terminal, or Rich, takes for a command.
 
 from __future__ import annotations
 
+import io
 import logging
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,79 @@ ProgressCall = Callable[..., None]
 
 #: A log file gets one line per stage this often, and one at the stage's end; chosen: three a minute.
 _LOG_EVERY_S = 20.0
+#: Columns of a log file; chosen.
+_LOG_WIDTH = 100
+#: Where :func:`log_file` writes.
+_log_path: ContextVar[Path | None] = ContextVar("_log_path", default=None)
+
+
+@contextmanager
+def log_file(path: Path) -> Iterator[None]:
+    """Also write what is shown in the block into a file, with the time, after what it holds already.
+
+    Args:
+        path: In a folder that exists; a file that cannot be written is done without.
+    """
+    token = _log_path.set(path)
+    try:
+        yield
+    except Exception as error:
+        _log(f"error: {error}")
+        raise
+    except KeyboardInterrupt:
+        _log("interrupted")
+        raise
+    finally:
+        _log_path.reset(token)
+
+
+def _log(text: str) -> None:
+    path = _log_path.get()
+    if path is not None:
+        now = time.strftime("%Y-%m-%d %H:%M:%S")
+        with suppress(OSError), path.open("a", encoding="utf-8") as file:
+            file.writelines(f"{now} {printable(line)}\n" for line in text.splitlines())
+
+
+@dataclass
+class _Pass:
+    """One pass of a stage over what it has to do; a stage may pass over its frames several times."""
+
+    number: int
+    began_s: float
+    first: int
+    done: int
+    total: int
+
+
+class _LineLog:
+    """Lines of progress now and then, with what is left of the pass at its speed so far."""
+
+    def __init__(self, write: Callable[[str], None]) -> None:
+        self._write = write
+        self._due_s: dict[str, float] = {}
+        self._passes: dict[str, _Pass] = {}
+
+    def show(self, key: str, text: str, done: int, total: int) -> None:
+        now_s = time.monotonic()
+        at = self._passes.get(key)
+        if at is None or at.total != total or done < at.done:
+            at = self._passes[key] = _Pass(1 if at is None else at.number + 1, now_s, done, done, total)
+        at.done = done
+        if done == total or now_s >= self._due_s.get(key, 0.0):
+            self._due_s[key] = now_s + _LOG_EVERY_S
+            which = f", pass {at.number}" if at.number > 1 else ""
+            left = ""
+            if at.first < done < total:
+                left_s = (now_s - at.began_s) * (total - done) / (done - at.first)
+                left = f", about {duration(left_s)} left{' of it' if which else ''}"
+            self._write(f"{text}{which}: {done} of {total}{left}")
+
+
+def duration(seconds: float) -> str:
+    """Return a duration for people, as ``40 s`` or ``2 min 05 s``."""
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
 
 
 @contextmanager
@@ -39,15 +115,12 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
     """
     console = Console(stderr=True, markup=False, emoji=False)
     if not console.is_terminal:
-        due_s: dict[str, float] = {}
 
-        def log(key: str, text: str, done: int, total: int) -> None:
-            now_s = time.monotonic()
-            if done == total or now_s >= due_s.get(key, 0.0):
-                due_s[key] = now_s + _LOG_EVERY_S
-                _write_stderr(f"{printable(text)}: {done} of {total}\n")
+        def write(line: str) -> None:
+            _write_stderr(f"{printable(line)}\n")
+            _log(line)
 
-        yield log
+        yield _LineLog(write).show
         return
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -55,10 +128,12 @@ def _bars() -> Iterator[Callable[[str, str, int, int], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
+    lines = _LineLog(_log)
     with Progress(*columns, console=console) as progress:
         tasks: dict[str, Any] = {}
 
         def show(key: str, text: str, done: int, total: int) -> None:
+            lines.show(key, text, done, total)
             text = printable(text)
             if key not in tasks:
                 tasks[key] = progress.add_task(text, total=total)
@@ -148,11 +223,15 @@ def _write_stderr(text: str) -> None:
 def say(text: str, err: bool = False) -> None:
     """Print a text on stdout, or on stderr."""
     typer.echo(printable(text), err=err)
+    _log(text)
 
 
 def show_rich(table: Table) -> None:
     """Print a table of printable cells."""
     Console(markup=False, emoji=False).print(table)
+    text = io.StringIO()
+    Console(file=text, width=_LOG_WIDTH, markup=False, emoji=False).print(table)
+    _log(text.getvalue())
 
 
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -6,7 +6,7 @@ import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -269,6 +269,35 @@ def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
     if n > 1 and across_cm < _LEAST_MAP_CM:
         raise MapFormatError(
             f"{path}: all {n} frames lie within {across_cm:g} cm, expected at least {_LEAST_MAP_CM:g} cm"
+        )
+
+
+class MapVerdict(NamedTuple):
+    """How far a map can be trusted, as its report has it.
+
+    Attributes:
+        grade: ``good``, ``usable`` or ``reject``.
+        sentence: What that comes from and what to do about it.
+        remarks: What a person should check.
+    """
+
+    grade: str
+    sentence: str
+    remarks: tuple[str, ...]
+
+
+def verdict_of(folder: Path) -> MapVerdict:
+    """Return the verdict on a map.
+
+    Raises:
+        MapFormatError: If the map's report cannot be read.
+    """
+    file = folder / "report.json"
+    plain = read_json(file, MapFormatError)
+    with parsing(f"{file}: key 'verdict'", MapFormatError):
+        verdict = plain["verdict"]
+        return MapVerdict(
+            str(verdict["grade"]), str(verdict["sentence"]), tuple(map(str, verdict["remarks"]))
         )
 
 

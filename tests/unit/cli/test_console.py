@@ -19,13 +19,19 @@ def test_a_log_gets_a_line_at_once_now_and_then_and_at_the_end(capsys, monkeypat
             now_s[0] += 1.0
             progress("edges", done, 60)
         progress("lines", 1, 2)
+        # Over the same frames once more.
+        now_s[0] += 10.0
+        progress("edges", 1, 60)
+        now_s[0] += 20.0
+        progress("edges", 31, 60)
     told = capsys.readouterr().err.splitlines()
     assert told == [
         "map: edges: 1 of 60",
-        "map: edges: 21 of 60",
-        "map: edges: 41 of 60",
+        "map: edges: 21 of 60, about 39 s left",
+        "map: edges: 41 of 60, about 19 s left",
         "map: edges: 60 of 60",
         "map: lines: 1 of 2",
+        "map: edges, pass 2: 31 of 60, about 19 s left of it",
     ]
 
 
