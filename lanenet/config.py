@@ -164,8 +164,10 @@ def read_yaml(path: Path, error: type[LanenetError] = ConfigError) -> dict[str, 
 def apply_overrides(data: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
     """Return ``data`` with ``a.b=value`` overrides applied; values are parsed as YAML.
 
+    Entries of a list are counted from 0: ``drives.0.split=lap``.
+
     Raises:
-        ConfigError: If an override has no ``=`` or goes through a key that is not a mapping.
+        ConfigError: If an override has no ``=`` or goes through a key that is neither a mapping nor a list.
     """
     result = dict(data)
     for override in overrides:
@@ -174,15 +176,25 @@ def apply_overrides(data: dict[str, Any], overrides: list[str]) -> dict[str, Any
             raise ConfigError(f"override {override!r}: expected key=value")
         value = parse_yaml(text, f"override {override!r}")
         *parents, last = key.split(".")
-        node = result
+        node: Any = result
         for parent in parents:
-            child = node.get(parent, {})
-            if not isinstance(child, dict):
+            at = _entry(node, parent, override)
+            child = node.get(at, {}) if isinstance(node, dict) else node[at]
+            if not isinstance(child, dict | list):
                 raise ConfigError(f"override {override!r}: {parent} is not a section")
-            node[parent] = dict(child)
-            node = node[parent]
-        node[last] = value
+            node[at] = list(child) if isinstance(child, list) else dict(child)
+            node = node[at]
+        node[_entry(node, last, override)] = value
     return result
+
+
+def _entry(node: dict[str, Any] | list[Any], key: str, override: str) -> Any:
+    """Return a key of a mapping, or the number of an entry of a list."""
+    if isinstance(node, dict):
+        return key
+    if not key.isdecimal() or int(key) >= len(node):
+        raise ConfigError(f"override {override!r}: {key} is no entry of a list of {len(node)}, from 0")
+    return int(key)
 
 
 def load_settings(schema: type[SettingsT], path: Path, overrides: list[str] | None = None) -> SettingsT:

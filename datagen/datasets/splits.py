@@ -128,7 +128,7 @@ def _cut(
         if not rows.size:
             raise ConfigError(
                 f"{what} with a gap of {gap_frames} frames and {gap_cm:g} cm leave a part empty; the drive "
-                f"has {len(labels)} labelled frames"
+                f"has {len(labels)} labelled frames: drive longer, two laps or more, or set smaller gaps"
             )
         parts.append(labels.subset(rows))
         last = int(rows[-1])

@@ -178,7 +178,11 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
         # The map of another drive would not be replaced.
         shutil.rmtree(written[0], ignore_errors=True)
     made_before = time.time_ns()
-    assert invoke(" ".join([line, SMALLER.get(verb, "")]))
+    smaller = SMALLER.get(verb, "")
+    if line.startswith("lanenet train my_tub"):
+        # The parts of so short a drive lie within the usual gaps.
+        smaller += " data.drives.0.gap_frames=2 data.drives.0.gap_cm=0"
+    assert invoke(" ".join([line, smaller]))
     for path in written:
         # Some write several files that begin with the name.
         newest = max((made.stat().st_mtime_ns for made in Path().glob(f"{path}*")), default=0)

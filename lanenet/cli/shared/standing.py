@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lanenet.cli.shared import console
+from lanenet.cli.shared.own_drive import learned_from
 from lanenet.config import read_yaml
 from lanenet.data.drives import find_format
 from lanenet.errors import LanenetError
@@ -89,24 +90,31 @@ def say_standing(folder: Path) -> None:
 
 
 def _say_next(here: Standing) -> None:
+    trained = {drive: path for path in here.checkpoints for drive in learned_from(path / "run.yaml")}
     mapped = {path.resolve() for path in here.maps.values()}
     tried = {path.resolve(): at for at, path in here.refused.items()}
-    new = [drive for drive in here.drives if drive.resolve() not in mapped]
-    without_labels = [path for path in here.maps if path.with_suffix(".parquet") not in here.label_sets]
-    if here.maps and without_labels:
-        path = without_labels[0]
-        console.next_command("label", path, "--out", path.with_suffix(".parquet"))
-    elif here.maps and here.checkpoints:
-        console.next_command("val", here.checkpoints[0], next(iter(here.maps)))
+    new = [drive for drive in here.drives if drive.resolve() not in {*mapped, *trained}]
+    unlearned = [path for path, drive in here.maps.items() if drive.resolve() not in trained]
+    if unlearned:
+        console.next_command("train", unlearned[0], "--name", unlearned[0].name)
+    elif here.maps:
+        path, drive = next(iter(here.maps.items()))
+        console.next_command("val", trained[drive.resolve()], path)
     elif untried := [drive for drive in new if drive.resolve() not in tried]:
         name = untried[0].resolve().stem
-        console.next_command("map", untried[0], "--lane-width", "CM", "--out", Path("runs", name))
+        console.next_command("train", untried[0], "--lane-width", "CM", "--name", name)
     elif here.refused:
         console.say(f"next: read why there is no map, in {next(iter(here.refused)) / 'report.html'}")
-    elif not here.maps:
+    elif trained:
+        drive, checkpoint = next(iter(trained.items()))
+        camera = checkpoint / "camera.yaml"
+        console.next_command(
+            *("detect", drive, "--model", checkpoint, "--camera", camera, "--out", "runs/lanes.csv")
+        )
+    else:
         console.say(
             "next: copy a drive here (a Donkeycar tub, a folder with frames.csv, or a video), then "
-            "lanenet map DRIVE --lane-width CM --out runs/DRIVE"
+            "lanenet train DRIVE --lane-width CM --name NAME"
         )
 
 

@@ -32,7 +32,7 @@ from lanenet.cli.shared.own_drive import (
 )
 from lanenet.cli.shared.stages import Stages, stopped_in
 from lanenet.cli.train import expected_s, run_settings_schema
-from lanenet.config import check_settings
+from lanenet.config import apply_overrides, check_settings
 from lanenet.data.label_set import write_labels
 from lanenet.data.maps.folder import write_map
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
@@ -80,6 +80,18 @@ def test_a_tub_and_what_was_measured_become_a_config_that_starts_from_general(he
     assert settings_of(changed).learn.epochs == 3 and settings_of(changed).data.colour_weight == 0.0
     with pytest.raises(ConfigError, match="tub: expected --lane-width"):
         config_of(Path("tub"))
+
+
+def test_a_setting_of_one_drive_is_replaced_by_its_number(here: Path) -> None:
+    plain = {"drives": [{"path": "a"}, {"path": "b", "split": "auto"}]}
+    assert apply_overrides(plain, ["drives.1.split=lap"])["drives"] == [
+        {"path": "a"},
+        {"path": "b", "split": "lap"},
+    ]
+    assert plain["drives"][1]["split"] == "auto"
+    for key in ("drives.2.split", "drives.first.split", "drives.2"):
+        with pytest.raises(ConfigError, match=f"override '{key}=lap': .* is no entry of a list of 2"):
+            apply_overrides(plain, [f"{key}=lap"])
 
 
 def test_few_frames_are_shown_more_often() -> None:

@@ -38,15 +38,25 @@ def test_it_goes_with_the_user_from_drive_to_network(here: Path) -> None:
     (here / "mycar" / "data").mkdir(parents=True)
     tub = write_tub(here / "mycar" / "data" / "tub_1", [record(0)])
     assert "drives       mycar/data/tub_1" in said()
-    assert "next: lanenet map mycar/data/tub_1 --lane-width CM --out runs/tub_1" in said()
+    assert "next: lanenet train mycar/data/tub_1 --lane-width CM --name tub_1" in said()
     add_map(here / "runs" / "tub_1", tub, verdict="good")
     assert "maps         runs/tub_1" in said()
-    assert "next: lanenet label runs/tub_1 --out runs/tub_1.parquet" in said()
+    assert "next: lanenet train runs/tub_1 --name tub_1" in said()
     for ending in ("parquet", "json"):
         (here / "runs" / f"tub_1.{ending}").touch()
+    # One of simulated drives has not learned from it.
     add_map(here / "checkpoints" / "general", tub, "checkpoint")
     assert "label sets   runs/tub_1.parquet" in said() and "checkpoints  checkpoints/general" in said()
-    assert "next: lanenet val checkpoints/general runs/tub_1" in said()
+    assert "next: lanenet train runs/tub_1 --name tub_1" in said()
+    add_map(here / "checkpoints" / "tub_1", tub, "checkpoint")
+    run = {"data": {"drives": [{"path": str(here / "runs" / "tub_1")}]}}
+    (here / "checkpoints" / "tub_1" / "run.yaml").write_text(yaml.safe_dump(run))
+    assert "next: lanenet val checkpoints/tub_1 runs/tub_1" in said()
+    # The map of a whole training lies deeper than is looked.
+    (here / "runs" / "tub_1" / "map.yaml").rename(here / "runs" / "a")
+    run["data"]["drives"][0]["path"] = str(tub)
+    (here / "checkpoints" / "tub_1" / "run.yaml").write_text(yaml.safe_dump(run))
+    assert f"next: lanenet detect {tub} --model checkpoints/tub_1" in said()
 
 
 @pytest.mark.parametrize("name", ["map", "refused"])
@@ -55,7 +65,7 @@ def test_a_drive_without_a_good_map_is_not_mapped_once_more(here: Path, name: st
     assert "no good map  runs/lap" in said() and "in runs/lap/report.html" in said()
     # The next drive is.
     write_drive(here / "lap2", 2)
-    assert "next: lanenet map lap2 " in said()
+    assert "next: lanenet train lap2 " in said()
 
 
 def test_what_is_damaged_hidden_or_part_of_something_is_no_drive(here: Path) -> None:
