@@ -41,7 +41,7 @@ help:
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
 	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
 	@echo "make docs         the documentation as a site into site/; any broken link or warning fails it"
-	@echo "make figures      draw frames, windows and lengths anew into docs/images/frames"
+	@echo "make figures      draw frames, windows and lengths anew, and the board to print, into docs/"
 	@echo "make links        ask for every address that the documents name (needs the network)"
 	@echo "make check        format, lint, types, import rules, fast tests"
 	@echo "make format       rewrite the code in the project's format"
@@ -143,6 +143,7 @@ docs: $(VENV)/.stamp-dev
 
 figures: $(VENV)/.stamp-dev
 	$(BIN)/python contrib/docs/figures.py docs/images/frames
+	for paper in a4 letter; do $(BIN)/lanenet calibrate print --paper $$paper --out docs/print/board-$$paper.pdf; done
 
 links: $(VENV)/.stamp-dev
 	$(BIN)/python contrib/docs/links.py

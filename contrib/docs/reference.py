@@ -117,7 +117,10 @@ def _schema(key: str, schema: type[BaseModel], told: set[type[BaseModel]]) -> It
     """A section of settings, then those below it; one that stood before is not repeated."""
     summary, meanings = _docstring(schema)
     if key:
-        yield f"### {key}" + (f" (`kind: {_kind(schema)}`)" if _kind(schema) else "")
+        # Only the first level stands in the table of contents.
+        yield f"{'####' if '.' in key else '###'} {key}" + (
+            f" (`kind: {_kind(schema)}`)" if _kind(schema) else ""
+        )
     if schema in told:
         yield f"{summary} The keys are those of `{schema.__name__}` above."
         return
@@ -218,4 +221,6 @@ def _plain(text: str) -> str:
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+    table = "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    return f'<div class="reference" markdown>\n\n{table}\n\n</div>'

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from lanenet.calibration.printed import Paper
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import (
     DriveArgument,
@@ -257,6 +258,38 @@ def drive_(
     console.wrote(out, *pictures)
     width = "LANE_WIDTH" if lane_width is None else f"{lane_width:g}"
     console.next_command("map", drive, "--lane-width", width, "--camera", out, "--out", "MAP")
+
+
+@app.command("print", epilog="Example: lanenet calibrate print --board 9x6 --square 2.5 --out runs/board.pdf")
+def print_(
+    out: Annotated[Path, typer.Option(help="PDF to write (.pdf).")],
+    board: Annotated[str, typer.Option(help="Inner corners of the board, as 9x6.")] = "9x6",
+    square: _Square = 2.5,
+    paper: Annotated[Paper, typer.Option(help="Paper of the printer.")] = Paper.A4,
+) -> None:
+    """Draw a chessboard to print, and a sheet that places it on the floor before the car, at true scale."""
+    from lanenet.calibration.chessboard import parse_board
+    from lanenet.calibration.printed import calibration_pdf, near_left_cm
+    from lanenet.data.files import write_bytes
+
+    check_ending(out, ".pdf")
+    lock_outputs(out)
+    wanted = parse_board(board, square)
+    write_bytes(out, calibration_pdf(wanted, paper))
+    x_cm, y_cm = near_left_cm(wanted, paper)
+    console.say(f"print at 100 %, and check the 10 cm; board on the floor: --near-left {x_cm:g},{y_cm:g}")
+    console.wrote(out)
+    console.next_command(
+        "calibrate",
+        "chessboard",
+        "PHOTOS",
+        "--board",
+        board,
+        "--square",
+        f"{square:g}",
+        "--out",
+        "CAMERA.yaml",
+    )
 
 
 def _read_lens(path: Path) -> Camera:
