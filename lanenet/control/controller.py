@@ -12,7 +12,7 @@ from lanenet.control.plausibility import JumpCheck, fault_of
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.geometry.lane import parabola_through
-from lanenet.perception.estimate import LaneEstimate, LaneMemory
+from lanenet.perception.estimate import Detector, LaneEstimate, LaneMemory, TakesMotion
 
 #: The width is learned from frames of at least this confidence; chosen: those at which the car does not slow.
 _WIDTH_CONFIDENCE = 0.5
@@ -144,6 +144,19 @@ class LaneController:
         self._smoother.reset()
         self._jumps.reset()
         self._t_s = math.nan
+
+    def tell(self, detector: Detector, t_s: float, speed_cm_s: float, steering_rad: float) -> None:
+        """Tell a detector that asks for it how the car has moved since the last frame.
+
+        Args:
+            detector: That of the frame to come.
+            t_s: Time of that frame.
+            speed_cm_s: Speed since the frame before, as far as it is known.
+            steering_rad: Steering since then, positive left.
+        """
+        if isinstance(detector, TakesMotion) and math.isfinite(self._t_s):
+            travel_cm, wheelbase_cm = speed_cm_s * (t_s - self._t_s), self._steering.wheelbase_cm
+            detector.moved(travel_cm, travel_cm * math.tan(steering_rad) / wheelbase_cm, wheelbase_cm)
 
     def target(
         self, estimate: LaneEstimate, t_s: float, speed_cm_s: float = 0.0, steering_rad: float = 0.0

@@ -173,6 +173,8 @@ class LanePilot:
             # A copy, since some of Donkeycar's cameras reuse one array.
             bgr = _bgr_of(image_rgb)
             if self._is_new(bgr):
+                motion = self._target[1], self._limiter.steering_rad
+                self._controller.tell(self._detector, now_s, *motion)
                 self.estimate = self._detector.detect(bgr)
                 self._look_at_camera(bgr, now_s)
                 self._follow(now_s)

@@ -202,10 +202,10 @@ class DriveLoop:
         if frame is not None:
             self._count(frame)
         if frame is not None and not fault:
+            motion = self._speed_cm_s(), self._limiter.steering_rad
+            self._parts.controller.tell(self._parts.detector, frame.t_s, *motion)
             estimate = self._parts.detector.detect(frame.image_bgr)
-            target = self._parts.controller.target(
-                estimate, frame.t_s, self._speed_cm_s(), self._limiter.steering_rad
-            )
+            target = self._parts.controller.target(estimate, frame.t_s, *motion)
             steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
             now_s = self._clock()
             fault = self._fault_of_answer(frame, target, now_s)

@@ -72,6 +72,21 @@ class Detector(Protocol):
 
 
 @runtime_checkable
+class TakesMotion(Protocol):
+    """A detector that follows the lane over what it cannot see, if it is told how the car moves."""
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        """Take the car's motion since the last frame, before the next one.
+
+        Args:
+            travel_cm: Distance of the rear axle, positive ahead.
+            turn_rad: Change of heading, positive left.
+            wheelbase_cm: Distance between the axles.
+        """
+        ...
+
+
+@runtime_checkable
 class EdgeDetector(Protocol):
     """A detector that works on edge points, so that label sets, which hold no frames, can be its input."""
 

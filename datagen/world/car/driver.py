@@ -418,6 +418,7 @@ class DetectorPilot:
         """
         if sight.image_bgr is None:
             raise ValueError("a detector needs an image")
+        self._controller.tell(self._detector, sight.t_s, sight.speed_cm_s, sight.steering_rad)
         estimate = self._detector.detect(sight.image_bgr)
         return self._controller.target(estimate, sight.t_s, sight.speed_cm_s, sight.steering_rad).steering_rad
 

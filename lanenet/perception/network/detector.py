@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from lanenet.config import Settings
 from lanenet.errors import ModelMismatchError
@@ -41,6 +41,8 @@ _ONE_LINE = 0.05
 #: Length along the road, [cm], from which a line is seen on its edges; below it what the network says of it
 #: counts by half. Chosen: three bins of the refinement.
 _SEEN_CM = 9.0
+#: Presence that counts of lines that are continued over a junction: neither seen nor unknown. Chosen.
+_CONTINUED = 0.6
 #: Label row at which the car aims, 15 cm ahead.
 _AIM = 1
 
@@ -93,7 +95,7 @@ class NetworkDetector:
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self._told, self._keeps = False, keeps
         self.memory = LaneMemory(lane_width_cm, self.meta.widths_cm)
-        self._tracker = LaneTracker(self.memory, keep)
+        self._tracker = LaneTracker(self.memory, keep, lambda line_cm: _sees(camera, line_cm))
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         self._raster = new_raster(self.meta.window, self.meta.planes)
         self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
@@ -123,7 +125,10 @@ class NetworkDetector:
             self._told = True
             self.problems.append(contradiction)
             log.warning(contradiction)
-        confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
+        if self._tracker.straight_on.on:
+            presence = confirmed = np.full_like(presence, _CONTINUED)
+        else:
+            confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
         return self._estimate(points_cm, sigma_cm, presence, confirmed)
 
     def __call__(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
@@ -167,10 +172,31 @@ class NetworkDetector:
             own_lane=self._tracker.looks.own_lane,
         )
 
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        """Take the car's motion since the last frame; as :class:`lanenet.perception.estimate.TakesMotion`."""
+        self._tracker.straight_on.moved(travel_cm, turn_rad, wheelbase_cm)
+
     def reset(self) -> None:
         """Forget the lane and its markings; its width stays likely, since most roads stay the same."""
         self.memory.doubt()
         self._tracker.reset()
+
+
+#: y of the places at which a line has to be in the image to be in sight, and which share of them. Chosen.
+_PLACES_CM, _IN_SIGHT = np.arange(15.0, 41.0, 5.0), 0.6
+
+
+def _sees(camera: Camera, line_cm: Float[np.ndarray, "3"]) -> bool:
+    """Return whether most of a line, given by its points at the label rows, is in a camera's image."""
+    x = np.polyval(parabola_through(*line_cm.tolist()), _PLACES_CM)
+    return bool(_in_image(camera, np.stack([x, _PLACES_CM], axis=1)).mean() >= _IN_SIGHT)
+
+
+def _in_image(camera: Camera, points_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    """Return which ground points lie in a camera's image."""
+    pixels = camera.project_ground(points_cm)
+    with np.errstate(invalid="ignore"):
+        return ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
@@ -194,10 +220,7 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
 def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
     """Return the share of the far half of a window that lies in a camera's image."""
     row, column = np.mgrid[0 : window.rows / 2 : 16j, 0 : window.columns - 1 : 32j]
-    pixels = camera.project_ground(window.points(np.stack([row.ravel(), column.ravel()], axis=1)))
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
-    return float(inside.mean())
+    return float(_in_image(camera, window.points(np.stack([row.ravel(), column.ravel()], axis=1))).mean())
 
 
 def _centre_cm(points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> float:

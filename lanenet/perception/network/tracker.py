@@ -8,7 +8,7 @@ seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float
 
 from lanenet.geometry.lane import ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
-from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.estimate import SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.refinement import BASIS, RefinedLines, RoadBorders, line_at, refine_lines
+from lanenet.perception.network.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.rolling_median import RollingMedian
 
 #: Factor on a network's own sigma. On nine drives, eight simulated, refined lines lay within one and two
@@ -61,7 +62,15 @@ _MOST_LANES = 0.1
 _BY_LOOK_CM = 15.0
 #: A line is another one from this share of the lane's width away, and the same one within that share. Chosen.
 _CHANGED, _SAME = 0.5, 0.3
+#: Presence below which a line may have ended. On `garage_tape` a blurred one that goes on has 0.67 and more.
+_ENDED = 0.62
+#: The other line of a bend is found within this share of the width of where it is expected. Chosen.
+_BESIDE = 0.1
 _NOWHERE, _UNSEEN = np.zeros(3, dtype=bool), np.full(3, np.nan)
+
+
+#: Whether most of a line, given by its points at the label rows, frame car, would be in the image.
+Sees = Callable[[Float[np.ndarray, "3"]], bool]
 
 
 class _Candidate(NamedTuple):
@@ -84,15 +93,18 @@ class LaneTracker:
         looks: What its lines look like, and whether it is the lane to drive in.
     """
 
-    def __init__(self, lane: LaneMemory, keep: Keep | None = None) -> None:
+    def __init__(self, lane: LaneMemory, keep: Keep | None = None, sees: Sees | None = None) -> None:
         self.lane = lane
         self.looks = LineLooks(keep)
         self._last: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]] | None = None
+        self.straight_on = StraightOn()
+        self._sees = sees
         self._markings_cm = [RollingMedian(_LENGTH), RollingMedian(_LENGTH)]
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         self._last = None
+        self.straight_on.reset()
         self.looks.reset()
         for widths_cm in self._markings_cm:
             widths_cm.clear()
@@ -119,6 +131,9 @@ class LaneTracker:
         own = points_cm.reshape(2, 3), _NETWORK_SIGMA * sigma_cm.reshape(2, 3)
         borders = RoadBorders(edges)
         pair = self._best_pair(self._candidates(own, presence, borders))
+        if self._at_junction(pair, presence, borders):
+            self._last = self.straight_on.lane()
+            return (*self._known(*(a.reshape(6) for a in self._last)), np.zeros(len(SIDES)))
         self._notice_change(pair)
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
@@ -131,9 +146,16 @@ class LaneTracker:
         # One line that is seen tells where the other one is.
         told = np.where(seen_cm >= _LINE_SEEN_CM, 1.0, 0.0)
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
-        self._last = found_cm.reshape(2, 3), found_sigma_cm.reshape(2, 3)
-        unknown = found_sigma_cm > _MOST_LANES * self.lane.likely_cm
-        return np.where(unknown, np.nan, found_cm), np.where(unknown, np.nan, found_sigma_cm), seen_cm
+        self._last = found_cm.reshape(2, 3), found_sigma_cm.reshape(2, 3).copy()
+        found_sigma_cm[self.straight_on.doubts(found_cm, self.lane.width_cm)] = np.inf
+        return (*self._known(found_cm, found_sigma_cm), seen_cm)
+
+    def _known(
+        self, points_cm: Float[np.ndarray, "6"], sigma_cm: Float[np.ndarray, "6"]
+    ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
+        """Return points and sigmas, NaN where the place is unknown."""
+        unknown = sigma_cm > _MOST_LANES * self.lane.likely_cm
+        return np.where(unknown, np.nan, points_cm), np.where(unknown, np.nan, sigma_cm)
 
     def _candidates(
         self,
@@ -190,6 +212,50 @@ class LaneTracker:
                 starts.append((1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM))
                 starts.append((side, next_cm, np.hypot(sigma_cm, _MOVED_CM), _BY_CONTINUING_CM))
         return starts
+
+    def _at_junction(
+        self, pair: tuple[_Candidate, _Candidate], presence: Float[np.ndarray, "2"], borders: RoadBorders
+    ) -> bool:
+        """Return whether the lines that the frame shows are not those of the lane, which goes straight on."""
+        width_cm = self.lane.width_cm
+        if self._last is None or width_cm is None:
+            return False
+        points_cm, seen_cm, seen_at = (np.array([line[i] for line in pair]) for i in (0, 3, 5))
+        lines = SeenLines(points_cm, seen_cm, seen_at)
+        bends, leaving, ended = self._turning(pair, presence, width_cm, borders)
+        if self.straight_on.on:
+            assert self.straight_on.leaving is not None
+            other = 1 - self.straight_on.leaving
+            goes_on = bool(presence[other] > SURE and seen_cm[other] >= _WIDTH_SEEN_CM)
+            self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
+        else:
+            self.straight_on.look(lines, leaving, ended, width_cm)
+        return self.straight_on.on
+
+    def _turning(
+        self,
+        pair: tuple[_Candidate, _Candidate],
+        presence: Float[np.ndarray, "2"],
+        width_cm: float,
+        borders: RoadBorders,
+    ) -> tuple[bool, int | None, bool]:
+        """Return whether the lines turn together, or which one does alone, and if the other has ended."""
+        for side, (line, other) in enumerate(zip(pair, pair[::-1], strict=True)):
+            if line.seen_cm < _LINE_SEEN_CM or (
+                turns_away_cm(line.points_cm, side) < self.straight_on.turns * width_cm
+            ):
+                continue
+            beside_cm = parallel_points(line.points_cm, width_cm if side == 0 else -width_cm)
+            if not np.isfinite(beside_cm).all() or self._sees is None or not self._sees(beside_cm):
+                continue
+            sigma_cm = np.hypot(line.sigma_cm, _MOVED_CM)
+            found = self._refine(beside_cm[None], sigma_cm[None], [1 - side], [None], borders)
+            off_cm = np.abs(found.points_cm[0] - beside_cm).max()
+            if found.seen_at[0, -1] and found.seen_cm[0] >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
+                return True, None, False
+            if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM:
+                return False, side, bool(presence[1 - side] < _ENDED)
+        return False, None, False
 
     def _notice_change(self, pair: tuple[_Candidate, _Candidate]) -> None:
         """Notice that one of the lane's lines was the other one before: the car is in the next lane."""

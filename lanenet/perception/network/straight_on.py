@@ -1,0 +1,174 @@
+"""A lane at a junction: its lines end, or turn away one without the other, and it goes straight on.
+
+The lane of the last plain frame is continued beside the car's own motion, until its lines are seen again.
+Whoever wants to turn there has to know it from elsewhere: a camera sees the roads, and not the route.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lanenet.geometry.frames import car_from_map, map_from_car
+from lanenet.geometry.lane import ROWS_CM
+
+_ROWS, _MIDDLE, _FAR = np.array(ROWS_CM), 1, 2
+#: By how much a line turns away, as the second difference of its points at the label rows and as a share of
+#: the lane's width, at first and once it does, and for how many frames. Chosen: a bend within a lane's width.
+_TURNS, _TURNS_STILL, _AFTER = 0.15, 0.1, 2
+#: Meanwhile a point that far from the continued lane, as a share of the width, is unknown. Chosen: 3 of 40.
+_DOUBTED = 0.08
+#: A lane is plain whose lines are both seen in this length, [cm], beside the car and 15 cm ahead, have its
+#: width within this share, and turn by less than this one. It is worth continuing for so many frames, with
+#: and without knowing the car's motion. Chosen.
+_PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD = 9.0, 0.12, 0.12, 15, 6
+#: A line is the lane's again if it is seen in this length, [cm], and if it is within this share of the width
+#: of where it is expected, and turns away by less than this one. Chosen.
+_SEEN_CM, _SAME, _STRAIGHT = 12.0, 0.12, 0.08
+#: Two lines are, if their distance is between these shares of the width, and their middle not further from
+#: the expected one than this. Chosen.
+_NARROW, _WIDE, _BESIDE = 0.8, 1.25, 0.35
+#: Sigma of the continued lane beside the car, and per cm ahead and driven since. Chosen: 1.5 degrees.
+_PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
+#: The same while nobody tells how the car moves: more than what counts as known.
+_UNTOLD_CM = 100.0
+#: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
+_FARTHEST_CM, _LONGEST = 160.0, 40
+
+
+def turns_away_cm(points_cm: Float[np.ndarray, "3"], side: int) -> float:
+    """Return by how much a line turns away from its lane: the second difference of its points, [cm]."""
+    second = float(points_cm[2] - 2.0 * points_cm[1] + points_cm[0])
+    return second if side == 1 else -second
+
+
+class SeenLines(NamedTuple):
+    """The lines of a frame, the left one first.
+
+    Attributes:
+        points_cm: x at the label rows, frame car.
+        seen_cm: Length in which each is seen.
+        seen_at: Whether it is at each label row.
+    """
+
+    points_cm: Float[np.ndarray, "2 3"]
+    seen_cm: Float[np.ndarray, "2"]
+    seen_at: Bool[np.ndarray, "2 3"]
+
+    def turn(self, width_cm: float) -> Float[np.ndarray, "2"]:
+        """By how much each turns away, as a share of the lane's width."""
+        return np.array([turns_away_cm(x, side) for side, x in enumerate(self.points_cm)]) / width_cm
+
+
+class StraightOn:
+    """Notices that a lane's lines leave it, and continues the lane.
+
+    Attributes:
+        on: Whether the lane is continued at present.
+        leaving: The line that turns away, 0 for the left one, or turned away when the lane was left; None for
+            neither.
+    """
+
+    def __init__(self) -> None:
+        """Know of no junction."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what earlier frames showed."""
+        self.on = self._told = False
+        self.leaving: int | None = None
+        self._lines_cm: Float[np.ndarray, "2 3"] | None = None
+        self._suspicious = self._frames = 0
+        self._driven_cm = 0.0
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
+        self._told = True
+        if self._lines_cm is None:
+            return
+        self._driven_cm += travel_cm
+        half_rad = 0.5 * turn_rad
+        pose = np.array([travel_cm * math.cos(half_rad), travel_cm * math.sin(half_rad), turn_rad])
+        for line_cm in self._lines_cm:
+            ends_cm = map_from_car(np.column_stack([line_cm, _ROWS])[[0, -1]], np.zeros(3), wheelbase_cm)
+            (x_0, y_0), (x_1, y_1) = car_from_map(ends_cm, pose, wheelbase_cm)
+            line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
+
+    @property
+    def turns(self) -> float:
+        """By how much a line has to turn away, as a share of the lane's width."""
+        return _TURNS_STILL if self._suspicious else _TURNS
+
+    def look(self, lines: SeenLines, leaving: int | None, ended: bool, width_cm: float) -> None:
+        """Take a frame while the lane is not continued.
+
+        Args:
+            lines: Its lines.
+            leaving: The one that turns away, while the other one, which would be in sight, does not.
+            ended: Whether the other one has probably come to its end.
+            width_cm: The lane's width.
+        """
+        self.leaving = leaving
+        leaves = leaving is not None
+        self._suspicious = self._suspicious + 1 if leaves and ended else max(0, self._suspicious - 1)
+        self._frames += 1
+        if not leaves and self._suspicious == 0 and _is_plain(lines, width_cm):
+            # Their direction 15 cm ahead, as far as both are seen.
+            far, x = _FAR if lines.seen_at[:, _FAR].all() else _MIDDLE, lines.points_cm
+            slope = float(np.mean(x[:, far] - x[:, 0])) / ROWS_CM[far]
+            self._lines_cm = x[:, [_MIDDLE]] + slope * (_ROWS - _ROWS[_MIDDLE])
+            self._driven_cm, self._frames = 0.0, 0
+        elif self._frames > (_FRESH if self._told else _FRESH_UNTOLD):
+            self._lines_cm = None
+        if self._suspicious >= _AFTER and self._lines_cm is not None:
+            self.on, self._suspicious, self._frames = True, 0, 0
+
+    def look_for_its_end(self, lines: SeenLines, found: bool, width_cm: float) -> None:
+        """Take a frame while the lane is continued.
+
+        Args:
+            lines: Its lines.
+            found: Whether they are the lane's for sure.
+            width_cm: The lane's width.
+        """
+        assert self._lines_cm is not None
+        self._frames += 1
+        too_long = self._frames > _LONGEST or self._driven_cm > _FARTHEST_CM
+        if too_long or found or self._are_the_lanes(lines, self._lines_cm, width_cm):
+            self.on, self._lines_cm = False, None
+
+    @staticmethod
+    def _are_the_lanes(lines: SeenLines, expected_cm: Float[np.ndarray, "2 3"], width_cm: float) -> bool:
+        """Return whether one line is where it is expected, or both together are a lane near there."""
+        x, seen, turn = lines.points_cm, lines.seen_cm >= _SEEN_CM, lines.turn(width_cm)
+        off = np.abs(x - expected_cm)[:, :_FAR].max(axis=1) / width_cm
+        if (seen & (off < _SAME) & (turn < _STRAIGHT) & lines.seen_at[:, _MIDDLE:].all(axis=1)).any():
+            return True
+        across = float(x[1, _MIDDLE] - x[0, _MIDDLE]) / width_cm
+        beside = abs(float(x[:, _MIDDLE].mean() - expected_cm[:, _MIDDLE].mean())) / width_cm
+        is_lane = bool(seen.all()) and _NARROW < across < _WIDE and float(turn.max()) < _TURNS
+        return is_lane and beside < _BESIDE
+
+    def doubts(self, points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> Bool[np.ndarray, "6"]:
+        """Return which points of a frame seem to be those of a line that leaves the lane."""
+        if self._lines_cm is None or width_cm is None or self.leaving is None:
+            return np.zeros(len(points_cm), dtype=bool)
+        return np.abs(points_cm - self._lines_cm.reshape(-1)) > _DOUBTED * width_cm
+
+    def lane(self) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
+        """Return the continued lines and their sigmas, very large ones while the car's motion is unknown."""
+        assert self._lines_cm is not None
+        ahead_cm = _ROWS + self._driven_cm
+        sigma_cm = np.hypot(_PLACE_CM, _DIRECTION_RAD * ahead_cm) if self._told else np.full(3, _UNTOLD_CM)
+        return self._lines_cm.copy(), np.tile(sigma_cm, (2, 1))
+
+
+def _is_plain(lines: SeenLines, width_cm: float) -> bool:
+    """Return whether both lines of a lane are seen, and are nearly straight."""
+    if not ((lines.seen_cm >= _PLAIN_CM).all() and lines.seen_at[:, :_FAR].all()):
+        return False
+    off = np.abs((lines.points_cm[1] - lines.points_cm[0])[:_FAR] / width_cm - 1.0)
+    return bool(off.max() < _PLAIN_WIDTH and np.abs(lines.turn(width_cm)).max() < _PLAIN_TURN)
