@@ -196,7 +196,8 @@ def _in_image(camera: Camera, points_cm: Float[np.ndarray, "n 2"]) -> Bool[np.nd
     """Return which ground points lie in a camera's image."""
     pixels = camera.project_ground(points_cm)
     with np.errstate(invalid="ignore"):
-        return ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(axis=1)
+        inside = (pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))
+    return np.asarray(inside.all(axis=1))
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:

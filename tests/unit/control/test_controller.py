@@ -128,6 +128,33 @@ def test_smoothing_does_not_carry_a_blind_frame() -> None:
     assert math.isnan(controller.target(LaneEstimate(confidence=1.0), 0.03).steering_rad)
 
 
+class Passenger:
+    """A detector that only writes down how it was moved."""
+
+    def __init__(self) -> None:
+        self.motions: list[tuple[float, float, float]] = []
+
+    def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
+        return LaneEstimate(lane(), confidence=1.0)
+
+    def reset(self) -> None:
+        pass
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        self.motions.append((travel_cm, turn_rad, wheelbase_cm))
+
+
+def test_a_detector_that_follows_the_lane_is_told_how_the_car_moves() -> None:
+    controller, detector = LaneController(settings()), Passenger()
+    wheelbase_cm = settings().steering.wheelbase_cm
+    for t_s in (1.0, 1.05):
+        controller.tell(detector, t_s, 60.0, 0.2)
+        controller.target(detector.detect(np.zeros((2, 2, 3), np.uint8)), t_s, 60.0, 0.2)
+    # Nothing is known of the time before the first frame.
+    (motion,) = detector.motions
+    assert motion == pytest.approx((3.0, 3.0 * math.tan(0.2) / wheelbase_cm, wheelbase_cm))
+
+
 def test_the_detectors_own_target_stays_within_the_lock() -> None:
     controller = LaneController(settings(own_target=True))
     assert controller.target(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1
