@@ -243,7 +243,8 @@ def _describe(schema: type[BaseModel], error: Any) -> str:
         return f"key {key!r} is missing"
     found = error.get("input")
     shown = "NaN" if isinstance(found, float) and math.isnan(found) else repr(found)
-    message = error["msg"][:1].lower() + error["msg"][1:]
+    message = error["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
     return f"key {key!r}: {message}, found {shown[:80]}"
 
 

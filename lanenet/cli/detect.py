@@ -158,6 +158,9 @@ def detect(
         console.say(f"hint: {hint}")
     console.wrote(report.out, report.video, *views.files)
     if report.video is None:
+        drawn = out.with_suffix(".mp4")
+        if drawn.resolve() == source.resolve():
+            drawn = drawn.with_stem(f"{drawn.stem}_lanes")
         again = {
             "--detector": detector,
             "--model": model,
@@ -170,7 +173,7 @@ def detect(
             "--config": config,
             "--mask": mask,
             "--out": out,
-            "--video": out.with_suffix(".mp4"),
+            "--video": drawn,
         }
         console.next_command("detect", source, *console.given(again))
     else:

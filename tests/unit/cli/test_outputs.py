@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused
+from drives import write_video
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
@@ -82,6 +83,14 @@ def test_answers_may_have_the_name_of_their_video(tmp_path):
     check_not_source(video, out)
     DetectionTable().write(out)
     check_not_source(video, out)
+
+
+def test_the_video_of_answers_gets_another_name_than_its_source(tmp_path):
+    video = write_video(tmp_path / "a.mp4")
+    words = ["detect", str(video), "--detector", "painter", "--out", str(tmp_path / "a.csv")]
+    result = CliRunner().invoke(app, words, env={"COLUMNS": "1000"})
+    assert result.exit_code == 0, result.output
+    assert "a_lanes.mp4" in result.stdout.rpartition("next: ")[2]
 
 
 def test_endings(tmp_path):
