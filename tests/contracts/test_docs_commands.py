@@ -7,6 +7,7 @@ What is not run is named in ``NOT_RUN`` with the reason; its verbs, options, tar
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import shutil
 import time
@@ -19,6 +20,7 @@ import pytest
 import yaml
 from chessboards import BOARD, board_poses, fisheye_of, painted
 from documents import DOCUMENTS, REPO, VERBS, Command, commands_of, inline_commands, unmarked_blocks
+from PIL import Image
 from typer.testing import CliRunner
 
 from lanenet.calibration.printed import Paper, near_left_cm
@@ -115,6 +117,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     drive = project / "runs" / "drive7"
     count_from(940, project.parent / "shared" / "data" / "donkey_circuit" / "frames.csv")
     shutil.copytree(drive, project / "my_tub")
+    shutil.copytree(drive, project / "other_tub")
     shutil.copytree(drive, project / "runs" / "drive8")
     shutil.copytree(project / "runs" / "my_map", project / "runs" / "donkey_map")
     shutil.copytree(project / "checkpoints" / "general", project / "checkpoints" / "donkey_circuit")
@@ -194,6 +197,10 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
     shutil.copytree(folder.parent / "runs", folder / "runs")
     monkeypatch.chdir(folder)
     verb = line.split()[1]
+    # What the line before it in the README trains.
+    shutil.rmtree("checkpoints/mycar", ignore_errors=True)
+    if verb != "train":
+        shutil.copytree("checkpoints/donkey_circuit", "checkpoints/mycar")
     written = re.findall(r"--(?:out|video) (\S+)", line)
     if line.startswith("lanenet calibrate drive"):
         # The camera alone needs a closed loop.
@@ -211,6 +218,21 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
         # Some write several files that begin with the name.
         newest = max((made.stat().st_mtime_ns for made in Path().glob(f"{path}*")), default=0)
         assert newest > made_before - CLOCK_STEP_NS, f"{line}: did not write {path}"
+
+
+def test_the_moving_picture_shows_edges_and_no_photos(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``make pictures`` without its map."""
+    monkeypatch.chdir(folder)
+    for photos in ([], ["--photos"]):
+        out = folder / f"drive{len(photos)}.webp"
+        words = [str(folder.parent / "runs" / "my_map"), str(out), "--frames", "10:15", *photos]
+        monkeypatch.setattr("sys.argv", ["pictures.py", *words])
+        runpy.run_path(str(REPO / "contrib" / "pictures.py"), run_name="__main__")
+        with Image.open(out) as picture:
+            assert picture.n_frames == 3
+            left = np.asarray(picture.convert("L"))[:, : picture.width // 2]
+        # Where there is no edge, all is dark.
+        assert (np.median(left) > 40) == bool(photos)
 
 
 @pytest.mark.parametrize("command", LEFT_OUT, ids=lambda command: command.line)

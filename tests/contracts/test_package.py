@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from documents import VERBS as COMMANDS
+from documents import commands_of
 from typer.testing import CliRunner
 
 import lanenet
@@ -37,9 +38,8 @@ def documents_text() -> str:
 
 def readme_lines() -> list[str]:
     """The command lines ``lanenet ...`` in the code blocks of the README and of the page of commands."""
-    blocks = re.findall(r"```(?:bash|sh|console)?\n(.*?)```", documents_text(), re.DOTALL)
-    lines = (line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines())
-    return [line for line in lines if line.startswith("lanenet ")]
+    found = [command.line for document in DOCUMENTS for command in commands_of(document)]
+    return [line for line in found if line.startswith("lanenet ")]
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
