@@ -18,6 +18,7 @@ from datagen.slam.commands import SteeringFit
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap, MapMeta
 from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.errors import counted
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 from lanenet.page import (
@@ -122,7 +123,7 @@ def summary_rows(figures: dict[str, Any], drive_map: DriveMap) -> list[Row]:
     """What most readers ask of a map."""
     held, labelled, meta = figures["held_out"], figures["labelled"], drive_map.meta
     metres = 0.01 * sum(segment["path_cm"] for segment in figures["segments_mapped"])
-    laps = "1 lap" if meta.laps == 1 else f"{meta.laps} laps"
+    laps = counted(meta.laps, "lap") if meta.laps else "no whole lap"
     mounting = drive_map.camera.mounting
     return [
         ("The drive in figures", ""),

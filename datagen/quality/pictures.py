@@ -111,7 +111,7 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
     """Draw a scale of one metre into the lower left corner."""
     y, end = image.shape[0] - 20, 20 + int(100.0 * px_per_cm)
     cv2.line(image, (20, y), (end, y), (255, 255, 255), 2)
-    cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.putText(image, "1 m", (20, y - 12), cv2.FONT_HERSHEY_SIMPLEX, 1.6, (255, 255, 255), 2, cv2.LINE_AA)
 
 
 def _polyline(  # type: ignore[no-untyped-def]

@@ -145,7 +145,7 @@ def plot_along(source: SeenSource) -> bytes | None:
         return None
     axes = figure.add_subplot()
     axes.plot(source.frames.frames[known], np.nanmax(error_cm[known], axis=1), ".", color="#2060c0", ms=3)
-    axes.axhline(LARGE_CM, color="gray", lw=0.8, ls=":")
+    axes.axhline(LARGE_CM, color="#c0392b", lw=1.2, ls=":")
     axes.grid(True, alpha=0.3)
     axes.set(ylim=(0.0, None), xlabel="frame", ylabel="largest error, cm")
     return png_bytes(figure)
