@@ -28,7 +28,7 @@ help:
 	@echo "make install      environment for mapping and training in $(VENV)"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
-	@echo "make test-base-install  detection in an environment with the base installation only"
+	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
 	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
@@ -65,7 +65,7 @@ test-slow: $(VENV)/.stamp-dev
 
 # What the car installs, in an empty environment; fetches packages.
 test-base-install: $(VENV)/.stamp-dev
-	$(PYTEST) -m slow tests/contracts/test_base_install.py
+	$(PYTEST) -rs -m slow tests/contracts/test_base_install.py
 
 # Each file stays in one process, for its fixtures.
 chain: $(VENV)/.stamp-dev
