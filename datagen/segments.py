@@ -118,8 +118,8 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
     doubt = ""
     if found.strain > MAX_STRAIN:
         doubt = (
-            "the drive does not show the camera: the one that fits best has its principal point or roll "
-            f"{found.strain:.1f} standard deviations from those of ordinary cameras"
+            "the camera cannot be found from this drive: the one that fits best is unlike ordinary ones "
+            f"(principal point or roll {found.strain:.1f} standard deviations off)"
         )
     notes = (found.note, *notes)
     return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
@@ -265,8 +265,9 @@ def fit_lanes(
         if doubt:
             why = str(reason).removeprefix(f"{drive.path}: ")
             raise CalibrationError(
-                f"{drive.path}: {doubt}, and with that one {why}; calibrate it with photos of a chessboard "
-                "(lanenet calibrate chessboard) and give it with --camera"
+                f"{drive.path}: {doubt}, and with it {why}; calibrate it with photos of a chessboard "
+                "and points on the floor (lanenet calibrate chessboard, then lanenet calibrate ground), and "
+                "give it with --camera"
             ) from reason
         raise reason
     mapped.sort(key=lambda one: int(one.rows[0]))
