@@ -79,7 +79,8 @@ def draw_map(
         p = (points - low) * scale
         return np.stack([p[:, 0], height - 1 - p[:, 1]], axis=1).astype(np.int32)
 
-    hues = np.full((1, len(clouds), 3), 200, np.uint8)
+    # Pale and dark, so that the lines stand out.
+    hues = np.full((1, len(clouds), 3), 140, np.uint8)
     hues[0, :, 0] = np.linspace(0, 150, len(clouds))
     hues = np.asarray(cv2.cvtColor(hues, cv2.COLOR_HSV2BGR))
     for cloud, colour in zip(clouds, hues[0], strict=True):
@@ -111,7 +112,9 @@ def draw_metre(image: UInt8[np.ndarray, "h w 3"], px_per_cm: float) -> None:
     """Draw a scale of one metre into the lower left corner."""
     y, end = image.shape[0] - 20, 20 + int(100.0 * px_per_cm)
     cv2.line(image, (20, y), (end, y), (255, 255, 255), 2)
-    cv2.putText(image, "1 m", (20, y - 12), cv2.FONT_HERSHEY_SIMPLEX, 1.6, (255, 255, 255), 2, cv2.LINE_AA)
+    # In proportion, so that it can be read where the picture is shown small.
+    size = max(0.5, 0.001 * max(image.shape))
+    cv2.putText(image, "1 m", (20, y - 8), cv2.FONT_HERSHEY_SIMPLEX, size, (255, 255, 255), 2, cv2.LINE_AA)
 
 
 def _polyline(  # type: ignore[no-untyped-def]
