@@ -136,6 +136,19 @@ def test_a_wrong_command_line_is_told_in_the_form_of_all_errors(words: str, said
     assert re.fullmatch(f"error: {said}\n", result.stderr), result.stderr
 
 
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("de", {"detect"}), ("detect --ma", {"--marking", "--mask"}), ("calibrate g", {"ground"})],
+)
+def test_the_tab_key_completes_verbs_and_options(typed: str, offered: set[str]) -> None:
+    """As the shell asks, once ``lanenet --install-completion`` was run."""
+    asked = {"COMP_WORDS": f"lanenet {typed}", "COMP_CWORD": str(len(typed.split()))}
+    result = CliRunner().invoke(
+        cli.app, [], prog_name="lanenet", env={"_LANENET_COMPLETE": "complete_bash", **asked}
+    )
+    assert set(result.stdout.split()) == offered
+
+
 def test_a_group_without_a_verb_shows_its_help() -> None:
     result = run("calibrate")
     assert "chessboard" in result.output and "error" not in result.output
