@@ -31,7 +31,7 @@ def load(
     ``reset()`` before those of another.
 
     Args:
-        model: Checkpoint folder or ONNX file.
+        model: Checkpoint folder or ONNX file, or ``hf:owner/name`` on the Hugging Face Hub.
         camera: The camera of the images: a camera file, the folder of a map, or a camera. None takes the
             ``camera.yaml`` beside a model that was trained with that camera alone.
         lane_width_cm: Between the middles of the lane's two lines. None takes it from the frames that show
@@ -51,6 +51,7 @@ def load(
     import logging
 
     from lanenet.data.camera_file import read_camera
+    from lanenet.data.hub import pulled
     from lanenet.errors import CalibrationError
     from lanenet.geometry.camera import Camera
     from lanenet.geometry.lane import check_lane_width
@@ -62,7 +63,7 @@ def load(
     width_cm = _float(lane_width_cm)
     if width_cm is not None:
         check_lane_width(width_cm)
-    file = find_model(Path(model))
+    file = find_model(pulled(model))
     own = file.parent / "camera.yaml"
     if camera is None and not own.is_file():
         raise CalibrationError(f"{model}: expected a camera (camera=...), since none lies beside the model")

@@ -15,6 +15,8 @@ from lanenet.errors import ConfigError, counted
 #: Those of lanenet.data.exports, which needs more than the car has.
 _FORMATS = ("huggingface", "tusimple", "coco")
 if TYPE_CHECKING:
+    from lanenet.data.hub import Kind
+
     FormatName = str
 else:
     FormatName = StrEnum("FormatName", {name: name for name in _FORMATS})
@@ -58,19 +60,49 @@ def export(
     force: Annotated[
         bool, typer.Option("--force", help="With --format: replace an earlier export in the folder.")
     ] = False,
+    push: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OWNER/NAME",
+            help="Then put the checkpoint, or what --format huggingface wrote, on the Hugging Face Hub.",
+        ),
+    ] = None,
+    public: Annotated[
+        bool, typer.Option("--public", help="With --push: others may see it; default: only you.")
+    ] = False,
 ) -> None:
     """Write a checkpoint as one ONNX file, checked against PyTorch; or labels in other tools' formats."""
     if format is not None:
         if int8 or check:
             raise ConfigError("--format writes labels: it cannot be combined with --int8 or --check")
-        _export_labels(source, str(format), frames, out, force)
+        if push is not None and format != "huggingface":
+            raise ConfigError(f"--push: expected --format huggingface, found {format}")
+        folder = _export_labels(source, str(format), frames, out, force)
+        if push is not None:
+            _push(folder, push, "dataset", public)
         return
     if frames is not None or force or source.suffix == ".parquet":
         raise ConfigError(f"{source}: to export labels expected --format {'|'.join(_FORMATS)}")
+    if push is not None and (int8 or out is not None or not source.is_dir()):
+        raise ConfigError("--push: puts a checkpoint folder on the Hub, without --int8 and --out")
     _export_model(source, out, check or [], int8)
+    if push is not None:
+        _push(source, push, "model", public)
 
 
-def _export_labels(labels: Path, name: str, frames: Path | None, out: Path | None, force: bool) -> None:
+def _push(folder: Path, name: str, kind: Kind, public: bool) -> None:
+    from lanenet.data.hub import push
+
+    tags = ["lane-detection", "autonomous-driving", "donkeycar", "onnx"]
+    card = {"library_name": "lanenet", "pipeline_tag": "keypoint-detection", "tags": tags}
+    console.say(f"on the Hub: {push(folder, name, kind, card if kind == 'model' else None, public)}")
+    again = f"hf:{name}" if kind == "model" else f"hf:datasets/{name}"
+    console.next_command(
+        *(("detect", "my_tub", "--model", again) if kind == "model" else ("val", "MODEL", again))
+    )
+
+
+def _export_labels(labels: Path, name: str, frames: Path | None, out: Path | None, force: bool) -> Path:
     from lanenet.data.exports import check_export, export_labels
 
     if frames is None or out is None:
@@ -87,6 +119,7 @@ def _export_labels(labels: Path, name: str, frames: Path | None, out: Path | Non
     console.say(f"{counted(report.frames, 'frame')} with {counted(report.points, 'point')}")
     console.wrote(out)
     console.say(f"how to read it: {out / 'README.md'}")
+    return out
 
 
 def _export_model(checkpoint: Path, out: Path | None, check: list[Path], int8: bool) -> None:

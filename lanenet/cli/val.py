@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import AnyCameraOption, MarkingOption, check_not_source, lock_outputs
+from lanenet.cli.shared.options import (
+    AnyCameraOption,
+    MarkingOption,
+    check_not_source,
+    lock_outputs,
+    path_or_hub,
+)
 from lanenet.cli.shared.own_drive import learned_from
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, view_answers, with_viewers
 from lanenet.errors import ConfigError
@@ -35,7 +41,9 @@ def val(
         list[Path],
         typer.Argument(
             metavar="[MODEL] SOURCE...",
-            help="Model (.onnx) or checkpoint folder; simulated drives, maps, or label sets (.parquet).",
+            parser=path_or_hub,
+            help="Model (.onnx) or checkpoint folder; simulated drives, maps, or label sets (.parquet). On "
+            "the Hugging Face Hub: hf:owner/name, and hf:datasets/owner/name.",
         ),
     ],
     out: Annotated[

@@ -24,6 +24,7 @@ HEAVY = (
 #: written, a bag read, and a device of the car opened, only if its package is there.
 NAMED_IMPORTS = {
     "lanenet/data/": {"pyarrow"},
+    "lanenet/data/hub.py": {"huggingface_hub"},
     "lanenet/data/drives/bag/": {"mcap", "rosbags"},
     "lanenet/learn/sweep.py": {"optuna"},
     "lanenet/onboard/actuators/": {"serial", "termios"},

@@ -71,6 +71,16 @@ def frame_range(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
+def path_or_hub(text: str) -> Path:
+    """Read the path of a model or a label set, or its name on the Hub: the parser of such options."""
+    if not str(text).startswith("hf:"):
+        return Path(text)
+    # Imported here: few names are on the Hub.
+    from lanenet.data.hub import pulled
+
+    return pulled(text)
+
+
 DriveArgument = Annotated[Path, typer.Argument(metavar="DRIVE", help="Drive, tub or video.")]
 CameraOption = Annotated[
     Path | None, typer.Option("--camera", help="Camera YAML, or an earlier map of the same car.")
@@ -125,7 +135,12 @@ MarkingOption = Annotated[
 ]
 ModelOption = Annotated[
     Path | None,
-    typer.Option("--model", help="Model (.onnx) or checkpoint folder of the network."),
+    typer.Option(
+        "--model",
+        parser=path_or_hub,
+        metavar="MODEL",
+        help="Model (.onnx) or checkpoint folder of the network, or hf:owner/name on the Hugging Face Hub.",
+    ),
 ]
 AnyCameraOption = Annotated[
     bool, typer.Option("--any-camera", help="Use a model with another camera than it was trained with.")
