@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from bags import START_NS, STEP_NS, ackermann, compressed, write_bag
 from chessboards import BOARD, board_poses, fisheye_of, painted
 from documents import DOCUMENTS, REPO, VERBS, Command, commands_of, inline_commands, unmarked_blocks
 from PIL import Image
@@ -26,6 +27,7 @@ from typer.testing import CliRunner
 from lanenet.calibration.printed import Paper, near_left_cm
 from lanenet.cli.app import app
 from lanenet.data.camera_file import read_camera
+from lanenet.data.drives import open_drive
 
 CONFIGS = sorted((REPO / "configs").glob("*.yaml"))
 COMMANDS = [command for document in DOCUMENTS for command in commands_of(document)]
@@ -35,6 +37,7 @@ FRAMES = 60
 NOT_RUN = {
     r"(?!lanenet )": "not a command of lanenet: installs packages, changes the computer or takes minutes",
     r"lanenet (drive|stop|doctor) .*(picamera|\bcar\.yaml)": "needs a car",
+    r"lanenet .*(--push|\bhf:)": "needs an account on the Hugging Face Hub; run with a folder in test_hub.py",
 }
 #: What stands in ``slow`` takes longer than the gate has time for; the chain trains by `train` in the gate.
 SLOW = r"lanenet (train|sweep|judge|reality|calibrate drive|val .*--robust|sheets \w)\b"
@@ -126,6 +129,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(project / "checkpoints" / "small" / "model.onnx", project / "alexnet.onnx")
     shutil.copytree(project / "runs", project.parent / "runs")
     write_video(project / "road.mp4", sorted(drive.rglob("*.jpg")))
+    write_recordings(project, drive)
     write_floor_points(project / "floor_points.csv", drive / "camera.yaml")
     write_photos(project / "photos")
     write_floor_photo(project / "floor.jpg", drive / "camera.yaml")
@@ -145,6 +149,23 @@ def count_from(first: int, table: Path) -> None:
     cells = [row.split(",", 1) for row in rows]
     numbered = [f"{first + int(frame)},{rest}" for frame, rest in cells]
     table.write_text("\n".join([head, *numbered]) + "\n", encoding="utf-8")
+
+
+def write_recordings(project: Path, path: Path) -> None:
+    """A drive as a ROS 2 bag and as an MCAP file."""
+    drive = open_drive(path)
+    times = [START_NS + k * STEP_NS for k in range(len(drive))]
+    speed_cm_s, steering_rad = drive.commands.speed_cm_s, drive.commands.steering_rad
+    assert speed_cm_s is not None and steering_rad is not None
+    topics = {
+        "/camera": [(t, compressed(drive.image(k), t)) for k, t in enumerate(times)],
+        "/drive": [
+            (t, ackermann(0.01 * float(speed_cm_s[k]), float(steering_rad[k]), t))
+            for k, t in enumerate(times)
+        ],
+    }
+    write_bag(project / "my_bag", topics)
+    shutil.copy(write_bag(project / "clip", topics, "mcap") / "clip.mcap", project)
 
 
 def write_video(path: Path, images: list[Path]) -> None:
