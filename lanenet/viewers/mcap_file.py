@@ -35,7 +35,7 @@ _LINE_STRIP, _SPHERE_LIST, _ADD, _DELETE = 4, 7, 0, 2
 _ANNOTATED_STRIP, _FLOAT32 = 3, 7
 #: Drawn widths, [m] and [px]. Chosen: half a tape; a label's point stands out.
 _LINE_M, _POINT_M, _LINE_PX = 0.015, 0.03, 1.5
-_MAP_BGR, _PATH_BGR = (200, 200, 200), (255, 140, 90)
+_MAP_BGR, _PATH_BGR = (150, 160, 0), (255, 140, 90)
 #: Names of lenses: those of ROS 2's ``sensor_msgs`` and those of Foxglove.
 _ROS_LENS = {"fisheye": "equidistant", "pinhole": "plumb_bob"}
 _FOXGLOVE_LENS = {"fisheye": "kannala_brandt", "pinhole": "plumb_bob"}

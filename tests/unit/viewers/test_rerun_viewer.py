@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+import socket
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import rerun
 from rerun.chunk import RrdReader
 from watched import CAMERA, PATH, POINTS_CM, POSE, SCENE, frames, image
 
+from lanenet.errors import LanenetError
 from lanenet.geometry.frames import map_from_car
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.viewers.recording import record
@@ -114,3 +118,26 @@ def test_photos_have_no_time(tmp_path: Path) -> None:
             recording.add(seen)
     rows = Rrd(tmp_path / "p.rrd").rows["/camera/image"]
     assert [row["frame"] for row in rows] == [7, 8, 9] and "time" not in rows[0]
+
+
+def test_a_viewer_that_nobody_runs_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"rerun+http://127.0.0.1:{free.getsockname()[1]}/proxy"
+    with (
+        pytest.raises(LanenetError, match=r"no viewer can be reached \(.*refused.*\)"),
+        record({"rerun": address}, SCENE),
+    ):
+        pass
+
+    def spawn(self: rerun.RecordingStream, **_: Any) -> None:
+        assert shutil.which("rerun") is not None, "the SDK's own viewer is not on the path"
+        raise RuntimeError("no display\nuse another one")
+
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
+    monkeypatch.setenv("PATH", "")
+    with (
+        pytest.raises(LanenetError, match=r"reached \(no display\); --rerun FILE\.rrd"),
+        record({"rerun": "live"}, SCENE),
+    ):
+        pass
