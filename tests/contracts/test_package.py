@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import yaml
 from documents import VERBS as COMMANDS
 from documents import commands_of
 from typer.testing import CliRunner
@@ -57,6 +58,15 @@ def test_small_systems_are_solved_by_one_thread_unless_given(monkeypatch, given,
 def test_the_version_stands_once() -> None:
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
     assert lanenet.__version__ == version("lanenet") and "version" in project["dynamic"]
+
+
+def test_a_release_says_what_changed_and_how_to_cite_it() -> None:
+    """The newest change is this version; the keys are those that Citation File Format 1.2.0 asks for."""
+    changes = re.findall(r"^## (\S+)$", (REPO / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert changes[0] == lanenet.__version__
+    citation = yaml.safe_load((REPO / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert all({"type", "title", "authors"} <= set(reference) for reference in citation["references"])
 
 
 def test_the_installed_command_answers() -> None:
