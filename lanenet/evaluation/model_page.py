@@ -36,7 +36,7 @@ from lanenet.page import (
     table,
 )
 
-#: Frames of a kind, and sources drawn frame by frame. Chosen: what a person looks at.
+#: Frames of a kind, and sources named and drawn frame by frame. Chosen: what a person looks at.
 _PICTURES, _SOURCES = 8, 3
 _COLOURS = "Magenta: the lines by the {reference}; green and orange: left and right line of the answer."
 
@@ -57,7 +57,8 @@ def model_page(name: str, comparison: Comparison, seen: Sequence[SeenSource], wh
     worst = _pictures(seen, [source.answers_cm for source in seen])
     off = _pictures(seen, [source.off_cm for source in seen])
     frames = counted(sum(source.frames for source in comparison.sources), "frame")
-    sources = ", ".join(Path(source.name).name for source in comparison.sources)
+    names = [Path(source.name).name for source in comparison.sources]
+    sources = ", ".join(names) if len(names) <= _SOURCES else f"{len(names)} drives"
     body = [
         table(point_rows(comparison)),
         note(
