@@ -144,7 +144,7 @@ imports: $(VENV)/.stamp-dev
 
 # Nothing is fetched. The warning that is switched off advertises another generator.
 docs: $(VENV)/.stamp-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 figures: $(VENV)/.stamp-dev
 	$(BIN)/python contrib/docs/figures.py docs/images/frames

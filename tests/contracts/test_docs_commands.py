@@ -38,9 +38,10 @@ NOT_RUN = {
     r"(?!lanenet )": "not a command of lanenet: installs packages, changes the computer or takes minutes",
     r"lanenet (drive|stop|doctor) .*(picamera|\bcar\.yaml)": "needs a car",
     r"lanenet .*(--push|\bhf:)": "needs an account on the Hugging Face Hub; run with a folder in test_hub.py",
+    r"lanenet .*--rerun live": "opens a viewer's window",
 }
 #: What stands in ``slow`` takes longer than the gate has time for; the chain trains by `train` in the gate.
-SLOW = r"lanenet (train|sweep|judge|reality|calibrate drive|val .*--robust|sheets \w)\b"
+SLOW = r"lanenet (train|sweep|judge|reality|calibrate drive|val .*--robust|sheets \w+)\b"
 #: A file's time may be that of the clock's last tick. Chosen: ten ticks of a slow one.
 CLOCK_STEP_NS = 10**8
 #: What makes a command small.
