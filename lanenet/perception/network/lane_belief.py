@@ -23,6 +23,8 @@ _LENGTH, _ENOUGH = 100, 10
 #: drives yellow lines had a mean of 0.4 to 1 and most white ones one within 0.2, dashes 0.1 to 0.3 and most
 #: solid lines 0 to 0.1; on `donkey_circuit` yellow dashes have 0.33 and 0.07, the white line 0.04 and 0.02.
 _YELLOWER, _MORE_GAPS = 0.4, 0.15
+#: From this share of what is plain, a line is the one between two lanes. Chosen.
+_BETWEEN = 0.5
 #: Log odds that a plain frame adds, and what a frame keeps of the sum: in the end 6, 400 to 1. Chosen:
 #: neighbouring frames show the same metre of road, so that each says little, and a second says enough.
 _PLAIN, _KEPT = 0.3, 0.95
@@ -86,10 +88,20 @@ class LineLooks:
         self._log_odds *= _KEPT
         if self.keep is None or not left.known or not right.known:
             return
-        gaps = statistics.fmean(left.gaps) - statistics.fmean(right.gaps)
-        like_own = (left.yellow.median - right.yellow.median) / _YELLOWER + gaps / _MORE_GAPS
+        like_own = self._between_lanes(left, right)
         sign = 1.0 if self.keep == "right" else -1.0
         self._log_odds += sign * _PLAIN * max(-1.0, min(1.0, like_own))
+
+    def is_between_lanes(self, side: int) -> bool:
+        """Return whether a line is plainly one between two lanes: yellower than the other, or with gaps."""
+        line, other = self._lines[side], self._lines[1 - side]
+        return line.known and other.known and self._between_lanes(line, other) > _BETWEEN
+
+    @staticmethod
+    def _between_lanes(line: _Line, other: _Line) -> float:
+        """By how much a line is yellower than the other one and has more gaps; 1 where that is plain."""
+        gaps = statistics.fmean(line.gaps) - statistics.fmean(other.gaps)
+        return (line.yellow.median - other.yellow.median) / _YELLOWER + gaps / _MORE_GAPS
 
     def hues(self, side: int | None) -> tuple[float, float]:
         """Return by how much a line is yellower and redder than the floor; NaN while unknown, or of none."""

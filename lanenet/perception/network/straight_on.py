@@ -16,9 +16,10 @@ from lanenet.geometry.frames import car_from_map, map_from_car
 from lanenet.geometry.lane import ROWS_CM
 
 _ROWS, _MIDDLE, _FAR = np.array(ROWS_CM), 1, 2
-#: By how much a line turns away, as the second difference of its points at the label rows and as a share of
-#: the lane's width, at first and once it does, and for how many frames. Chosen: a bend within a lane's width.
-_TURNS, _TURNS_STILL, _AFTER = 0.15, 0.1, 2
+#: By how much a line turns away within the label rows, as the second difference of its points there, [cm],
+#: and as a share of the lane's width; at first and once it does; for how many frames. 7 cm are 43 degrees in
+#: 30 cm: an inner line that bends more is rare, since cars cannot follow it.
+_TURNS, _TURNS_STILL, _AFTER = (7.0, 0.15), (5.0, 0.12), 2
 #: Meanwhile a point that far from the continued lane, as a share of the width, is unknown. Chosen: 3 of 40.
 _DOUBTED = 0.08
 #: A lane is plain whose lines are both seen in this length, [cm], beside the car and 15 cm ahead, have its
@@ -97,10 +98,10 @@ class StraightOn:
             (x_0, y_0), (x_1, y_1) = car_from_map(ends_cm, pose, wheelbase_cm)
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
 
-    @property
-    def turns(self) -> float:
-        """By how much a line has to turn away, as a share of the lane's width."""
-        return _TURNS_STILL if self._suspicious else _TURNS
+    def turns_away(self, points_cm: Float[np.ndarray, "3"], side: int, width_cm: float) -> bool:
+        """Return whether a line turns away from its lane more than lanes bend."""
+        least_cm, share = _TURNS_STILL if self._suspicious else _TURNS
+        return turns_away_cm(points_cm, side) >= max(least_cm, share * width_cm)
 
     def look(self, lines: SeenLines, leaving: int | None, ended: bool, width_cm: float) -> None:
         """Take a frame while the lane is not continued.
@@ -149,7 +150,7 @@ class StraightOn:
             return True
         across = float(x[1, _MIDDLE] - x[0, _MIDDLE]) / width_cm
         beside = abs(float(x[:, _MIDDLE].mean() - expected_cm[:, _MIDDLE].mean())) / width_cm
-        is_lane = bool(seen.all()) and _NARROW < across < _WIDE and float(turn.max()) < _TURNS
+        is_lane = bool(seen.all()) and _NARROW < across < _WIDE and float(turn.max()) < _TURNS[1]
         return is_lane and beside < _BESIDE
 
     def doubts(self, points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> Bool[np.ndarray, "6"]:

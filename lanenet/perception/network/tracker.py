@@ -20,7 +20,7 @@ from lanenet.perception.estimate import SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.refinement import BASIS, RefinedLines, RoadBorders, line_at, refine_lines
-from lanenet.perception.network.straight_on import SeenLines, StraightOn, turns_away_cm
+from lanenet.perception.network.straight_on import SeenLines, StraightOn
 from lanenet.perception.rolling_median import RollingMedian
 
 #: Factor on a network's own sigma. On nine drives, eight simulated, refined lines lay within one and two
@@ -241,9 +241,8 @@ class LaneTracker:
     ) -> tuple[bool, int | None, bool]:
         """Return whether the lines turn together, or which one does alone, and if the other has ended."""
         for side, (line, other) in enumerate(zip(pair, pair[::-1], strict=True)):
-            if line.seen_cm < _LINE_SEEN_CM or (
-                turns_away_cm(line.points_cm, side) < self.straight_on.turns * width_cm
-            ):
+            turns = self.straight_on.turns_away(line.points_cm, side, width_cm)
+            if line.seen_cm < _LINE_SEEN_CM or not turns or self.looks.is_between_lanes(side):
                 continue
             beside_cm = parallel_points(line.points_cm, width_cm if side == 0 else -width_cm)
             if not np.isfinite(beside_cm).all() or self._sees is None or not self._sees(beside_cm):

@@ -49,3 +49,11 @@ def test_nothing_is_known_after_a_reset():
     looks = seen("right", YELLOW_DASHES, WHITE)
     looks.reset()
     assert looks.own_lane == 0.5 and looks.unlike(0, WHITE) == 0.0
+
+
+@pytest.mark.parametrize("middle", [YELLOW_DASHES, WHITE_DASHES])
+def test_the_line_between_the_lanes_is_known_without_a_rule_of_the_road(middle):
+    looks = seen(None, middle, WHITE)
+    assert looks.is_between_lanes(0) and not looks.is_between_lanes(1)
+    assert not seen(None, WHITE, WHITE).is_between_lanes(0)
+    assert not seen(None, middle, WHITE, frames=9).is_between_lanes(0)
