@@ -427,19 +427,16 @@ class _Run:
         from lanenet.evaluation.sources import Opened
 
         camera = self.checkpoint / "camera.yaml" if data.camera is not None else None
-        source: Path | str = "SOURCE"
-        if data.example is not None:
+        source, width_cm = Path("SOURCE"), None
+        mapped = next((job for job in self.jobs if not job.is_labels), None)
+        if mapped is not None:
+            source, width_cm = Opened(mapped.frames).drive, f"{mapped.recording.lane_width_cm:g}"
+            # With synthetic drives the checkpoint's own camera may be that of its example.
+            camera = mapped.frames / "camera.yaml" if camera is None or data.example is not None else camera
+        elif data.example is not None:
             source = self.checkpoint / f"example{data.example.suffix}"
-        elif camera is not None:
-            source = Opened(self.jobs[0].frames).drive
-        known = self.jobs and not self.jobs[0].is_labels
-        options = {
-            "--model": self.checkpoint,
-            "--camera": camera,
-            "--lane-width": self.jobs[0].recording.lane_width_cm if known else None,
-            "--out": "runs/lanes.csv",
-        }
-        console.next_command("detect", source, *console.given(options))
+        options = {"--model": self.checkpoint, "--camera": camera, "--lane-width": width_cm}
+        console.next_command("detect", source, *console.given(options), "--out", "runs/lanes.csv")
 
 
 #: Seconds that the stages take, measured on donkey_circuit with two cores of 2.4 GHz: for each frame to map

@@ -80,6 +80,9 @@ def test_one_command_goes_from_a_drive_to_a_network(here: Path, first: str) -> N
     assert (here / "runs" / "mycar" / "test.mp4").stat().st_size > 10_000
     seen = np.loadtxt(here / "runs" / "mycar" / "test.csv", delimiter=",", skiprows=1, usecols=0)
     assert seen[0] == parts["test"].frame[0] and seen[-1] == parts["test"].frame[-1]
+    camera = Path("checkpoints") / "mycar" / "camera.yaml"
+    next_command = f"next: lanenet detect {here / 'drive'} --model checkpoints/mycar --camera {camera}"
+    assert f"{next_command} --lane-width 40 --out runs/lanes.csv" in first
     # All of it is in the log, with times, and what is left of the stages.
     log = (here / "runs" / "mycar" / "train.log").read_text()
     for line in first.splitlines()[1:]:
