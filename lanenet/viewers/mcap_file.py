@@ -98,9 +98,13 @@ class McapFile:
             self._write(f"/{name}", "std_msgs/Float64", {"data": value})
 
     def close(self) -> None:
-        """Finish the file."""
-        self._writer.finish()
-        self._file.close()
+        """Finish the file.
+
+        Raises:
+            OSError: If it could not be written to its end.
+        """
+        with self._file:
+            self._writer.finish()
 
     def _time_s(self, t_s: float, frame: int) -> float:
         """Return the time of a frame; photos, which have none, are one second apart."""

@@ -51,6 +51,7 @@ class RerunViewer:
             MissingExtraError: If rerun-sdk is not installed.
         """
         self._rr, self._target = require("rerun", "viewers"), target
+        self._is_live = target.startswith((_LIVE, _ADDRESS))
         self._blueprints = require("rerun.blueprint", "viewers")
         self._first_s: float | None = None
         self._shown: set[str] = set()
@@ -61,7 +62,7 @@ class RerunViewer:
         self._artist = artist
         self._stream = rr.RecordingStream("lanenet")
         layout = self._layout(scene.camera)
-        if self._target.startswith((_LIVE, _ADDRESS)):
+        if self._is_live:
             self._connect(layout)
         else:
             self._stream.save(self._target, default_blueprint=layout)
@@ -110,7 +111,17 @@ class RerunViewer:
             self._log(f"plots/{group}/{shown}", rr.Scalars([np.rad2deg(value) if is_angle else value]))
 
     def close(self) -> None:
-        """Write what waits."""
+        """Write what waits.
+
+        Raises:
+            OSError: If a file could not be written to its end; the SDK itself only logs that.
+        """
+        try:
+            if not self._is_live:
+                self._stream.flush()
+        except RuntimeError as error:
+            # Without disconnecting, which would wait for the writer that has given up.
+            raise OSError(first_line(error)) from None
         self._stream.disconnect()
 
     def _add_lanes(self, drawing: Drawing) -> None:

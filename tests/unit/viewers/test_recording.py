@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -20,6 +22,8 @@ from lanenet.viewers.recording import (
     record_in_background,
 )
 from lanenet.viewers.registry import VIEWERS
+
+REPO = Path(__file__).resolve().parents[3]
 
 
 class Slow:
@@ -113,3 +117,38 @@ def test_a_viewer_that_fails_stops_the_recording_and_not_the_car(monkeypatch: py
             background.add(seen)
             driven += 1
     assert driven == 3 and slow.frames == [7]
+
+
+#: Writes more than a process may; ends at once, since Rerun's SDK waits for its writer, which has given up.
+FULL_DISK = """
+import os, resource, signal, sys
+from watched import SCENE, frames
+from lanenet.errors import LanenetError
+from lanenet.viewers.recording import record
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+try:
+    with record({sys.argv[1]: sys.argv[2]}, SCENE) as recording:
+        for k in range(10):
+            for seen in frames():
+                recording.add(seen)
+except LanenetError as error:
+    os.write(1, str(error).encode())
+os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("name", list(VIEWERS))
+def test_a_full_disk_leaves_no_half_file(name: str, tmp_path: Path) -> None:
+    path = tmp_path / f"drive{VIEWERS[name].ending}"
+    folders = [str(REPO), str(REPO / "tests" / "support")]
+    result = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, name, str(path)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert f"{path}: cannot be written" in result.stdout
+    assert not list(tmp_path.glob("drive*"))
