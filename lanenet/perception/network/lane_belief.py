@@ -111,8 +111,8 @@ class LineLooks:
 
     def unlike(self, side: int | None, look: Float[np.ndarray, "3"]) -> float:
         """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""
-        yellow, red = self.hues(side)
-        off = math.hypot(yellow - look[0], red - look[1]) / _HUE_SIGMA
+        (yellow, red), shown = self.hues(side), look.tolist()
+        off = math.hypot(yellow - shown[0], red - shown[1]) / _HUE_SIGMA
         return 0.0 if math.isnan(off) else 1.0 - math.exp(-0.5 * off * off)
 
     def cross(self, side: int) -> None:

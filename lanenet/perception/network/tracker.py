@@ -306,25 +306,30 @@ class LaneTracker:
     ) -> tuple[_Candidate, _Candidate]:
         """Choose the left and the right line, and learn the width from what would be chosen without."""
         lefts_cm, rights_cm = (np.array([line.points_cm for line in lines]) for lines in candidates)
-        score_cm = np.add.outer(
-            [line.score_cm for line in candidates[0]], [line.score_cm for line in candidates[1]]
-        )
-        across_cm, least_cm = distances_cm(lefts_cm, rights_cm), _NARROWEST * self.lane.likely_cm
-        outside_cm = np.maximum.outer(lefts_cm[:, 0], -rights_cm[:, 0])
-        score_cm -= _BY_OUTSIDE_CM * np.clip(outside_cm / _OUTSIDE_CM, 0.0, 1.0)
-        score_cm[across_cm < least_cm] = -np.inf
-        if not np.isfinite(score_cm).any():
+        across_cm, least_cm = distances_cm(lefts_cm, rights_cm).tolist(), _NARROWEST * self.lane.likely_cm
+        left_edges, right_edges = lefts_cm[:, 0].tolist(), (-rights_cm[:, 0]).tolist()
+        # Plain numbers: for so few pairs arrays cost more than they save.
+        pairs, scores, outsides, widths = [], [], [], []
+        for left, left_cm, row in zip(candidates[0], left_edges, across_cm, strict=True):
+            for right, right_cm, width_cm in zip(candidates[1], right_edges, row, strict=True):
+                if width_cm < least_cm:
+                    continue
+                outside_cm = max(left_cm, right_cm)
+                apart_cm = _BY_OUTSIDE_CM * min(max(outside_cm / _OUTSIDE_CM, 0.0), 1.0)
+                pairs.append((left, right))
+                scores.append(left.score_cm + right.score_cm - apart_cm)
+                outsides.append(outside_cm)
+                widths.append(max(width_cm, least_cm))
+        if not pairs:
             return candidates[0][-1], candidates[1][-1]
-        likely = self.lane.match(np.maximum(across_cm, least_cm), _WIDTH_SIGMA)
-        left, right = np.unravel_index(int(np.argmax(score_cm)), score_cm.shape)
-        shown = candidates[0][left], candidates[1][right]
+        likely = self.lane.match(np.array(widths), _WIDTH_SIGMA).tolist()
+        best = scores.index(max(scores))
+        shown = pairs[best]
         # A belief must not choose its own evidence: else a wrong one would never be unlearned.
-        if outside_cm[left, right] <= 0.0 and min(line.seen_cm for line in shown) >= _TELLS_WIDTH_CM:
+        if outsides[best] <= 0.0 and min(line.seen_cm for line in shown) >= _TELLS_WIDTH_CM:
             self.lane.learn(np.concatenate([line.points_cm for line in shown]), np.ones(len(SIDES)))
-        left, right = np.unravel_index(
-            int(np.argmax(score_cm - _BY_WIDTH_CM * (1.0 - likely))), score_cm.shape
-        )
-        return candidates[0][left], candidates[1][right]
+        scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
+        return pairs[scores.index(max(scores))]
 
 
 def _sigma_cm(line: _Candidate) -> Float[np.ndarray, "3"]:
