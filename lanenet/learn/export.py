@@ -29,6 +29,7 @@ from lanenet.errors import CheckpointError, ConfigError, ModelMismatchError
 from lanenet.learn.config import LearnSettings
 from lanenet.learn.network import DeployedLaneNet, LaneNet
 from lanenet.outputs import restore_output
+from lanenet.perception.edges.raster import MIDDLE, STEPS
 from lanenet.perception.network.model_file import (
     BATCH_NAME,
     HASH_NAME,
@@ -56,6 +57,8 @@ IR_VERSION = 9
 TOLERANCE = 1e-3
 #: Lane widths that a network is given in the check, beside none at all: unknown, narrow and wide.
 _CHECKED_WIDTHS_CM = (0.0, 30.0, 60.0)
+#: What an exported network does to a raster's bytes before its first layer.
+_DECODING = ("Cast", "Slice", "Sub", "Mul", "Concat")
 #: Rasters of the check at a time; bounds the memory.
 _BATCH = 256
 
@@ -392,6 +395,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
         if "metadata_props" in owner.DESCRIPTOR.fields_by_name:
             owner.ClearField("metadata_props")
     del model.graph.value_info[:]
+    _decode_at_once(model.graph, meta.planes)
     if meta.takes_width:
         _make_optional(model.graph)
     model.ir_version = IR_VERSION
@@ -400,6 +404,33 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
     onnx.helper.set_model_props(model, meta.to_properties())
     onnx.checker.check_model(model)
     return model
+
+
+def _decode_at_once(graph: onnx.GraphProto, planes: int) -> None:
+    """Make one node of those that turn bytes into the network's input: the same numbers, in one pass.
+
+    They take a sixth of the time of a small network where each goes through all planes.
+    """
+    decoded, nodes = {INPUT_NAME}, []
+    for node in graph.node:
+        if node.op_type in _DECODING and decoded & set(node.input):
+            decoded |= set(node.output)
+            nodes.append(node)
+            if node.op_type == ("Mul" if planes == 1 else "Concat"):
+                break
+    scales = np.full(planes, 1.0 / STEPS, np.float32)
+    scales[0] = 1.0 / 255.0
+    zeros = np.full(planes, MIDDLE, np.uint8)
+    zeros[0] = 0
+    names = "plane_scales", "plane_zeros"
+    for name, values in zip(names, (scales, zeros), strict=True):
+        graph.initializer.append(onnx.numpy_helper.from_array(values, name))
+    at_once = onnx.helper.make_node(
+        "DequantizeLinear", [INPUT_NAME, *names], [nodes[-1].output[0]], name="decode", axis=1
+    )
+    others = [node for node in graph.node if node not in nodes]
+    del graph.node[:]
+    graph.node.extend([at_once, *others])
 
 
 def _make_optional(graph: onnx.GraphProto) -> None:
