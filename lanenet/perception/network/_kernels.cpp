@@ -21,6 +21,12 @@
 #else
 #define WIDE
 #endif
+// Part of its caller, for whichever processor that is compiled.
+#ifdef __GNUC__
+#define WITHIN inline __attribute__((always_inline))
+#else
+#define WITHIN inline
+#endif
 
 namespace {
 
@@ -43,6 +49,7 @@ struct Near {
   std::vector<double> x, y, normal_x, normal_y, yellow, red;
   std::vector<double> off, agree;
   std::vector<int> index;
+  int count;
 };
 
 // Edge points of one line.
@@ -71,7 +78,7 @@ inline double sign_of(double x) { return (x > 0.0) - (x < 0.0); }
 
 // _inverse() of one matrix.
 template <int n>
-void invert(double (*m)[n]) {
+WITHIN void invert(double (*m)[n]) {
   for (int i = 0; i < n; ++i) {
     double row[n], column[n];
     const double scale = 1.0 / m[i][i];
@@ -85,28 +92,31 @@ void invert(double (*m)[n]) {
 }
 
 template <int n>
-inline void times(const double (*matrix)[n], const double* vector, double* out) {
+WITHIN void times(const double (*matrix)[n], const double* vector, double* out) {
   for (int i = 0; i < n; ++i) {
     out[i] = 0.0;
     for (int j = 0; j < n; ++j) out[i] += matrix[i][j] * vector[j];
   }
 }
 
-void take_near(const Numbers& s, const double* points, const double* normals, const double* hues, size_t n,
-               Near& out) {
-  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red}) values->clear();
+template <class T>
+void take_near(const Numbers& s, const T* points, const T* normals, const T* hues, size_t n, Near& out) {
+  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red}) values->resize(n);
+  size_t count = 0;
   for (size_t i = 0; i < n; ++i) {
     const double y = points[2 * i + 1];
     if (!(y > s.near_cm && y < s.far_cm)) continue;
-    out.x.push_back(points[2 * i]);
-    out.y.push_back(y);
-    out.normal_x.push_back(normals[2 * i]);
-    out.normal_y.push_back(normals[2 * i + 1]);
-    out.yellow.push_back(hues[2 * i]);
-    out.red.push_back(hues[2 * i + 1]);
+    out.x[count] = points[2 * i];
+    out.y[count] = y;
+    out.normal_x[count] = normals[2 * i];
+    out.normal_y[count] = normals[2 * i + 1];
+    out.yellow[count] = hues ? hues[2 * i] : 0.0;
+    out.red[count] = hues ? hues[2 * i + 1] : 0.0;
+    ++count;
   }
-  out.off.resize(out.x.size());
-  out.agree.resize(out.x.size());
+  out.count = static_cast<int>(count);
+  out.off.resize(n);
+  out.agree.resize(n);
 }
 
 WIDE void measure_off(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
@@ -121,7 +131,7 @@ WIDE void measure_off(const double* x, const double* y, const double* normal_x, 
 
 // RoadBorders.beside() of one line.
 void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near, Beside& out) {
-  const int n = static_cast<int>(near.x.size());
+  const int n = near.count;
   measure_off(near.x.data(), near.y.data(), near.normal_x.data(), near.normal_y.data(), n, line.a, line.b, line.c,
               near.off.data(), near.agree.data());
   auto& index = near.index;
@@ -212,7 +222,7 @@ WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, doubl
 }
 
 // _refine() of one line, whose edge points are in `e`.
-void refine_line(const Numbers& s, const double* points, const double* sigma, double marking, double marking_sigma,
+WIDE void refine_line(const Numbers& s, const double* points, const double* sigma, double marking, double marking_sigma,
                  bool any, Beside& e, double* out) {
   double prior[kRows][kRows], by_prior[kRows][kRows];
   for (int i = 0; i < kRows; ++i)
@@ -385,7 +395,11 @@ double distance_of(const double* left, const double* right, const double* y, int
 struct Buffer {
   Py_buffer view{};
   ~Buffer() { PyBuffer_Release(&view); }
-  const double* data() const { return static_cast<const double*>(view.buf); }
+  template <class T>
+  const T* as() const {
+    return static_cast<const T*>(view.buf);
+  }
+  const double* data() const { return as<double>(); }
   size_t size() const { return view.len / sizeof(double); }
 };
 
@@ -396,13 +410,16 @@ PyObject* refuse(const char* what) {
 
 PyObject* refine(PyObject*, PyObject* args) {
   Buffer points, sigma, marking, marking_sigma, hues, edges, normals, edge_hues, numbers;
-  if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*y*y*y*", &points.view, &sigma.view, &marking.view, &marking_sigma.view,
-                        &hues.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view))
+  int single;
+  if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*y*z*y*p", &points.view, &sigma.view, &marking.view, &marking_sigma.view,
+                        &hues.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view, &single))
     return nullptr;
   const size_t m = marking.size();
   if (points.size() != 3 * m || sigma.size() != 3 * m || marking_sigma.size() != m || hues.size() != 2 * m)
     return refuse("lines: points, sigmas, markings and hues differ in number");
-  if (edges.size() % 2 || normals.size() != edges.size() || edge_hues.size() != edges.size())
+  const size_t pair = 2 * (single ? sizeof(float) : sizeof(double));
+  if (edges.view.len % pair || normals.view.len != edges.view.len ||
+      (edge_hues.view.buf && edge_hues.view.len != edges.view.len))
     return refuse("edges: points, normals and hues differ in number");
   if (numbers.view.len != sizeof(Numbers)) return refuse("numbers: not of this size");
   Numbers s;
@@ -420,10 +437,15 @@ PyObject* refine(PyObject*, PyObject* args) {
     PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerLine * sizeof(double));
     if (!result) return nullptr;
     double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
-    take_near(s, edges.data(), normals.data(), edge_hues.data(), edges.size() / 2, near);
+    const auto take = [&](auto type) {
+      using T = decltype(type);
+      take_near(s, edges.as<T>(), normals.as<T>(), edge_hues.as<T>(), edges.view.len / pair, near);
+    };
+    if (single) take(float{});
+    else take(double{});
     double widest = 0.0;
     for (size_t i = 0; i < m; ++i) widest = std::max(widest, std::abs(marking.data()[i]));
-    const bool any = near.x.size() >= s.least;
+    const bool any = near.count >= s.least;
     for (size_t i = 0; i < m; ++i) {
       if (any) {
         choose(s, parabola_of(s, points.data() + 3 * i), s.first_cm + s.bent_cm + widest, near, beside);

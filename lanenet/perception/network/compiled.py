@@ -33,14 +33,17 @@ def refine(
 
     Args:
         lines: Points, their sigmas, widths of the markings, their sigmas, and hues.
-        edges: The frame's edge points, contiguous and in double precision, with hues.
+        edges: The frame's edge points, all float32 or all float64.
         numbers: The settings, in the order of ``Numbers`` in ``_kernels.cpp``.
 
     Returns:
         Of each line the points, their sigmas, the width, the length seen, where it is seen, and its look.
     """
     given = (np.ascontiguousarray(x, np.float64) for x in lines)
-    found = _kernels.refine(*given, edges.points_cm, edges.normals, edges.hues, numbers)
+    looks = edges.points_cm, edges.normals, edges.hues
+    points_cm, normals, hues = (None if x is None else np.ascontiguousarray(x) for x in looks)
+    single = edges.points_cm.dtype == np.float32
+    found = _kernels.refine(*given, points_cm, normals, hues, numbers, single)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
 
 

@@ -125,23 +125,21 @@ class RoadBorders:
     """Edge points of a frame, for lines to be compared with.
 
     Attributes:
-        edges: In double precision.
+        edges: All of the frame.
     """
 
     def __init__(self, edges: RoadEdges) -> None:
-        hues = np.zeros_like(edges.points_cm) if edges.hues is None else edges.hues
-        looks = (np.ascontiguousarray(x, np.float64) for x in (edges.points_cm, edges.normals, hues))
-        self.edges = RoadEdges(*looks)
+        self.edges = edges
 
     @cached_property
     def near(self) -> _NearEdges:
         """The edge points within the label rows; ``key`` puts them in an order that is spread evenly."""
-        y = self.edges.points_cm[:, 1]
-        near = (y > _NEAR_CM) & (y < _FAR_CM)
-        (x, y), (normal_x, normal_y) = self.edges.points_cm[near].T, self.edges.normals[near].T
-        assert self.edges.hues is not None
-        key = (np.arange(len(x)) * _GOLDEN) % 1.0
-        return _NearEdges(x, y, normal_x, normal_y, self.edges.hues[near], key)
+        edges = self.edges
+        near = (edges.points_cm[:, 1] > _NEAR_CM) & (edges.points_cm[:, 1] < _FAR_CM)
+        hues = np.zeros_like(edges.points_cm) if edges.hues is None else edges.hues
+        points, normals, hues = (x[near].astype(np.float64) for x in (edges.points_cm, edges.normals, hues))
+        key = (np.arange(len(points)) * _GOLDEN) % 1.0
+        return _NearEdges(points[:, 0], points[:, 1], normals[:, 0], normals[:, 1], hues, key)
 
     def off_cm(
         self, points_cm: Float[np.ndarray, "m 3"]

@@ -42,17 +42,19 @@ def assert_same(found, expected):
     n=st.integers(0, 700),
     m=st.integers(1, 6),
     hues=st.booleans(),
+    single=st.booleans(),
     spread_cm=st.sampled_from([0.1, 1.0, 8.0]),
 )
-def test_lines_are_the_same(seed, n, m, hues, spread_cm):
+def test_lines_are_the_same(seed, n, m, hues, single, spread_cm):
     rng = np.random.default_rng(seed)
     y = rng.uniform(-8.0, 50.0, n)
     turn = rng.normal(0.0, 0.3, n) + np.pi * rng.integers(0, 2, n)
     x = rng.choice([-21.5, -18.5, 18.5, 21.5], n) + 0.1 * y + rng.normal(0.0, spread_cm, n)
+    number = np.float32 if single else np.float64
     edges = RoadEdges(
-        np.stack([x, y], axis=1).astype(np.float32),
-        np.stack([np.cos(turn), np.sin(turn)], axis=1).astype(np.float32),
-        rng.uniform(-1.0, 1.0, (n, 2)).astype(np.float32) if hues else None,
+        np.stack([x, y], axis=1).astype(number),
+        np.stack([np.cos(turn), np.sin(turn)], axis=1).astype(number),
+        rng.uniform(-1.0, 1.0, (n, 2)).astype(number) if hues else None,
     )
     points_cm = rng.choice([-20.0, 20.0], (m, 1)) + rng.normal(0.0, 3.0, (m, 3))
     known = np.where(rng.random((m, 1)) < 0.5, rng.uniform(-1.0, 1.0, (m, 2)), np.nan)
@@ -89,17 +91,17 @@ def test_memory_beyond_the_arguments_is_not_read():
     """The checks of the compiled code itself, behind those of its callers."""
     edges = np.zeros((9, 2))
     good = [np.zeros((2, 3)), np.ones((2, 3)), np.ones(2), np.ones(2), np.zeros((2, 2)), edges, edges, edges]
-    good.append(refinement._NUMBERS)
+    good += [refinement._NUMBERS, False]
     assert len(compiled._kernels.refine(*good)) == 2 * compiled._PER_LINE * 8
     # A bin beside the first label row.
     wrong_bin = refinement._NUMBERS.copy()
     wrong_bin[9 + 9 + 64 + 8 + 3] = 64.0
-    for at in range(len(good) - 1):
+    for at in range(len(good) - 2):
         with pytest.raises(ValueError, match=r"differ"):
             compiled._kernels.refine(*good[:at], good[at][:1], *good[at + 1 :])
-    for numbers in (good[-1][1:], wrong_bin):
+    for numbers in (good[-2][1:], wrong_bin):
         with pytest.raises(ValueError, match=r"numbers"):
-            compiled._kernels.refine(*good[:-1], numbers)
+            compiled._kernels.refine(*good[:-2], numbers, False)
     lines, y = np.zeros((2, 3)), np.arange(4.0)
     for arguments in (
         (lines[:, :2], lines, refinement.BASIS, y, 0, 4),
