@@ -8,16 +8,19 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import typer
-from griffe import Docstring, DocstringSectionKind
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from lanenet.cli.app import app
+
+#: One entry below ``Attributes:``, for one name or several.
+_ATTRIBUTE = r"^    (\w[\w, ]*): (.*?)(?=^    \w[\w, ]*: |^\S|\Z)"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -134,7 +137,8 @@ def _schema(key: str, schema: type[BaseModel], told: set[type[BaseModel]]) -> It
         if not nested and field.default is not PydanticUndefined:
             default = _shown(field.default)
         shown = "section" if nested else _type(field.annotation) + _bounds(field.metadata)
-        rows.append((f"`{name}`", shown, default, meanings.get(name, "")))
+        meaning = meanings.get(name) or (_docstring(nested[0])[0] if nested else "")
+        rows.append((f"`{name}`", shown, default, meaning))
     yield _table(("key", "value", "default", "meaning"), rows)
     for inner, each in below:
         yield from _schema(inner, each, told)
@@ -146,14 +150,10 @@ def _docstring(schema: type[BaseModel]) -> tuple[str, dict[str, str]]:
     for cls in reversed(schema.__mro__):
         if not issubclass(cls, BaseModel) or cls is BaseModel or not cls.__doc__:
             continue
-        for part in Docstring(inspect.cleandoc(cls.__doc__)).parse("google", warnings=False):
-            if part.kind is DocstringSectionKind.text:
-                summary = _plain(part.value.split("\n\n")[0])
-            elif part.kind is DocstringSectionKind.attributes:
-                for item in part.value:
-                    # Of one meaning for several keys: "a, b: ...".
-                    for name in item.name.split(","):
-                        meanings[name.strip()] = _plain(item.description)
+        text, _, attributes = inspect.cleandoc(cls.__doc__).partition("\nAttributes:\n")
+        summary = _plain(text.split("\n\n")[0])
+        for names, meaning in re.findall(_ATTRIBUTE, attributes, re.MULTILINE | re.DOTALL):
+            meanings |= {name.strip(): _plain(meaning) for name in names.split(",")}
     return summary, meanings
 
 
@@ -184,7 +184,7 @@ def _type(annotation: Any) -> str:
     if origin in (list, tuple):
         each = [_type(part) for part in arguments if part is not Ellipsis]
         return "list of " + (each[0] if len(set(each)) == 1 else ", ".join(each))
-    if origin is dict:
+    if origin is dict or is_dataclass(annotation):
         return "mapping"
     if arguments:
         return " or ".join(dict.fromkeys(_type(part) for part in arguments))
@@ -208,6 +208,10 @@ def _shown(value: Any) -> str:
         return f"`{str(value).lower()}`"
     if isinstance(value, Enum):
         value = value.value
+    if is_dataclass(value):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
+    if isinstance(value, dict):
+        value = f"{{{', '.join(f'{key}: {each}' for key, each in value.items())}}}"
     if isinstance(value, list | tuple):
         value = f"[{', '.join(str(each) for each in value)}]"
     return f"`{value.as_posix() if isinstance(value, Path) else value}`"
@@ -221,6 +225,7 @@ def _plain(text: str) -> str:
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [head, tuple("---" for _ in head), *rows]
-    cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+    # A bar would end the cell, and an escaped one keeps its backslash within code.
+    cells = [[cell.replace("|", " or ") for cell in line] for line in lines]
     table = "\n".join(f"| {' | '.join(line)} |" for line in cells)
     return f'<div class="reference" markdown>\n\n{table}\n\n</div>'

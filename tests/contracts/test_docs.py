@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
-from documents import LINKED, REPO, anchors_of, links_of
+from documents import LINKED, REPO, VERBS, anchors_of, links_of
 
 DOCS = REPO / "docs"
 
@@ -113,3 +114,28 @@ def test_the_drawings_are_those_of_the_code(tmp_path: Path) -> None:
         )
         # Versions of Matplotlib differ in how they round.
         assert re.findall(r">([^<\n]+)<", drawn) == re.findall(r">([^<\n]+)<", shown), path.name
+
+
+REFERENCE = runpy.run_path(str(REPO / "contrib" / "docs" / "reference.py"))
+
+
+def test_the_reference_has_every_option_with_its_meaning() -> None:
+    page = REFERENCE["options_page"]()
+    for names, command in VERBS.items():
+        (part,) = re.findall(rf"^### {' '.join(names)}\n(.*?)(?=^##|\Z)", page, re.MULTILINE | re.DOTALL)
+        rows = dict(re.findall(r"^\| (`[^|]*`) \| ([^|]*?) \|", part, re.MULTILINE))
+        told = " ".join(rows)
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and not parameter.hidden:
+                assert f"`{parameter.opts[0]}" in told, f"{names}: {parameter.opts[0]}"
+        assert all(rows.values()), names
+
+
+def test_the_reference_has_every_setting_with_its_meaning() -> None:
+    page = REFERENCE["settings_page"]()
+    rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", page, re.MULTILINE)
+    assert len(rows) > 250
+    assert [key for key, value, _, meaning in rows if not meaning.strip() or not value.strip()] == []
+    # Nothing of Python that a YAML file does not know.
+    assert not [row for row in rows if re.search(r"<|\(|Undefined|typing", " ".join(row[1:3]))]
+    assert "| `epochs` | whole number, ≥ 1 | `12` |" in page

@@ -53,13 +53,23 @@ class OneOf(Settings):
 
 
 class StraightPiece(Settings):
-    """A straight."""
+    """A straight.
+
+    Attributes:
+        length_cm: Along the centre line.
+    """
 
     length_cm: float = Field(gt=0.0)
 
 
 class ArcPiece(Settings):
-    """A part of a circle."""
+    """A part of a circle.
+
+    Attributes:
+        radius_cm: Of the centre line.
+        angle_deg: By which the road turns.
+        direction: Where it turns.
+    """
 
     radius_cm: float = Field(gt=0.0)
     angle_deg: float = Field(gt=0.0, le=360.0)
