@@ -274,14 +274,13 @@ def check_paths(config: Path, paths: Iterable[Path | None]) -> None:
     Raises:
         ConfigError: Names the folder to go to.
     """
-    for path in paths:
-        if path is None or path.is_absolute() or path.exists():
-            continue
-        file = config.resolve()
-        folder = next((above for above in file.parents if (above / path).exists()), None)
-        if folder is not None:
-            words = shlex.join(["lanenet", "train", str(file.relative_to(folder))])
-            raise ConfigError(
-                f"{config}: its paths count from the folder in which the command runs, and {path} is not in "
-                f"{Path.cwd()}: type cd {shlex.quote(str(folder))} && {words}"
-            )
+    missing = [path for path in paths if path is not None and not path.is_absolute() and not path.exists()]
+    file = config.resolve()
+    found = {above: [path for path in missing if (above / path).exists()] for above in file.parents}
+    folder = max(found, key=lambda above: len(found[above]))
+    if found[folder]:
+        words = shlex.join(["lanenet", "train", str(file.relative_to(folder))])
+        raise ConfigError(
+            f"{config}: its paths count from the folder in which the command runs, and {found[folder][0]} is "
+            f"not in {Path.cwd()}: type cd {shlex.quote(str(folder))} && {words}"
+        )

@@ -182,6 +182,16 @@ def test_a_config_from_another_folder_says_where_its_paths_are(here: Path, tmp_p
         ConfigError, match=r"drive is not in .*here: type cd '.*/pro ject' && lanenet train configs/mine.yaml"
     ):
         check_paths(config, [None, Path("drive")])
+    # The folder that has most of them.
+    (tmp_path / "network").mkdir()
+    (project / "network").mkdir()
+    (tmp_path / "camera.yaml").touch()
+    paths = [Path("camera.yaml"), Path("drive"), Path("network"), Path("nowhere")]
+    with pytest.raises(ConfigError, match=r"type cd '.*/pro ject' && "):
+        check_paths(config, paths[1:])
+    shutil.rmtree(project / "network")
+    with pytest.raises(ConfigError, match=r"type cd \S*test_a_config\S* && lanenet train 'pro ject/configs"):
+        check_paths(config, [paths[0], paths[2], paths[1]])
     # What is nowhere has its own error, and so has a full path.
     check_paths(config, [Path("nowhere"), tmp_path / "nowhere"])
     (here / "drive").mkdir()
