@@ -122,16 +122,18 @@ def test_a_viewer_that_fails_stops_the_recording_and_not_the_car(monkeypatch: py
 #: Writes more than a process may; ends at once, since Rerun's SDK waits for its writer, which has given up.
 FULL_DISK = """
 import os, resource, signal, sys
+from dataclasses import replace
+import numpy as np
 from watched import SCENE, frames
 from lanenet.errors import LanenetError
 from lanenet.viewers.recording import record
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 try:
     with record({sys.argv[1]: sys.argv[2]}, SCENE) as recording:
-        for k in range(10):
-            for seen in frames():
-                recording.add(seen)
+        noise = np.random.default_rng(0).integers(0, 256, (40, 120, 160, 3), np.uint8)
+        for image in noise:
+            recording.add(replace(frames()[0], image_bgr=image))
 except LanenetError as error:
     os.write(1, str(error).encode())
 os._exit(0)
