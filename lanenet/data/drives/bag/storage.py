@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from typing import BinaryIO
 from urllib.parse import quote
 
 from lanenet.config import read_yaml
@@ -150,6 +151,19 @@ def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages
     return topics, messages
 
 
+class _BoundedReads:
+    """A file of which never more than its size is asked: Python allocates what a damaged length says."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream = stream
+        self._size = size
+        self.seek, self.tell = stream.seek, stream.tell
+
+    def read(self, length: int = -1) -> bytes:
+        """Read up to a number of bytes, or all."""
+        return self._stream.read(min(length, self._size))
+
+
 def _opened_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages]:
     # Not by rosbags: it refuses files without ROS's profile, as Foxglove and others write them.
     library = require("mcap.reader", "bags")
@@ -162,7 +176,7 @@ def _opened_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages]:
     if start != _MCAP_SIGN:
         raise DriveFormatError(f"{path}: not an MCAP file (it begins with {start!r})")
     # No record is longer than the file, whatever its length says.
-    reader = library.SeekingReader(stream, record_size_limit=size)
+    reader = library.SeekingReader(_BoundedReads(stream, size), record_size_limit=size)
     summary = reader.get_summary() if whole else None
     if summary is None or summary.statistics is None:
         raise DriveFormatError(
