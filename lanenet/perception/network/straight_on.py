@@ -22,10 +22,10 @@ _ROWS, _MIDDLE, _FAR = np.array(ROWS_CM), 1, 2
 _TURNS, _TURNS_STILL, _AFTER = (7.0, 0.15), (5.0, 0.12), 2
 #: Meanwhile a point that far from the continued lane, as a share of the width, is unknown. Chosen: 3 of 40.
 _DOUBTED = 0.08
-#: A lane is plain whose lines are both seen in this length, [cm], beside the car and 15 cm ahead, have its
-#: width within this share, and turn by less than this one. It is worth continuing for so many frames, with
-#: and without knowing the car's motion. Chosen.
-_PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD = 9.0, 0.12, 0.12, 15, 6
+#: A lane is plain whose lines are both seen in this length, [cm], have its width within this share beside the
+#: car and 15 cm ahead, and turn by less than this one. It is worth continuing for so many frames, with and
+#: without knowing the car's motion. Chosen.
+_PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD = 9.0, 0.12, 0.12, 25, 6
 #: A line is the lane's again if it is seen in this length, [cm], and if it is within this share of the width
 #: of where it is expected, and turns away by less than this one. Chosen.
 _SEEN_CM, _SAME, _STRAIGHT = 12.0, 0.12, 0.08
@@ -169,7 +169,7 @@ class StraightOn:
 
 def _is_plain(lines: SeenLines, width_cm: float) -> bool:
     """Return whether both lines of a lane are seen, and are nearly straight."""
-    if not ((lines.seen_cm >= _PLAIN_CM).all() and lines.seen_at[:, :_FAR].all()):
+    if (lines.seen_cm < _PLAIN_CM).any():
         return False
     off = np.abs((lines.points_cm[1] - lines.points_cm[0])[:_FAR] / width_cm - 1.0)
     return bool(off.max() < _PLAIN_WIDTH and np.abs(lines.turn(width_cm)).max() < _PLAIN_TURN)

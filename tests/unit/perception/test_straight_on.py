@@ -53,7 +53,7 @@ def test_a_bend_in_which_the_other_line_goes_on_is_no_junction():
 def test_a_lane_that_was_plain_long_ago_is_not_continued():
     lane = StraightOn()
     lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
-    for _ in range(20):
+    for _ in range(30):
         lane.look(seen(SIDE_ROAD, left=False), leaving=None, ended=False, width_cm=WIDTH_CM)
     for _ in range(5):
         lane.look(seen(SIDE_ROAD, left=False), leaving=1, ended=True, width_cm=WIDTH_CM)
