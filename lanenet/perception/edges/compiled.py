@@ -6,16 +6,35 @@ callers, in which each step is explained, do the work themselves; they also are 
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+from types import ModuleType
+
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.perception.edges.pixels import EdgePixels
 
+log = logging.getLogger(__name__)
+
+
+def if_current(module: ModuleType) -> ModuleType | None:
+    """Return a module of compiled loops; None if its source, which lies beside it, is newer."""
+    built = Path(str(module.__file__))
+    source = built.with_name("_kernels.cpp")
+    if source.exists() and source.stat().st_mtime > built.stat().st_mtime:
+        log.warning("%s is newer than what was built of it: slower until `make install` builds it", source)
+        return None
+    return module
+
+
 try:
     from lanenet.perception.edges import _kernels  # type: ignore[attr-defined]
 except ImportError:
     _kernels = None
+else:
+    _kernels = if_current(_kernels)
 
 #: Smallest side of an image; OpenCV treats the borders of smaller ones in its own way.
 _LEAST_PX = 3

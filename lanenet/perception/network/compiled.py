@@ -8,12 +8,15 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from lanenet.perception.edges.compiled import if_current
 from lanenet.perception.edges.road import RoadEdges
 
 try:
     from lanenet.perception.network import _kernels  # type: ignore[attr-defined]
 except ImportError:
     _kernels = None
+else:
+    _kernels = if_current(_kernels)
 
 #: Numbers per line that :func:`refine` returns.
 _PER_LINE = 14

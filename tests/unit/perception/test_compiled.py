@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import astuple
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -153,3 +155,18 @@ def test_memory_beyond_the_arguments_is_not_read():
             compiled._kernels.raster(*arguments, *place, 1, 128, 127, False)
     nowhere = compiled._kernels.lift(np.full((1, 2), np.nan), points[:1], None, table, 4, 5, False)
     assert np.isnan(np.frombuffer(nowhere)[:2]).all()
+
+
+def test_loops_that_are_older_than_their_source_are_not_used(tmp_path, caplog):
+    module = ModuleType("_kernels")
+    module.__file__ = str(tmp_path / "_kernels.abi3.so")
+    built, source = tmp_path / "_kernels.abi3.so", tmp_path / "_kernels.cpp"
+    built.touch()
+    # As in a wheel, without the source.
+    assert compiled.if_current(module) is module
+    source.touch()
+    os.utime(source, (1000.0, 1000.0))
+    assert compiled.if_current(module) is module and not caplog.records
+    os.utime(built, (999.0, 999.0))
+    assert compiled.if_current(module) is None
+    assert "_kernels.cpp is newer" in caplog.text
