@@ -162,6 +162,7 @@ class LanePilot:
         if now_s - self._run_s > _PAUSE_S:
             # A person drove meanwhile: the throttle starts from 0, and the lane memory is out of date.
             self._limiter.neutral(now_s)
+            self._detector.reset()
             self._controller.reset()
             self._finding = Finding()
             if self._check is not None:

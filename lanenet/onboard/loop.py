@@ -96,6 +96,11 @@ class DriveMode:
         """Whether any command is sent."""
         return self.armed or self.steering_only
 
+    @property
+    def drives(self) -> bool:
+        """Whether the car moves as commanded; else somebody pushes or steers it, or it is a recording."""
+        return self.armed and self.record_commands
+
 
 class DriveLoop:
     """Runs the car until the source ends, a signal comes, or the car has to stop for good.
@@ -203,7 +208,8 @@ class DriveLoop:
             self._count(frame)
         if frame is not None and not fault:
             motion = self._speed_cm_s(), self._limiter.steering_rad
-            self._parts.controller.tell(self._parts.detector, frame.t_s, *motion)
+            if self._mode.drives:
+                self._parts.controller.tell(self._parts.detector, frame.t_s, *motion)
             estimate = self._parts.detector.detect(frame.image_bgr)
             target = self._parts.controller.target(estimate, frame.t_s, *motion)
             steering_rad, speed_cm_s = target.steering_rad, target.speed_cm_s
@@ -297,11 +303,9 @@ class DriveLoop:
         check = self._parts.camera_check
         if check is None or self._limiter.throttle <= self._speed.throttle_at_rest:
             return
-        # In a dry run somebody else steers.
-        steers = self._mode.armed and self._mode.record_commands
         before = self._finding.concern
         self._finding = check.look(
-            frame.image_bgr, frame.t_s, self._limiter.steering_rad if steers else math.nan
+            frame.image_bgr, frame.t_s, self._limiter.steering_rad if self._mode.drives else math.nan
         )
         if self._finding.concern > before:
             log.warning("camera: %s", self._finding.text)

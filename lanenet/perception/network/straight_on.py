@@ -38,6 +38,8 @@ _PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
 _UNTOLD_CM = 100.0
 #: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
 _FARTHEST_CM, _LONGEST = 160.0, 40
+#: A car that stands across a lane at a larger slope, cm beside per cm ahead, has left it. Chosen: 45 degrees.
+_STEEPEST = 1.0
 
 
 def turns_away_cm(points_cm: Float[np.ndarray, "3"], side: int) -> float:
@@ -86,16 +88,23 @@ class StraightOn:
         self._driven_cm = 0.0
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
-        """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
+        """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`.
+
+        A lane that the car has turned away from is forgotten.
+        """
         self._told = True
         if self._lines_cm is None:
             return
-        self._driven_cm += travel_cm
+        self._driven_cm += abs(travel_cm)
         half_rad = 0.5 * turn_rad
         pose = np.array([travel_cm * math.cos(half_rad), travel_cm * math.sin(half_rad), turn_rad])
         for line_cm in self._lines_cm:
             ends_cm = map_from_car(np.column_stack([line_cm, _ROWS])[[0, -1]], np.zeros(3), wheelbase_cm)
             (x_0, y_0), (x_1, y_1) = car_from_map(ends_cm, pose, wheelbase_cm)
+            # Not a number where the motion is none.
+            if not abs(x_1 - x_0) <= _STEEPEST * (y_1 - y_0):
+                self.on, self._lines_cm = False, None
+                return
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
 
     def turns_away(self, points_cm: Float[np.ndarray, "3"], side: int, width_cm: float) -> bool:

@@ -49,13 +49,14 @@ class Answers:
     def __init__(self) -> None:
         self.estimate = LaneEstimate()
         self.seen = None
+        self.resets = 0
 
     def detect(self, frame_bgr):
         self.seen = frame_bgr
         return self.estimate
 
     def reset(self):
-        pass
+        self.resets += 1
 
 
 @pytest.fixture
@@ -185,8 +186,10 @@ def test_throttle_rises_from_zero_after_a_person_drove(pilot):
     pilot._detector.estimate = lane(0.0)
     before = [pilot.run(IMAGE)[1] for _ in range(6)][-1]
     assert before == 0.25
+    resets = pilot._detector.resets
     pilot._clock.now_s += 10.0
     after = [pilot.run(IMAGE)[1] for _ in range(3)]
+    assert pilot._detector.resets == resets + 1, "the lane of before is not continued beside another road"
     assert after == pytest.approx([0.0, 0.05, 0.1])
 
 

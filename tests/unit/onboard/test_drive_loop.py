@@ -62,6 +62,7 @@ class Camera:
 class Eye:
     def __init__(self, answer: Callable[[int], LaneEstimate]) -> None:
         self._answer, self._seen = answer, -1
+        self.travels_cm: list[float] = []
 
     def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
         self._seen += 1
@@ -69,6 +70,9 @@ class Eye:
 
     def reset(self) -> None:
         self._seen = -1
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        self.travels_cm.append(travel_cm)
 
 
 class Wire:
@@ -111,10 +115,10 @@ class Car:
     ) -> None:
         self.clock = Clock()
         self.camera = Camera(self.clock, count, faults or {})
-        self.wire = Wire(self.clock)
+        self.wire, self.eye = Wire(self.clock), Eye(answer)
         self.steps: list[Step] = []
         self.loop = DriveLoop(
-            CarParts(self.camera, Eye(answer), LaneController(CONTROL), self.wire, None, check, None, hold),
+            CarParts(self.camera, self.eye, LaneController(CONTROL), self.wire, None, check, None, hold),
             SafetySettings(countdown_s=countdown_s),
             LimitSettings(),
             CONTROL.speed,
@@ -126,6 +130,16 @@ class Car:
 
 def test_fakes_answer_to_the_protocols() -> None:
     assert isinstance(Camera(Clock(), 1, {}), FrameSource)
+
+
+def test_the_detector_hears_how_the_car_moves_only_if_it_moves_as_commanded() -> None:
+    armed = Car(armed=True)
+    armed.loop.run()
+    # 60 cm/s in the end, at 30 frames/s.
+    assert len(armed.eye.travels_cm) == 59 and armed.eye.travels_cm[-1] == pytest.approx(2.0)
+    for pushed in (Car(), Car(steering_only=True), Car(armed=True, record_commands=False)):
+        pushed.loop.run()
+        assert pushed.eye.travels_cm == []
 
 
 def test_an_armed_car_drives_and_ends_in_neutral() -> None:

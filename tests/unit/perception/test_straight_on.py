@@ -81,6 +81,24 @@ def test_the_lane_moves_with_the_car(turn_rad):
     assert (sigma_cm > before_cm).all()
 
 
+@pytest.mark.parametrize("motion", [(3.9, math.radians(90 / 24)), (4.0, math.radians(-5.0)), (math.nan, 0.0)])
+def test_a_lane_that_the_car_turned_away_from_is_forgotten(motion):
+    lane = at_a_junction()
+    with np.errstate(invalid="ignore"):
+        for _ in range(24):
+            lane.moved(*motion, WHEELBASE_CM)
+            assert not lane.on or np.abs(lane.lane()[0]).max() < 200.0
+    assert not lane.on
+    assert not lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM).any()
+
+
+def test_its_place_is_less_sure_after_reversing():
+    lane = at_a_junction()
+    before_cm = lane.lane()[1]
+    lane.moved(-5.0, 0.0, WHEELBASE_CM)
+    assert (lane.lane()[1] > before_cm).all()
+
+
 def test_it_ends_when_one_line_is_where_it_is_expected():
     lane = at_a_junction()
     lane.look_for_its_end(seen(SIDE_ROAD, left=False), found=False, width_cm=WIDTH_CM)
