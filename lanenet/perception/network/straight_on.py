@@ -107,10 +107,25 @@ class StraightOn:
                 return
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
 
-    def turns_away(self, points_cm: Float[np.ndarray, "3"], side: int, width_cm: float) -> bool:
-        """Return whether a line turns away from its lane more than lanes bend."""
+    def turns_away(
+        self, points_cm: Float[np.ndarray, "3"], seen_at: Bool[np.ndarray, "3"], side: int, width_cm: float
+    ) -> bool:
+        """Return whether a line turns away from its lane more than lanes bend.
+
+        Args:
+            points_cm: The line at the label rows, frame car.
+            seen_at: Whether it is there.
+            side: 0 for the left line, 1 for the right one.
+            width_cm: The lane's width.
+        """
         least_cm, share = _TURNS_STILL if self._suspicious else _TURNS
-        return turns_away_cm(points_cm, side) >= max(least_cm, share * width_cm)
+        if turns_away_cm(points_cm, side) >= max(least_cm, share * width_cm):
+            return True
+        # Of a sharp corner only the beginning is found.
+        if self._lines_cm is None or seen_at[_FAR]:
+            return False
+        off_cm = float(points_cm[_MIDDLE] - self._lines_cm[side, _MIDDLE])
+        return (off_cm if side == 1 else -off_cm) >= _DOUBTED * width_cm
 
     def look(self, lines: SeenLines, leaving: int | None, ended: bool, width_cm: float) -> None:
         """Take a frame while the lane is not continued.

@@ -241,7 +241,7 @@ class LaneTracker:
     ) -> tuple[bool, int | None, bool]:
         """Return whether the lines turn together, or which one does alone, and if the other has ended."""
         for side, (line, other) in enumerate(zip(pair, pair[::-1], strict=True)):
-            turns = self.straight_on.turns_away(line.points_cm, side, width_cm)
+            turns = self.straight_on.turns_away(line.points_cm, line.seen_at, side, width_cm)
             if line.seen_cm < _LINE_SEEN_CM or not turns or self.looks.is_between_lanes(side):
                 continue
             beside_cm = parallel_points(line.points_cm, width_cm if side == 0 else -width_cm)
