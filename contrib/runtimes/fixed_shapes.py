@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 import onnx
+from onnx import numpy_helper
 
 
 def main(source: str, target: str) -> None:
@@ -24,8 +26,25 @@ def main(source: str, target: str) -> None:
     constants = [each for each in graph.initializer if each.name not in names]
     del graph.initializer[:], model.metadata_props[:]
     graph.initializer.extend(constants)
+    _decode_floats(graph)
     onnx.checker.check_model(model)
     onnx.save(model, target)
+
+
+def _decode_floats(graph: onnx.GraphProto) -> None:
+    """Replace the node that decodes bytes by its arithmetic on floats: less the zero, times the scale."""
+    (node,) = (each for each in graph.node if each.op_type == "DequantizeLinear")
+    raster, scales, zeros = node.input
+    values = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+    for name in (scales, zeros):
+        planes = values[name].astype(np.float32).reshape(-1, 1, 1)
+        graph.initializer.append(numpy_helper.from_array(planes, f"{name}_float"))
+    less = onnx.helper.make_node("Sub", [raster, f"{zeros}_float"], ["raster_less_zeros"])
+    times = onnx.helper.make_node("Mul", ["raster_less_zeros", f"{scales}_float"], list(node.output))
+    at = list(graph.node).index(node)
+    graph.node.remove(node)
+    graph.node.insert(at, times)
+    graph.node.insert(at, less)
 
 
 if __name__ == "__main__":

@@ -155,7 +155,9 @@ def test_the_longest_segment_says_why_nothing_could_be_mapped(monkeypatch):
 
 
 def test_a_doubtful_camera_is_why_nothing_could_be_mapped(monkeypatch):
-    with pytest.raises(CalibrationError, match=r"made-up: no such camera\. .*no pair of lines in 130 frames"):
+    with pytest.raises(
+        CalibrationError, match="made-up: no such camera, and with it no pair of lines in 130 frames"
+    ):
         _map(monkeypatch, made_up_drive(130), no_lane=(130,), doubt="no such camera")
 
 
