@@ -26,7 +26,8 @@ from scipy.interpolate import BSpline
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-MANIFEST = HERE / "manifest.json"
+# Not manifest.json, which makes a folder a tub.
+MANIFEST = HERE / "origins.json"
 
 Results = dict[str, np.ndarray]
 

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from lanenet.cli.app import app
 from lanenet.cli.shared.standing import look_around
+from lanenet.data.drives import find_format
 
 
 @pytest.fixture
@@ -82,6 +83,14 @@ def test_what_is_damaged_hidden_or_part_of_something_is_no_drive(here: Path) -> 
     # An annotated video of a run is no drive.
     assert found.drives == (Path("clip.mp4"), Path("lap"))
     assert list(found.refused) == [Path("broken")] and not found.maps and not found.label_sets
+
+
+def test_a_clone_holds_no_drive_before_one_is_copied_into_it() -> None:
+    repo = Path(__file__).resolve().parents[3]
+    shipped = [
+        path for name in ("checkpoints", "configs", "docs", "tests") for path in (repo / name).rglob("*")
+    ]
+    assert [path for path in shipped if path.is_dir() and find_format(path) is not None] == []
 
 
 def test_help_has_its_verbs_in_groups() -> None:
