@@ -204,10 +204,10 @@ def _next_words(
     source, detector = with_frames[0], kind_of("network" if model is not None else shown)
     is_map = source.drive != source.path
     options = {
-        "--detector": detector.name,
+        "--detector": detector.name if model is None else None,
         "--model": model,
         "--camera": source.path / "camera.yaml" if is_map else None,
-        "--lane-width": round(source.lane_width_cm, 2) if is_map and detector.takes_lane_width else None,
+        "--lane-width": f"{source.lane_width_cm:g}" if is_map and detector.takes_lane_width else None,
         "--marking": marking if detector.takes_marking else None,
         "--any-camera": any_camera and model is not None,
         "--out": "runs/lanes.csv",

@@ -273,7 +273,7 @@ def test_what_val_suggests_runs(tmp_path: Path, simulation: Path, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     run("simulate", simulation, "camera.height_cm=19", "--out", "d")
     of_network = next_words(run("val", CHECKPOINT, "d", "--any-camera", "--detectors", "network"))
-    assert of_network[:4] == ["detect", "d", "--detector", "network"] and "--any-camera" in of_network
+    assert of_network[:3] == ["detect", "d", "--model"] and "--any-camera" in of_network
     of_filter = next_words(run("val", "d", "--detectors", "lane-filter", "--marking", "2.5"))
     assert of_filter[of_filter.index("--marking") + 1] == "2.5"
     # A label set has no frames to detect on.
