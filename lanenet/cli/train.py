@@ -190,7 +190,10 @@ def train_run(
     stopped = stopped_in(log)
     with console.log_file(log):
         if stopped is not None:
-            console.say(f"resumes: the last run stopped in the stage {stopped}; what it finished is used")
+            console.say(
+                f"resumes: the last run of this name stopped in the stage {stopped}; what it finished with "
+                "the same drives and settings is used"
+            )
         return _Run(settings, marking, show_all).run()
 
 

@@ -131,7 +131,7 @@ def test_a_stopped_run_resumes_and_says_so(here: Path, first: str, monkeypatch: 
     before = made(here)
     result = train(*words)
     assert result.exit_code == 0, result.output
-    assert "resumes: the last run stopped in the stage test; what it finished is used" in result.stdout
+    assert "resumes: the last run of this name stopped in the stage test; what it finished " in result.stdout
     assert made(here) == before
 
 
