@@ -32,7 +32,7 @@ def label(
     report = label_set(map_folder, out, force, colour_weight)
     console.show_lines(report.lines)
     console.wrote(out)
-    console.next_command("val", "MODEL", out)
+    console.next_command("val", "MODEL", map_folder)
 
 
 def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | None) -> Report:

@@ -151,7 +151,7 @@ def train(
 
 def _write_config(plain: dict[str, Any], settings: Any) -> None:
     """Write down what was chosen, so that it can be read, changed and run again from any folder."""
-    config = settings.work_folder / f"{settings.name}.yaml"
+    config = _config_of(settings)
     folders = {key: str(getattr(settings, key).resolve()) for key in ("work_folder", "checkpoints_dir")}
     plain = {**plain, "work_dir": folders["work_folder"], "checkpoints_dir": folders["checkpoints_dir"]}
     again = shlex.join(["lanenet", "train", str(config)])
@@ -162,14 +162,19 @@ def _write_config(plain: dict[str, Any], settings: Any) -> None:
 
 
 def check_taken(settings: Any, force: bool) -> None:
-    """Refuse to replace a network of other drives without force.
+    """Refuse to replace a network or a config of other drives without force.
 
     Raises:
         LanenetError: Names the other drives.
     """
     if not force:
         drives = [drive.path for drive in settings.data.drives]
-        check_name(settings.checkpoints_dir / settings.name, drives)
+        check_name(settings.checkpoints_dir / settings.name, _config_of(settings), drives)
+
+
+def _config_of(settings: Any) -> Path:
+    """Where the config that a run writes itself stands."""
+    return Path(settings.work_folder / f"{settings.name}.yaml")
 
 
 def train_run(

@@ -196,26 +196,27 @@ def finished_map(drive: dict[str, Any], folder: Path, runs: Path) -> Path | None
     return next((file.parent for file in maps if Output(file, own.key).done), None)
 
 
-def check_name(checkpoint: Path, drives: Iterable[Path]) -> None:
-    """Refuse to replace a network of other drives.
+def check_name(checkpoint: Path, config: Path, drives: Iterable[Path]) -> None:
+    """Refuse to replace a network, or the config of a run, of other drives.
 
     Args:
         checkpoint: Folder to write; may be missing.
+        config: The run's config; may be missing.
         drives: The recorded drives that are to be learned from.
 
     Raises:
         LanenetError: Names the other drives.
     """
-    if not checkpoint.exists():
-        return
-    own, others = set(map(_drive_behind, drives)), learned_from(checkpoint / "run.yaml")
-    # One of simulated drives alone has none.
-    if own != others and own.isdisjoint(others):
-        found = ", ".join(sorted(map(str, others))) or "simulated drives"
-        raise LanenetError(
-            f"{checkpoint}: the name is taken by a network of {found}; choose another --name (name=... with "
-            "a config), or replace that network with --force"
-        )
+    own = set(map(_drive_behind, drives))
+    for taken, what, written in ((checkpoint, "network", checkpoint / "run.yaml"), (config, "run", config)):
+        others = learned_from(written)
+        # A network of simulated drives alone has none.
+        if taken.exists() and own != others and own.isdisjoint(others):
+            found = ", ".join(sorted(map(str, others))) or "simulated drives"
+            raise LanenetError(
+                f"{taken}: the name is taken by a {what} of {found}; choose another --name (name=... with a "
+                f"config), or replace that {what} with --force"
+            )
 
 
 def learned_from(config: Path) -> set[Path]:

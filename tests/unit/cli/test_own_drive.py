@@ -39,6 +39,8 @@ from lanenet.errors import ConfigError, DriveFormatError, LanenetError
 
 GENERAL = Path(__file__).resolve().parents[3] / "checkpoints" / "general"
 
+NO_CONFIG = Path("none.yaml")
+
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -155,22 +157,22 @@ def test_a_network_of_another_drive_is_kept(here: Path) -> None:
         return folder
 
     one, other = write_drive(here / "one", 2), write_drive(here / "other", 2)
-    check_name(here / "checkpoints" / "mine", [one])
+    check_name(here / "checkpoints" / "mine", NO_CONFIG, [one])
     checkpoint = trained(other)
     assert learned_from(checkpoint / "run.yaml") == {other}
     with pytest.raises(LanenetError, match=f"the name is taken by a network of {other}.*--force"):
-        check_name(checkpoint, [one])
-    check_name(checkpoint, [one, other])
+        check_name(checkpoint, NO_CONFIG, [one])
+    check_name(checkpoint, NO_CONFIG, [one, other])
     # A map stands for its drive, and simulated drives for each other.
     folder = mapped(here / "map")
     plain = yaml.safe_load((folder / "map.yaml").read_text())
     (folder / "map.yaml").write_text(yaml.safe_dump({**plain, "drive": str(other)}))
-    check_name(checkpoint, [folder])
+    check_name(checkpoint, NO_CONFIG, [folder])
     with pytest.raises(LanenetError, match="taken by a network of"):
-        check_name(checkpoint, [])
-    check_name(trained(), [])
+        check_name(checkpoint, NO_CONFIG, [])
+    check_name(trained(), NO_CONFIG, [])
     with pytest.raises(LanenetError, match="taken by a network of simulated drives"):
-        check_name(checkpoint, [one])
+        check_name(checkpoint, NO_CONFIG, [one])
 
 
 def test_a_config_from_another_folder_says_where_its_paths_are(here: Path, tmp_path: Path) -> None:
@@ -266,3 +268,11 @@ def test_a_finished_map_takes_no_time(here: Path) -> None:
     assert stages["map"]["map"] == 0.0 < stages["drive"]["map"]
     simulated = settings_of({"name": "a", "data": {"synthetic": {"train": 1, "validation": 1}}})
     assert not any(expected_s(simulated, []).values()) and "map" not in expected_s(simulated, [])
+
+
+def test_the_config_of_another_drives_run_is_not_written_over(tmp_path: Path) -> None:
+    one, other, config = tmp_path / "one", tmp_path / "other", tmp_path / "mine.yaml"
+    config.write_text(f"data:\n  drives:\n  - path: {one}\n")
+    check_name(tmp_path / "none", config, [one])
+    with pytest.raises(LanenetError, match=r"taken by a run of .*one; .*--force"):
+        check_name(tmp_path / "none", config, [other])
