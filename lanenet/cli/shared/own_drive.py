@@ -208,14 +208,14 @@ def check_name(checkpoint: Path, config: Path, drives: Iterable[Path]) -> None:
         LanenetError: Names the other drives.
     """
     own = set(map(_drive_behind, drives))
-    for taken, what, written in ((checkpoint, "network", checkpoint / "run.yaml"), (config, "run", config)):
+    for taken, written in ((checkpoint, checkpoint / "run.yaml"), (config, config)):
         others = learned_from(written)
         # A network of simulated drives alone has none.
         if taken.exists() and own != others and own.isdisjoint(others):
             found = ", ".join(sorted(map(str, others))) or "simulated drives"
             raise LanenetError(
-                f"{taken}: the name is taken by a {what} of {found}; choose another --name (name=... with a "
-                f"config), or replace that {what} with --force"
+                f"{taken}: the name is taken by a network of {found}; choose another --name (name=... with a "
+                "config), or replace what is there with --force"
             )
 
 

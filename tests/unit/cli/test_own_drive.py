@@ -274,5 +274,5 @@ def test_the_config_of_another_drives_run_is_not_written_over(tmp_path: Path) ->
     one, other, config = tmp_path / "one", tmp_path / "other", tmp_path / "mine.yaml"
     config.write_text(f"data:\n  drives:\n  - path: {one}\n")
     check_name(tmp_path / "none", config, [one])
-    with pytest.raises(LanenetError, match=r"taken by a run of .*one; .*--force"):
+    with pytest.raises(LanenetError, match=r"taken by a network of .*one; .*--force"):
         check_name(tmp_path / "none", config, [other])
