@@ -63,9 +63,9 @@ test: $(VENV)/.stamp-dev
 test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
 
-# What the car installs, in an empty environment; fetches packages.
+# What the car installs, in an empty environment; fetches packages. One process, so that the release is built once.
 test-base-install: $(VENV)/.stamp-dev
-	$(PYTEST) -rs -m slow tests/contracts/test_base_install.py
+	$(PYTEST) -rs -m slow --dist loadfile tests/contracts/test_base_install.py
 
 # Each file stays in one process, for its fixtures.
 chain: $(VENV)/.stamp-dev
