@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,17 +20,14 @@ from datagen.slam.camera.self_calibration import (
     check_observable,
     find_camera,
 )
-from datagen.slam.odometry.scans import Progress
 from datagen.slam.odometry.stillness import following_frames
-from datagen.slam.segment import SegmentSolver
+from datagen.slam.segment import SegmentSolver, StageProgress
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Drive, open_drive
 from lanenet.errors import CalibrationError, TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
 
-#: Called with (stage, done, total).
-StageProgress = Callable[[str, int, int], None]
 #: Relative difference from the given lane width, where the scale comes from elsewhere, that is worth a note.
 #: Chosen: more than the sigma of a measured lane width on a good drive.
 _OTHER_LANE = 0.05
@@ -158,17 +154,14 @@ def calibrate_drive(
         guess = settings.guess.model_copy(update={"wheelbase_cm": start.wheelbase_cm})
         settings = settings.model_copy(update={"guess": guess})
     rng = np.random.default_rng(settings.seed)
-    solver = SegmentSolver(settings, rng, _track_progress(progress))
-    search = None if progress is None else lambda done, total: progress("try cameras", done, total)
+    solver = SegmentSolver(settings, rng, progress)
     try:
-        found = find_camera(drive, start, solver, search)
+        found = find_camera(drive, start, solver)
     except TrackingLostError as error:
         raise CalibrationError(f"{error}. {DRIVE_INSTEAD.capitalize()}") from error
     if start is None and lane_width_cm is not None and camera_height_cm is not None:
         found, more = fit_height(found, drive, lane_width_cm / camera_height_cm, settings, solver)
         notes += more
-    if progress is not None:
-        progress(_ADJUST, 1, 1)
     notes += check_observable(found, str(drive_path), accept_open_loop)
     lane = _lane_of(
         found, settings, drive_path, needed=lane_width_cm is not None and camera_height_cm is None
@@ -194,22 +187,6 @@ def calibrate_drive(
         shown=straight_frames(found.solved.poses, _SEEN_HEIGHTS * height, _SHOWN),
         drive=drive,
     )
-
-
-_ADJUST = "adjust poses and camera"
-
-
-def _track_progress(progress: StageProgress | None) -> Progress | None:
-    """Report the progress of tracking, and after it the adjustment, which has no steps."""
-    if progress is None:
-        return None
-
-    def report(done: int, total: int) -> None:
-        progress("follow the drive", done, total)
-        if done == total:
-            progress(_ADJUST, 0, 1)
-
-    return report
 
 
 def _moving_part(recorded: Drive, start: Camera | None) -> tuple[Drive, list[str]]:

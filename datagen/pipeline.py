@@ -20,8 +20,7 @@ from datagen.refusal import Attempt, report_refusal
 from datagen.segments import camera_of_drive, fit_lanes, solve_drive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
-from datagen.slam.odometry.scans import Progress
-from datagen.slam.segment import SegmentSolver
+from datagen.slam.segment import SegmentSolver, StageProgress
 from lanenet.config import dump_settings
 from lanenet.data.files import atomic_folder, check_replaceable, write_text
 from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
@@ -39,7 +38,7 @@ def map_drive(
     request: MapRequest,
     settings: MapSettings,
     out: Path,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
     pictures: bool = True,
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
@@ -48,7 +47,7 @@ def map_drive(
         request: The drive and what is known about it.
         settings: Settings of all stages.
         out: Map folder to write.
-        progress: Called with (done, total).
+        progress: Called with (stage, done, total).
         pictures: Draw the map, its frames and the report's page; on a short drive a third of the time. A
             drive that is refused gets a page as well, see :mod:`datagen.refusal`.
 
@@ -96,7 +95,9 @@ def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
         return f"; its report could not be written ({failed})"
 
 
-def _map_drive(attempt: Attempt, key: str, out: Path, progress: Progress | None, pictures: bool) -> Report:
+def _map_drive(
+    attempt: Attempt, key: str, out: Path, progress: StageProgress | None, pictures: bool
+) -> Report:
     request = attempt.request
     prepared = attempt.prepared = prepare(request, attempt.settings)
     settings = prepared.settings
@@ -105,9 +106,12 @@ def _map_drive(attempt: Attempt, key: str, out: Path, progress: Progress | None,
     camera = attempt.camera = camera_of_drive(prepared, solver)
     # Track, close loops, adjust: SegmentSolver.solve.
     solved = attempt.solved = solve_drive(prepared, camera, solver)
+    solver.tell("lines and checks", 0, 2)
     lanes = fit_lanes(prepared, solved.segments, solved.refused, camera.doubt)
     assembled = assemble(prepared, camera.camera, camera.sigma, lanes.segments)
+    solver.tell("lines and checks", 1, 2)
     checked = check_map(prepared, assembled, camera.figures)
+    solver.tell("lines and checks", 2, 2)
     notes = [*prepared.notes, *camera.notes, *lanes.notes, *checked.notes]
     figures = {
         "drive": str(request.drive_path),

@@ -109,7 +109,7 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
         return CameraOfDrive(prepared.camera)
     drive = prepared.drive
     check_edges(drive, prepared.settings.perception.edges)
-    found = find_camera(drive, prepared.camera, solver, solver.progress)
+    found = find_camera(drive, prepared.camera, solver)
     notes: tuple[str, ...] = ()
     width_cm, height_cm = prepared.request.lane_width_cm, prepared.request.camera_height_cm
     if height_cm is not None:

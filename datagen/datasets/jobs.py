@@ -18,6 +18,7 @@ from datagen.datasets.splits import in_window, split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
 from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive, map_key
+from datagen.slam.segment import StageProgress
 from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
 from datagen.world.world import SimulationSettings
@@ -26,8 +27,6 @@ from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import read_map
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
 
-#: Called with (done, total).
-MapProgress = Callable[[int, int], None]
 Role = Literal["train", "validation", "test"]
 ROLES: tuple[Role, ...] = ("train", "validation", "test")
 
@@ -257,11 +256,11 @@ class RecordedJob:
             return len(read_labels(self.recording.path))
         return len(read_map(self.frames).frames) if self.is_map else len(self._request.open_drive())
 
-    def make_map(self, progress: MapProgress | None = None) -> None:
+    def make_map(self, progress: StageProgress | None = None) -> None:
         """Map the drive, unless it has been mapped before.
 
         Args:
-            progress: Called with (done, total).
+            progress: Called with (stage, done, total).
 
         Raises:
             LanenetError: If the drive cannot be read or mapped.

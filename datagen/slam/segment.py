@@ -5,7 +5,7 @@ A slow car is tracked by keyframes; the frames between them are placed and adjus
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -31,7 +31,7 @@ from datagen.slam.loops.consistency import (
 from datagen.slam.loops.parts import connected, placing_revisits, whole_turns
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
 from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_beside, propose_revisits, thumbnails
-from datagen.slam.odometry.scans import Progress, Scans
+from datagen.slam.odometry.scans import Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
 from datagen.slam.view import RoadView, SegmentView, view_road, view_segment
@@ -39,6 +39,9 @@ from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
 
+#: Called with (stage, done, total).
+StageProgress = Callable[[str, int, int], None]
+_ADJUST = "adjust poses"
 #: Camera parameters that are observable without a loop closure. The focal length is not: before the loop was
 #: closed it diverged on two of three real drives.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
@@ -166,12 +169,12 @@ class SegmentSolver:
     Attributes:
         settings: Settings of all stages.
         rng: Source of randomness; every solution draws from it.
-        progress: Called with (done, total) while a segment is tracked.
+        progress: Called with (stage, done, total); stages come again with every start of the camera.
     """
 
     settings: SlamSettings
     rng: np.random.Generator
-    progress: Progress | None = None
+    progress: StageProgress | None = None
 
     def solve(
         self,
@@ -204,6 +207,11 @@ class SegmentSolver:
         solved = self.solve(drive.subset(keys), camera, find_camera, prior_camera, between)
         return self.place_between(solved, keys, view.steps_heights, drive, commands)
 
+    def tell(self, stage: str, done: int, total: int) -> None:
+        """Report progress, if anybody listens."""
+        if self.progress is not None:
+            self.progress(stage, done, total)
+
     def place_between(
         self,
         solved: SolvedSegment,
@@ -235,7 +243,9 @@ class SegmentSolver:
             inliers = inlier_revisits(poses, revisits, height)
             pairs += loop_pairs(inliers, part) + neighbouring_laps(poses, height, settings.revisits)
         start = BundleEstimate(poses, values_between(solved.bundle.tilt, keys, steps), camera)
+        self.tell(_ADJUST, 0, 1)
         bundle = adjust(road.observed(commands), start, settings.bundle, self.rng, (), pairs)
+        self.tell(_ADJUST, 1, 1)
         opened, t = poses_between(solved.open_poses, keys, steps), solved.trajectory
         # The match of a keyframe stands for the frames before it.
         after = np.searchsorted(keys, np.arange(len(drive)))
@@ -295,16 +305,21 @@ class _DenseSegment:
     def solve(self) -> SolvedSegment:
         """Take the drive through all stages."""
         view, solver = self.view, self.solver
-        trajectory, steering = track(view, solver.settings, solver.rng, solver.progress)
+        followed = partial(solver.tell, "follow the drive")
+        trajectory, steering = track(view, solver.settings, solver.rng, followed)
+        solver.tell(_ADJUST, 0, 3)
         start = BundleEstimate.level(trajectory.poses, view.camera)
         opened = self.adjust(self.observed, start, free=self.free)
+        solver.tell(_ADJUST, 1, 3)
         matched = self.find_revisits(opened)
         closure = self.choose_closure(opened, matched)
+        solver.tell(_ADJUST, 2, 3)
         road, bundle = view.road, opened
         if closure is not None and self.find_camera:
             road, closure = self.adjust_with_camera(closure, _together(matched, closure.revisits))
         if closure is not None:
             bundle = closure.bundle
+        solver.tell(_ADJUST, 3, 3)
         return SolvedSegment(
             rows=np.arange(len(view.drive)),
             camera=bundle.camera,

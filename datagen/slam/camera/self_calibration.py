@@ -8,6 +8,7 @@ length.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from jaxtyping import Float
 
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleSettings
 from datagen.slam.camera.coarse import Candidate, coarse_camera, looking_alike, nudged
-from datagen.slam.odometry.scans import Progress
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives import Drive
 from lanenet.errors import CalibrationError
@@ -136,16 +136,13 @@ class FoundCamera:
         return f"{found}; no place was seen twice, so the lens is as it started"
 
 
-def find_camera(
-    drive: Drive, start: Camera | None, solver: SegmentSolver, search_progress: Progress | None = None
-) -> FoundCamera:
+def find_camera(drive: Drive, start: Camera | None, solver: SegmentSolver) -> FoundCamera:
     """Find a drive's camera, or refine a known one, together with the drive's poses.
 
     Args:
         drive: One segment.
         start: Camera to refine, with close priors about it; None looks for one, with wide priors.
         solver: Solves the segment.
-        search_progress: Called with (done, total) during the coarse search.
 
     Returns:
         The camera, in the scale of the start or of a nominal height.
@@ -157,7 +154,7 @@ def find_camera(
     settings = solver.settings
     if start is None:
         camera, candidates = coarse_camera(
-            drive, settings.perception, settings.guess, solver.rng, search_progress
+            drive, settings.perception, settings.guess, solver.rng, partial(solver.tell, "try cameras")
         )
     else:
         camera = start
