@@ -4,6 +4,7 @@
     |- ConfigError           a setting: misspelt key, wrong type, empty range
     |- CalibrationError      a camera file, or pixels that the camera cannot see
     |- DriveFormatError      a recorded drive: tub, frames.csv, images, video
+    |- LibraryError          a library of drives: its file, or a drive in it
     |- MapFormatError        a map folder
     |- LabelFormatError      a label set or a table of detections
     |- CheckpointError       a checkpoint folder
@@ -61,6 +62,10 @@ class CalibrationError(LanenetError):
 
 class DriveFormatError(LanenetError):
     """A recorded drive cannot be read."""
+
+
+class LibraryError(LanenetError):
+    """A library of drives cannot be used, or does not hold a drive as it is asked for."""
 
 
 class MapFormatError(LanenetError):

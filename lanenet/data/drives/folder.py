@@ -71,6 +71,7 @@ def read_folder(path: Path) -> RecordedFrames:
 
 
 FORMAT = DriveFormat(
+    kind="folder",
     described=f"a drive folder ({FRAMES_FILE})",
     recognises=lambda path: is_regular(path / FRAMES_FILE),
     read=read_folder,

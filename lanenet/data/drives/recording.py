@@ -25,11 +25,13 @@ from lanenet.data.tables import ColumnSpec, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import LaneWidthCm
-from lanenet.reading import FolderFiles, read_image
+from lanenet.reading import MAX_IMAGE, FolderFiles, decode_image, read_bytes
 
 #: A longer pause is a break: even a slow car has left the road that its last frame showed.
 MAX_PAUSE_S = 2.0
 
+#: What a drive can be on disk.
+Kind = Literal["folder", "tub", "video", "bag"]
 COMMAND_NAMES: tuple[str, ...] = ("speed_cm_s", "throttle", "steering_rad", "angle", "yaw_rate_rad_s")
 DRIVE_FILE = "drive.yaml"
 DRIVE_FORMAT = "lanenet-drive/1"
@@ -44,6 +46,19 @@ class ImageSource(Protocol):
 
         Raises:
             DriveFormatError: If it cannot be read; names the file.
+        """
+        ...
+
+
+@runtime_checkable
+class StoredImages(Protocol):
+    """Source of images that lie on disk one by one; those of a video do not."""
+
+    def data(self, row: int) -> bytes:
+        """Return image ``row`` as it was stored: an image file, or a message of a bag.
+
+        Raises:
+            DriveFormatError: If it cannot be read.
         """
         ...
 
@@ -194,7 +209,11 @@ class ImageFiles:
 
     def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
         """Read one image; see :class:`ImageSource`."""
-        return read_image(self.paths[row], DriveFormatError)
+        return decode_image(self.data(row), self.paths[row], DriveFormatError)
+
+    def data(self, row: int) -> bytes:
+        """Return the bytes of one file; see :class:`StoredImages`."""
+        return read_bytes(self.paths[row], DriveFormatError, MAX_IMAGE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +248,7 @@ class DriveFormat:
     """A way in which drives lie on disk.
 
     Attributes:
+        kind: Its name.
         described: What to expect, for error messages, such as "a Donkeycar tub (manifest.json)".
         recognises: Tells whether a path that exists is such a drive; looks at names only.
         read: Reads a drive that was recognised; raises DriveFormatError if it cannot be used.
@@ -236,6 +256,7 @@ class DriveFormat:
             drive that is one file, where ``{stem}`` stands for the file's name without its ending.
     """
 
+    kind: Kind
     described: str
     recognises: Callable[[Path], bool]
     read: Callable[[Path], RecordedFrames]

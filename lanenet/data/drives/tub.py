@@ -154,6 +154,7 @@ def read_tub(path: Path) -> RecordedFrames:
 
 
 FORMAT = DriveFormat(
+    kind="tub",
     described=f"a Donkeycar tub ({MANIFEST_FILE})",
     recognises=lambda path: is_regular(path / MANIFEST_FILE),
     read=read_tub,

@@ -186,6 +186,7 @@ def read_video(path: Path) -> RecordedFrames:
 
 
 FORMAT = DriveFormat(
+    kind="video",
     described=f"a video ({', '.join(VIDEO_ENDINGS)})",
     recognises=lambda path: is_regular(path) and path.suffix.lower() in VIDEO_ENDINGS,
     read=read_video,

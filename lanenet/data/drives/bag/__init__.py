@@ -60,6 +60,7 @@ class BagImages:
         self._bag = Bag(path)
         self._decoder = Decoder(topic)
         self._next = 0
+        self._last = (-1, b"")
         self._stream: Iterator[tuple[int, bytes]] = iter(())
 
     def __reduce__(self) -> tuple[type[BagImages], tuple[Path, Topic, np.ndarray]]:
@@ -68,6 +69,12 @@ class BagImages:
 
     def read(self, row: int) -> UInt8[np.ndarray, "h w 3"]:
         """Read one image; see :class:`lanenet.data.drives.recording.ImageSource`."""
+        return self._decoder.image(self.data(row), f"{self.path}: image {row} of {self.topic.name}")
+
+    def data(self, row: int) -> bytes:
+        """Return one message; see :class:`lanenet.data.drives.recording.StoredImages`."""
+        if self._last[0] == row:
+            return self._last[1]
         if not 0 < self._next <= row <= self._next + _MAX_FORWARD:
             # From the first of the messages that were recorded in the same nanosecond.
             self._next = int(np.searchsorted(self._recorded_ns, self._recorded_ns[row]))
@@ -80,7 +87,8 @@ class BagImages:
         except (DriveFormatError, StopIteration):
             self._next = 0
             raise DriveFormatError(f"{self.path}: image {row} of {self.topic.name} cannot be read") from None
-        return self._decoder.image(data, f"{self.path}: image {row} of {self.topic.name}")
+        self._last = (row, data)
+        return data
 
 
 def read_bag(path: Path) -> RecordedFrames:
@@ -133,6 +141,7 @@ def _is_bag(path: Path) -> bool:
 
 
 FORMAT = DriveFormat(
+    kind="bag",
     described=f"a ROS 2 bag ({METADATA_FILE}; {', '.join(STORAGE_ENDINGS)})",
     recognises=_is_bag,
     read=read_bag,

@@ -1,0 +1,301 @@
+"""The library: drives are added, found, changed and removed."""
+
+from __future__ import annotations
+
+import datetime
+import shutil
+import sqlite3
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from lanenet.data.drives import FORMATS, open_drive
+from lanenet.data.drives.recording import Drive, drive_file_of
+from lanenet.data.library import database
+from lanenet.data.library.entry import FIELDS, Entry, check_name, check_told, name_of
+from lanenet.data.library.fingerprint import checksum
+from lanenet.errors import LanenetError, LibraryError, did_you_mean
+from lanenet.outputs import lock_output, make_folder, put_in_place, remove, temporary_output
+
+#: Where a library is, unless it is said: in the current folder.
+DEFAULT_LIBRARY = Path("drives.sqlite")
+
+
+class Library:
+    """Drives of a car, a club or a course, in one SQLite file.
+
+    Every call opens the file anew: a library may be used by many threads and processes, and passed to them.
+    """
+
+    def __init__(self, path: Path = DEFAULT_LIBRARY) -> None:
+        """Name a library; see :meth:`open`.
+
+        Args:
+            path: Its file.
+        """
+        self.path = Path(path)
+
+    @classmethod
+    def open(cls, path: Path = DEFAULT_LIBRARY, *, create: bool = False) -> Library:
+        """Open a library.
+
+        Args:
+            path: Its file.
+            create: Make it if there is none.
+
+        Raises:
+            LibraryError: If it is missing, no library, damaged, locked, or of a newer version.
+        """
+        library = cls(path)
+        if create:
+            database.create(library.path)
+        with database.reading(library.path):
+            return library
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its file, which relative sources begin at."""
+        return self.path.resolve().parent
+
+    @property
+    def copies(self) -> Path:
+        """The folder of the drives that were copied."""
+        return self.folder / f"{self.path.stem}.files"
+
+    def entries(self) -> list[Entry]:
+        """Return all drives, in the order of their names.
+
+        Raises:
+            LibraryError: If the file cannot be read.
+        """
+        with database.reading(self.path) as connection:
+            return [_entry(row) for row in connection.execute("SELECT * FROM drives ORDER BY name")]
+
+    def get(self, name: str) -> Entry:
+        """Return the drive of a name.
+
+        Raises:
+            LibraryError: If there is none; names the most similar one.
+        """
+        with database.reading(self.path) as connection:
+            return self._get(connection, name)
+
+    def path_of(self, entry: Entry) -> Path:
+        """Return where a drive is, absolute."""
+        return self.folder / entry.source
+
+    def open_drive(self, name: str) -> Drive:
+        """Open a drive.
+
+        Raises:
+            LibraryError: If there is none of that name, or nothing is left at its path.
+            DriveFormatError: If it can no longer be read.
+            CalibrationError: If its camera file cannot be used.
+        """
+        entry = self.get(name)
+        path = self.path_of(entry)
+        if not path.exists():
+            raise LibraryError(
+                f"{name}: its source {path} is gone; put it back, or lanenet drives remove {name}"
+            )
+        return open_drive(path)
+
+    def check(self, name: str) -> None:
+        """Read a drive's files and compare them with what was added.
+
+        Raises:
+            LibraryError: If its source is gone or has changed since.
+            DriveFormatError: If it can no longer be read.
+        """
+        entry, drive = self.get(name), self.open_drive(name)
+        if checksum(drive) != entry.checksum:
+            raise LibraryError(
+                f"{name}: its source {drive.path} has changed since it was added on {entry.added_at[:10]} "
+                f"({entry.frames} frames then, {len(drive)} now); remove it and add it again"
+            )
+
+    def add(
+        self,
+        source: Path,
+        *,
+        name: str | None = None,
+        copy: bool = False,
+        force: bool = False,
+        **told: str | float | None,
+    ) -> Entry:
+        """Add a drive: read all of it, and keep what it is known by.
+
+        Args:
+            source: Tub, drive folder, video or bag.
+            name: Its name in the library; None makes one of the source's.
+            copy: Copy it beside the library's file, instead of keeping where it is.
+            force: Add it even if the library holds the same recording.
+            **told: ``car``, ``camera``, ``track``, ``licence``, ``notes``, ``lane_width_cm``; the last two
+                default to those of the drive's own ``drive.yaml``.
+
+        Returns:
+            The new entry.
+
+        Raises:
+            LibraryError: If the name is taken or no name, or the library holds the recording.
+            DriveFormatError: If the drive cannot be read.
+            LanenetError: If it cannot be copied.
+        """
+        check_told(told)
+        if name is not None:
+            check_name(name)
+        drive = open_drive(source)
+        entry = self._found(drive, told)
+        if not copy:
+            with database.writing(self.path) as connection:
+                return self._insert(connection, replace(entry, name=name or ""), force)
+        # Before the work; another process may still add the same.
+        with database.reading(self.path) as connection:
+            entry = self._placed(connection, replace(entry, name=name or ""), force)
+        with lock_output(self.copies / entry.name):
+            return self._add_copy(drive, entry, force)
+
+    def update(self, name: str, **told: str | float | None) -> Entry:
+        """Change what people say about a drive.
+
+        Args:
+            name: The drive.
+            **told: As for :meth:`add`.
+
+        Returns:
+            The entry as it is now.
+
+        Raises:
+            LibraryError: If there is no such drive, or a field cannot have that value.
+        """
+        check_told(told)
+        with database.writing(self.path) as connection:
+            entry = replace(self._get(connection, name), **told)  # type: ignore[arg-type]
+            if told:
+                sets = ", ".join(f"{key} = :{key}" for key in told)
+                connection.execute(f"UPDATE drives SET {sets} WHERE name = :name", {**told, "name": name})
+        return entry
+
+    def remove(self, name: str, *, files: bool = False) -> Entry:
+        """Remove a drive from the library.
+
+        Args:
+            name: The drive.
+            files: Also remove its files, if they are a copy of the library's.
+
+        Returns:
+            What its entry was.
+
+        Raises:
+            LibraryError: If there is no such drive, or its files are to go and are not the library's.
+        """
+        with database.writing(self.path) as connection:
+            entry = self._get(connection, name)
+            inside = len(entry.source.parts) > 1 and ".." not in entry.source.parts
+            if files and not (entry.copied and inside and not entry.source.is_absolute()):
+                raise LibraryError(
+                    f"{name}: its files in {self.path_of(entry)} are no copy of the library and stay"
+                )
+            connection.execute("DELETE FROM drives WHERE name = ?", (name,))
+        if files:
+            remove(self.folder.joinpath(*entry.source.parts[:2]))
+        return entry
+
+    def _get(self, connection: sqlite3.Connection, name: str) -> Entry:
+        row = connection.execute("SELECT * FROM drives WHERE name = ?", (name,)).fetchone()
+        if row is None:
+            known = [each[0] for each in connection.execute("SELECT name FROM drives")]
+            raise LibraryError(f"{self.path}: no drive {name!r}{did_you_mean(name, known)}")
+        return _entry(row)
+
+    def _found(self, drive: Drive, told: dict[str, str | float | None]) -> Entry:
+        """Return what a drive says about itself, and people about it; the name is still missing."""
+        kind = next(known.kind for known in FORMATS if known.recognises(drive.path))
+        path = drive.path.resolve()
+        steps_s = np.diff(drive.t_s)[~drive.breaks[1:]]
+        entry = Entry(
+            name="",
+            source=path.relative_to(self.folder) if path.is_relative_to(self.folder) else path,
+            copied=False,
+            kind=kind,
+            car="",
+            camera="",
+            track="",
+            licence="",
+            notes=drive.notes,
+            lane_width_cm=drive.lane_width_cm,
+            frames=len(drive),
+            duration_s=float(steps_s.sum()),
+            checksum=checksum(drive),
+            added_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        )
+        return replace(entry, **told)  # type: ignore[arg-type]
+
+    def _placed(self, connection: sqlite3.Connection, entry: Entry, force: bool) -> Entry:
+        """Return the entry with its name, unless that is taken or the recording is there."""
+        same = connection.execute("SELECT name FROM drives WHERE checksum = ?", (entry.checksum,)).fetchone()
+        if same is not None and not force:
+            raise LibraryError(
+                f"{self.path_of(entry)}: the same recording as {same[0]} of the library, image by image"
+            )
+        taken = {row[0] for row in connection.execute("SELECT name FROM drives")}
+        if entry.name:
+            if entry.name in taken:
+                raise LibraryError(
+                    f"{self.path}: the name {entry.name!r} is taken; choose another with --name"
+                )
+            return entry
+        # The tubs of many cars are called data: their folder tells them apart.
+        own, above = name_of(self.path_of(entry)), name_of(self.path_of(entry).parent)
+        numbered = (f"{own}-{number}" for number in range(2, len(taken) + 3))
+        return replace(entry, name=next(n for n in (own, f"{above}-{own}"[:95], *numbered) if n not in taken))
+
+    def _insert(self, connection: sqlite3.Connection, entry: Entry, force: bool) -> Entry:
+        entry = self._placed(connection, entry, force)
+        values = {**asdict(entry), "source": entry.source.as_posix(), "copied": int(entry.copied)}
+        columns = ", ".join(f":{field}" for field in FIELDS)
+        connection.execute(f"INSERT INTO drives ({', '.join(FIELDS)}) VALUES ({columns})", values)
+        return entry
+
+    def _add_copy(self, drive: Drive, entry: Entry, force: bool) -> Entry:
+        """Copy a drive under a temporary name, read the copy, and give it its name with the entry's."""
+        home, inside = self.copies / entry.name, "" if drive.path.is_dir() else drive.path.name
+        if home.exists():
+            raise LibraryError(
+                f"{home}: left of a drive that was removed; remove it, or choose another --name"
+            )
+        make_folder(self.copies)
+        with temporary_output(home) as temporary:
+            try:
+                _copy(drive.path, temporary)
+            except OSError as error:
+                reason = error.args[0][0][2] if isinstance(error, shutil.Error) else error
+                raise LanenetError(f"{home}: {drive.path} cannot be copied there ({reason})") from None
+            if checksum(open_drive(temporary / inside)) != entry.checksum:
+                raise LibraryError(f"{drive.path}: changed while it was copied; nothing was added")
+            entry = replace(entry, source=(home / inside).relative_to(self.folder), copied=True)
+            try:
+                with database.writing(self.path) as connection:
+                    entry = self._insert(connection, entry, force)
+                    put_in_place(temporary, home)
+            except BaseException:
+                remove(home)
+                raise
+        return entry
+
+
+def _entry(row: sqlite3.Row) -> Entry:
+    values = {field: row[field] for field in FIELDS}
+    return Entry(**{**values, "source": Path(row["source"]), "copied": bool(row["copied"])})
+
+
+def _copy(source: Path, folder: Path) -> None:
+    """Copy a drive's folder, or a drive that is one file with what lies beside it under its name."""
+    if source.is_dir():
+        shutil.copytree(source, folder, symlinks=True)
+        return
+    folder.mkdir()
+    for file in (source, source.with_suffix(".csv"), drive_file_of(source)):
+        if file.is_file():
+            shutil.copy2(file, folder / file.name)
