@@ -305,7 +305,7 @@ class _Run:
     ) -> tuple[dict[str, str | bytes], dict[str, object], list[Part]]:
         """Measure the network on what was held out; returns the checkpoint's files, figures and the parts."""
         from lanenet.data.files import json_text
-        from lanenet.data.label_set import read_labels
+        from lanenet.data.label_set import read_places
         from lanenet.evaluation.answers import Compared
         from lanenet.evaluation.card import CARD_NAME, model_card
         from lanenet.evaluation.comparison import default_names, evaluate
@@ -323,7 +323,8 @@ class _Run:
             console.show_problems(["the data has no test part: the tables use the validation labels"])
             judged = data.of("validation")
         sources = open_tests([part.labels for part in judged], [part.frames for part in judged])
-        training = [read_labels(path) for path in dict.fromkeys(data.train)]
+        # Without their edges and images: there may be more of them than fit into memory.
+        training = [read_places(path) for path in dict.fromkeys(data.train)]
         with console.progress_bar("test") as progress:
             comparison, seen = evaluate(
                 sources,

@@ -18,7 +18,15 @@ from pydantic import Field
 
 from lanenet.config import Settings, check_settings
 from lanenet.data.files import require
-from lanenet.data.tables import MAX_PLACE, ParquetTable, float_array, list_array, png_bytes, write_parquet
+from lanenet.data.tables import (
+    MAX_PLACE,
+    ParquetTable,
+    float_array,
+    list_array,
+    png_bytes,
+    read_footer,
+    write_parquet,
+)
 from lanenet.errors import ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
@@ -26,9 +34,23 @@ from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
 from lanenet.reading import image_size, parsing
 
-__all__ = ["LabelMeta", "LabelSet", "Source", "read_labels", "write_labels"]
+__all__ = [
+    "LabelIndex",
+    "LabelMeta",
+    "LabelSet",
+    "Source",
+    "read_label_group",
+    "read_label_index",
+    "read_label_points",
+    "read_labels",
+    "read_places",
+    "write_labels",
+]
 
 FORMAT = "lanenet-labels/2"
+#: Rows of a row group, which training reads one by one where not all fit into memory. Chosen: 17 MB of the
+#: densest frames, and still few enough groups in a day of driving.
+GROUP_ROWS = 256
 Source = Literal["map", "truth"]
 
 
@@ -69,6 +91,7 @@ _EDGE_COLUMNS = (
 )
 _LINE_COLUMNS = (("left_line_x_cm", "left_line_y_cm"), ("right_line_x_cm", "right_line_y_cm"))
 _DIVIDES_COLUMNS = ("left_divides", "right_divides")
+_IMAGE_COLUMN = "image"
 _POSE_COLUMNS = ("x_cm", "y_cm", "heading_rad")
 
 
@@ -166,9 +189,9 @@ def write_labels(path: Path, label_set: LabelSet) -> None:
         {"bytes": png_bytes(window.rasterise(edge[:, :2])), "path": f"{drive}_{int(frame):06d}.png"}
         for edge, drive, frame in zip(edges, label_set.drive, label_set.frame, strict=True)
     ]
-    arrays["image"] = arrow.array(images, type=image_type)
-    hugging_face = {"info": {"features": {"image": {"_type": "Image"}}}}
-    write_parquet(path, arrays, meta, {b"huggingface": json.dumps(hugging_face).encode()})
+    arrays[_IMAGE_COLUMN] = arrow.array(images, type=image_type)
+    hugging_face = {"info": {"features": {_IMAGE_COLUMN: {"_type": "Image"}}}}
+    write_parquet(path, arrays, meta, {b"huggingface": json.dumps(hugging_face).encode()}, GROUP_ROWS)
 
 
 def read_labels(path: Path) -> LabelSet:
@@ -180,21 +203,92 @@ def read_labels(path: Path) -> LabelSet:
         MissingExtraError: If pyarrow is not installed.
     """
     table = ParquetTable(path)
-    meta = _meta_from_file(table.meta, str(path))
+    return _checked(table, images=True)
+
+
+def read_label_group(path: Path, group: int) -> LabelSet:
+    """Read one row group of a label set, without its images.
+
+    Raises:
+        LabelFormatError: As :func:`read_labels`.
+    """
+    return _checked(ParquetTable(path, group, lambda name: name != _IMAGE_COLUMN), images=False)
+
+
+def read_places(path: Path) -> LabelSet:
+    """Read a label set without what it shows: its frames have no edge points, no lines and no images.
+
+    Raises:
+        LabelFormatError: As :func:`read_labels`.
+    """
+    shown = {_IMAGE_COLUMN, *_EDGE_COLUMNS, *(name for names in _LINE_COLUMNS for name in names)}
+    table = ParquetTable(path, columns=lambda name: name not in shown)
+    return _checked(table, shown=False, images=False)
+
+
+def read_label_points(path: Path, group: int) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n"]]:
+    """Read the labels and the qualities of one row group, and nothing else.
+
+    Raises:
+        LabelFormatError: As :func:`read_labels`.
+    """
+    table = ParquetTable(path, group, {*POINT_NAMES, "quality"}.__contains__)
     with parsing(path, LabelFormatError):
-        label_set = _label_set(table, meta)
-    _check_values(label_set, str(path))
+        return _points_cm(table), table.floats("quality")
+
+
+@dataclass(frozen=True)
+class LabelIndex:
+    """What a label set says about itself without any of its rows.
+
+    Attributes:
+        meta: What all rows share.
+        group_rows: Rows of each row group.
+        group_bytes: What each row group unpacks to.
+        hash: Of the footer, see :class:`ParquetFooter`.
+    """
+
+    meta: LabelMeta
+    group_rows: tuple[int, ...]
+    group_bytes: tuple[int, ...]
+    hash: str
+
+
+def read_label_index(path: Path) -> LabelIndex:
+    """Read what a label set says about itself.
+
+    Raises:
+        LabelFormatError: If the file is missing or has another format.
+    """
+    footer = read_footer(path)
+    meta = _meta_from_file(footer.meta, str(path))
+    return LabelIndex(meta, footer.group_rows, footer.group_bytes, footer.hash)
+
+
+def _checked(table: ParquetTable, *, images: bool, shown: bool = True) -> LabelSet:
+    """Return the label set of a table: with a look at its images or without, and with its edges and lines."""
+    meta = _meta_from_file(table.meta, str(table.path))
+    with parsing(table.path, LabelFormatError):
+        label_set = _label_set(table, meta, shown)
+        if images:
+            _check_images(table, meta.window)
+    _check_values(label_set, str(table.path))
     return label_set
 
 
-def _label_set(table: ParquetTable, meta: LabelMeta) -> LabelSet:
-    edge_columns = [table.lists(name) for name in _EDGE_COLUMNS]
-    line_columns = [[table.lists(name, allow_nan=True) for name in names] for names in _LINE_COLUMNS]
-    left, right = (
-        _stacked(names, columns, table.path)
-        for names, columns in zip(_LINE_COLUMNS, line_columns, strict=True)
-    )
-    _check_images(table, meta.window)
+def _points_cm(table: ParquetTable) -> Float[np.ndarray, "n 6"]:
+    return np.stack([table.floats(name, allow_null=True) for name in POINT_NAMES], axis=1)
+
+
+def _label_set(table: ParquetTable, meta: LabelMeta, shown: bool) -> LabelSet:
+    edges: list[np.ndarray] = [np.empty((0, len(_EDGE_COLUMNS)), np.float32)] * len(table)
+    left = right = [np.empty((0, 2), np.float32)] * len(table)
+    if shown:
+        edges = _stacked(_EDGE_COLUMNS, [table.lists(name) for name in _EDGE_COLUMNS], table.path)
+        left, right = (
+            _stacked(names, [table.lists(name, allow_nan=True) for name in names], table.path)
+            for names in _LINE_COLUMNS
+        )
     return LabelSet(
         meta=meta,
         drive=table.texts("drive"),
@@ -203,8 +297,8 @@ def _label_set(table: ParquetTable, meta: LabelMeta) -> LabelSet:
         t_s=table.floats("t_s"),
         lap=table.ints("lap"),
         poses=np.stack([table.floats(name) for name in _POSE_COLUMNS], axis=1),
-        points_cm=np.stack([table.floats(name, allow_null=True) for name in POINT_NAMES], axis=1),
-        edges=_stacked(_EDGE_COLUMNS, edge_columns, table.path),
+        points_cm=_points_cm(table),
+        edges=edges,
         lines=list(zip(left, right, strict=True)),
         quality=table.floats("quality"),
         divides=np.stack([table.flags(name) for name in _DIVIDES_COLUMNS], axis=1),
@@ -307,7 +401,7 @@ def _stacked(names: tuple[str, ...], columns: list[list[np.ndarray]], path: Path
 
 def _check_images(table: ParquetTable, window: BirdseyeWindow) -> None:
     expected = (window.columns, window.rows)
-    for row, image in enumerate(table.raw("image")):
+    for row, image in enumerate(table.raw(_IMAGE_COLUMN)):
         found = image_size(image["bytes"]) if isinstance(image, dict) and image.get("bytes") else None
         if found != expected:
             shown = "no PNG" if found is None else f"{found[0]}x{found[1]} px"

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import array
 import csv
+import hashlib
 import io
 import json
 import math
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -298,29 +300,23 @@ class ParquetTable:
         meta: The JSON under :data:`META_KEY`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self, path: Path, group: int | None = None, columns: Callable[[str], bool] | None = None
+    ) -> None:
         """Read a file.
+
+        Args:
+            path: The file.
+            group: One of its row groups; None reads all.
+            columns: Tells by its name whether a column is read; None reads all.
 
         Raises:
             LabelFormatError: If there is no such file, it is not Parquet, or lanenet did not write it.
         """
-        arrow = require("pyarrow", "data")
         self.path = Path(path)
-        if not is_regular(self.path):
-            found = "is no file" if self.path.exists() else "no such file"
-            raise LabelFormatError(f"{path}: {found}")
-        try:
-            self._table = _bounded_table(self.path)
-        except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
-            raise LabelFormatError(f"{path}: not a readable Parquet file ({first_line(error)})") from error
-        text = (self._table.schema.metadata or {}).get(META_KEY)
-        if text is None:
-            raise LabelFormatError(f"{path}: a Parquet file, but without lanenet's metadata")
-        with parsing(f"{path}: lanenet's metadata is not JSON", LabelFormatError):
-            meta = json.loads(text)
-        if not isinstance(meta, dict):
-            raise LabelFormatError(f"{path}: lanenet's metadata is not a JSON object")
-        self.meta: dict[str, Any] = meta
+        with _readable(self.path):
+            self._table = _bounded_table(self.path, group, columns)
+        self.meta = _own_meta(self.path, self._table.schema)
 
     def __len__(self) -> int:
         return int(self._table.num_rows)
@@ -418,25 +414,101 @@ class ParquetTable:
         return values.astype(dtype)
 
 
-def _bounded_table(path: Path) -> Any:
+@dataclass(frozen=True)
+class ParquetFooter:
+    """What a Parquet file says about itself; none of its columns is read.
+
+    Attributes:
+        meta: The JSON under :data:`META_KEY`.
+        group_rows: Rows of each row group.
+        group_bytes: What each row group unpacks to, as it is encoded.
+        hash: Of the footer and the file's size. The footer holds places, sizes and ranges of all columns of
+            all row groups, so that other contents practically always have another hash.
+    """
+
+    meta: dict[str, Any]
+    group_rows: tuple[int, ...]
+    group_bytes: tuple[int, ...]
+    hash: str
+
+
+def read_footer(path: Path) -> ParquetFooter:
+    """Read the footer of a Parquet file.
+
+    Raises:
+        LabelFormatError: As :class:`ParquetTable`.
+    """
+    with _readable(path), _open_parquet(path) as file:
+        about, schema = file.metadata, file.schema_arrow
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        rows, sizes = ([getattr(g, name) for g in groups] for name in ("num_rows", "total_byte_size"))
+    meta = _own_meta(path, schema)
+    with path.open("rb") as raw:
+        # The last eight bytes: the footer's length, and the format's name.
+        size = raw.seek(-8, os.SEEK_END) + 8
+        length = int.from_bytes(raw.read(4), "little")
+        raw.seek(max(0, size - 8 - length))
+        digest = hashlib.sha256(f"{size} ".encode() + raw.read(length)).hexdigest()[:16]
+    return ParquetFooter(meta, tuple(rows), tuple(sizes), digest)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Refuse what is no file, and raise what pyarrow says about others as an error of their format."""
+    arrow = require("pyarrow", "data")
+    if not is_regular(path):
+        found = "is no file" if path.exists() else "no such file"
+        raise LabelFormatError(f"{path}: {found}")
+    try:
+        yield
+    except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise LabelFormatError(f"{path}: not a readable Parquet file ({first_line(error)})") from error
+
+
+def _own_meta(path: Path, schema: Any) -> dict[str, Any]:
+    """Return what lanenet wrote into a schema."""
+    text = (schema.metadata or {}).get(META_KEY)
+    if text is None:
+        raise LabelFormatError(f"{path}: a Parquet file, but without lanenet's metadata")
+    with parsing(f"{path}: lanenet's metadata is not JSON", LabelFormatError):
+        meta = json.loads(text)
+    if not isinstance(meta, dict):
+        raise LabelFormatError(f"{path}: lanenet's metadata is not a JSON object")
+    return meta
+
+
+def _open_parquet(path: Path) -> Any:
+    """Open a Parquet file; refuse more rows and columns than a table may have."""
+    parquet = require("pyarrow.parquet", "data")
+    limits = {"thrift_string_size_limit": _MAX_FOOTER, "thrift_container_size_limit": _MAX_FOOTER}
+    file = parquet.ParquetFile(path, page_checksum_verification=True, **limits)
+    about = file.metadata
+    if about.num_columns > _MAX_COLUMNS or about.num_rows > _MAX_ROWS:
+        file.close()
+        raise ValueError(
+            f"{about.num_rows} rows of {about.num_columns} columns, expected at most {_MAX_ROWS} of "
+            f"{_MAX_COLUMNS}"
+        )
+    return file
+
+
+def _bounded_table(path: Path, group: int | None, columns: Callable[[str], bool] | None) -> Any:
     """Read a Parquet file, as far as it may be unpacked; a few bytes can stand for any number of rows."""
     arrow = require("pyarrow", "data")
-    parquet = require("pyarrow.parquet", "data")
     size = path.stat().st_size
-    limits = {"thrift_string_size_limit": _MAX_FOOTER, "thrift_container_size_limit": _MAX_FOOTER}
-    with parquet.ParquetFile(path, page_checksum_verification=True, **limits) as file:
+    with _open_parquet(path) as file:
         about = file.metadata
-        if about.num_columns > _MAX_COLUMNS or about.num_rows > _MAX_ROWS:
-            raise ValueError(
-                f"{about.num_rows} rows of {about.num_columns} columns, expected at most {_MAX_ROWS} of "
-                f"{_MAX_COLUMNS}"
-            )
+        groups = list(range(about.num_row_groups)) if group is None else [group]
+        names = None if columns is None else [name for name in file.schema_arrow.names if columns(name)]
         # Not by the columns: pyarrow 26 ends the process when a column's statistics are damaged.
-        packed = sum(about.row_group(group).total_byte_size for group in range(about.num_row_groups))
+        packed = sum(about.row_group(number).total_byte_size for number in groups)
         most = _MAX_UNPACKED + _MAX_RATIO * size
         batches, unpacked = [], 0
+        schema = file.schema_arrow
+        if names is not None:
+            schema = arrow.schema([schema.field(name) for name in names], schema.metadata)
         if packed <= most:
-            for batch in file.iter_batches(batch_size=_BATCH_ROWS):
+            for batch in file.iter_batches(batch_size=_BATCH_ROWS, row_groups=groups, columns=names):
                 batches.append(batch)
                 unpacked += batch.nbytes
                 if unpacked > most:
@@ -446,13 +518,17 @@ def _bounded_table(path: Path) -> Any:
                 f"{size / MEBIBYTE:.1f} MB stand for {max(packed, unpacked) / MEBIBYTE:.0f} MB and more, "
                 f"expected at most {most / MEBIBYTE:.0f} MB"
             )
-        table = arrow.Table.from_batches(batches, schema=file.schema_arrow)
+        table = arrow.Table.from_batches(batches, schema=schema)
     table.validate(full=True)
     return table
 
 
 def write_parquet(
-    path: Path, arrays: dict[str, Any], meta: dict[str, Any], more_meta: dict[bytes, bytes] | None = None
+    path: Path,
+    arrays: dict[str, Any],
+    meta: dict[str, Any],
+    more_meta: dict[bytes, bytes] | None = None,
+    group_rows: int | None = None,
 ) -> None:
     """Write columns as Parquet, atomically.
 
@@ -461,13 +537,16 @@ def write_parquet(
         arrays: pyarrow arrays of equal length by column name.
         meta: What the table is, stored as JSON under :data:`META_KEY`.
         more_meta: Further schema metadata, for other tools.
+        group_rows: Rows that can be read without the others; None takes pyarrow's million.
     """
     arrow = require("pyarrow", "data")
     parquet = require("pyarrow.parquet", "data")
     table = arrow.table(arrays)
     table = table.replace_schema_metadata({META_KEY: json.dumps(meta).encode(), **(more_meta or {})})
     with atomic_file(path) as temporary:
-        parquet.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+        parquet.write_table(
+            table, temporary, compression="zstd", write_page_checksum=True, row_group_size=group_rows
+        )
 
 
 def write_columns(path: Path, columns: dict[str, np.ndarray], meta: dict[str, Any]) -> None:

@@ -40,8 +40,9 @@ from lanenet.learn.network import LaneNet, new_network
 from lanenet.learn.predict import predict
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import MARKER_NAME, MODEL_NAME, ModelMeta, open_model
-from lanenet.reading import read_json
-from lanenet.samples.dataset import LaneSamples, hash_files
+from lanenet.reading import MEBIBYTE, read_json
+from lanenet.samples.dataset import Samples, hash_files
+from lanenet.samples.shards import Shards, read_shards
 
 STATE_NAME = "last.pt"
 CURVE_NAME = "curve"
@@ -53,6 +54,9 @@ _ADVICE = "pick another name, or delete the folder to train anew"
 #: Rasters that are kept: to check later exports, and to find the value ranges of an INT8 model. Chosen:
 #: enough of both in files below 100 kB.
 _N_CHECK_RASTERS, _N_CALIBRATION_RASTERS = 48, 96
+#: Files that unpack to less than the memory even so need no look at their footers. Chosen: label sets unpack
+#: to 1.1 times their size, those of a still car to more.
+_MOST_UNPACKED = 20
 #: Whose versions the metrics name.
 _PACKAGES = ("lanenet", "numpy", "torch", "onnx", "onnxruntime", "opencv-python-headless")
 
@@ -115,11 +119,33 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
         CheckpointError: If there are no weights to start from.
     """
     weights = [] if settings.network.weights is None else [settings.network.weights]
-    text = (
-        f"{_VERSION} {settings.hash} {hash_files(train_paths)} {hash_files(val_paths)} {hash_files(weights)}"
-    )
+    shards = choose_stream(settings, train_paths, val_paths)
+    if shards is None:
+        data = f"{hash_files(train_paths)} {hash_files(val_paths)}"
+    else:
+        # By their footers: to read all of what does not fit into memory takes minutes.
+        data = " ".join(index.hash for part in shards for index in part.indices)
+        data += f" {len(train_paths)} {settings.memory_mb} MB"
+    text = f"{_VERSION} {settings.hash} {data} {hash_files(weights)}"
     text += hash_of_start(settings.start_from)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def choose_stream(
+    settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]
+) -> tuple[Shards, Shards] | None:
+    """Return the row groups of the training and the validation, if they do not fit into memory; else None.
+
+    Raises:
+        LabelFormatError: If a label set is missing or has another format.
+    """
+    # A file that cannot be read is told of where it is read as a whole.
+    sizes = [path.stat().st_size for path in (*train_paths, *val_paths) if path.is_file()]
+    if sum(sizes) * _MOST_UNPACKED <= settings.memory_mb * MEBIBYTE:
+        return None
+    train, val = read_shards(train_paths), read_shards(val_paths)
+    fits = train.unpacked_bytes + val.unpacked_bytes <= settings.memory_mb * MEBIBYTE
+    return None if fits else (train, val)
 
 
 def write_state(path: Path, state: RunState, run_hash: str) -> None:
@@ -187,8 +213,8 @@ def write_checkpoint(
     folder: Path,
     settings: LearnSettings,
     network: LaneNet,
-    samples: LaneSamples,
-    val: LaneSamples,
+    samples: Samples,
+    val: Samples,
     history: Sequence[EpochRecord],
     run_hash: str,
 ) -> float:
@@ -254,7 +280,7 @@ def write_checkpoint(
     return errors.all.rmse_cm
 
 
-def _spread_rasters(samples: LaneSamples, count: int, planes: int) -> UInt8[np.ndarray, "_ p r c"]:
+def _spread_rasters(samples: Samples, count: int, planes: int) -> UInt8[np.ndarray, "_ p r c"]:
     """Return rasters of frames spread evenly over all."""
     chosen = np.unique(np.linspace(0, len(samples) - 1, count).astype(np.intp))
     return np.ascontiguousarray(samples.plain_batch(chosen).rasters[:, :planes])

@@ -24,6 +24,10 @@ _UNUSED: dict[str, Any] = {
 }
 
 
+#: Settings of the training that do not decide its result, or only together with the data.
+_UNDECIDING = {"device", "threads", "memory_mb", "checkpoint_every", "tensorboard"}
+
+
 class NetworkSettings(Settings):
     """Which network, and its size.
 
@@ -132,6 +136,9 @@ class LearnSettings(Settings):
             the next batches meanwhile.
         balance: ``drive`` shows every training drive equally often, however many frames it has.
         start_from: Checkpoint folder whose weights the training starts from, for fine-tuning.
+        memory_mb: What samples may take in memory, [MiB]. Label sets that unpack to more are streamed: their
+            row groups are read again in each epoch, and frames are shuffled only over as many as fit. Chosen:
+            more than the shipped configs need, and less than a desktop computer has.
         checkpoint_every: Epochs between two writings of the state from which a stopped run resumes.
         tensorboard: Also write the curve for TensorBoard, into ``tensorboard/`` beside the state.
         augment: Augmentation of the samples.
@@ -153,6 +160,7 @@ class LearnSettings(Settings):
     threads: int = Field(default=1, ge=0)
     balance: Balance = "none"
     start_from: Path | None = None
+    memory_mb: int = Field(default=8000, ge=1)
     checkpoint_every: int = Field(default=1, ge=1)
     tensorboard: bool = False
     augment: AugmentSettings = AugmentSettings()
@@ -160,6 +168,9 @@ class LearnSettings(Settings):
 
     @property
     def hash(self) -> str:
-        """Short hash of every setting that decides the result; threads and the like do not."""
-        data = self.model_dump(mode="json", exclude={"device", "threads", "checkpoint_every", "tensorboard"})
+        """Short hash of every setting that decides the result; threads and the like do not.
+
+        Nor does ``memory_mb`` where all samples fit; where they do not, the hash of the run holds it.
+        """
+        data = self.model_dump(mode="json", exclude=_UNDECIDING)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from lanenet.evaluation.errors import ErrorTable, point_errors
 from lanenet.learn.loss import sigma_factors
 from lanenet.learn.network import LaneNet, LaneOutput, input_of_rasters
-from lanenet.samples.dataset import LaneSamples
+from lanenet.samples.dataset import Samples
 from lanenet.samples.settings import AugmentSettings
 
 _BATCH = 256
@@ -71,12 +71,10 @@ def answer_rasters(
     return LaneOutput(*(torch.cat(column) for column in columns))
 
 
-def predict(network: LaneNet, samples: LaneSamples) -> Answers:
+def predict(network: LaneNet, samples: Samples) -> Answers:
     """Run a network over frames as they are; its mode is left as it was."""
     parts: list[tuple[np.ndarray, ...]] = []
-    for start in range(0, len(samples), _BATCH):
-        # A batch at a time: the rasters of many frames take more memory than the frames.
-        batch = samples.plain_batch(np.arange(start, min(start + _BATCH, len(samples))))
+    for batch in samples.plain_batches(_BATCH):
         output = answer_rasters(network, batch.rasters, batch.lane_cm)
         values = (output.points_cm, output.sigma_cm, torch.sigmoid(output.presence_logit))
         present = batch.present.astype(np.float64)
@@ -92,22 +90,24 @@ def trimmed_rmse_cm(error_cm: Float[np.ndarray, "n 6"]) -> float:
     return float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan
 
 
-def calibrate_sigma(network: LaneNet, val: LaneSamples) -> None:
+def calibrate_sigma(network: LaneNet, val: Samples) -> None:
     """Scale a network's sigma so that 68 % of its errors on held-out frames lie within it."""
     answers = predict(network, val)
     factors = sigma_factors(answers.points_cm - answers.truth_cm, answers.sigma_cm)
     network.sigma_factor *= torch.from_numpy(factors).to(network.sigma_factor)
 
 
-def calibrate_presence(network: LaneNet, val: LaneSamples) -> None:
+def calibrate_presence(network: LaneNet, val: Samples) -> None:
     """Lower a network's presence, if needed, until it calls lines absent that are.
 
     How often lines are missing in the training is only a setting, and so is the meaning of a probability of
     one half. It is set where 96 % of the lines that are taken out of held-out frames are called absent.
     """
     missing = AugmentSettings.only(missing_line=0.8, missing_both=0.2)
-    batch = val.augmented_batch(np.arange(len(val)), missing, seed=0, epoch=0)
-    odds = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.double().cpu().numpy()
-    absent = odds[batch.present == 0.0]
+    parts = [np.empty(0)]
+    for batch in val.changed_batches(missing, 0, _BATCH):
+        odds = answer_rasters(network, batch.rasters, batch.lane_cm).presence_logit.double().cpu().numpy()
+        parts.append(odds[batch.present == 0.0])
+    absent = np.concatenate(parts)
     if absent.size:
         network.lower_presence(min(max(float(np.quantile(absent, _ABSENT_FOUND)), 0.0), _MOST_SHIFT))

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
-from lanenet.data.label_set import read_labels
+from lanenet.data.label_set import LabelMeta, read_labels
 from lanenet.errors import ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.checkpoint import (
     STATE_NAME,
     EpochRecord,
     RunState,
     best_record,
+    choose_stream,
     hash_run,
     load_start_weights,
     read_finished,
@@ -35,8 +36,10 @@ from lanenet.learn.network import LaneNet, input_of_rasters, new_network
 from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
 from lanenet.outputs import lock_output, make_folder
 from lanenet.perception.network.model_file import MODEL_NAME
+from lanenet.reading import MEBIBYTE
 from lanenet.samples.augment import Batch
-from lanenet.samples.dataset import LaneSamples, check_same
+from lanenet.samples.dataset import LaneSamples, Samples, check_same
+from lanenet.samples.shards import Shards, StreamedSamples
 
 #: Called after each epoch: epoch (from 1), epochs, training RMSE, validation RMSE, [cm], samples per second.
 Progress = Callable[[int, int, float, float, float], None]
@@ -137,7 +140,7 @@ class TrainingRun:
         history: One record per finished epoch.
     """
 
-    def __init__(self, settings: LearnSettings, samples: LaneSamples, saved: RunState | None = None) -> None:
+    def __init__(self, settings: LearnSettings, samples: Samples, saved: RunState | None = None) -> None:
         self.settings, self.samples = settings, samples
         self.device, window = _device(settings), samples.window
         self.network = new_network(settings.network, window.rows, window.columns, settings.seed)
@@ -176,7 +179,7 @@ class TrainingRun:
             return True
         return 0 < patience <= done and done - best_record(self.history).epoch >= patience
 
-    def run_epoch(self, val: LaneSamples) -> EpochRecord:
+    def run_epoch(self, val: Samples) -> EpochRecord:
         """Train one epoch and evaluate it."""
         settings, epoch = self.settings, len(self.history)
         started = time.perf_counter()
@@ -306,19 +309,42 @@ def running_mean(network: LaneNet, decay: float) -> AveragedModel:
 
 def _read_both(
     settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]
-) -> tuple[LaneSamples, LaneSamples]:
+) -> tuple[Samples, Samples]:
+    """Read training and validation samples, or what streams of them need if they do not fit into memory."""
+    shards = choose_stream(settings, train_paths, val_paths)
+    if shards is not None:
+        return _open_streams(settings, *shards)
     train_sets = [read_labels(path) for path in train_paths]
     val_sets = [read_labels(path) for path in val_paths]
-    for path, labels in zip(train_paths, train_sets, strict=True):
-        if labels.meta.source != "map":
-            raise LabelFormatError(
-                f"{path}: labels from the {labels.meta.source}; a network learns from maps, the truth only "
-                "scores it"
-            )
+    _refuse_truth(train_paths, [labels.meta for labels in train_sets])
     samples = LaneSamples(train_sets, [str(p) for p in train_paths], settings.min_quality)
     val = LaneSamples(val_sets, [str(p) for p in val_paths])
     check_same(train_sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))
     return samples, val
+
+
+def _open_streams(settings: LearnSettings, train: Shards, val: Shards) -> tuple[Samples, Samples]:
+    """Open training samples as a stream, and validation samples too if a quarter of memory is too little."""
+    _refuse_truth(train.paths, [index.meta for index in train.indices])
+    memory = settings.memory_mb * MEBIBYTE
+    if val.unpacked_bytes <= memory // 4:
+        val_sets = [read_labels(path) for path in val.paths]
+        chosen: Samples = LaneSamples(val_sets, [str(path) for path in val.paths])
+        memory -= memory // 4
+    else:
+        # Not beside the training's windows: its epoch is over when the validation begins.
+        chosen = StreamedSamples(val, memory)
+    samples = StreamedSamples(train, memory, settings.min_quality)
+    check_same(train.indices[0].meta, val.indices[0].meta, str(train.paths[0]), str(val.paths[0]))
+    return samples, chosen
+
+
+def _refuse_truth(paths: Sequence[Path], metas: Sequence[LabelMeta]) -> None:
+    for path, meta in zip(paths, metas, strict=True):
+        if meta.source != "map":
+            raise LabelFormatError(
+                f"{path}: labels from the {meta.source}; a network learns from maps, the truth only scores it"
+            )
 
 
 def _device(settings: LearnSettings) -> torch.device:

@@ -90,6 +90,26 @@ def join_frames(
     )
 
 
+def concat_frames(parts: Sequence[Frames]) -> Frames:
+    """Join frames that :func:`join_frames` returned, in their order."""
+    joined: dict[str, np.ndarray] = {}
+    for name in Frames._fields:
+        values = [getattr(part, name) for part in parts]
+        if name.endswith("_start"):
+            counts = np.concatenate([np.diff(value) for value in values])
+            joined[name] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        else:
+            joined[name] = np.concatenate(values)
+    return Frames(**joined)
+
+
+def concat_batches(parts: Sequence[Batch]) -> Batch:
+    """Join batches, in their order."""
+    if len(parts) == 1:
+        return parts[0]
+    return Batch(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
 def plain_batch(frames: Frames, indices: Int[np.ndarray, "b"], window: BirdseyeWindow) -> Batch:
     """Return frames as they are, with their lane width."""
     rasters, present = _empty(len(indices), window)

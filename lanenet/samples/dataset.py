@@ -2,29 +2,64 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import mirror_points
 from lanenet.perception.network.model_file import ANY_CAMERA
-from lanenet.samples.augment import TYPICAL_CAMERA_CM, Batch, augment_batch, join_frames, plain_batch
+from lanenet.samples.augment import (
+    TYPICAL_CAMERA_CM,
+    Batch,
+    augment_batch,
+    concat_frames,
+    join_frames,
+    plain_batch,
+)
+from lanenet.samples.kernels import Frames
 from lanenet.samples.settings import AugmentSettings, Balance
 
 #: A network that learned from more cameras than this is for any camera. Chosen.
 _MANY_CAMERAS = 8
+#: Outputs are scaled by at least this, [cm]. Chosen: labels that hardly differ are not blown up.
+LEAST_SCALE_CM = 2.0
 
 
-class LaneSamples:
-    """The frames of several label sets, flattened into a few arrays.
+@dataclass(frozen=True)
+class Cut:
+    """Which parts of every batch are drawn, where several processes share a training.
+
+    Attributes:
+        parts: Of a batch, of equal size but for one sample.
+        first: The first one of them, from 0.
+        count: How many.
+    """
+
+    parts: int = 1
+    first: int = 0
+    count: int = 1
+
+    def bounds(self, size: int) -> list[int]:
+        """Return where its parts of a batch begin, and where the last one ends."""
+        each, more = divmod(size, self.parts)
+        return [k * each + min(k, more) for k in range(self.first, self.first + self.count + 1)]
+
+
+WHOLE = Cut()
+
+
+class Samples(ABC):
+    """The frames of several label sets, as what trains and judges a network needs them.
 
     Attributes:
         window: The bird's-eye window that all sets share.
@@ -37,9 +72,130 @@ class LaneSamples:
         camera_hashes: Of the cameras that took the frames, sorted; ``any`` alone where they are so many that
             the network is for any calibrated camera.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
-        points_cm: Labels of each frame, NaN where masked, n x 6.
-        frames: Edge points, lane lines and labels, as the compiled loops take them.
         set_start: Set i owns the frames ``set_start[i]`` to ``set_start[i + 1]``.
+        weights: How often each set is shown, see :meth:`shown`.
+    """
+
+    def __init__(
+        self, metas: Sequence[LabelMeta], names: Sequence[str], kept: Sequence[int], least_quality: float
+    ) -> None:
+        """Describe what the sets share.
+
+        Args:
+            metas: Of each set.
+            names: Where each set came from, for messages.
+            kept: Frames of each set that are used.
+            least_quality: That these have, for messages.
+
+        Raises:
+            LabelFormatError: If there is no set, no frame is left, or two sets cannot be learned together.
+        """
+        if not metas:
+            raise LabelFormatError("no label set was given, expected at least one")
+        for other, name in zip(metas[1:], names[1:], strict=True):
+            check_same(metas[0], other, names[0], name)
+        first = metas[0]
+        self.window: BirdseyeWindow = first.window
+        same = all(meta.perception == first.perception for meta in metas)
+        self.perception = first.perception if same else first.perception.of_all_rows()
+        self.reference = " and ".join(sorted({meta.source for meta in metas}))
+        self.set_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum(kept)])
+        self.weights: tuple[float, ...] = (1.0,) * len(metas)
+        if not self.set_start[-1]:
+            raise LabelFormatError(
+                f"{', '.join(names)}: no frame has a label and a quality of at least {least_quality:g}"
+            )
+        hashes = sorted({meta.camera_hash for meta in metas})
+        self.camera_hashes = [ANY_CAMERA] if len(hashes) > _MANY_CAMERAS else hashes
+        self.lane_widths_cm = (min(m.lane_width_cm for m in metas), max(m.lane_width_cm for m in metas))
+        self.lane_width_cm = float(np.mean(np.repeat([meta.lane_width_cm for meta in metas], kept)))
+        self.wheelbase_cm = float(np.mean(np.repeat([meta.wheelbase_cm for meta in metas], kept)))
+
+    def __len__(self) -> int:
+        return int(self.set_start[-1])
+
+    @property
+    @abstractmethod
+    def points_cm(self) -> Float[np.ndarray, "n 6"]:
+        """Labels of each frame, NaN where masked."""
+
+    @abstractmethod
+    def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
+        """Return frames as they are, with their lane width."""
+
+    @abstractmethod
+    def plain_batches(self, size: int) -> Iterator[Batch]:
+        """Yield all frames as they are, in their order."""
+
+    @abstractmethod
+    def changed_batches(self, settings: AugmentSettings, seed: int, size: int) -> Iterator[Batch]:
+        """Yield all frames in their order, each changed by its draw of the first epoch."""
+
+    @abstractmethod
+    def epoch(
+        self,
+        settings: AugmentSettings,
+        seed: int,
+        epoch: int,
+        batch_size: int,
+        workers: int = 1,
+        balance: Balance = "none",
+        first_step: int = 0,
+        cut: Cut = WHOLE,
+    ) -> Iterator[Batch]:
+        """Yield the augmented batches of one epoch in a shuffled order that (seed, epoch) decides.
+
+        A last batch that is too small is left out, see :meth:`steps_per_epoch`.
+
+        Args:
+            settings: Changes of the samples.
+            seed: Of the run.
+            epoch: Counted from 0.
+            batch_size: Samples per batch.
+            workers: Threads that prepare batches ahead.
+            balance: How often each label set is shown, see :meth:`shown`.
+            first_step: Batches to leave out, of a run that goes on.
+            cut: Which parts of each batch are drawn.
+        """
+
+    @abstractmethod
+    def normalisation(self, mirrored: bool) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
+        """Return mean and standard deviation of each label, [cm]; they scale the outputs to order one.
+
+        Args:
+            mirrored: Count each frame once more with left and right swapped.
+        """
+
+    def steps_per_epoch(self, batch_size: int, parts: int = 1) -> int:
+        """Number of batches that :meth:`epoch` yields.
+
+        A last batch of a single sample is none, since batch normalisation cannot use it, and neither is one
+        with fewer samples than parts.
+        """
+        full, rest = divmod(len(self), batch_size)
+        return full + (rest >= max(2, parts))
+
+    def batch_length(self, step: int, batch_size: int) -> int:
+        """Number of samples of a batch of an epoch, all parts together."""
+        return min(batch_size, len(self) - step * batch_size)
+
+    def shown(self, balance: Balance) -> list[tuple[int, int]]:
+        """Return the sets that have frames, and how many samples of each an epoch shows.
+
+        An epoch has as many samples as there are frames. ``drive`` shows each label set equally often, and a
+        frame again only after all others of its set.
+        """
+        filled = [k for k, size in enumerate(np.diff(self.set_start)) if size]
+        # The first sets get the remainder of the division.
+        each, more = divmod(len(self), len(filled))
+        return [(k, each + (place < more)) for place, k in enumerate(filled)]
+
+
+class LaneSamples(Samples):
+    """The frames of several label sets in memory, flattened into a few arrays.
+
+    Attributes:
+        frames: Edge points, lane lines and labels, as the compiled loops take them.
     """
 
     def __init__(
@@ -55,47 +211,36 @@ class LaneSamples:
         Raises:
             LabelFormatError: If there is no set, no frame is left, or two sets cannot be learned together.
         """
-        if not label_sets:
-            raise LabelFormatError("no label set was given, expected at least one")
-        for other, name in zip(label_sets[1:], names[1:], strict=True):
-            check_same(label_sets[0].meta, other.meta, names[0], name)
-        first = label_sets[0].meta
-        self.window: BirdseyeWindow = first.window
-        same = all(labels.meta.perception == first.perception for labels in label_sets)
-        self.perception = first.perception if same else first.perception.of_all_rows()
-        self.reference = " and ".join(sorted({labels.meta.source for labels in label_sets}))
-        kept = [
-            np.flatnonzero((labels.quality >= min_quality) & np.isfinite(labels.points_cm).any(axis=1))
-            for labels in label_sets
-        ]
-        self.set_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum([len(rows) for rows in kept])])
-        pairs = [(labels, i) for labels, rows in zip(label_sets, kept, strict=True) for i in rows]
-        if not pairs:
-            raise LabelFormatError(
-                f"{', '.join(names)}: no frame has a label and a quality of at least {min_quality:g}"
-            )
+        kept = [usable(labels.points_cm, labels.quality, min_quality) for labels in label_sets]
         metas = [labels.meta for labels in label_sets]
-        hashes = sorted({meta.camera_hash for meta in metas})
-        self.camera_hashes = [ANY_CAMERA] if len(hashes) > _MANY_CAMERAS else hashes
-        self.lane_widths_cm = (min(m.lane_width_cm for m in metas), max(m.lane_width_cm for m in metas))
-        self.lane_width_cm = float(np.mean([labels.meta.lane_width_cm for labels, _ in pairs]))
-        self.wheelbase_cm = float(np.mean([labels.meta.wheelbase_cm for labels, _ in pairs]))
-        self.points_cm: Float[np.ndarray, "n 6"] = np.array([labels.points_cm[i] for labels, i in pairs])
-        self.frames = join_frames(
-            [labels.edges[i] for labels, i in pairs],
-            [labels.lines[i] for labels, i in pairs],
-            self.points_cm,
-            np.array([labels.meta.camera_cm or TYPICAL_CAMERA_CM for labels, _ in pairs]),
-            np.array([labels.meta.lane_width_cm for labels, _ in pairs]),
-            np.array([labels.divides[i] for labels, i in pairs]),
+        super().__init__(metas, names, [len(rows) for rows in kept], min_quality)
+        self.frames = concat_frames(
+            [frames_of(labels.subset(rows)) for labels, rows in zip(label_sets, kept, strict=True)]
         )
 
-    def __len__(self) -> int:
-        return len(self.points_cm)
+    @property
+    def points_cm(self) -> Float[np.ndarray, "n 6"]:
+        """Labels of each frame, NaN where masked."""
+        return self.frames.points_cm
 
     def plain_batch(self, indices: Int[np.ndarray, "b"]) -> Batch:
         """Return frames as they are, with their lane width."""
         return plain_batch(self.frames, indices, self.window)
+
+    def plain_batches(self, size: int) -> Iterator[Batch]:
+        """Yield all frames as they are, in their order."""
+        # A batch at a time: the rasters of many frames take more memory than the frames.
+        for rows in self._in_order(size):
+            yield self.plain_batch(rows)
+
+    def changed_batches(self, settings: AugmentSettings, seed: int, size: int) -> Iterator[Batch]:
+        """Yield all frames in their order, each changed by its draw of the first epoch."""
+        for rows in self._in_order(size):
+            yield self.augmented_batch(rows, settings, seed, epoch=0)
+
+    def _in_order(self, size: int) -> Iterator[Int[np.ndarray, "_"]]:
+        for start in range(0, len(self), size):
+            yield np.arange(start, min(start + size, len(self)))
 
     def augmented_batch(
         self,
@@ -120,8 +265,7 @@ class LaneSamples:
         Args:
             seed: Of the run.
             epoch: Counted from 0.
-            balance: ``none`` shows each frame once; ``drive`` shows each label set equally often, and a frame
-                again only after all others of its set.
+            balance: See :meth:`shown`; ``none`` shows each frame once.
         """
         n = len(self)
         # A stream of its own: the number after the last sample's.
@@ -129,11 +273,9 @@ class LaneSamples:
         if balance == "none":
             frames = rng.permutation(n)
             return frames, frames
-        sets = [np.arange(a, b) for a, b in pairwise(self.set_start.tolist()) if b > a]
         shown, streams = [], []
-        # The first sets get the remainder of the division.
-        for number, rows in enumerate(sets):
-            wanted = n // len(sets) + (number < n % len(sets))
+        for number, wanted in self.shown(balance):
+            rows = np.arange(self.set_start[number], self.set_start[number + 1])
             rounds = -(-wanted // len(rows))
             shown.append(np.concatenate([rng.permutation(rows) for _ in range(rounds)])[:wanted])
             streams.append(shown[-1] + n * (np.arange(wanted) // len(rows)))
@@ -148,56 +290,77 @@ class LaneSamples:
         batch_size: int,
         workers: int = 1,
         balance: Balance = "none",
+        first_step: int = 0,
+        cut: Cut = WHOLE,
     ) -> Iterator[Batch]:
-        """Yield the augmented batches of one epoch in a shuffled order that (seed, epoch) decides.
-
-        A last batch of a single sample is left out: batch normalisation cannot use it.
-
-        Args:
-            settings: Changes of the samples.
-            seed: Of the run.
-            epoch: Counted from 0.
-            batch_size: Samples per batch.
-            workers: Threads that prepare batches ahead.
-            balance: How often each label set is shown, see :meth:`order`.
-        """
+        """Yield the batches of one epoch, see :meth:`Samples.epoch`."""
         order, streams = self.order(seed, epoch, balance)
-        slices = [slice(k, k + batch_size) for k in range(0, len(order), batch_size)]
-        jobs = [(order[k], settings, seed, epoch, streams[k]) for k in slices if len(order[k]) > 1]
-        with ThreadPoolExecutor(workers) as pool:
-            ahead: list[Future[Batch]] = []
-            try:
-                for job in jobs:
-                    ahead.append(pool.submit(self.augmented_batch, *job))
-                    if len(ahead) > workers + 1:
-                        yield ahead.pop(0).result()
-                for future in ahead:
-                    yield future.result()
-            finally:
-                for future in ahead:
-                    future.cancel()
 
-    def steps_per_epoch(self, batch_size: int) -> int:
-        """Number of batches that :meth:`epoch` yields."""
-        full, rest = divmod(len(self), batch_size)
-        return full + (rest > 1)
+        def jobs() -> Iterator[Callable[[], Batch]]:
+            for step in range(first_step, self.steps_per_epoch(batch_size, cut.parts)):
+                start, bounds = step * batch_size, cut.bounds(self.batch_length(step, batch_size))
+                own = slice(start + bounds[0], start + bounds[-1])
+                yield functools.partial(self.augmented_batch, order[own], settings, seed, epoch, streams[own])
+
+        yield from ahead(jobs(), workers)
 
     def normalisation(self, mirrored: bool) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
-        """Return mean and standard deviation of each label, [cm]; they scale the outputs to order one.
-
-        Args:
-            mirrored: Count each frame once more with left and right swapped.
-        """
+        """Return mean and standard deviation of each label, see :meth:`Samples.normalisation`."""
         points = self.points_cm
         if mirrored:
             points = np.concatenate([points, mirror_points(points)])
-        known = np.isfinite(points)
+        known, clipped = clip_labels(points)
         count = np.maximum(known.sum(axis=0), 1)
-        # Robust against the few frames in sharp bends whose line lies a metre to the side.
-        clipped = np.where(known, np.clip(points, -200.0, 200.0), 0.0)
         mean = clipped.sum(axis=0) / count
         variance = (np.where(known, clipped - mean, 0.0) ** 2).sum(axis=0) / count
-        return mean, np.maximum(np.sqrt(variance), 2.0)
+        return mean, np.maximum(np.sqrt(variance), LEAST_SCALE_CM)
+
+
+def usable(
+    points_cm: Float[np.ndarray, "n 6"], quality: Float[np.ndarray, "n"], min_quality: float
+) -> Int[np.ndarray, "_"]:
+    """Return the rows that have a label and enough quality."""
+    return np.flatnonzero((quality >= min_quality) & np.isfinite(points_cm).any(axis=1))
+
+
+def frames_of(labels: LabelSet) -> Frames:
+    """Return the frames of a label set, as the compiled loops take them."""
+    meta, size = labels.meta, len(labels)
+    return join_frames(
+        labels.edges,
+        labels.lines,
+        labels.points_cm,
+        np.tile(np.array(meta.camera_cm or TYPICAL_CAMERA_CM, np.float64), (size, 1)),
+        np.full(size, meta.lane_width_cm),
+        labels.divides,
+    )
+
+
+def clip_labels(
+    points_cm: Float[np.ndarray, "n 6"],
+) -> tuple[Bool[np.ndarray, "n 6"], Float[np.ndarray, "n 6"]]:
+    """Return which labels are known, and their values; 0 for the others.
+
+    Values are clipped, against the few frames in sharp bends whose line lies a metre to the side.
+    """
+    known = np.isfinite(points_cm)
+    return known, np.where(known, np.clip(points_cm, -200.0, 200.0), 0.0)
+
+
+def ahead(calls: Iterator[Callable[[], Batch]], workers: int) -> Iterator[Batch]:
+    """Yield what calls return, in their order; threads make some of it before it is asked for."""
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: list[Future[Batch]] = []
+        try:
+            for call in calls:
+                waiting.append(pool.submit(call))
+                if len(waiting) > workers + 1:
+                    yield waiting.pop(0).result()
+            for future in waiting:
+                yield future.result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 def compile_kernels(path: Path) -> None:
