@@ -24,7 +24,7 @@ from lanenet.perception.edges.static import find_static, lens_circle_px, spread_
 #: the steering is fitted to 50.
 LEAST_FRAMES = 60
 #: Memory for the images of a drive; the rest is read again. About 1100 frames of 320 x 240 px.
-_MOST_BYTES = 250_000_000
+MOST_IMAGE_BYTES = 250_000_000
 #: Frames looked at, evenly over the drive. Chosen: enough for a median, and quick.
 _CHECKED = 40
 #: Mean difference below which frames from all over a drive are the same, [gray levels] of block means.
@@ -145,7 +145,7 @@ class KeptImages:
     The first ones are kept until they take up too much.
     """
 
-    def __init__(self, source: ImageSource, most_bytes: int = _MOST_BYTES) -> None:
+    def __init__(self, source: ImageSource, most_bytes: int = MOST_IMAGE_BYTES) -> None:
         self._source, self._free = source, most_bytes
         self._kept: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
 
 from lanenet.errors import LanenetError
@@ -20,6 +21,10 @@ ResultT = TypeVar("ResultT")
 
 #: How often a worker process looks whether its parent is still there. Chosen: nobody waits for it.
 _LOOK_EVERY_S = 1.0
+#: With these in its environment from the start, a process computes in one thread: libraries read them once.
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
 #: Set in a worker process, whose siblings have the other cores.
 _ONE_THREAD = threading.Event()
 
@@ -98,12 +103,32 @@ def in_threads(work: Callable[[JobT], ResultT], jobs: Iterable[JobT]) -> Iterato
 
 def prepare_process() -> None:
     """Make a worker process leave the cores to its siblings, and end at once at Ctrl-C or with its parent."""
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    use_one_thread()
+
+
+def use_one_thread() -> None:
+    """Make OpenCV and :func:`in_threads` compute in one thread in this process."""
     import cv2
 
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     _ONE_THREAD.set()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
     cv2.setNumThreads(1)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Make processes that are started in the block compute in one thread, whatever was set before."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _end_with(parent: int) -> None:

@@ -51,6 +51,8 @@ def label_map(
     window: BirdseyeWindow | None = None,
     force: bool = False,
     pictures: bool = True,
+    drive: Path | None = None,
+    name: str | None = None,
 ) -> Report:
     """Project a map's lines into each frame; write the label set, its report and a contact sheet.
 
@@ -65,11 +67,13 @@ def label_map(
         window: The network's window; None takes the default.
         force: Label a rejected map, too.
         pictures: Draw the contact sheet.
+        drive: Where the drive is now, if it has moved since it was mapped.
+        name: Of the drive in the label set; None for that of its folder or file.
 
     Raises:
         TrackingLostError: If the map was rejected, or no frame can be labelled.
     """
-    mapped = open_mapped_drive(map_folder)
+    mapped = open_mapped_drive(map_folder, drive)
     drive_map = mapped.drive_map
     if not force:
         refuse_rejected(map_folder, drive_map)
@@ -106,7 +110,7 @@ def label_map(
             marking_cm=drive_map.meta.tape_cm,
             camera_cm=drive_map.camera.mounting.at_cm,
         ),
-        drive=[mapped.drive.name] * len(rows),
+        drive=[mapped.drive.name if name is None else name] * len(rows),
         file=[""] * len(rows),
         frame=drive_map.frames[rows],
         t_s=drive_map.t_s[rows],

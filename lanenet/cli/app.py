@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from lanenet.cli import calibrate, detect, export, label, map, sweep, train, val
+from lanenet.cli import calibrate, detect, export, label, label_all, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console, standing
@@ -24,6 +24,7 @@ from lanenet.errors import LanenetError
 _VERBS = {
     "Your own drive": (map, label, train, val, detect, calibrate),
     "On the car": (doctor, bench, drive, stop, export),
+    "Many drives": (label_all,),
     "Research": (simulate, sweep, judge, worlds, reality, localise, analyse),
 }
 #: The extra that brings a package, for the message when the package is missing.
@@ -34,6 +35,7 @@ _EXTRA_OF = {
     "optuna": "sweep",
     **dict.fromkeys(("rerun", "mcap"), "viewers"),
     **dict.fromkeys(("smbus2", "serial"), "car"),
+    **dict.fromkeys(("fsspec", "ray"), "cluster"),
 }
 
 

@@ -171,6 +171,19 @@ def training_bar() -> Iterator[ProgressCall]:
         yield report
 
 
+@contextmanager
+def fleet_bar() -> Iterator[ProgressCall]:
+    """Show how many drives are done, refused, failed and left: a function of the first three and of all."""
+    with _bars() as show:
+
+        def report(done: int, refused: int, failed: int, total: int) -> None:
+            left = total - done - refused - failed
+            text = f"label-all: {done} done, {refused} refused, {failed} failed, {left} left"
+            show("label-all", text, total - left, total)
+
+        yield report
+
+
 class _LiveLog(logging.Handler):
     """Prints log lines above the live line."""
 

@@ -1,0 +1,277 @@
+"""Label all drives of a list: what is new is done, by an engine, and what is finished is used."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from datagen.fleet.engine import Engine, Task
+from datagen.fleet.memory import memory_bytes
+from datagen.fleet.source import checksum, drive_files
+from datagen.fleet.storage import Storage
+from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
+from datagen.fleet.work import LABELS_NAME, REFUSED, REJECTED, Job, Outcome, label_drive, version
+from datagen.made import key_of
+from lanenet.data.files import json_text
+from lanenet.outputs import lock_output
+
+#: What became of the drives of a run, and the checksums of their files, beside the results.
+INDEX_NAME, CHECKSUMS_NAME = "drives.json", "checksums.json"
+_INDEX_FORMAT = "lanenet-fleet/1"
+#: Of a drive that has no result: it failed; the run ended before it was begun; it is there twice.
+FAILED, LEFT, DUPLICATE = "failed", "left", "duplicate"
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How many drives of a run are done, refused (or their maps rejected), failed, and in all."""
+
+    done: int
+    refused: int
+    failed: int
+    total: int
+
+    @property
+    def ended(self) -> int:
+        """Drives that are not left to be done."""
+        return self.done + self.refused + self.failed
+
+
+#: Called whenever a drive has ended.
+Progress = Callable[[Counts], None]
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """What became of a drive.
+
+    Attributes:
+        drive: The drive.
+        verdict: ``good`` or ``usable`` if it has labels; ``reject``, ``refused``, ``failed``, ``left`` or
+            ``duplicate``.
+        reason: Why it has none.
+        new: Whether something was done for it in this run.
+        map_key: Of its map, in the storage.
+        labels_key: Of its labels.
+        mapped: What the marker of the map says; None without one.
+        labelled: What the marker of the labels says; None without one.
+    """
+
+    drive: FleetDrive
+    verdict: str
+    reason: str
+    new: bool
+    map_key: str
+    labels_key: str
+    mapped: dict[str, Any] | None = None
+    labelled: dict[str, Any] | None = None
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether there is a label set of it."""
+        return self.verdict not in (REJECTED, REFUSED, FAILED, LEFT, DUPLICATE)
+
+
+@dataclass(frozen=True)
+class FleetResult:
+    """What became of all drives of a run, in their order, and whether a full disk ended it."""
+
+    drives: tuple[Labelled, ...]
+    disk_full: str = ""
+
+    def of(self, *verdicts: str) -> list[Labelled]:
+        """Return the drives with one of the verdicts."""
+        return [drive for drive in self.drives if drive.verdict in verdicts]
+
+    @property
+    def with_labels(self) -> list[Labelled]:
+        """The drives that have labels."""
+        return [drive for drive in self.drives if drive.has_labels]
+
+
+def with_checksums(drives: Iterable[FleetDrive], storage: Storage) -> list[FleetDrive]:
+    """Return the drives with the checksums of their files.
+
+    Files that have the size and time of an earlier run are not read again.
+
+    Raises:
+        DriveFormatError: If a drive is not there.
+    """
+    known: dict[str, list[str]] = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
+    found: dict[str, list[str]] = {}
+    checked = []
+    for drive in drives:
+        stamp = key_of(drive_files(drive.source))
+        before = known.get(drive.source, ["", ""])
+        found[drive.source] = before if before[0] == stamp else [stamp, checksum(drive.source)]
+        checked.append(replace(drive, checksum=found[drive.source][1]))
+    if any(known.get(source) != pair for source, pair in found.items()):
+        storage.write(CHECKSUMS_NAME, json_text({**known, **found}).encode())
+    return checked
+
+
+def label_all(
+    drives: Sequence[FleetDrive],
+    settings: FleetSettings,
+    storage: Storage,
+    engine: Engine,
+    progress: Progress | None = None,
+    refused_again: bool = False,
+) -> FleetResult:
+    """Map and label drives, as far as that has not been done with the same settings.
+
+    A drive is one task. Drives that cannot be mapped, tasks that fail and workers that are lost stop nothing;
+    a full disk ends the run. What is finished is kept in any case, also at Ctrl-C.
+
+    Args:
+        drives: Drives with their checksums.
+        settings: What they are made with.
+        storage: Where results are kept; no other run may write there.
+        engine: What spreads the tasks.
+        progress: Called whenever a drive has ended.
+        refused_again: Try drives again that were refused before.
+
+    Raises:
+        LanenetError: If another run writes there, or the engine cannot be started.
+    """
+    with ExitStack() as stack:
+        if storage.folder is not None:
+            stack.enter_context(lock_output(storage.folder))
+        run = _Run(drives, settings, storage)
+        run.sweep(run.refused_keys() if refused_again else set())
+        found = run.look()
+        missing = [k for k, drive in enumerate(found) if drive.verdict == LEFT]
+        ended: dict[int, Outcome] = {}
+        disk_full = ""
+        if missing:
+            try:
+                ended, disk_full = run.work(missing, found, engine, progress)
+            finally:
+                run.sweep()
+            found = run.look(ended)
+        result = FleetResult(tuple(found), disk_full)
+        storage.write(INDEX_NAME, json_text(_index(result)).encode())
+        return result
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The drives of a run and their storage."""
+
+    drives: Sequence[FleetDrive]
+    settings: FleetSettings
+    storage: Storage
+
+    @cached_property
+    def keys(self) -> dict[str, list[str]]:
+        """The keys of all maps and of all labels."""
+        return {
+            MAPS: [drive.map_key(self.settings) for drive in self.drives],
+            LABELS: [drive.labels_key(self.settings) for drive in self.drives],
+        }
+
+    def results(self, kind: str) -> list[dict[str, Any] | None]:
+        """Return what the markers of a kind say; None for what is not finished."""
+        finished = self.storage.finished(kind)
+        found = self.storage.results(kind, finished.intersection(self.keys[kind]))
+        return [found.get(key) for key in self.keys[kind]]
+
+    def refused_keys(self) -> set[str]:
+        """Return the keys of the maps and labels that say that their drive was refused."""
+        return {
+            key
+            for kind, keys in self.keys.items()
+            for key, result in zip(keys, self.results(kind), strict=True)
+            if result is not None and result["verdict"] == REFUSED
+        }
+
+    def sweep(self, also: Iterable[str] = ()) -> None:
+        """Remove what lost workers left, and these results."""
+        for kind in (MAPS, LABELS):
+            self.storage.sweep(kind, also)
+
+    def look(self, ended: Mapping[int, Outcome] | None = None) -> list[Labelled]:
+        """Return how each drive stands.
+
+        Args:
+            ended: How the tasks ended that were run.
+        """
+        maps, labels = self.results(MAPS), self.results(LABELS)
+        found = []
+        for k, drive in enumerate(self.drives):
+            first = self.keys[MAPS].index(self.keys[MAPS][k])
+            outcome = None if ended is None else ended.get(k)
+            if first != k:
+                verdict, reason = DUPLICATE, f"is the same recording as {self.drives[first].name}"
+            elif outcome is not None and not outcome.verdict:
+                verdict, reason = FAILED, outcome.reason
+            else:
+                verdict, reason = _standing(maps[k], labels[k])
+            keys = self.keys[MAPS][k], self.keys[LABELS][k]
+            found.append(Labelled(drive, verdict, reason, outcome is not None, *keys, maps[k], labels[k]))
+        return found
+
+    def work(
+        self,
+        missing: Sequence[int],
+        found: Sequence[Labelled],
+        engine: Engine,
+        progress: Progress | None,
+    ) -> tuple[dict[int, Outcome], str]:
+        """Do what is missing; returns how the tasks ended, and which disk was full."""
+        verdicts = {k: drive.verdict for k, drive in enumerate(found) if drive.verdict != DUPLICATE}
+        total, ended = len(verdicts), dict[int, Outcome]()
+        tasks = [self._task(k) for k in missing]
+        with closing(engine.run(label_drive, tasks)) as running:
+            _tell(progress, verdicts.values(), total)
+            for end in running:
+                k = missing[end.number]
+                ended[k] = Outcome("", end.error) if end.error else end.result
+                verdicts[k] = ended[k].verdict or FAILED
+                _tell(progress, verdicts.values(), total)
+                if ended[k].disk_full:
+                    return ended, ended[k].reason
+        return ended, ""
+
+    def _task(self, k: int) -> Task:
+        drive = self.drives[k]
+        job = Job(drive, self.settings, self.storage.url, version())
+        return Task(drive.name, job, memory_bytes(drive.source))
+
+
+def _standing(mapped: dict[str, Any] | None, labelled: dict[str, Any] | None) -> tuple[str, str]:
+    """Return verdict and reason of a drive by what is finished of it."""
+    if mapped is not None and mapped["verdict"] in (REJECTED, REFUSED):
+        return str(mapped["verdict"]), str(mapped["reason"])
+    if mapped is None or labelled is None:
+        return LEFT, "the run ended before"
+    return str(labelled["verdict"] or mapped["verdict"]), str(labelled["reason"])
+
+
+def _tell(progress: Progress | None, verdicts: Iterable[str], total: int) -> None:
+    if progress is not None:
+        count = Counter(verdicts)
+        refused, failed = count[REJECTED] + count[REFUSED], count[FAILED]
+        progress(Counts(count.total() - count[LEFT] - refused - failed, refused, failed, total))
+
+
+def _index(result: FleetResult) -> dict[str, Any]:
+    """Return what a program wants to know of a run: the drives, and the paths of their results."""
+    return {
+        "format": _INDEX_FORMAT,
+        "drives": [
+            {
+                **vars(found.drive),
+                "verdict": found.verdict,
+                "reason": found.reason,
+                "map": None if found.mapped is None else f"{MAPS}/{found.map_key}",
+                "labels": f"{LABELS}/{found.labels_key}/{LABELS_NAME}" if found.has_labels else None,
+            }
+            for found in result.drives
+        ],
+    }

@@ -1,0 +1,218 @@
+"""``lanenet label-all``: many drives become maps and label sets, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import astuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from lanenet.cli.shared import console
+from lanenet.cli.shared.options import (
+    CameraHeightOption,
+    MappingOption,
+    TapeWidthOption,
+    WheelbaseOption,
+    lane_cm,
+)
+from lanenet.cli.shared.own_drive import sources_in
+from lanenet.config import load_settings
+from lanenet.data.drives import open_drive
+from lanenet.data.library.entry import name_of
+from lanenet.errors import ConfigError, LanenetError, counted
+
+if TYPE_CHECKING:
+    from datagen.fleet.run import FleetResult
+    from datagen.fleet.task import FleetDrive
+
+app = typer.Typer()
+
+#: The log, beside the results of a storage that is a folder.
+_LOG_NAME = "label-all.log"
+
+
+@app.command(epilog="Example: lanenet label-all my_tub other_tub --lane-width 40 --out runs/labelled")
+def label_all(
+    out: Annotated[
+        str, typer.Option(metavar="FOLDER|URL", help="Where maps and labels are kept, as s3://bucket/labels.")
+    ],
+    drives: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[DRIVE]...", help="Drives, tubs, videos or bags; folders of them; URLs."),
+    ] = None,
+    library: Annotated[
+        Path | None, typer.Option(help="Also all drives of a library (lanenet drives).")
+    ] = None,
+    lane_width: Annotated[
+        float | None,
+        typer.Option(
+            parser=lane_cm,
+            metavar="CM",
+            help="Between the middles of the lane's two lines, cm, of drives that do not say it.",
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera YAML of drives that do not name one.")
+    ] = None,
+    wheelbase: WheelbaseOption = None,
+    camera_height: CameraHeightOption = None,
+    tape_width: TapeWidthOption = None,
+    config: MappingOption = None,
+    colour_weight: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, max=1.0, help="Weight of colour beside brightness when edges are found; default 0.75."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes at a time on this machine; default: one per core.")
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Draw the report of each map and the frames of each label set.")
+    ] = False,
+    refused_again: Annotated[
+        bool, typer.Option("--refused-again", help="Try drives again that were refused before.")
+    ] = False,
+) -> None:
+    """Map and label many drives; what is finished is used, and what fails stops nothing."""
+    from datagen.fleet.local_engine import LocalEngine
+    from datagen.fleet.run import label_all as run
+    from datagen.fleet.run import with_checksums
+    from datagen.fleet.storage import Storage
+    from datagen.fleet.task import FleetSettings
+    from datagen.settings import MapSettings
+
+    settings = FleetSettings(pictures=pictures)
+    if config is not None:
+        settings = settings.model_copy(update={"map": load_settings(MapSettings, config)})
+    if colour_weight is not None:
+        settings = settings.model_copy(update={"colour_weight": colour_weight})
+    told = Told(lane_width, None if camera is None else _full(camera), wheelbase, camera_height, tape_width)
+    known = [] if library is None else drives_of_library(library, told)
+    sources = [source for each in drives or () for source in found_in(each)]
+    known += [told.drive(name, source) for name, source in named(sources, known).items()]
+    if not known:
+        raise ConfigError("expected drives, or a --library that holds some")
+    storage = Storage(_full(out))
+    engine = LocalEngine(workers or os.cpu_count() or 1)
+    with ExitStack() as stack:
+        if storage.folder is not None:
+            storage.folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(console.log_file(storage.folder / _LOG_NAME))
+        checked = with_checksums(known, storage)
+        with console.fleet_bar() as show:
+            result = run(
+                checked, settings, storage, engine, lambda counts: show(*astuple(counts)), refused_again
+            )
+        show_result(result, out)
+
+
+def show_result(result: FleetResult, out: str) -> None:
+    """Say what became of the drives.
+
+    Raises:
+        LanenetError: If some failed, or were left when a disk was full.
+    """
+    labelled, refused = result.with_labels, result.of("reject", "refused")
+    failed, left, twice = (result.of(verdict) for verdict in ("failed", "left", "duplicate"))
+    new = sum(found.new for found in result.drives)
+    console.say(
+        f"{counted(len(labelled), 'drive')} with labels, {len(refused)} refused, {len(failed)} failed, "
+        f"{len(left)} left; {new} done in this run"
+    )
+    console.show_problems([f"{found.drive.name}: {found.reason}" for found in (*refused, *failed, *twice)])
+    again = "run the command again: what is finished is kept"
+    if result.disk_full:
+        raise LanenetError(f"{result.disk_full}; {counted(len(left), 'drive')} left; make room, then {again}")
+    if failed:
+        raise LanenetError(f"{counted(len(failed), 'drive')} failed, the first: {failed[0].reason}; {again}")
+
+
+class Told(NamedTuple):
+    """What the command line says of drives; see :class:`datagen.fleet.task.FleetDrive`."""
+
+    lane_width_cm: float | None
+    camera: str | None
+    wheelbase_cm: float | None
+    camera_height_cm: float | None
+    tape_width_cm: float | None
+
+    def drive(
+        self, name: str, source: str, lane_width_cm: float | None = None, camera: str | None = None
+    ) -> FleetDrive:
+        """Return a drive that says so much of itself.
+
+        Raises:
+            ConfigError: If its lane width is not known.
+        """
+        from datagen.fleet.task import FleetDrive
+
+        width_cm = lane_width_cm or _own_width_cm(source) or self.lane_width_cm
+        if width_cm is None:
+            raise ConfigError(
+                f"{source}: expected --lane-width: the distance in cm between the middles of the lane's two "
+                "lines"
+            )
+        return FleetDrive(name, source, "", width_cm, camera or self.camera, *self[2:])
+
+
+def drives_of_library(file: Path, told: Told) -> list[FleetDrive]:
+    """Return the drives of a library.
+
+    Raises:
+        LibraryError: If it cannot be read.
+        ConfigError: If the lane width of one is not known.
+    """
+    from lanenet.data.library import Library
+
+    library = Library.open(file)
+    drives = []
+    for entry in library.entries():
+        # It may also be just a name.
+        camera = library.folder / entry.camera
+        given = str(camera.resolve()) if entry.camera and camera.exists() else None
+        path = str(library.path_of(entry).resolve())
+        drives.append(told.drive(entry.name, path, entry.lane_width_cm, given))
+    return drives
+
+
+def _own_width_cm(source: str) -> float | None:
+    """Return the lane width that a drive on this machine knows by itself."""
+    if "://" in source:
+        return None
+    try:
+        return open_drive(Path(source)).lane_width_cm
+    except LanenetError:  # it will be refused
+        return None
+
+
+def found_in(source: str) -> list[str]:
+    """Return the drives that a path or URL names: a drive, or those in a folder, by their full paths."""
+    return [source] if "://" in source else [str(path.resolve()) for path in sources_in(Path(source))]
+
+
+def named(sources: Sequence[str], others: Sequence[FleetDrive] = ()) -> dict[str, str]:
+    """Return sources by a name of their own: the last part of the path, numbered where that is taken.
+
+    Args:
+        sources: Paths or URLs.
+        others: Drives that have names already; what is one of them is left out.
+    """
+    names, taken = dict[str, str](), {drive.name for drive in others}
+    for source in dict.fromkeys(sources):
+        if source in {drive.source for drive in others}:
+            continue
+        stem = name_of(Path(source))
+        numbered = (stem if number == 1 else f"{stem}_{number}" for number in itertools.count(1))
+        names[next(name for name in numbered if name not in names and name not in taken)] = source
+    return names
+
+
+def _full(place: str) -> str:
+    """Return a path in full, since workers have other working folders; a URL as it is."""
+    return place if "://" in place else str(Path(place).resolve())

@@ -1,0 +1,302 @@
+"""Label all: each drive once, by content and settings; what fails stops nothing, and nothing varies."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import shutil
+import uuid
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+from fleet_work import HereEngine
+
+from datagen.fleet import work
+from datagen.fleet.engine import Ended, Task
+from datagen.fleet.local_engine import LocalEngine
+from datagen.fleet.run import FleetResult, label_all, with_checksums
+from datagen.fleet.source import checksum
+from datagen.fleet.storage import Storage
+from datagen.fleet.task import FleetDrive, FleetSettings
+from datagen.settings import MapSettings
+from datagen.world.simulate import simulate_drive
+from datagen.world.world import SimulationSettings
+from lanenet.data.label_set import read_labels
+from lanenet.errors import DriveFormatError, LanenetError, TrackingLostError
+
+SETTINGS = FleetSettings(map=MapSettings(find_bumper=False))
+LANE_CM = 40.0
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive that is just long enough."""
+    camera = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
+    track = {"left": {}, "right": {}, "interruptions_per_m": 0.0}
+    settings = {"seed": 1, "frames": 70, "camera": camera, "track": track}
+    folder = tmp_path_factory.mktemp("drives") / "tiny"
+    return simulate_drive(SimulationSettings.model_validate(settings), folder)
+
+
+def drives_of(*paths: Path | str, names: tuple[str, ...] = ()) -> list[FleetDrive]:
+    named = names or tuple(Path(path).name for path in paths)
+    return [FleetDrive(name, str(path), "", LANE_CM) for name, path in zip(named, paths, strict=True)]
+
+
+def run(
+    out: Path | str, drives: list[FleetDrive], settings: FleetSettings = SETTINGS, **more: Any
+) -> tuple[FleetResult, list[str]]:
+    """Label drives in this process; returns the result and the names of the tasks."""
+    storage, engine = Storage(str(out)), HereEngine()
+    return label_all(with_checksums(drives, storage), settings, storage, engine, **more), engine.names
+
+
+@pytest.fixture(scope="module")
+def labelled(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The storage of the tiny drive, labelled by a process of its own."""
+    out = tmp_path_factory.mktemp("labelled") / "out"
+    storage = Storage(str(out))
+    result = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, LocalEngine(1))
+    assert [drive.verdict for drive in result.drives] == ["good"]
+    return out
+
+
+@pytest.fixture
+def mapping(monkeypatch: pytest.MonkeyPatch, labelled: Path) -> list[str]:
+    """Instead of mapping, copy the tiny drive's map, or fail as the drive's name says; notes the names."""
+    (ready,) = (labelled / "maps").iterdir()
+    mapped: list[str] = []
+
+    def copy(request: Any, settings: Any, out: Path, **_: Any) -> Any:
+        name = request.drive_path.name
+        mapped.append(name)
+        if "lost" in name:
+            raise TrackingLostError(f"{request.drive_path}: the car stands still")
+        if "bug" in name:
+            raise ZeroDivisionError("by zero")
+        if "memory" in name:
+            raise MemoryError
+        if "full" in name:
+            raise LanenetError(f"{out}: cannot be written") from OSError(errno.ENOSPC, "No space left")
+        shutil.copytree(ready, out, dirs_exist_ok=True)
+        verdict = {"reasons": ["as good as it looks"]}
+        if "reject" in name:
+            report = json.loads((out / "report.json").read_text())
+            report["verdict"] |= {"grade": "reject", "sentence": "the lines are not where they seem"}
+            (out / "report.json").write_text(json.dumps(report))
+        return type("Report", (), {"figures": {"verdict": verdict}})()
+
+    monkeypatch.setattr(work, "map_drive", copy)
+    return mapped
+
+
+def copy_of(tiny: Path, path: Path) -> Path:
+    """Copy a drive and make it another one."""
+    shutil.copytree(tiny, path)
+    (path / "note.txt").write_text(path.name)
+    return path
+
+
+def labels_in(out: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in out.glob("labels/*/labels.parquet")}
+
+
+def test_a_drive_becomes_a_map_and_a_label_set(tiny: Path, labelled: Path):
+    (index,) = json.loads((labelled / "drives.json").read_text())["drives"]
+    assert index["name"] == "tiny" and index["verdict"] == "good" and index["reason"] == ""
+    labels = read_labels(labelled / index["labels"])
+    assert set(labels.drive) == {"tiny"} and len(labels) > 60
+    mapped = json.loads((labelled / index["map"] / "result.json").read_text())
+    assert mapped["frames"] == 70 and mapped["driven_s"] == pytest.approx(69 * 0.05)
+    assert mapped["took"]["cpu_s"] > 0 and mapped["took"]["peak_bytes"] > 1e8 and mapped["bytes"] > 1e5
+    assert (labelled / index["map"] / "thumbnail.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert not list(labelled.glob("*/.*"))
+
+
+def test_a_second_run_does_nothing(tiny: Path, labelled: Path):
+    before = {path: path.stat().st_mtime_ns for path in labelled.rglob("*") if path.name != "drives.json"}
+    result, names = run(labelled, drives_of(tiny))
+    assert names == [] and [drive.verdict for drive in result.drives] == ["good"]
+    assert not any(drive.new for drive in result.drives)
+    after = {path: path.stat().st_mtime_ns for path in labelled.rglob("*") if path.name != "drives.json"}
+    assert before.keys() == after.keys()
+    files = [path for path in before if path.is_file()]
+    assert [before[path] for path in files] == [after[path] for path in files]
+
+
+def test_the_same_bytes_in_this_process_and_in_an_object_store(tiny: Path, labelled: Path):
+    url, memory = f"memory://{uuid.uuid4().hex}", fsspec.filesystem("memory")
+    memory.put(str(tiny), f"{url}/drives/tiny", recursive=True)
+    (result,) = run(f"{url}/out", drives_of(f"{url}/drives/tiny"))[0].drives
+    assert result.verdict == "good"
+    found = memory.cat_file(f"{url}/out/labels/{result.labels_key}/labels.parquet")
+    assert labels_in(labelled) == {result.labels_key: found}
+    kept = Path(labelled / "maps" / result.map_key)
+    for name in (
+        "poses.csv",
+        "lanes.json",
+        "edges.parquet",
+        "camera.yaml",
+        "trajectory.tum",
+        "thumbnail.jpg",
+    ):
+        assert memory.cat_file(f"{url}/out/maps/{result.map_key}/{name}") == (kept / name).read_bytes(), name
+    # The map names its drive by the place that all machines know.
+    assert (
+        f"drive: {url}/drives/tiny\n" in memory.cat_file(f"{url}/out/maps/{result.map_key}/map.yaml").decode()
+    )
+    memory.rm(url, recursive=True)
+
+
+def test_a_changed_setting_redoes_what_it_touches(tiny: Path, tmp_path: Path, mapping: list[str]):
+    drives = drives_of(tiny)
+    run(tmp_path, drives)
+    assert mapping == ["tiny"]
+    other = SETTINGS.model_copy(update={"colour_weight": 0.25})
+    assert run(tmp_path, drives, other)[1] == ["tiny"]
+    assert mapping == ["tiny"] and len(labels_in(tmp_path)) == 2
+    # Back again there is nothing to do; another setting of the mapping maps again.
+    assert run(tmp_path, drives)[1] == []
+    run(tmp_path, drives, FleetSettings(map=MapSettings(find_bumper=False, seed=5)))
+    assert mapping == ["tiny", "tiny"] and len(labels_in(tmp_path)) == 3
+
+
+def test_another_name_or_place_keeps_the_map(tiny: Path, tmp_path: Path, mapping: list[str]):
+    run(tmp_path / "out", drives_of(tiny))
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(tiny, moved)
+    assert run(tmp_path / "out", drives_of(moved, names=("tiny",)))[1] == []
+    assert run(tmp_path / "out", drives_of(moved, names=("renamed",)))[1] == ["renamed"]
+    assert mapping == ["tiny"]
+    assert len(set(labels_in(tmp_path / "out").values())) == 2
+
+
+def test_a_changed_recording_is_another_drive(tiny: Path, tmp_path: Path, mapping: list[str]):
+    drive = copy_of(tiny, tmp_path / "tub")
+    run(tmp_path / "out", drives_of(drive))
+    table = drive / "frames.csv"
+    table.write_text(table.read_text().rstrip("\n") + "\n\n")
+    run(tmp_path / "out", drives_of(drive))
+    assert mapping == ["tub", "tub"]
+
+
+def test_a_recording_given_twice_is_labelled_once(tiny: Path, tmp_path: Path, mapping: list[str]):
+    shutil.copytree(tiny, tmp_path / "copy")
+    result, names = run(tmp_path / "out", drives_of(tiny, tmp_path / "copy"))
+    assert names == ["tiny"] and [drive.verdict for drive in result.drives] == ["good", "duplicate"]
+    assert result.drives[1].reason == "is the same recording as tiny"
+    assert len(labels_in(tmp_path / "out")) == 1
+
+
+def test_what_fails_or_is_refused_stops_nothing(tiny: Path, tmp_path: Path, mapping: list[str]):
+    names = ("lost", "bug", "reject", "memory", "fine")
+    drives = drives_of(*(copy_of(tiny, tmp_path / "drives" / name) for name in names))
+    counts: list[tuple[int, int, int, int]] = []
+    result, _ = run(
+        tmp_path / "out",
+        drives,
+        progress=lambda c: counts.append((c.done, c.refused, c.failed, c.total)),
+    )
+    assert [(drive.verdict, drive.reason) for drive in result.drives] == [
+        ("refused", "the car stands still"),
+        ("failed", "ZeroDivisionError: by zero"),
+        ("reject", "the lines are not where they seem"),
+        ("failed", "out of memory"),
+        ("good", ""),
+    ]
+    assert counts == [(0, 0, 0, 5), (0, 1, 0, 5), (0, 1, 1, 5), (0, 2, 1, 5), (0, 2, 2, 5), (1, 2, 2, 5)]
+    assert not list((tmp_path / "out").glob("*/.*"))
+    # What was refused stays so; what failed is tried again.
+    mapping.clear()
+    run(tmp_path / "out", drives)
+    assert mapping == ["bug", "memory"]
+    mapping.clear()
+    run(tmp_path / "out", drives, refused_again=True)
+    assert mapping == ["lost", "bug", "memory"]
+
+
+def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(tiny: Path, tmp_path: Path, mapping: list[str]):
+    drives = drives_of(*(copy_of(tiny, tmp_path / "drives" / name) for name in ("a", "full", "z")))
+    result, names = run(tmp_path / "out", drives)
+    assert names == ["a", "full"]
+    assert [drive.verdict for drive in result.drives] == ["good", "failed", "left"]
+    assert "full" in result.disk_full and "cannot be written" in result.disk_full
+    assert not list((tmp_path / "out").glob("*/.*"))
+    assert run(tmp_path / "out", drives_of(drives[2].source))[1] == ["z"]
+
+
+def test_ctrl_c_leaves_what_is_finished(tiny: Path, tmp_path: Path, mapping: list[str]):
+    drives = drives_of(*(copy_of(tiny, tmp_path / "drives" / name) for name in ("a", "b")))
+
+    def interrupt(counts: Any) -> None:
+        if counts.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "out", drives, progress=interrupt)
+    assert len(labels_in(tmp_path / "out")) == 1
+    result, names = run(tmp_path / "out", drives)
+    assert names == ["b"] and [drive.verdict for drive in result.drives] == ["good", "good"]
+
+
+def test_a_task_that_the_engine_gave_up_is_a_failure(tiny: Path, tmp_path: Path):
+    class Losing:
+        def run(self, work: Callable[[Any], Any], tasks: Sequence[Task]) -> Generator[Ended, None, None]:
+            yield Ended(0, error="its machine was lost")
+
+    storage = Storage(str(tmp_path))
+    result = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, Losing())
+    assert [(drive.verdict, drive.reason) for drive in result.drives] == [("failed", "its machine was lost")]
+
+
+def test_a_worker_with_another_version_does_nothing(tiny: Path, tmp_path: Path):
+    (drive,) = with_checksums(drives_of(tiny), Storage(str(tmp_path)))
+    outcome = work.label_drive(work.Job(drive, SETTINGS, str(tmp_path), "lanenet 0.1"))
+    assert outcome.verdict == "" and "the run needs lanenet 0.1" in outcome.reason
+
+
+def test_a_drive_that_is_not_on_the_worker_has_failed_and_is_not_refused(tiny: Path, tmp_path: Path):
+    storage = Storage(str(tmp_path / "out"))
+    drive = copy_of(tiny, tmp_path / "tub")
+    checked = with_checksums(drives_of(drive), storage)
+    shutil.rmtree(drive)
+    result = label_all(checked, SETTINGS, storage, HereEngine())
+    assert (
+        result.drives[0].verdict == "failed" and "storage that all machines share" in result.drives[0].reason
+    )
+
+
+def test_a_missing_drive_is_named(tmp_path: Path):
+    with pytest.raises(DriveFormatError, match="nowhere: no such drive"):
+        run(tmp_path, drives_of(tmp_path / "nowhere"))
+
+
+def test_files_are_read_again_only_if_they_changed(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    drive, storage = copy_of(tiny, tmp_path / "tub"), Storage(str(tmp_path / "out"))
+    read: list[str] = []
+    monkeypatch.setattr(
+        "datagen.fleet.run.checksum", lambda source: (read.append(source), checksum(source))[1]
+    )
+    (first,) = with_checksums(drives_of(drive), storage)
+    assert with_checksums(drives_of(drive), storage) == [first] and read == [str(drive)]
+    (drive / "images" / "more.txt").write_text("x")
+    (second,) = with_checksums(drives_of(drive), storage)
+    assert second.checksum != first.checksum and len(read) == 2
+
+
+def test_a_video_has_the_checksum_of_its_files_under_any_name(tmp_path: Path):
+    (tmp_path / "one.avi").write_bytes(b"video")
+    (tmp_path / "one.csv").write_bytes(b"t_s")
+    before = checksum(str(tmp_path / "one.avi"))
+    for name in ("one.avi", "one.csv"):
+        (tmp_path / name).rename(tmp_path / name.replace("one", "two"))
+    (tmp_path / "three.csv").write_bytes(b"of another one")
+    assert checksum(str(tmp_path / "two.avi")) == before
+    (tmp_path / "two.csv").write_bytes(b"other")
+    assert checksum(str(tmp_path / "two.avi")) != before
