@@ -8,8 +8,9 @@ from datagen.prepare import MOST_IMAGE_BYTES
 from lanenet.data.drives import open_drive
 from lanenet.errors import LanenetError
 
-#: Taken beside the drive; taken for each of its frames, beside its image, [bytes]. Measured: docs/fleet.md.
-_FIXED, _PER_FRAME = 500_000_000, 400_000
+#: Taken by the program, also while it compiles its loops; taken for each frame beside its image, [bytes].
+#: Measured (docs/fleet.md): 360 MB, 120 MB more while compiling, and 0.31 MB a frame; the rest is reserve.
+_FIXED, _PER_FRAME = 500_000_000, 360_000
 #: Least number of frames that a drive in an object store is taken to have, since a video is one file. Chosen:
 #: 150 s at 20 frames a second.
 _UNSEEN_FRAMES = 3000

@@ -56,9 +56,7 @@ def label_all(
             help="Between the middles of the lane's two lines, cm, of drives that do not say it.",
         ),
     ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Camera YAML of drives that do not name one.")
-    ] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera YAML of drives that do not name one.")] = None,
     wheelbase: WheelbaseOption = None,
     camera_height: CameraHeightOption = None,
     tape_width: TapeWidthOption = None,

@@ -1,0 +1,105 @@
+"""``lanenet label-all``: which drives it takes, what it says, and its codes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drives import write_drive
+from fleet_work import HereEngine
+from typer.testing import CliRunner
+
+from datagen.fleet import work
+from datagen.fleet.task import FleetDrive
+from lanenet.cli.app import app
+from lanenet.cli.label_all import Told, drives_of_library, found_in, named
+from lanenet.data.library import Library
+from lanenet.errors import ConfigError, TrackingLostError
+
+TOLD = Told(40.0, None, 26.0, None, None)
+
+
+def invoke(*words: object) -> Any:
+    return CliRunner().invoke(app, ["label-all", *map(str, words)])
+
+
+@pytest.fixture
+def faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in this process; drives stand still or meet a fault of the program, by their names."""
+
+    def fail(request: Any, *_: Any, **__: Any) -> Any:
+        if "bug" in request.drive_path.name:
+            raise ZeroDivisionError("by zero")
+        raise TrackingLostError(f"{request.drive_path}: the car stands still")
+
+    monkeypatch.setattr(work, "map_drive", fail)
+    monkeypatch.setattr("datagen.fleet.local_engine.LocalEngine", lambda workers: HereEngine())
+
+
+def test_refused_drives_are_an_answer(tmp_path: Path, faults: None):
+    write_drive(tmp_path / "drives" / "a")
+    write_drive(tmp_path / "drives" / "b", n=6)
+    found = invoke(tmp_path / "drives", "--out", tmp_path / "out")
+    assert found.exit_code == 0, found.output
+    assert "0 drives with labels, 2 refused, 0 failed, 0 left; 2 done in this run" in found.output
+    assert "a: the car stands still" in found.output
+    log = (tmp_path / "out" / "label-all.log").read_text()
+    assert "label-all: 0 done, 2 refused, 0 failed, 0 left: 2 of 2" in log
+    again = invoke(tmp_path / "drives", "--out", tmp_path / "out")
+    assert "; 0 done in this run" in again.output
+
+
+def test_a_failed_drive_gives_code_1_and_its_reason(tmp_path: Path, faults: None):
+    write_drive(tmp_path / "bug")
+    found = invoke(tmp_path / "bug", "--out", tmp_path / "out")
+    assert found.exit_code == 1
+    assert re.search(
+        r"error: 1 drive failed, the first: ZeroDivisionError: by zero; run .* again", found.output
+    )
+
+
+def test_no_drives_are_refused(tmp_path: Path):
+    found = invoke("--out", tmp_path / "out")
+    assert found.exit_code == 1 and "expected drives, or a --library" in found.output
+
+
+def test_the_lane_width_is_the_libraries_then_the_drives_then_the_given_one(tmp_path: Path):
+    drive = write_drive(tmp_path / "tub")  # which says 40 cm
+    told = TOLD._replace(lane_width_cm=50.0)
+    assert told.drive("tub", str(drive)).lane_width_cm == 40.0
+    assert told.drive("tub", str(drive), 45.0).lane_width_cm == 45.0
+    assert told.drive("tub", "s3://drives/tub").lane_width_cm == 50.0
+    with pytest.raises(ConfigError, match="s3://drives/tub: expected --lane-width"):
+        told._replace(lane_width_cm=None).drive("tub", "s3://drives/tub")
+
+
+def test_drives_of_a_library(tmp_path: Path):
+    library = Library.open(tmp_path / "drives.sqlite", create=True)
+    camera = write_drive(tmp_path / "one") / "camera.yaml"
+    write_drive(tmp_path / "two", n=7)
+    library.add(tmp_path / "one", name="first", lane_width_cm=35.0, camera=str(camera))
+    library.add(tmp_path / "two", camera="a name")
+    assert drives_of_library(library.path, TOLD) == [
+        FleetDrive("first", str(tmp_path / "one"), "", 35.0, str(camera), 26.0),
+        FleetDrive("two", str(tmp_path / "two"), "", 40.0, None, 26.0),
+    ]
+
+
+def test_names_are_unique():
+    others = [FleetDrive("tub", "/library/tub", "", 40.0)]
+    sources = ["/a/tub", "/b/tub", "/a/tub", "/library/tub", "s3://drives/tub.mp4", "/c/my tub"]
+    assert named(sources, others) == {
+        "tub_2": "/a/tub",
+        "tub_3": "/b/tub",
+        "tub_4": "s3://drives/tub.mp4",
+        "my-tub": "/c/my tub",
+    }
+
+
+def test_a_url_is_one_drive_and_a_folder_holds_several(tmp_path: Path):
+    for name in ("a", "b"):
+        write_drive(tmp_path / name)
+    assert found_in(str(tmp_path)) == [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert found_in("s3://drives/tub") == ["s3://drives/tub"]
