@@ -63,7 +63,11 @@ def near_points(solved: SolvedSegment) -> list[Float[np.ndarray, "_ 2"]]:
 
 
 def assemble(
-    prepared: PreparedDrive, camera: Camera, sigma: dict[str, float], mapped: Sequence[MappedSegment]
+    prepared: PreparedDrive,
+    camera: Camera,
+    sigma: dict[str, float],
+    mapped: Sequence[MappedSegment],
+    lane: LaneWidth | None = None,
 ) -> AssembledMap:
     """Put the segments in one map, in centimetres; the lane width sets the scale of an unknown camera.
 
@@ -72,10 +76,12 @@ def assemble(
         camera: The camera, known or found.
         sigma: Standard deviation of each of its numbers, none for a known camera.
         mapped: Segments in its scale.
+        lane: Width of the driven lane in that scale; None to take that of the longest segment.
     """
     request, segments = prepared.request, list(mapped)
     longest = max(segments, key=lambda s: len(s.rows))
-    lane = fitted_width(longest.lines, longest.lane, longest.s_frames_cm)
+    if lane is None:
+        lane = fitted_width(longest.lines, longest.lane, longest.s_frames_cm)
     factor = 1.0
     if prepared.camera is None:
         factor = request.lane_width_cm / lane.width_cm

@@ -12,7 +12,7 @@ from datagen.check import CheckedMap, check_map
 from datagen.compile_ahead import compile_ahead
 from datagen.labels.label_map import label_map
 from datagen.made import Output, fingerprint, key_of
-from datagen.prepare import MapRequest, prepare
+from datagen.prepare import MapRequest, PreparedDrive, prepare
 from datagen.quality.figures import Report, map_edges
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
@@ -29,7 +29,7 @@ from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, Tra
 from lanenet.outputs import lock_output
 from lanenet.page import PAGE_NAME
 
-__all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive", "map_key"]
+__all__ = ["MapRequest", "MapSettings", "Report", "label_map", "map_drive", "map_key", "write_checked"]
 
 _SHOWN = 24  # frames on the contact sheet: six rows of four
 
@@ -122,17 +122,40 @@ def _map_drive(
         "notes": notes,
     }
     with atomic_folder(out, "map", check_map_files) as folder:
-        drive_map, opened = checked.mapped.drive_map, assembled.open_poses
-        edges = map_edges(assembled.segments, prepared.drive.frames, assembled.factor)
-        write_map(folder, drive_map, edges, figures, camera.how)
-        write_text(folder / SETTINGS_NAME, dump_settings(settings))
-        write_tum(folder / "open_loop.tum", drive_map.t_s, opened)
-        if pictures:
-            _draw(folder, assembled, checked, figures, settings)
+        write_checked(folder, prepared, assembled, checked, figures, camera.how, pictures)
         Output(folder / "map.yaml", key).mark()
     verdict = checked.verdict
     first = f"verdict: {verdict.grade}: {verdict.sentence}"
     return Report((first, *verdict.reasons, *notes, *verdict.remarks), figures)
+
+
+def write_checked(
+    folder: Path,
+    prepared: PreparedDrive,
+    assembled: AssembledMap,
+    checked: CheckedMap,
+    figures: dict[str, Any],
+    how_calibrated: str,
+    pictures: bool,
+) -> None:
+    """Write a map that was checked into an existing folder.
+
+    Args:
+        folder: The folder.
+        prepared: The drive.
+        assembled: Its map.
+        checked: The same with its verdict.
+        figures: For the report.
+        how_calibrated: How the camera was found.
+        pictures: Draw the map, its frames and the report's page.
+    """
+    drive_map, settings = checked.mapped.drive_map, prepared.settings
+    edges = map_edges(assembled.segments, prepared.drive.frames, assembled.factor)
+    write_map(folder, drive_map, edges, figures, how_calibrated)
+    write_text(folder / SETTINGS_NAME, dump_settings(settings))
+    write_tum(folder / "open_loop.tum", drive_map.t_s, assembled.open_poses)
+    if pictures:
+        _draw(folder, assembled, checked, figures, settings)
 
 
 def _draw(

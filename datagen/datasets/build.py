@@ -21,6 +21,7 @@ from datagen.datasets.jobs import (
     run_job,
 )
 from datagen.datasets.settings import DataSettings
+from lanenet.data.maps.joined import maps_in
 from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.processes import Progress, run_jobs
 
@@ -121,8 +122,14 @@ def prepare(
 
 
 def recorded_jobs(settings: DataSettings, work_dir: Path) -> list[RecordedJob]:
-    """Return the jobs of the recorded drives of a run, whose maps can be made before the rest."""
-    return [RecordedJob(drive, settings, work_dir / "drives") for drive in settings.drives]
+    """Return the jobs of the recorded drives of a run, whose maps can be made before the rest.
+
+    Joined maps have a job for each of their drives.
+    """
+    drives = [
+        drive.model_copy(update={"path": path}) for drive in settings.drives for path in maps_in(drive.path)
+    ]
+    return [RecordedJob(drive, settings, work_dir / "drives") for drive in drives]
 
 
 def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import cKDTree
 
@@ -33,6 +33,8 @@ _ROUGH_LANES, _MOST_GUESSES = 0.5, 16
 _SAME_LANES = 0.4
 #: Gates of the refinement, in lane widths, steps in each, and cosine between lines that may be one.
 _GATES_LANES, _STEPS, _COSINE = (0.6, 0.3, 0.15, 0.1, 0.1), 4, 0.92
+#: Lines of two maps are one up to this distance, in lane widths. Chosen: far from the middle of the lane.
+_MET_LANES = 0.2
 #: Sigma of the scale between two maps: two lane widths measured with a ruler, 1.2 % each, which the shape
 #: overrules; and of a point across its line, in lane widths, of which one in so many lane widths counts.
 _SCALE_SIGMA, _POINT_LANES, _ALIKE_LANES = 0.02, 0.02, 0.5
@@ -241,8 +243,8 @@ def refined(first: TrackShape, second: TrackShape, guess: Similarity, opposite: 
             pull = -(jacobian * weight[:, None]).T @ off[met] - prior @ [0, 0, 0, np.log(move.scale)]
             dx, dy, turn, grow = np.linalg.lstsq(information + prior, pull, rcond=1e-12)[0]
             move = _stepped(move, centre, float(dx), float(dy), float(turn), float(grow))
-    apart_cm = _apart(second, move.points(first.points_cm), move.directions(first.tangents))
-    back_cm = _apart(first.moved(move), second.points_cm, second.tangents)
+    apart_cm, _ = distances(second, move.points(first.points_cm), move.directions(first.tangents))
+    back_cm, _ = distances(first.moved(move), second.points_cm, second.tangents)
     slack = _slack(information + prior, move.points(first.path_cm) - move.points(centre[None])[0])
     return Alignment(move, opposite, apart_cm, back_cm, slack)
 
@@ -277,15 +279,15 @@ def _off_lines(
     return off, normal, (np.abs(off) < gate_cm) & beside & same
 
 
-def _apart(
+def distances(
     second: TrackShape, at_cm: Float[np.ndarray, "m 2"], along: Float[np.ndarray, "m 2"]
-) -> Float[np.ndarray, "m"]:
-    """See :attr:`Alignment.apart_cm`."""
+) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    """Distance of points from the lines of a map, see :attr:`Alignment.apart_cm`, and the nearest points."""
     off, _, met = _off_lines(
-        second.tree, second.points_cm, second.tangents, at_cm, along, 0.2 * second.lane_cm
+        second.tree, second.points_cm, second.tangents, at_cm, along, _MET_LANES * second.lane_cm
     )
     missing = np.where(second.surveyed(at_cm) & ~second.unknown(at_cm), np.nan, np.inf)
-    return np.where(met, off, missing)
+    return np.where(met, off, missing), np.asarray(second.tree.query(at_cm)[1])
 
 
 def _slack(information: Float[np.ndarray, "4 4"], offsets_cm: Float[np.ndarray, "p 2"]) -> float:

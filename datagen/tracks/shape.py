@@ -56,6 +56,11 @@ class Similarity:
         """Move poses; headings stay unwrapped."""
         return np.column_stack([self.points(poses[:, :2]), poses[:, 2] + self.turn_rad])
 
+    def then(self, other: Similarity) -> Similarity:
+        """Return both moves, one after the other."""
+        x, y = other.points(np.array([[self.x_cm, self.y_cm]]))[0]
+        return Similarity(float(x), float(y), self.turn_rad + other.turn_rad, self.scale * other.scale)
+
     @property
     def inverse(self) -> Similarity:
         """The way back."""

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from lanenet.cli import calibrate, detect, export, label, label_all, map, sweep, train, val
+from lanenet.cli import calibrate, detect, export, join, label, label_all, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console, standing
@@ -22,7 +22,7 @@ from lanenet.cli.shared.options import held_to_the_end
 from lanenet.errors import LanenetError
 
 _VERBS = {
-    "Your own drive": (map, label, train, val, detect, calibrate),
+    "Your own drive": (map, join, label, train, val, detect, calibrate),
     "On the car": (doctor, bench, drive, stop, export),
     "Many drives": (label_all,),
     "Research": (simulate, sweep, judge, worlds, reality, localise, analyse),

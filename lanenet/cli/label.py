@@ -19,7 +19,9 @@ app = typer.Typer()
 @app.command(epilog="Example: lanenet label runs/tub --out runs/tub.parquet")
 def label(
     map_folder: Annotated[Path, typer.Argument(metavar="MAP", help="Folder of a map.")],
-    out: Annotated[Path, typer.Option(help="Label set to write (.parquet).")],
+    out: Annotated[
+        Path, typer.Option(help="Label set to write (.parquet); of joined maps one for each drive.")
+    ],
     force: Annotated[bool, typer.Option("--force", help="Label a rejected map, too.")] = False,
     colour_weight: Annotated[
         float | None,
@@ -29,10 +31,16 @@ def label(
     ] = None,
 ) -> None:
     """Project a map's lane lines into each frame: six labels per frame, and a report of their quality."""
-    report = label_set(map_folder, out, force, colour_weight)
-    console.show_lines(report.lines)
-    console.wrote(out)
-    console.next_command("val", "MODEL", map_folder)
+    from lanenet.data.maps.joined import maps_in
+
+    maps = maps_in(map_folder)
+    # Each drive of joined maps has a camera, frame numbers and laps of its own.
+    outs = [out] if maps == [map_folder] else [out.with_stem(f"{out.stem}-{one.name}") for one in maps]
+    for one, own in zip(maps, outs, strict=True):
+        report = label_set(one, own, force, colour_weight)
+        console.show_lines(report.lines)
+    console.wrote(*outs)
+    console.next_command("val", "MODEL", maps[0])
 
 
 def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | None) -> Report:

@@ -29,6 +29,8 @@ FOLDER_KINDS: dict[str, tuple[str, ...]] = {
         *("map.yaml", "settings.yaml", "camera.yaml", "poses.csv", "trajectory.tum"),
         *("lanes.json", "edges.parquet", "report.json"),
     ),
+    # Maps of several drives of one track.
+    "joined": ("joined.yaml", "join.json"),
     # Of a drive that gave no map; a map replaces it.
     "refused": ("refused.yaml", "report.html"),
     "export": ("export.yaml", "README.md", "camera.yaml"),

@@ -206,7 +206,9 @@ def read_map_meta(folder: Path) -> MapMeta:
     restore_output(folder)
     if not (folder / "map.yaml").is_file():
         refused = (folder / "refused.yaml").is_file()
+        joined = (folder / "joined.yaml").is_file()
         why = f"its drive was refused, see {folder / 'report.html'}" if refused else "no map.yaml in it"
+        why = "it holds joined maps: give that of one drive in it" if joined else why
         raise MapFormatError(f"{folder}: is not a map ({why})")
     path = FolderFiles(folder).file("map.yaml", folder, MapFormatError)
     plain = read_yaml(path, MapFormatError)

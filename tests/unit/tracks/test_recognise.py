@@ -18,6 +18,12 @@ def wavy(xy: np.ndarray) -> np.ndarray:
     return xy + 1.5 * np.stack([np.sin(xy[:, 1] / 70.0), np.cos(xy[:, 0] / 90.0)], axis=1)
 
 
+def marks_on(centre_cm: np.ndarray) -> np.ndarray:
+    """Marks near the middle of the lane, at random."""
+    rng = np.random.default_rng(3)
+    return centre_cm[rng.integers(len(centre_cm), size=60)] + rng.normal(0.0, 4.0, (60, 2))
+
+
 @pytest.mark.parametrize(
     ("start", "laps", "opposite"),
     [(0.0, 1.0, False), (0.37, 1.0, False), (0.7, 1.0, True), (0.2, 0.6, False), (0.55, 0.6, True)],
@@ -25,9 +31,9 @@ def wavy(xy: np.ndarray) -> np.ndarray:
 def test_a_track_is_known_again_from_any_start_in_both_directions_and_from_part_of_a_lap(
     start, laps, opposite
 ):
-    centre = bean()
-    other = track(centre, start, laps, opposite, bend=wavy)
-    found = recognise(other.moved(ELSEWHERE), track(centre))
+    centre, marks = bean(), marks_on(bean())
+    other = track(centre, start, laps, opposite, marks, bend=wavy)
+    found = recognise(other.moved(ELSEWHERE), track(centre, marks_cm=marks))
     assert found.answer == "same", found.sentence
     assert found.alignment.opposite is opposite
     # Back where it came from: the bend of the map is left, and what it does beyond the part that was driven.
@@ -43,6 +49,12 @@ def test_other_tracks_of_the_same_length_and_width_are_not_joined(phase):
     assert "lines" in found.sentence
 
 
+def test_a_part_of_a_lap_needs_more_than_its_lines():
+    found = recognise(track(bean(), 0.2, 0.6), track(bean()))
+    assert found.answer == "undetermined"
+    assert "confirm" in found.sentence
+
+
 def test_the_mirror_image_of_a_track_is_another_track():
     assert recognise(track(bean() * [1.0, -1.0]), track(bean())).answer == "different"
 
@@ -52,8 +64,7 @@ def test_an_oval_fits_itself_turned_and_is_refused_unless_marks_tell():
     assert plain.answer == "ambiguous"
     assert "2 ways" in plain.sentence
     rng = np.random.default_rng(3)
-    at = rng.uniform(0.0, 2.0 * np.pi, 60)
-    marks = np.stack([220.0 * np.cos(at), 130.0 * np.sin(at)], axis=1) + rng.normal(0.0, 4.0, (60, 2))
+    marks = marks_on(oval())
     marked = track(oval(), 0.1, marks_cm=marks).moved(ELSEWHERE)
     told = recognise(marked, track(oval(), 0.6, marks_cm=marks + rng.normal(0.0, 0.5, (60, 2))))
     assert told.answer == "same"

@@ -55,7 +55,7 @@ def track(
         _line(index, _bent(xy + aside * LANE_CM * left, bend), closed)
         for index, aside in enumerate((0.5, -0.5))
     )
-    marks = np.empty((0, 2)) if marks_cm is None else marks_cm
+    marks = np.empty((0, 2)) if marks_cm is None else _bent(marks_cm, bend)
     return TrackShape(
         "known", LANE_CM, lines, _bent(xy[::10], bend), marks, np.tile([1.0, 0.0], (len(marks), 1))
     )
