@@ -28,6 +28,7 @@ from lanenet.calibration.printed import Paper, near_left_cm
 from lanenet.cli.app import app
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive
+from lanenet.data.maps.joined import FORMAT, JoinedDrive, JoinedMeta, write_joined
 
 CONFIGS = sorted((REPO / "configs").glob("*.yaml"))
 COMMANDS = [command for document in DOCUMENTS for command in commands_of(document)]
@@ -126,10 +127,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                     invoke(f"{example} frames={FRAMES} {width} --out {shown['path']}")
     drive = project / "runs" / "drive7"
     count_from(940, project.parent / "shared" / "data" / "donkey_circuit" / "frames.csv")
-    shutil.copytree(drive, project / "my_tub")
-    shutil.copytree(drive, project / "other_tub")
+    for name in ("my_tub", "other_tub", "monday_tub", "tuesday_tub"):
+        shutil.copytree(drive, project / name)
     shutil.copytree(drive, project / "runs" / "drive8")
     shutil.copytree(project / "runs" / "my_map", project / "runs" / "donkey_map")
+    write_track(project / "runs" / "track", project / "runs" / "my_map")
     shutil.copytree(project / "checkpoints" / "general", project / "checkpoints" / "donkey_circuit")
     for copy in (project / "runs", project / "checkpoints" / "donkey_circuit"):
         shutil.copy(drive / "camera.yaml", copy / "camera.yaml")
@@ -149,6 +151,16 @@ def count_from(first: int, table: Path) -> None:
     cells = [row.split(",", 1) for row in rows]
     numbered = [f"{first + int(frame)},{rest}" for frame, rest in cells]
     table.write_text("\n".join([head, *numbered]) + "\n", encoding="utf-8")
+
+
+def write_track(track: Path, one_map: Path) -> None:
+    """A folder as ``join`` leaves it, of two drives that have the same map."""
+    drives = []
+    for name in ("monday", "tuesday"):
+        shutil.copytree(one_map, track / name)
+        how = {"x_cm": 0.0, "y_cm": 0.0, "turn_rad": 0.0, "scale": 1.0, "opposite": False}
+        drives.append(JoinedDrive(map=name, made_from=f"runs/{name}", **how))
+    write_joined(track, JoinedMeta(format=FORMAT, shared_camera=True, drives=tuple(drives)))
 
 
 def write_recordings(project: Path, path: Path) -> None:
@@ -234,7 +246,8 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
     assert invoke(" ".join([line, smaller]))
     for path in written:
         # Some write several files that begin with the name.
-        newest = max((made.stat().st_mtime_ns for made in Path().glob(f"{path}*")), default=0)
+        beginning = path.removesuffix(".parquet")
+        newest = max((made.stat().st_mtime_ns for made in Path().glob(f"{beginning}*")), default=0)
         assert newest > made_before - CLOCK_STEP_NS, f"{line}: did not write {path}"
 
 

@@ -21,8 +21,9 @@ HEAVY = (
     *("onnx", "onnxscript", "safetensors", "tensorboard"),
 )
 #: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
-#: written, a bag read, and a device of the car opened, only if its package is there.
+#: written, a bag read, a storage used, and a device of the car opened, only if its package is there.
 NAMED_IMPORTS = {
+    "datagen/fleet/storage.py": {"fsspec"},
     "lanenet/data/": {"pyarrow"},
     "lanenet/data/hub.py": {"huggingface_hub"},
     "lanenet/data/drives/bag/": {"mcap", "rosbags"},

@@ -34,6 +34,23 @@ CREATE TABLE drives (
   added_at TEXT NOT NULL
 ) STRICT;
 CREATE INDEX drives_by_checksum ON drives (checksum);
+CREATE TABLE fingerprints (
+  drive_id INTEGER PRIMARY KEY REFERENCES drives ON DELETE CASCADE,
+  data BLOB NOT NULL
+) STRICT;
+CREATE TABLE relations (
+  drive_id INTEGER NOT NULL REFERENCES drives ON DELETE CASCADE,
+  other_id INTEGER NOT NULL REFERENCES drives ON DELETE CASCADE,
+  first_frame INTEGER NOT NULL,
+  last_frame INTEGER NOT NULL,
+  other_first_frame INTEGER NOT NULL,
+  other_last_frame INTEGER NOT NULL,
+  matched INTEGER NOT NULL,
+  same_bytes INTEGER NOT NULL,
+  difference REAL NOT NULL
+) STRICT;
+CREATE INDEX relations_by_drive ON relations (drive_id);
+CREATE INDEX relations_by_other ON relations (other_id);
 """
 
 

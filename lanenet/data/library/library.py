@@ -5,7 +5,8 @@ from __future__ import annotations
 import datetime
 import shutil
 import sqlite3
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,21 @@ from lanenet.data.drives import FORMATS, open_drive
 from lanenet.data.drives.recording import Drive, drive_file_of
 from lanenet.data.library import database
 from lanenet.data.library.entry import FIELDS, Entry, check_name, check_told, name_of
-from lanenet.data.library.fingerprint import checksum
+from lanenet.data.library.fingerprint import Fingerprint, checksum, take_fingerprint
+from lanenet.data.library.overlap import Overlap, Recording, find_overlaps
 from lanenet.errors import LanenetError, LibraryError, did_you_mean
 from lanenet.outputs import lock_output, make_folder, put_in_place, remove, temporary_output
 
 #: Where a library is, unless it is said: in the current folder.
 DEFAULT_LIBRARY = Path("drives.sqlite")
+
+#: Fingerprints in memory at a time; chosen: 10 MB of drives of 2000 frames.
+_AT_A_TIME = 64
+_RELATIONS = """
+SELECT one.name, other.name,
+  first_frame, last_frame, other_first_frame, other_last_frame, matched, same_bytes, difference
+FROM relations JOIN drives AS one ON one.id = drive_id JOIN drives AS other ON other.id = other_id
+"""
 
 
 class Library:
@@ -122,15 +132,19 @@ class Library:
         name: str | None = None,
         copy: bool = False,
         force: bool = False,
+        progress: Callable[[int, int], object] | None = None,
         **told: str | float | None,
     ) -> Entry:
         """Add a drive: read all of it, and keep what it is known by.
+
+        Frames that it shares with drives of the library are kept as relations (:meth:`relations`).
 
         Args:
             source: Tub, drive folder, video or bag.
             name: Its name in the library; None makes one of the source's.
             copy: Copy it beside the library's file, instead of keeping where it is.
             force: Add it even if the library holds the same recording.
+            progress: Called with (frames read, frames).
             **told: ``car``, ``camera``, ``track``, ``licence``, ``notes``, ``lane_width_cm``; the last two
                 default to those of the drive's own ``drive.yaml``.
 
@@ -146,15 +160,61 @@ class Library:
         if name is not None:
             check_name(name)
         drive = open_drive(source)
-        entry = self._found(drive, told)
-        if not copy:
-            with database.writing(self.path) as connection:
-                return self._insert(connection, replace(entry, name=name or ""), force)
+        fingerprint, found = take_fingerprint(drive, progress)
+        entry = replace(self._found(drive, told), name=name or "", checksum=found)
         # Before the work; another process may still add the same.
         with database.reading(self.path) as connection:
-            entry = self._placed(connection, replace(entry, name=name or ""), force)
+            entry = self._placed(connection, entry, force)
+        new = _New(replace(entry, name=name or ""), Recording(entry.name, fingerprint), force)
+        new.compare(self._recordings())
+        if not copy:
+            with database.writing(self.path) as connection:
+                return self._insert(connection, new)
         with lock_output(self.copies / entry.name):
-            return self._add_copy(drive, entry, force)
+            return self._add_copy(drive, replace(new, entry=entry))
+
+    def relations(self, name: str) -> list[tuple[str, Overlap]]:
+        """Return which frames a drive shares with others of the library.
+
+        Returns:
+            The other's name and the frames, in the order of both.
+
+        Raises:
+            LibraryError: If there is no such drive.
+        """
+        return self.all_relations().get(self.get(name).name, [])
+
+    def all_relations(self) -> dict[str, list[tuple[str, Overlap]]]:
+        """Return what :meth:`relations` does of every drive that shares frames with another.
+
+        Raises:
+            LibraryError: If the file cannot be read.
+        """
+        found: dict[str, list[tuple[str, Overlap]]] = {}
+        with database.reading(self.path) as connection:
+            for row in connection.execute(_RELATIONS):
+                one, other, *frames, matched, same_bytes, difference = row
+                overlap = Overlap(
+                    (frames[0], frames[1]), (frames[2], frames[3]), matched, bool(same_bytes), difference
+                )
+                found.setdefault(one, []).append((other, overlap))
+                found.setdefault(other, []).append((one, overlap.swapped))
+        return {
+            name: sorted(all_, key=lambda each: (each[0], each[1].frames)) for name, all_ in found.items()
+        }
+
+    def recording(self, name: str) -> Recording:
+        """Return by what a drive is known again, to compare it with others.
+
+        Raises:
+            LibraryError: If there is no such drive.
+        """
+        with database.reading(self.path) as connection:
+            entry = self._get(connection, name)
+            row = connection.execute(
+                "SELECT data FROM fingerprints JOIN drives ON id = drive_id WHERE name = ?", (name,)
+            ).fetchone()
+        return Recording(name, Fingerprint.from_bytes(row["data"]), entry.track)
 
     def update(self, name: str, **told: str | float | None) -> Entry:
         """Change what people say about a drive.
@@ -210,7 +270,7 @@ class Library:
         return _entry(row)
 
     def _found(self, drive: Drive, told: dict[str, str | float | None]) -> Entry:
-        """Return what a drive says about itself, and people about it; the name is still missing."""
+        """Return what a drive says about itself, and people about it; name and checksum are still missing."""
         kind = next(known.kind for known in FORMATS if known.recognises(drive.path))
         path = drive.path.resolve()
         steps_s = np.diff(drive.t_s)[~drive.breaks[1:]]
@@ -227,7 +287,7 @@ class Library:
             lane_width_cm=drive.lane_width_cm,
             frames=len(drive),
             duration_s=float(steps_s.sum()),
-            checksum=checksum(drive),
+            checksum="",
             added_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         )
         return replace(entry, **told)  # type: ignore[arg-type]
@@ -251,15 +311,41 @@ class Library:
         numbered = (f"{own}-{number}" for number in range(2, len(taken) + 3))
         return replace(entry, name=next(n for n in (own, f"{above}-{own}"[:95], *numbered) if n not in taken))
 
-    def _insert(self, connection: sqlite3.Connection, entry: Entry, force: bool) -> Entry:
-        entry = self._placed(connection, entry, force)
+    def _recordings(self, after: int = 0) -> Iterator[tuple[int, Recording]]:
+        """Yield the drives added after one, by their numbers; nobody has to wait for who compares them."""
+        while True:
+            with database.reading(self.path) as connection:
+                rows = list(_stored(connection, after, _AT_A_TIME))
+            if not rows:
+                return
+            yield from rows
+            after = rows[-1][0]
+
+    def _insert(self, connection: sqlite3.Connection, new: _New) -> Entry:
+        entry = self._placed(connection, new.entry, new.force)
+        # Others may have been added and removed meanwhile.
+        new.compare(_stored(connection, new.compared, -1))
+        there = {row[0] for row in connection.execute("SELECT id FROM drives")}
         values = {**asdict(entry), "source": entry.source.as_posix(), "copied": int(entry.copied)}
         columns = ", ".join(f":{field}" for field in FIELDS)
-        connection.execute(f"INSERT INTO drives ({', '.join(FIELDS)}) VALUES ({columns})", values)
+        drive_id = connection.execute(
+            f"INSERT INTO drives ({', '.join(FIELDS)}) VALUES ({columns})", values
+        ).lastrowid
+        data = new.recording.fingerprint.to_bytes()
+        connection.execute("INSERT INTO fingerprints VALUES (?, ?)", (drive_id, data))
+        connection.executemany(
+            "INSERT INTO relations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [
+                (drive_id, other, *o.frames, *o.other_frames, o.matched, int(o.same_bytes), o.difference)
+                for other, o in new.overlaps
+                if other in there
+            ],
+        )
         return entry
 
-    def _add_copy(self, drive: Drive, entry: Entry, force: bool) -> Entry:
+    def _add_copy(self, drive: Drive, new: _New) -> Entry:
         """Copy a drive under a temporary name, read the copy, and give it its name with the entry's."""
+        entry = new.entry
         home, inside = self.copies / entry.name, "" if drive.path.is_dir() else drive.path.name
         if home.exists():
             raise LibraryError(
@@ -277,12 +363,42 @@ class Library:
             entry = replace(entry, source=(home / inside).relative_to(self.folder), copied=True)
             try:
                 with database.writing(self.path) as connection:
-                    entry = self._insert(connection, entry, force)
+                    entry = self._insert(connection, replace(new, entry=entry))
                     put_in_place(temporary, home)
             except BaseException:
                 remove(home)
                 raise
         return entry
+
+
+@dataclass
+class _New:
+    """A drive that is being added.
+
+    Attributes:
+        entry: The entry, perhaps without a name.
+        recording: By what it is known.
+        force: Whether the library may hold it already.
+        compared: Number of the last drive that it was compared with.
+        overlaps: What it shares with which.
+    """
+
+    entry: Entry
+    recording: Recording
+    force: bool
+    compared: int = 0
+    overlaps: list[tuple[int, Overlap]] = field(default_factory=list)
+
+    def compare(self, others: Iterable[tuple[int, Recording]]) -> None:
+        for number, other in others:
+            self.overlaps += [(number, overlap) for overlap in find_overlaps(self.recording, other)]
+            self.compared = number
+
+
+def _stored(connection: sqlite3.Connection, after: int, most: int) -> Iterator[tuple[int, Recording]]:
+    query = "SELECT id, name, data FROM drives JOIN fingerprints ON id = drive_id WHERE id > ? ORDER BY id"
+    for row in connection.execute(f"{query} LIMIT ?", (after, most)):
+        yield row["id"], Recording(row["name"], Fingerprint.from_bytes(row["data"]))
 
 
 def _entry(row: sqlite3.Row) -> Entry:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 from drives import record, write_drive, write_tub, write_video
 from nth_failure import DISK, every_failure, visible
+from recordings import lap, write_recording
 
 from lanenet.data.library import Entry, Library, database
+from lanenet.data.library.overlap import Overlap, Recording
 from lanenet.errors import ConfigError, LanenetError, LibraryError
 from lanenet.processes import run_jobs
 
@@ -284,6 +287,53 @@ def test_each_failure_of_a_copy_leaves_no_half_drive(tmp_path: Path) -> None:
         assert not library.copies.is_dir() or visible(library.copies) == [], failure.call
     library.check("source")
     assert points > 5
+
+
+def test_what_drives_share_is_kept_as_a_relation(tmp_path: Path) -> None:
+    library = _library(tmp_path)
+    pictures = lap(1, 120)
+    library.add(write_recording(tmp_path / "whole", pictures))
+    library.add(write_recording(tmp_path / "cut", pictures[30:90], quality=50, first=7))
+    library.add(write_recording(tmp_path / "lap", lap(2, 120)))
+    ((other, overlap),) = library.relations("cut")
+    assert other == "whole" and not overlap.same_bytes
+    assert (overlap.frames, overlap.other_frames) == ((7, 66), (30, 89))
+    assert library.relations("whole") == [("cut", overlap.swapped)]
+    assert library.relations("lap") == []
+    copied = library.add(tmp_path / "whole", name="again", force=True)
+    assert copied.checksum == library.get("whole").checksum
+    assert library.relations("again")[1] == ("whole", Overlap((0, 119), (0, 119), 120, True, 0.0))
+    library.remove("whole")
+    assert [other for other, _ in library.relations("cut")] == ["again"]
+
+
+def test_drives_that_were_added_meanwhile_are_compared_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = _library(tmp_path)
+    pictures = lap(1, 60)
+    one, other = (
+        write_recording(tmp_path / f"q{quality}", pictures, quality=quality) for quality in (40, 90)
+    )
+    compared = library._recordings
+
+    def late() -> Iterator[tuple[int, Recording]]:
+        yield from compared()
+        monkeypatch.undo()
+        library.add(other)
+
+    monkeypatch.setattr(library, "_recordings", late)
+    library.add(one)
+    assert [name for name, _ in library.relations("q40")] == ["q90"]
+
+
+def test_a_recording_is_ready_to_be_compared(tmp_path: Path) -> None:
+    library = _library(tmp_path)
+    library.add(write_recording(tmp_path / "a", lap(1, 20)), track="hall")
+    recording = library.recording("a")
+    assert (recording.name, recording.track, len(recording.fingerprint)) == ("a", "hall", 20)
+    with pytest.raises(LibraryError, match="no drive 'b'"):
+        library.recording("b")
 
 
 def test_what_is_no_drive_is_refused(tmp_path: Path) -> None:
