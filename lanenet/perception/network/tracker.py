@@ -32,16 +32,22 @@ _LEAST_PRESENCE = 0.3
 #: moves by 5 cm between two, and turns by 0.1 rad in the tightest bend.
 _MOVED_CM = np.array([2.0, 3.0, 5.0])
 #: Width of a marking before any was seen, and its sigma; its sigma once so many were seen; so many count.
-_MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM, _ENOUGH, _LENGTH = 3.0, 2.0, 0.3, 10, 200
+_MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM, _ENOUGH, _LENGTH = 3.0, 2.0, 0.3, 10, 50
+#: Once markings are known, every so many frames one is measured that may have any width. Chosen: a wrong belief is
+#: gone after as many seconds as it took frames to learn, and costs a tenth of the refinement.
+_MEASURED_EVERY = 4
 #: Length along the road, [cm], in which a border has to be seen for a width to count, and for a line to.
 _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
 #: What speaks for a pair of lines, in centimetres of seen borders: the presence that the network gives it,
 #: that it continues the last frame's; what its width costs at most, and sigma of the width's logarithm. The
 #: last two were tried: a lane may widen in plain sight, but the line of another lane is none of its own.
 _BY_PRESENCE_CM, _BY_CONTINUING_CM, _BY_WIDTH_CM, _WIDTH_SIGMA = 6.0, 3.0, 45.0, 0.2
+#: The same presence while the front axle's middle is within this share of the lane's width of one of its lines: in which of two
+#: lanes a car is that drives on a line, the network has learned from those who set the labels.
+_BY_PRESENCE_ON_LINE_CM, _ON_LINE = 24.0, 0.12
 #: What it costs at most that the front axle's middle is not between the two, and how far beside them that is.
 #: Chosen: more than what a network's opinion brings, less than a line that is not to be seen.
-_BY_OUTSIDE_CM, _OUTSIDE_CM = 20.0, 2.0
+_BY_OUTSIDE_CM, _OUTSIDE_CM = 40.0, 1.0
 #: Length in which a line beyond a crossed one has to be seen. A single border, as that of a mat, is seen over
 #: half of the 46 cm that count.
 _BEYOND_SEEN_CM = 26.0
@@ -100,6 +106,7 @@ class LaneTracker:
         self.straight_on = StraightOn()
         self._sees = sees
         self._markings_cm = [RollingMedian(_LENGTH), RollingMedian(_LENGTH)]
+        self._frames = 0
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
@@ -135,9 +142,9 @@ class LaneTracker:
             self._last = self.straight_on.lane()
             return (*self._known(*(a.reshape(6) for a in self._last)), np.zeros(len(SIDES)))
         self._notice_change(pair)
+        self._measure_markings(own, presence, pair, borders)
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
-                self._markings_cm[side].append(line.marking_cm)
                 self.looks.remember(side, line.look)
         self.looks.judge()
         found_cm = np.concatenate([line.points_cm for line in pair])
@@ -165,9 +172,12 @@ class LaneTracker:
     ) -> tuple[list[_Candidate], list[_Candidate]]:
         """Collect what the left and the right line may be; the last of each is the network's, as it is."""
         starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
+        by_presence_cm = _BY_PRESENCE_CM
+        if self._last is not None and np.abs(self._last[0][:, 0]).min() < _ON_LINE * self.lane.likely_cm:
+            by_presence_cm = _BY_PRESENCE_ON_LINE_CM
         for side in range(len(SIDES)):
             if presence[side] >= _LEAST_PRESENCE:
-                starts.append((side, own[0][side], own[1][side], _BY_PRESENCE_CM * float(presence[side])))
+                starts.append((side, own[0][side], own[1][side], by_presence_cm * float(presence[side])))
             if self._last is not None:
                 moved_cm = np.hypot(self._last[1][side], _MOVED_CM)
                 starts.append((side, self._last[0][side], moved_cm, _BY_CONTINUING_CM))
@@ -272,6 +282,30 @@ class LaneTracker:
                 self._markings_cm[side] = RollingMedian(_LENGTH)
                 return
 
+    def _measure_markings(
+        self,
+        own: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]],
+        presence: Float[np.ndarray, "2"],
+        pair: tuple[_Candidate, _Candidate],
+        borders: RoadBorders,
+    ) -> None:
+        """Learn how wide the lane's markings are, and whether they are light, from the network's own lines.
+
+        What was learned has no say: else a wrong belief would find itself confirmed in every frame.
+        """
+        self._frames += 1
+        known = all(len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm)
+        if known and self._frames % _MEASURED_EVERY:
+            return
+        sides = [side for side in range(len(SIDES)) if presence[side] >= _LEAST_PRESENCE]
+        if not sides:
+            return
+        found = self._refine(own[0][sides], own[1][sides], sides, [None] * len(sides), borders, known=False)
+        for i, side in enumerate(sides):
+            off_cm = np.abs(found.points_cm[i] - pair[side].points_cm).max()
+            if found.seen_cm[i] >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
+                self._markings_cm[side].append(float(found.marking_cm[i]))
+
     def _refine(
         self,
         points_cm: Float[np.ndarray, "m 3"],
@@ -279,21 +313,22 @@ class LaneTracker:
         sides: Sequence[int],
         known_as: Sequence[int | None],
         borders: RoadBorders,
+        known: bool = True,
     ) -> RefinedLines:
-        """Refine lines; light or dark is tried until markings are known."""
-        known = [len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm]
+        """Refine lines; light or dark is tried until markings are known, and where they are not to count."""
+        counts = [known and len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm]
         usual = [
             widths_cm.median if enough else _MARKING_CM
-            for widths_cm, enough in zip(self._markings_cm, known, strict=True)
+            for widths_cm, enough in zip(self._markings_cm, counts, strict=True)
         ]
         marking = np.array([usual[side] for side in sides])
-        sigma = np.array([_KNOWN_SIGMA_CM if known[side] else _MARKING_SIGMA_CM for side in sides])
+        sigma = np.array([_KNOWN_SIGMA_CM if counts[side] else _MARKING_SIGMA_CM for side in sides])
         hues = np.array([self.looks.hues(side) for side in known_as])
         light = refine_lines(points_cm, sigma_cm, borders, marking, sigma, hues)
-        if all(known[side] for side in sides):
+        if all(counts[side] for side in sides):
             return light
         dark = refine_lines(points_cm, sigma_cm, borders, -marking, sigma, hues)
-        darker = (dark.seen_cm > light.seen_cm) & ~np.array([known[side] for side in sides])
+        darker = (dark.seen_cm > light.seen_cm) & ~np.array([counts[side] for side in sides])
         return RefinedLines(
             *(
                 np.where(darker.reshape(-1, *[1] * (a.ndim - 1)), b, a)
