@@ -65,6 +65,17 @@ def test_dark_and_light_markings_are_told_apart(marking_cm):
     assert (seen_cm > 30.0).all() and (sigma_cm < 1.0).all()
 
 
+def test_a_marking_that_was_learned_wrong_is_unlearned():
+    """A dark tape of 6 cm of which glare showed the near border only, as a light strip of 1 cm."""
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    glare = BENT + np.array([2.5] * 3 + [-2.5] * 3)
+    for _ in range(12):
+        tracker.follow(glare, SURE, SEEN, edges_of(glare, 1.0))
+    for _ in range(60):
+        points_cm, _, _ = tracker.follow(BENT + 0.5, SURE, SEEN, edges_of(BENT, -6.0))
+    np.testing.assert_allclose(points_cm, BENT, atol=0.1)
+
+
 def test_a_frame_that_looks_like_the_next_lane_does_not_change_the_lane():
     tracker = LaneTracker(LaneMemory(LANE_CM))
     next_lane = BENT + LANE_CM
