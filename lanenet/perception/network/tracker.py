@@ -43,7 +43,7 @@ _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
 #: last two were tried: a lane may widen in plain sight, but the line of another lane is none of its own.
 _BY_PRESENCE_CM, _BY_CONTINUING_CM, _BY_WIDTH_CM, _WIDTH_SIGMA = 6.0, 3.0, 45.0, 0.2
 #: The same for presence while the front axle's middle is within this share of the lane's width of a line: the
-#: network has learned from the labels in which of two lanes a car on a line is. Tried: 6 to 24 cm, 0.12 and 0.2.
+#: network has learned from the labels in which of two lanes a car on a line is. Tried: 6 to 24 cm, 0.12, 0.2.
 _BY_PRESENCE_ON_LINE_CM, _ON_LINE = 24.0, 0.12
 #: What it costs at most that the front axle's middle is not between the two, and how far beside them that is.
 #: Tried: 20, 40 and 60 cm, 1 to 3 cm; about what a line is worth that is seen all along.
