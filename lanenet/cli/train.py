@@ -222,6 +222,7 @@ class _Run:
     def run(self) -> Path:
         """Do all stages; returns the checkpoint's folder."""
         begin = self._stages.begin
+        self._check_leaks()
         if self.jobs:
             with begin("map"):
                 for job in self.jobs:
@@ -240,6 +241,14 @@ class _Run:
         self._stages.finish()
         self._say_next(data)
         return self.checkpoint
+
+    def _check_leaks(self) -> None:
+        """Refuse drives that would leak between the parts, before anything is made of them."""
+        from datagen.datasets.build import check_leaks
+
+        with console.progress_bar("leaks") as progress:
+            unknown = check_leaks(self.settings.data, self.settings.work_folder, progress)
+        console.show_problems(unknown)
 
     def _map(self, job: RecordedJob) -> None:
         """Map a drive unless there is a map, and say what the map is worth.
@@ -372,6 +381,8 @@ class _Run:
         if len(jobs) < len(judged) or any(part.role != "test" for part in judged):
             return "on the test drives" if judged[0].role == "test" else "on the validation drives"
         splits = {chosen_split(read_labels(job.whole), job.recording) for job in jobs}
+        if splits == {"test"}:
+            return f"on {counted(len(jobs), 'drive')} that it had not seen"
         each = "" if len(jobs) == 1 else f" of each of the {len(jobs)} drives"
         what = "the last lap" if splits == {"lap"} else "the later part"
         return f"on {what}{each}, which it had not seen,"
@@ -486,7 +497,7 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
 
     Args:
         parts: Its label sets by their role.
-        how: ``lap``, ``time`` or ``none``.
+        how: ``lap``, ``time``, or the part that holds all of it.
         wanted: The setting, which ``how`` stands for.
     """
 
@@ -496,8 +507,10 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
         laps = f"lap {first}" if first == last else f"laps {first} to {last}"
         return f"{counted(len(labels), 'frame')}, {laps}"
 
-    if how == "none":
-        return [f"learns from all of it ({said('train')})"]
+    if len(parts) == 1:
+        (role,) = parts
+        does = {"train": "learns from", "validation": "chooses the epoch by", "test": "tests on"}[role]
+        return [f"{does} all of it ({said(role)})"]
     lines = [
         f"learns from {said('train')}; chooses the epoch by {said('validation')}; tests on {said('test')}"
     ]
