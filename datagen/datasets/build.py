@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.datasets.from_library import with_library
 from datagen.datasets.jobs import (
     CompileJob,
     Job,
@@ -80,6 +81,7 @@ def prepare(
         TrackingLostError: If more drives fail than may.
         LanenetError: What the first failing job raised; or that its process died, naming the drive.
     """
+    settings, _ = with_library(settings)
     synthetic = settings.synthetic
     jobs: list[Job] = [
         SyntheticJob.draw(settings, role, number, work_dir)

@@ -108,12 +108,42 @@ class RecordedSettings(Settings):
         return self
 
 
+class LibrarySettings(Settings):
+    """Drives of a library, all drives of a track in one part, see :mod:`datagen.datasets.from_library`.
+
+    Attributes:
+        file: The library (``lanenet drives``), relative to the folder in which the command runs.
+        labelled: What ``lanenet label-all`` wrote: drives have their maps from there, and those that it
+            refused are left out; None maps all drives.
+        seed: Of the draw of the tracks.
+        validation_share: Share of the tracks to choose the epoch by, rounded up. Chosen, like the next.
+        test_share: Share of the tracks to test on, likewise; the rest is learned from.
+        validation_tracks, test_tracks: Tracks of these parts, instead of drawn ones.
+    """
+
+    file: Path
+    labelled: Path | None = None
+    seed: int = Field(default=0, ge=0)
+    validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
+    test_share: float = Field(default=0.2, gt=0.0, lt=1.0)
+    validation_tracks: tuple[str, ...] = ()
+    test_tracks: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _a_track_is_in_one_part(self) -> LibrarySettings:
+        both = sorted(set(self.validation_tracks) & set(self.test_tracks))
+        if both:
+            raise ValueError(f"{both[0]!r} is one of validation_tracks and of test_tracks")
+        return self
+
+
 class DataSettings(Settings):
     """Where the label sets of a run come from.
 
     Attributes:
         synthetic: Synthetic drives.
         drives: Recorded drives.
+        library: More recorded drives, of a library, split by their tracks.
         map: Settings for mapping the synthetic drives.
         window: The bird's-eye window of the network: wide enough for the lane's lines on either side.
         colour_weight: Weight of colours beside brightness in the network's edges; maps use brightness alone.
@@ -122,6 +152,7 @@ class DataSettings(Settings):
 
     synthetic: SyntheticSettings = SyntheticSettings()
     drives: tuple[RecordedSettings, ...] = ()
+    library: LibrarySettings | None = None
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)

@@ -133,7 +133,9 @@ def train(
             raise ConfigError(f"{option}: is for drives, but {paths[0]} is a config, which has a key for it")
         words = [*map(str, paths[1:]), *overrides]
         settings: Any = load_settings(run_settings_schema(), paths[0], words)
-        check_paths(paths[0], [*(drive.path for drive in settings.data.drives), settings.learn.start_from])
+        data = settings.data
+        files = [] if data.library is None else [data.library.file, data.library.labelled]
+        check_paths(paths[0], [*(drive.path for drive in data.drives), *files, settings.learn.start_from])
         train_run(settings, marking, force, show_all)
         return
     if not paths:
@@ -185,8 +187,12 @@ def train_run(
     Returns:
         The checkpoint's folder.
     """
+    from datagen.datasets.from_library import with_library
     from lanenet.learn.checkpoint import check_start
 
+    # The run's config lists the drives: the library may be another one tomorrow.
+    data, tracks = with_library(settings.data)
+    settings = settings.model_copy(update={"data": data})
     check_taken(settings, force)
     lock_outputs(settings.checkpoints_dir / settings.name)
     check_start(settings.learn, settings.data.window, settings.data.perceptions)
@@ -194,6 +200,7 @@ def train_run(
     log = settings.work_folder / "train.log"
     stopped = stopped_in(log)
     with console.log_file(log):
+        console.show_lines(tracks)
         if stopped is not None:
             console.say(
                 f"resumes: the last run of this name stopped in the stage {stopped}; what it finished with "
