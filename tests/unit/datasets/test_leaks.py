@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from commands import refused
 from recordings import lap, write_recording
 from small_map import small_map
 
@@ -195,3 +197,23 @@ def test_whole_drives_make_the_parts_of_a_run(
     with pytest.raises(ConfigError, match="would leak"):
         prepare(leaky, tmp_path / "leaky")
     assert not list((tmp_path / "leaky").rglob("*.parquet"))
+
+
+def test_a_training_that_would_leak_is_refused_before_anything_is_made(
+    drives: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    listed = [
+        {"path": name, "lane_width_cm": 40.0, "split": split}
+        for name, split in (("whole", "train"), ("again", "test"), ("lap", "validation"))
+    ]
+    (tmp_path / "leaky.yaml").write_text(yaml.safe_dump({"name": "leaky", "data": {"drives": listed}}))
+    said = refused(tmp_path, "train", "leaky.yaml", writes="runs")
+    assert "error: data.drives: 1 pair of drives would leak" in said
+    assert "whole is a re-encoded copy of again: its frames 0 to 159 are 0 to 159 of again" in said
+    made = {
+        path.relative_to(tmp_path / "runs" / "leaky").parts[:2]
+        for path in (tmp_path / "runs").rglob("*")
+        if path.is_file()
+    }
+    assert made == {("train.log",), ("drives", "leaks")}
