@@ -68,6 +68,10 @@ class LibraryError(LanenetError):
     """A library of drives cannot be used, or does not hold a drive as it is asked for."""
 
 
+class SameRecordingError(LibraryError):
+    """A library holds the recording already, under another name."""
+
+
 class MapFormatError(LanenetError):
     """A map folder cannot be read."""
 

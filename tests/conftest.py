@@ -13,7 +13,7 @@ settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real drives, which are not part of the repository; tests that need them are skipped without them."""
     default = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -9,18 +9,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.datasets.from_library import with_library
 from datagen.datasets.jobs import (
-    ROLES,
     CompileJob,
     Job,
     LeftOut,
     Part,
     RecordedJob,
-    Role,
     SyntheticJob,
     run_job,
 )
-from datagen.datasets.settings import DataSettings
+from datagen.datasets.leaks import refuse_leaks
+from datagen.datasets.settings import ROLES, DataSettings, Role
 from lanenet.data.maps.joined import maps_in
 from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.processes import Progress, run_jobs
@@ -76,10 +76,12 @@ def prepare(
             synthetic drives: compiles what the training needs. A function of a module.
 
     Raises:
-        ConfigError: If there is nothing to learn from or to choose the epoch by.
+        ConfigError: If there is nothing to learn from or to choose the epoch by, or drives of different parts
+            share frames or a track.
         TrackingLostError: If more drives fail than may.
         LanenetError: What the first failing job raised; or that its process died, naming the drive.
     """
+    settings, _ = with_library(settings)
     synthetic = settings.synthetic
     jobs: list[Job] = [
         SyntheticJob.draw(settings, role, number, work_dir)
@@ -87,12 +89,14 @@ def prepare(
         for number in range(getattr(synthetic, role))
     ]
     jobs += recorded_jobs(settings, work_dir)
-    for role in ("train", "validation"):
-        split = [drive for drive in settings.drives if role == "train" or drive.split != "none"]
-        if not split and not getattr(synthetic, role):
+    roles: tuple[Role, ...] = ("train", "validation")
+    for role in roles:
+        if not any(role in drive.parts for drive in settings.drives) and not getattr(synthetic, role):
             raise ConfigError(
-                f"data: no {role} drives; set data.synthetic.{role} or list data.drives that are split"
+                f"data: no {role} drives; set data.synthetic.{role}, or list data.drives that are split, or "
+                f"whole ones of it (split: {role})"
             )
+    check_leaks(settings, work_dir)
     # The first drive that is mapped compiles what all others use. The test drives, which need little of that,
     # run beside it, so that no second process compiles the same.
     jobs[1:] = sorted(jobs[1:], key=lambda job: not (isinstance(job, SyntheticJob) and job.role == "test"))
@@ -130,6 +134,25 @@ def recorded_jobs(settings: DataSettings, work_dir: Path) -> list[RecordedJob]:
         drive.model_copy(update={"path": path}) for drive in settings.drives for path in maps_in(drive.path)
     ]
     return [RecordedJob(drive, settings, work_dir / "drives") for drive in drives]
+
+
+def check_leaks(
+    settings: DataSettings, work_dir: Path, progress: Callable[[str, int, int], object] | None = None
+) -> tuple[str, ...]:
+    """Refuse drives of which one is learned from and another, of the same recording or track, judged by.
+
+    Args:
+        settings: The data of a run.
+        work_dir: As for :func:`prepare`.
+        progress: Called with (stage, done, total).
+
+    Returns:
+        What could not be checked, for people.
+
+    Raises:
+        LanenetError: As :func:`datagen.datasets.leaks.refuse_leaks`.
+    """
+    return refuse_leaks(recorded_jobs(settings, work_dir), work_dir / "drives" / "leaks", progress)
 
 
 def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:

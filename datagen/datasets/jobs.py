@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from datagen.datasets.settings import DataSettings, RecordedSettings
+from datagen.datasets.settings import ROLES, DataSettings, RecordedSettings, Role
 from datagen.datasets.splits import in_window, split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
@@ -26,9 +25,6 @@ from lanenet.data.files import write_text
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import read_map
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
-
-Role = Literal["train", "validation", "test"]
-ROLES: tuple[Role, ...] = ("train", "validation", "test")
 
 #: Synthetic drives of each role whose map and labels get pictures. Chosen: nobody looks at those of hundreds.
 _PICTURED = 2
@@ -276,7 +272,7 @@ class RecordedJob:
             self._check_width()
 
     def run(self) -> tuple[Part, ...]:
-        """Make the three label sets, or the one to learn from.
+        """Make the three label sets, or the one that holds all of the drive.
 
         Raises:
             LanenetError: If the drive cannot be read, mapped or split.
@@ -286,19 +282,20 @@ class RecordedJob:
         files = [settings.path]
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
-        key = key_of(settings, data.window, data.colour_weight, *map(fingerprint, files))
+        # The track's name changes no label.
+        known = settings.model_dump(mode="json", exclude={"track"})
+        key = key_of(known, data.window, data.colour_weight, *map(fingerprint, files))
         folder = self.folder / "labels"
+        is_whole = len(settings.parts) == 1
         parts = tuple(
             Part(
                 role,
-                folder / f"{self.name}.{role}.parquet",
+                self.whole if is_whole else folder / f"{self.name}.{role}.parquet",
                 self.frames,
                 settings.counts_as if role == "train" else 1,
             )
-            for role in ROLES
+            for role in settings.parts
         )
-        if settings.split == "none":
-            parts = (Part("train", self.whole, self.frames, settings.counts_as),)
         # The last file that is written stands for all.
         done = Output(parts[-1].labels, key)
 
@@ -307,7 +304,7 @@ class RecordedJob:
             if not self.is_labels:
                 window, weight = data.window, data.colour_weight
                 label_map(self.frames, self.whole, window=window, colour_weight=weight)
-            if settings.split == "none":
+            if is_whole:
                 return
             labels = in_window(read_labels(self.whole), data.window)
             for part, split in zip(parts, split_recording(labels, settings), strict=True):

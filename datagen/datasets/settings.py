@@ -16,6 +16,9 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import LaneWidthCm
 from lanenet.perception.edges.road import COLOUR_WEIGHT, PerceptionSettings
 
+Role = Literal["train", "validation", "test"]
+ROLES: tuple[Role, ...] = ("train", "validation", "test")
+
 
 class SyntheticSettings(Settings):
     """Synthetic drives, each with its own road and its own look.
@@ -51,7 +54,7 @@ class SyntheticSettings(Settings):
 
 
 class RecordedSettings(Settings):
-    """A recorded drive, split along its time or by its laps, or all of it to learn from.
+    """A recorded drive, split along its time or by its laps, or all of it in one part.
 
     Attributes:
         path: Drive folder, tub or video, a finished map of one, or its label set (``.parquet``); relative to
@@ -62,8 +65,10 @@ class RecordedSettings(Settings):
         frames: First and last number of the frames to map; None for all. Not for a finished map.
         split: ``time`` cuts at the shares below; ``lap`` keeps the last lap for the test, the one before it
             for the validation and all earlier ones for learning; ``auto`` is ``lap`` where there are three
-            complete laps, and else ``time``; ``none`` learns from all of it, so that other drives must
-            choose the epoch.
+            complete laps, and else ``time``; ``train``, ``validation`` and ``test`` give all of it to that
+            part, so that other drives must make up the others; ``none`` is the older word for ``train``.
+        track: Name of the track. Drives of one track are all in one part, see :mod:`datagen.datasets.leaks`;
+            empty if that is not asked.
         train_share: Share of the labelled frames, from the start, to learn from. Chosen, like the next.
         validation_share: Share of the following frames to choose the epoch by; the rest is for the test.
         gap_frames: Frames left out between the parts, so that neighbours are never on both sides. Chosen: 2 s
@@ -81,7 +86,8 @@ class RecordedSettings(Settings):
     camera_height_cm: float | None = Field(default=None, gt=0.0)
     tape_width_cm: float | None = Field(default=None, gt=0.0)
     frames: tuple[int, int] | None = None
-    split: Literal["time", "lap", "auto", "none"] = "time"
+    split: Literal["time", "lap", "auto", "train", "validation", "test", "none"] = "time"
+    track: str = ""
     train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     gap_frames: int = Field(default=40, ge=0)
@@ -89,10 +95,45 @@ class RecordedSettings(Settings):
     counts_as: int = Field(default=1, ge=1, le=100)
     map: MapSettings = MapSettings()
 
+    @property
+    def parts(self) -> tuple[Role, ...]:
+        """The parts that the drive is in: one if all of it is in that, else the three."""
+        whole: dict[str, Role] = {"none": "train", **{role: role for role in ROLES}}
+        return (whole[self.split],) if self.split in whole else ROLES
+
     @model_validator(mode="after")
     def _leave_some_for_the_test(self) -> RecordedSettings:
         if self.train_share + self.validation_share > 0.999:
             raise ValueError("train_share and validation_share must sum to less than 1: the rest is the test")
+        return self
+
+
+class LibrarySettings(Settings):
+    """Drives of a library, all drives of a track in one part, see :mod:`datagen.datasets.from_library`.
+
+    Attributes:
+        file: The library (``lanenet drives``), relative to the folder in which the command runs.
+        labelled: What ``lanenet label-all`` wrote: drives have their maps from there, and those that it
+            refused are left out; None maps all drives.
+        seed: Of the draw of the tracks.
+        validation_share: Share of the tracks to choose the epoch by, rounded up. Chosen, like the next.
+        test_share: Share of the tracks to test on, likewise; the rest is learned from.
+        validation_tracks, test_tracks: Tracks of these parts, instead of drawn ones.
+    """
+
+    file: Path
+    labelled: Path | None = None
+    seed: int = Field(default=0, ge=0)
+    validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
+    test_share: float = Field(default=0.2, gt=0.0, lt=1.0)
+    validation_tracks: tuple[str, ...] = ()
+    test_tracks: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _a_track_is_in_one_part(self) -> LibrarySettings:
+        both = sorted(set(self.validation_tracks) & set(self.test_tracks))
+        if both:
+            raise ValueError(f"{both[0]!r} is one of validation_tracks and of test_tracks")
         return self
 
 
@@ -102,6 +143,7 @@ class DataSettings(Settings):
     Attributes:
         synthetic: Synthetic drives.
         drives: Recorded drives.
+        library: More recorded drives, of a library, split by their tracks.
         map: Settings for mapping the synthetic drives.
         window: The bird's-eye window of the network: wide enough for the lane's lines on either side.
         colour_weight: Weight of colours beside brightness in the network's edges; maps use brightness alone.
@@ -110,6 +152,7 @@ class DataSettings(Settings):
 
     synthetic: SyntheticSettings = SyntheticSettings()
     drives: tuple[RecordedSettings, ...] = ()
+    library: LibrarySettings | None = None
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from lanenet.cli import calibrate, detect, export, join, label, label_all, map, sweep, train, val
+from lanenet.cli import calibrate, detect, drives, export, join, label, label_all, map, sweep, train, val
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console, standing
@@ -24,7 +24,7 @@ from lanenet.errors import LanenetError
 _VERBS = {
     "Your own drive": (map, join, label, train, val, detect, calibrate),
     "On the car": (doctor, bench, drive, stop, export),
-    "Many drives": (label_all,),
+    "Many drives": (drives, label_all),
     "Research": (simulate, sweep, judge, worlds, reality, localise, analyse),
 }
 #: The extra that brings a package, for the message when the package is missing.
@@ -91,8 +91,8 @@ app = typer.Typer(
 )
 for _panel, _verbs in _VERBS.items():
     for _verb in _verbs:
-        # Those of a group, such as calibrate, stand in the help of the group.
-        if _verb is not calibrate:
+        # Those of a group stand in the help of the group.
+        if _verb not in (calibrate, drives):
             for _command in _verb.app.registered_commands:
                 _command.rich_help_panel = _panel
         app.add_typer(_verb.app, rich_help_panel=_panel)

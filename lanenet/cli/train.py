@@ -133,7 +133,9 @@ def train(
             raise ConfigError(f"{option}: is for drives, but {paths[0]} is a config, which has a key for it")
         words = [*map(str, paths[1:]), *overrides]
         settings: Any = load_settings(run_settings_schema(), paths[0], words)
-        check_paths(paths[0], [*(drive.path for drive in settings.data.drives), settings.learn.start_from])
+        data = settings.data
+        files = [] if data.library is None else [data.library.file, data.library.labelled]
+        check_paths(paths[0], [*(drive.path for drive in data.drives), *files, settings.learn.start_from])
         train_run(settings, marking, force, show_all)
         return
     if not paths:
@@ -185,8 +187,12 @@ def train_run(
     Returns:
         The checkpoint's folder.
     """
+    from datagen.datasets.from_library import with_library
     from lanenet.learn.checkpoint import check_start
 
+    # The run's config lists the drives: the library may be another one tomorrow.
+    data, tracks = with_library(settings.data)
+    settings = settings.model_copy(update={"data": data})
     check_taken(settings, force)
     lock_outputs(settings.checkpoints_dir / settings.name)
     check_start(settings.learn, settings.data.window, settings.data.perceptions)
@@ -194,6 +200,7 @@ def train_run(
     log = settings.work_folder / "train.log"
     stopped = stopped_in(log)
     with console.log_file(log):
+        console.show_lines(tracks)
         if stopped is not None:
             console.say(
                 f"resumes: the last run of this name stopped in the stage {stopped}; what it finished with "
@@ -222,6 +229,7 @@ class _Run:
     def run(self) -> Path:
         """Do all stages; returns the checkpoint's folder."""
         begin = self._stages.begin
+        self._check_leaks()
         if self.jobs:
             with begin("map"):
                 for job in self.jobs:
@@ -240,6 +248,14 @@ class _Run:
         self._stages.finish()
         self._say_next(data)
         return self.checkpoint
+
+    def _check_leaks(self) -> None:
+        """Refuse drives that would leak between the parts, before anything is made of them."""
+        from datagen.datasets.build import check_leaks
+
+        with console.progress_bar("leaks") as progress:
+            unknown = check_leaks(self.settings.data, self.settings.work_folder, progress)
+        console.show_problems(unknown)
 
     def _map(self, job: RecordedJob) -> None:
         """Map a drive unless there is a map, and say what the map is worth.
@@ -372,6 +388,8 @@ class _Run:
         if len(jobs) < len(judged) or any(part.role != "test" for part in judged):
             return "on the test drives" if judged[0].role == "test" else "on the validation drives"
         splits = {chosen_split(read_labels(job.whole), job.recording) for job in jobs}
+        if splits == {"test"}:
+            return f"on {counted(len(jobs), 'drive')} that it had not seen"
         each = "" if len(jobs) == 1 else f" of each of the {len(jobs)} drives"
         what = "the last lap" if splits == {"lap"} else "the later part"
         return f"on {what}{each}, which it had not seen,"
@@ -486,7 +504,7 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
 
     Args:
         parts: Its label sets by their role.
-        how: ``lap``, ``time`` or ``none``.
+        how: ``lap``, ``time``, or the part that holds all of it.
         wanted: The setting, which ``how`` stands for.
     """
 
@@ -496,8 +514,10 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
         laps = f"lap {first}" if first == last else f"laps {first} to {last}"
         return f"{counted(len(labels), 'frame')}, {laps}"
 
-    if how == "none":
-        return [f"learns from all of it ({said('train')})"]
+    if len(parts) == 1:
+        (role,) = parts
+        does = {"train": "learns from", "validation": "chooses the epoch by", "test": "tests on"}[role]
+        return [f"{does} all of it ({said(role)})"]
     lines = [
         f"learns from {said('train')}; chooses the epoch by {said('validation')}; tests on {said('test')}"
     ]

@@ -157,6 +157,8 @@ def prepare_quickly(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(jobs, "truth_labels", truth_labels)
     monkeypatch.setattr(jobs, "write_labels", write_or_move)
     monkeypatch.setattr(jobs, "fingerprint", str)
+    # Reads all images; tested in test_leaks.py.
+    monkeypatch.setattr(build, "refuse_leaks", lambda *_: ())
     data = read_training_run(path).data
     few = {"train": 2, "validation": 1, "test": 1} if data.synthetic.train else {}
     data = data.model_copy(update={"synthetic": data.synthetic.model_copy(update=few), "workers": 1})

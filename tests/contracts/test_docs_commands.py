@@ -129,6 +129,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     count_from(940, project.parent / "shared" / "data" / "donkey_circuit" / "frames.csv")
     for name in ("my_tub", "other_tub", "monday_tub", "tuesday_tub"):
         shutil.copytree(drive, project / name)
+    for name in ("my_tub", "other_tub"):
+        library = project / "drives.sqlite"
+        invoke(f"lanenet drives add {project / name} --library {library} --lane-width 40 --force")
+    # Its drives lie relative to its folder, to which it is copied back.
+    shutil.move(project / "drives.sqlite", project.parent)
     shutil.copytree(drive, project / "runs" / "drive8")
     shutil.copytree(project / "runs" / "my_map", project / "runs" / "donkey_map")
     write_track(project / "runs" / "track", project / "runs" / "my_map")
@@ -228,6 +233,7 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
     # No line needs what another one has left.
     shutil.rmtree(folder / "runs")
     shutil.copytree(folder.parent / "runs", folder / "runs")
+    shutil.copy(folder.parent / "drives.sqlite", folder)
     monkeypatch.chdir(folder)
     verb = line.split()[1]
     # What the line before it in the README trains.

@@ -247,11 +247,16 @@ def show_rich(table: Table) -> None:
     _log(text.getvalue())
 
 
-def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table whose first column is text and whose others are figures."""
+def show_table(
+    title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1
+) -> None:
+    """Print a table whose first columns are text, whole at any width, and whose others are figures."""
     table = Table(title=printable(title), title_justify="left")
     for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
+        is_text = index < text_columns
+        table.add_column(
+            column, justify="left" if is_text else "right", overflow="fold" if is_text else "ellipsis"
+        )
     for row in rows:
         table.add_row(*(printable(cell) for cell in row))
     show_rich(table)

@@ -22,6 +22,7 @@ __all__ = [
     "Commands",
     "Drive",
     "drive_above",
+    "drives_in",
     "find_format",
     "formats_text",
     "meant_instead",
@@ -62,7 +63,7 @@ def meant_instead(path: Path) -> str:
         return f"; a bag of ROS 1 has to be converted first: {instead}"
     if (above := drive_above(path)) is not None:
         return f"; the drive is the folder above it: type {shlex.quote(str(above))}"
-    inside = list(itertools.islice(_drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))
+    inside = list(itertools.islice(drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))
     if not inside:
         return ""
     names = ", ".join(shlex.quote(str(each)) for each in inside[:_HINT_COUNT])
@@ -79,8 +80,13 @@ def drive_above(path: Path) -> Path | None:
     return above if find_format(above) is not None else None
 
 
-def _drives_in(path: Path, depth: int) -> Iterator[Path]:
-    """Yield the drives in a folder and those in it."""
+def drives_in(path: Path, depth: int) -> Iterator[Path]:
+    """Yield the drives in a folder, and in folders of it that are none.
+
+    Args:
+        path: A folder; anything else holds none.
+        depth: Folders deep in which drives are looked for.
+    """
     try:
         entries = sorted(path.iterdir()) if is_folder(path) else []
     except OSError:  # a folder that cannot be read has no hint
@@ -89,7 +95,7 @@ def _drives_in(path: Path, depth: int) -> Iterator[Path]:
     if depth > 1:
         for entry in entries:
             if find_format(entry) is None:
-                yield from _drives_in(entry, depth - 1)
+                yield from drives_in(entry, depth - 1)
 
 
 def find_format(path: Path) -> DriveFormat | None:

@@ -17,7 +17,8 @@ from lanenet.data.library import database
 from lanenet.data.library.entry import FIELDS, Entry, check_name, check_told, name_of
 from lanenet.data.library.fingerprint import Fingerprint, checksum, take_fingerprint
 from lanenet.data.library.overlap import Overlap, Recording, find_overlaps
-from lanenet.errors import LanenetError, LibraryError, did_you_mean
+from lanenet.data.library.relation import relation_sentence
+from lanenet.errors import LanenetError, LibraryError, SameRecordingError, did_you_mean
 from lanenet.outputs import lock_output, make_folder, put_in_place, remove, temporary_output
 
 #: Where a library is, unless it is said: in the current folder.
@@ -152,7 +153,8 @@ class Library:
             The new entry.
 
         Raises:
-            LibraryError: If the name is taken or no name, or the library holds the recording.
+            SameRecordingError: If the library holds the recording.
+            LibraryError: If the name is taken or no name.
             DriveFormatError: If the drive cannot be read.
             LanenetError: If it cannot be copied.
         """
@@ -183,6 +185,18 @@ class Library:
             LibraryError: If there is no such drive.
         """
         return self.all_relations().get(self.get(name).name, [])
+
+    def relation_sentences(self, name: str) -> list[str]:
+        """Say in words what a drive shares with others, a sentence for each of them.
+
+        Raises:
+            LibraryError: If there is no such drive.
+        """
+        found: dict[str, list[Overlap]] = {}
+        for other, overlap in self.relations(name):
+            found.setdefault(other, []).append(overlap)
+        one = self.recording(name)
+        return [relation_sentence(one, self.recording(other), overlaps) for other, overlaps in found.items()]
 
     def all_relations(self) -> dict[str, list[tuple[str, Overlap]]]:
         """Return what :meth:`relations` does of every drive that shares frames with another.
@@ -296,8 +310,9 @@ class Library:
         """Return the entry with its name, unless that is taken or the recording is there."""
         same = connection.execute("SELECT name FROM drives WHERE checksum = ?", (entry.checksum,)).fetchone()
         if same is not None and not force:
-            raise LibraryError(
-                f"{self.path_of(entry)}: the same recording as {same[0]} of the library, image by image"
+            raise SameRecordingError(
+                f"{self.path_of(entry)}: the same recording as {same[0]} of the library: the images and "
+                f"commands of all {entry.frames} frames are equal"
             )
         taken = {row[0] for row in connection.execute("SELECT name FROM drives")}
         if entry.name:

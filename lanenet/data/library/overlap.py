@@ -83,16 +83,6 @@ class Overlap:
         """The same, seen from the other drive."""
         return Overlap(self.other_frames, self.frames, self.matched, self.same_bytes, self.difference)
 
-    def __str__(self) -> str:
-        how = (
-            f"{self.matched} images are the same byte by byte"
-            if self.same_bytes
-            else f"encoded again ({self.matched} frames compared, {100.0 * self.difference:.2f} % of their "
-            "signs differ; of another lap, 5 % or more)"
-        )
-        (first, last), (other_first, other_last) = self.frames, self.other_frames
-        return f"frames {first} to {last} are {other_first} to {other_last}: {how}"
-
 
 @dataclass(frozen=True)
 class _Line:

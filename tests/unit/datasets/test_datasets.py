@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from recordings import lap, write_recording
 from small_map import small_map
 
 from datagen.datasets.build import prepare, shared_camera
@@ -211,8 +212,8 @@ def test_a_whole_recording_is_learned_from_and_other_drives_choose(tmp_path, mon
     monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
     monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
     whole = _labels(np.arange(400))
-    for name in ("whole", "split"):
-        (tmp_path / name).mkdir()
+    for seed, name in enumerate(("whole", "split")):
+        write_recording(tmp_path / name, lap(seed, 40))
     drive = RecordedSettings(path=tmp_path / "whole", lane_width_cm=40.0, split="none", counts_as=2)
     with pytest.raises(ConfigError, match="no validation drives"):
         prepare(DataSettings(drives=(drive,)), tmp_path / "work")

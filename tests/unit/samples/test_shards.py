@@ -140,6 +140,21 @@ def test_balance_shows_every_drive_of_a_stream_equally_often(files):
     assert len(np.unique(changed.reshape(36, -1), axis=0)) == 36
 
 
+@pytest.mark.parametrize("source", [streamed, in_memory])
+@pytest.mark.parametrize(("balance", "shown"), [("none", [57, 7, 10]), ("drive", [45, 15, 14])])
+def test_a_set_that_counts_as_several_drives_is_shown_as_often(files, source, balance, shown):
+    # As data.drives.counts_as lists it; the second and the third may be synthetic.
+    samples = source([files[0], files[0], files[0], *files[1:]])
+    points = [part.points_cm for part in (read_labels(path) for path in files)]
+    known = {tuple(row): k for k, rows in enumerate(points) for row in rows.astype(np.float32).tolist()}
+    batches = list(samples.epoch(AugmentSettings.only(), 1, 2, 2, balance=balance))
+    sets = [known[tuple(row)] for batch in batches for row in batch.points_cm.tolist()]
+    assert np.bincount(sets).tolist() == shown
+    # Each time by a draw of its own.
+    changed = np.concatenate([b.rasters for b in samples.epoch(AugmentSettings(), 1, 2, 2, balance=balance)])
+    assert len(np.unique(changed.reshape(len(sets), -1), axis=0)) == len(sets)
+
+
 def test_no_more_is_in_memory_than_a_window_and_the_next(files):
     stream = streamed(files, groups=3)
     windows = stream.windows(1, 2)
