@@ -128,10 +128,10 @@ def train(
 def _train(job: _Job, out: Path, processes: Processes, progress: Progress | None) -> TrainResult:
     """Do the first process's share: train, judge and write."""
     settings, run_hash = job.settings, job.run_hash
-    make_folder(out)
     with torch_threads(settings.threads):
         run, val = _open_run(job, processes)
         samples = run.samples
+        make_folder(out)
         with tensorboard_curve(out, len(run.history) + 1, settings.tensorboard) as show:
             while not run.ended:
                 record = run.run_epoch(val)
