@@ -29,7 +29,7 @@ help:
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
-	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config"
+	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config; two processes"
 	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
@@ -70,7 +70,7 @@ test-base-install: $(VENV)/.stamp-dev
 # Each file stays in one process, for its fixtures.
 chain: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow --dist loadfile tests/sim/test_chain.py tests/sim/test_train_own_drive.py \
-	  tests/contracts/test_configs.py
+	  tests/contracts/test_configs.py tests/unit/learn/test_parallel.py::test_two_processes_train_as_one
 
 # Most of an hour on one core; TRAPS adds arguments, such as --drives 0:20 --processes 2.
 traps: $(VENV)/.stamp-dev

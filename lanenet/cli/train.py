@@ -125,6 +125,11 @@ def train(
     does the same again. Given a config, the command makes all that the config needs. What is there already is
     used; a run that was stopped resumes.
     """
+    from lanenet.learn import parallel
+
+    if parallel.follows():
+        parallel.follow()
+        return
     numbers = None if frames is None else frame_range(frames)
     measured = Measured(lane_width, camera, wheelbase, camera_height, tape_width, numbers)
     paths, overrides = parts_of(sources)

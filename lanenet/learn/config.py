@@ -25,7 +25,7 @@ _UNUSED: dict[str, Any] = {
 
 
 #: Settings of the training that do not decide its result, or only together with the data.
-_UNDECIDING = {"device", "threads", "memory_mb", "checkpoint_every", "tensorboard"}
+_UNDECIDING = {"device", "threads", "processes", "memory_mb", "checkpoint_every", "tensorboard"}
 
 
 class NetworkSettings(Settings):
@@ -134,11 +134,14 @@ class LearnSettings(Settings):
         threads: Threads of the computation; 0 leaves the choice to torch. One thread gives the same weights
             on any number of cores, and does not stall when other programs are busy; a second core prepares
             the next batches meanwhile.
+        processes: How many share the training, each with its part of every batch and its own memory. The
+            weights are those of one process up to the order of sums. Under ``torchrun`` they are those that
+            it starts.
         balance: ``drive`` shows every training drive equally often, however many frames it has.
         start_from: Checkpoint folder whose weights the training starts from, for fine-tuning.
-        memory_mb: What samples may take in memory, [MiB]. Label sets that unpack to more are streamed: their
-            row groups are read again in each epoch, and frames are shuffled only over as many as fit. Chosen:
-            more than the shipped configs need, and less than a desktop computer has.
+        memory_mb: What samples may take in the memory of each process, [MiB]. Label sets that unpack to more
+            are streamed: their row groups are read again in each epoch, and frames are shuffled only over as
+            many as fit. Chosen: more than the shipped configs need, and less than a desktop computer has.
         checkpoint_every: Epochs between two writings of the state from which a stopped run resumes.
         tensorboard: Also write the curve for TensorBoard, into ``tensorboard/`` beside the state.
         augment: Augmentation of the samples.
@@ -158,6 +161,7 @@ class LearnSettings(Settings):
     min_quality: float = Field(default=0.0, ge=0.0, le=1.0)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     threads: int = Field(default=1, ge=0)
+    processes: int = Field(default=1, ge=1)
     balance: Balance = "none"
     start_from: Path | None = None
     memory_mb: int = Field(default=8000, ge=1)

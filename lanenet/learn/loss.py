@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -25,11 +27,29 @@ _NEAR_CM = 2.0
 _ENOUGH_POINTS = 50
 
 
+class Known(NamedTuple):
+    """How many labels of a batch are known.
+
+    Attributes:
+        points: Of its points.
+        lines: Lines of which it is known whether they can be seen.
+    """
+
+    points: int
+    lines: int
+
+
+def count_known(labels_cm: Float[Tensor, "n 6"], present: Float[Tensor, "n 2"]) -> Known:
+    """Count the known labels of a batch, as :func:`lane_loss` takes them."""
+    return Known(int(torch.isfinite(labels_cm).sum()), int(torch.isfinite(present).sum()))
+
+
 def lane_loss(
     output: LaneOutput,
     labels_cm: Float[Tensor, "n 6"],
     present: Float[Tensor, "n 2"],
     settings: LossSettings,
+    counts: Known | None = None,
 ) -> Float[Tensor, ""]:
     """Return the mean negative log likelihood of the known labels, and the cross-entropy of the presence.
 
@@ -43,6 +63,8 @@ def lane_loss(
         labels_cm: NaN where masked; such points add nothing to the loss and give no gradient.
         present: 1 for a line that can be seen, 0 for one that cannot, NaN where that is unknown.
         settings: Kind and weights.
+        counts: Of the whole batch, where this is a part of it: the losses of all parts add up to its loss.
+            None: this is all of it.
 
     Returns:
         The loss; zero, with a gradient of zero, if nothing is known.
@@ -53,6 +75,7 @@ def lane_loss(
         focal loss", eq. 6.
     """
     # Index, not multiply: 0 * NaN is NaN, and so would be its gradient.
+    n_points, n_lines = counts or count_known(labels_cm, present)
     known = torch.isfinite(labels_cm)
     error = output.points_cm[known] - labels_cm[known]
     if output.log_share is not None and output.bins_cm is not None:
@@ -60,16 +83,17 @@ def lane_loss(
         terms = terms + settings.distance * nn.functional.smooth_l1_loss(
             error, torch.zeros_like(error), beta=_NEAR_CM, reduction="none"
         )
-        points = terms.sum() / max(terms.numel(), 1)
+        points = terms.sum() / max(n_points, 1)
         # Sigma is learned from the errors, without moving the points.
-        points = points + settings.distance * _likelihood(error.detach(), output.sigma_cm[known], settings)
+        likelihood = _likelihood(error.detach(), output.sigma_cm[known], settings, n_points)
+        points = points + settings.distance * likelihood
     else:
-        points = _likelihood(error, output.sigma_cm[known], settings)
+        points = _likelihood(error, output.sigma_cm[known], settings, n_points)
     known_lines = torch.isfinite(present)
     entropy = nn.functional.binary_cross_entropy_with_logits(
         output.presence_logit[known_lines], present[known_lines], reduction="sum"
     )
-    return points + settings.presence * entropy / max(int(known_lines.sum()), 1)
+    return points + settings.presence * entropy / max(n_lines, 1)
 
 
 def _cross_entropy(
@@ -86,9 +110,9 @@ def _cross_entropy(
 
 
 def _likelihood(
-    error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossSettings
+    error: Float[Tensor, "k"], sigma: Float[Tensor, "k"], settings: LossSettings, count: int
 ) -> Float[Tensor, ""]:
-    """Mean negative log likelihood of errors, weighted by a power of their sigma."""
+    """Negative log likelihood of errors, weighted by a power of their sigma: sum over ``count``."""
     if settings.kind == "student":
         z = error * _STUDENT_SIGMA / sigma
         terms = 0.5 * (_FREEDOM + 1.0) * torch.log1p(z * z / _FREEDOM) + torch.log(sigma)
@@ -98,7 +122,7 @@ def _likelihood(
         z = error / sigma
         terms = 0.5 * z * z + torch.log(sigma)
     weights = sigma.detach() ** settings.evenness
-    return (weights * terms).sum() / max(terms.numel(), 1)
+    return (weights * terms).sum() / max(count, 1)
 
 
 def sigma_factors(

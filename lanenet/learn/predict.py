@@ -83,6 +83,12 @@ def predict(network: LaneNet, samples: Samples) -> Answers:
     return Answers(points, sigma, presence, samples.points_cm, present, samples.reference)
 
 
+def judge(network: LaneNet, val: Samples) -> tuple[float, float]:
+    """Return the RMSE of a network on held-out frames, [cm], and that of :func:`trimmed_rmse_cm`."""
+    answers = predict(network, val)
+    return answers.errors.all.rmse_cm, trimmed_rmse_cm(answers.points_cm - answers.truth_cm)
+
+
 def trimmed_rmse_cm(error_cm: Float[np.ndarray, "n 6"]) -> float:
     """Return the RMSE without the largest hundredth of the errors; NaN (a masked label) does not count."""
     sizes = np.sort(np.abs(error_cm[np.isfinite(error_cm)]))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
 from lanenet.data.label_set import LabelMeta, read_labels
-from lanenet.errors import ConfigError, LabelFormatError, LanenetError
+from lanenet.errors import CheckpointError, ConfigError, LabelFormatError, LanenetError
 from lanenet.learn.checkpoint import (
     STATE_NAME,
     EpochRecord,
@@ -31,9 +32,11 @@ from lanenet.learn.checkpoint import (
     write_state,
 )
 from lanenet.learn.config import LearnSettings
-from lanenet.learn.loss import lane_loss
+from lanenet.learn.loss import Known, count_known, lane_loss
 from lanenet.learn.network import LaneNet, input_of_rasters, new_network
-from lanenet.learn.predict import calibrate_presence, calibrate_sigma, predict, trimmed_rmse_cm
+from lanenet.learn.parallel import ALONE, Processes, let_go, start_processes
+from lanenet.learn.predict import calibrate_presence, calibrate_sigma, judge
+from lanenet.learn.shared_layers import share_layers
 from lanenet.outputs import lock_output, make_folder
 from lanenet.perception.network.model_file import MODEL_NAME
 from lanenet.reading import MEBIBYTE
@@ -67,6 +70,17 @@ class TrainResult:
     computed: bool
 
 
+@dataclass(frozen=True)
+class _Job:
+    """What the processes of a training are told."""
+
+    settings: LearnSettings
+    train_paths: tuple[Path, ...]
+    val_paths: tuple[Path, ...]
+    out: Path
+    run_hash: str
+
+
 def train(
     settings: LearnSettings,
     train_paths: Sequence[Path],
@@ -77,7 +91,8 @@ def train(
     """Train, evaluate and export a network.
 
     A run that was stopped resumes after its last written epoch and ends with the same weights, bit for bit on
-    the same machine and number of threads. A finished run with the same settings and data is not repeated.
+    the same machine and number of threads and processes. A finished run with the same settings and data is
+    not repeated.
 
     Args:
         settings: How to train.
@@ -93,29 +108,30 @@ def train(
         LabelFormatError: If the label sets cannot be read or learned together.
         CheckpointError: If the folder holds a run with other settings or data, or pretrained weights cannot
             be read.
-        ConfigError: If a GPU is set and there is none.
-        LanenetError: If the training diverges, or another run trains into the folder.
+        ConfigError: If a GPU is set and there is none, or not one for each process.
+        LanenetError: If the training diverges, another run trains into the folder, or one of several
+            processes ends before its time.
     """
     with lock_output(out):
-        return _train(settings, train_paths, val_paths, out, progress)
+        run_hash = hash_run(settings, train_paths, val_paths)
+        metrics = read_finished(out, run_hash)
+        if metrics is not None:
+            let_go()
+            return TrainResult(out, out / MODEL_NAME, metrics["best_epoch"], metrics["val_rmse_cm"], False)
+        uses_gpu = _device(settings).type == "cuda"
+        train_paths, val_paths = (tuple(p.absolute() for p in paths) for paths in (train_paths, val_paths))
+        job = _Job(settings, train_paths, val_paths, out.absolute(), run_hash)
+        with start_processes(settings.processes, uses_gpu, _take_part, job) as processes:
+            return _train(job, out, processes, progress)
 
 
-def _train(
-    settings: LearnSettings,
-    train_paths: Sequence[Path],
-    val_paths: Sequence[Path],
-    out: Path,
-    progress: Progress | None,
-) -> TrainResult:
-    run_hash = hash_run(settings, train_paths, val_paths)
-    metrics = read_finished(out, run_hash)
-    if metrics is not None:
-        return TrainResult(out, out / MODEL_NAME, metrics["best_epoch"], metrics["val_rmse_cm"], False)
-    saved = read_state(out / STATE_NAME, run_hash)
-    samples, val = _read_both(settings, train_paths, val_paths)
-    make_folder(out)
+def _train(job: _Job, out: Path, processes: Processes, progress: Progress | None) -> TrainResult:
+    """Do the first process's share: train, judge and write."""
+    settings, run_hash = job.settings, job.run_hash
     with torch_threads(settings.threads):
-        run = TrainingRun(settings, samples, saved)
+        run, val = _open_run(job, processes)
+        samples = run.samples
+        make_folder(out)
         with tensorboard_curve(out, len(run.history) + 1, settings.tensorboard) as show:
             while not run.ended:
                 record = run.run_epoch(val)
@@ -132,16 +148,54 @@ def _train(
     return TrainResult(out, out / MODEL_NAME, best_record(run.history).epoch, rmse_cm, True)
 
 
+def _take_part(job: _Job, processes: Processes) -> None:
+    """Do the share of a process that is not the first: its parts of the batches."""
+    with torch_threads(job.settings.threads):
+        run, val = _open_run(job, processes)
+        while not run.ended:
+            run.run_epoch(val)
+
+
+def _open_run(job: _Job, processes: Processes) -> tuple[TrainingRun, Samples]:
+    """Return a run at its beginning, or where it was stopped; and the validation samples."""
+    saved = read_state(job.out / STATE_NAME, job.run_hash)
+    samples, val = _read_both(job.settings, job.train_paths, job.val_paths)
+    return TrainingRun(job.settings, samples, saved, processes), val
+
+
+class StepSums(NamedTuple):
+    """What a step says of its batch: sums over all of its samples, as they were before the step.
+
+    Attributes:
+        squares: Of the errors of the points, [cm^2].
+        known: How many labels are known.
+        samples: How many there are.
+    """
+
+    squares: float
+    known: Known
+    samples: int
+
+
 class TrainingRun:
     """Weights, optimiser and curve of a run.
+
+    Several processes have a run each, with the same weights: all but the samples of its part of each batch,
+    and the judgement, which the first one makes, is the same in all of them.
 
     Attributes:
         network: What is trained.
         history: One record per finished epoch.
     """
 
-    def __init__(self, settings: LearnSettings, samples: Samples, saved: RunState | None = None) -> None:
-        self.settings, self.samples = settings, samples
+    def __init__(
+        self,
+        settings: LearnSettings,
+        samples: Samples,
+        saved: RunState | None = None,
+        processes: Processes = ALONE,
+    ) -> None:
+        self.settings, self.samples, self.processes = settings, samples, processes
         self.device, window = _device(settings), samples.window
         self.network = new_network(settings.network, window.rows, window.columns, settings.seed)
         self.network.to(self.device)
@@ -151,6 +205,7 @@ class TrainingRun:
         self.network.spread_bins(window.left_cm, window.right_cm)
         if settings.start_from is not None:
             load_start_weights(self.network, settings.start_from, window, samples.perception)
+        share_layers(self.network, processes)
         self.optimizer = new_optimizer(self.network, settings)
         self.step = 0
         self.history: list[EpochRecord] = []
@@ -163,6 +218,11 @@ class TrainingRun:
             self.mean.n_averaged.fill_(saved.step + 1)
             self.optimizer.load_state_dict(saved.optimizer)
             self.step, self.history, self.best = saved.step, list(saved.history), saved.best
+        if (first := processes.share(self.step)) != self.step:
+            raise CheckpointError(
+                f"{STATE_NAME}: found after {self.step} steps, but by the first process after {first}; "
+                "expected a folder that all processes share"
+            )
 
     @property
     def averaged(self) -> LaneNet:
@@ -186,54 +246,67 @@ class TrainingRun:
         squares, count, n_samples, rate = 0.0, 0, 0, 0.0
         self.network.train()
         batches = self.samples.epoch(
-            settings.augment, settings.seed, epoch, settings.batch_size, balance=settings.balance
+            settings.augment,
+            settings.seed,
+            epoch,
+            settings.batch_size,
+            balance=settings.balance,
+            cut=self.processes.cut,
         )
         # Torch's own draws (dropout) follow from seed and epoch; its global generators stay untouched.
         with torch.random.fork_rng([torch.cuda.current_device()] if self.device.type == "cuda" else []):
             torch.manual_seed(int(np.random.SeedSequence([settings.seed, epoch]).generate_state(1)[0]))
             for batch in batches:
                 rate = learning_rate_at(self.step, self.total, settings)
-                targets = torch.from_numpy(batch.points_cm).to(self.device)
-                points = self.learn_from(batch, targets, rate)
-                error = (points - targets)[torch.isfinite(targets)]
-                squares += float((error * error).sum())
-                count += error.numel()
-                n_samples += len(targets)
+                sums = self.learn_from(batch, rate)
+                squares += sums.squares
+                count += sums.known.points
+                n_samples += sums.samples
                 if not math.isfinite(squares):
                     raise LanenetError(
                         f"training diverged in epoch {epoch + 1}: the error is not finite; lower "
                         f"learning_rate (now {settings.learning_rate:g})"
                     )
         seconds = time.perf_counter() - started
-        answers = predict(self.averaged, val)
+        val_rmse_cm, val_trimmed_cm = self.processes.share(
+            judge(self.averaged, val) if self.processes.first else (math.nan, math.nan)
+        )
         record = EpochRecord(
             epoch=epoch + 1,
             train_rmse_cm=math.sqrt(squares / max(count, 1)),
-            val_rmse_cm=answers.errors.all.rmse_cm,
+            val_rmse_cm=val_rmse_cm,
             learning_rate=rate,
             samples_per_s=n_samples / seconds,
-            val_trimmed_cm=trimmed_rmse_cm(answers.points_cm - answers.truth_cm),
+            val_trimmed_cm=val_trimmed_cm,
         )
         self.history.append(record)
         if best_record(self.history) is record:
             self.best = {name: value.clone() for name, value in self.averaged.state_dict().items()}
         return record
 
-    def learn_from(self, batch: Batch, targets: Tensor, rate: float) -> Tensor:
-        """Take one step at a learning rate; returns the points as they were before it."""
+    def learn_from(self, batch: Batch, rate: float) -> StepSums:
+        """Take one step at a learning rate, with the process's own part of a batch."""
         set_learning_rate(self.optimizer, rate)
-        rasters, present, lane_cm = (
-            torch.from_numpy(part).to(self.device) for part in (batch.rasters, batch.present, batch.lane_cm)
-        )
+        rasters, targets, present, lane_cm = (torch.from_numpy(part).to(self.device) for part in batch)
         output = self.network(input_of_rasters(rasters), lane_cm)
         self.optimizer.zero_grad(set_to_none=True)
-        loss = lane_loss(output, targets, present, self.settings.loss)
+        sums = self._sum_up(output.points_cm.detach(), targets, present)
+        loss = lane_loss(output, targets, present, self.settings.loss, sums.known)
         loss.backward()  # type: ignore[no-untyped-call]
+        self.processes.sum_gradients(self.network)
         self.optimizer.step()
         self.step += 1
         self.mean.update_parameters(self.network)
-        points: Tensor = output.points_cm.detach()
-        return points
+        return sums
+
+    def _sum_up(self, points_cm: Tensor, targets: Tensor, present: Tensor) -> StepSums:
+        """Add up what all processes have of a batch."""
+        error = (points_cm - targets)[torch.isfinite(targets)]
+        own = [float((error * error).sum()), *count_known(targets, present), len(targets)]
+        # In double precision, which holds counts exactly.
+        squares, *counts = self.processes.sum(torch.tensor(own, dtype=torch.float64)).tolist()
+        n_points, n_lines, n_samples = map(int, counts)
+        return StepSums(squares, Known(n_points, n_lines), n_samples)
 
     def state(self) -> RunState:
         """Return what :class:`RunState` keeps of this run."""

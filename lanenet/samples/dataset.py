@@ -155,7 +155,7 @@ class Samples(ABC):
             workers: Threads that prepare batches ahead.
             balance: How often each label set is shown, see :meth:`shown`.
             first_step: Batches to leave out, of a run that goes on.
-            cut: Which parts of each batch are drawn.
+            cut: Which parts of each batch are drawn; those of a small last batch may be empty.
         """
 
     @abstractmethod
@@ -166,14 +166,13 @@ class Samples(ABC):
             mirrored: Count each frame once more with left and right swapped.
         """
 
-    def steps_per_epoch(self, batch_size: int, parts: int = 1) -> int:
+    def steps_per_epoch(self, batch_size: int) -> int:
         """Number of batches that :meth:`epoch` yields.
 
-        A last batch of a single sample is none, since batch normalisation cannot use it, and neither is one
-        with fewer samples than parts.
+        A last batch of a single sample is none, since batch normalisation cannot use it.
         """
         full, rest = divmod(len(self), batch_size)
-        return full + (rest >= max(2, parts))
+        return full + (rest >= 2)
 
     def batch_length(self, step: int, batch_size: int) -> int:
         """Number of samples of a batch of an epoch, all parts together."""
@@ -297,7 +296,7 @@ class LaneSamples(Samples):
         order, streams = self.order(seed, epoch, balance)
 
         def jobs() -> Iterator[Callable[[], Batch]]:
-            for step in range(first_step, self.steps_per_epoch(batch_size, cut.parts)):
+            for step in range(first_step, self.steps_per_epoch(batch_size)):
                 start, bounds = step * batch_size, cut.bounds(self.batch_length(step, batch_size))
                 own = slice(start + bounds[0], start + bounds[-1])
                 yield functools.partial(self.augmented_batch, order[own], settings, seed, epoch, streams[own])

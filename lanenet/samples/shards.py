@@ -291,7 +291,7 @@ class StreamedSamples(Samples):
                 ]
             )
 
-        steps = range(first_step, self.steps_per_epoch(batch_size, cut.parts))
+        steps = range(first_step, self.steps_per_epoch(batch_size))
         with closing(self._pieces(self.windows(seed, epoch, balance), steps, batch_size, cut)) as pieces:
             yield from ahead((functools.partial(draw, batch) for batch in pieces), workers)
 
@@ -324,9 +324,11 @@ class StreamedSamples(Samples):
                 ):
                     bounds = (step * batch_size, (step + 1) * batch_size)
                     a, b = np.searchsorted(loaded.numbers, bounds)
-                    if b > a:
+                    ends = min(bounds[1], end) <= window.end
+                    # An empty part of a batch is a piece, too.
+                    if b > a or (ends and not pieces):
                         pieces.append(_Piece(loaded.frames, loaded.rows[a:b], loaded.streams[a:b]))
-                    if min(bounds[1], end) <= window.end:
+                    if ends:
                         yield pieces
                         pieces = []
 

@@ -45,7 +45,7 @@ def measure(config: Path, paths: list[Path], steps: int) -> dict[str, Any]:
         start = time.process_time()
         batch = samples.augmented_batch(order[rows], settings.augment, settings.seed, 0, streams[rows])
         made = time.process_time()
-        run.learn_from(batch, torch.from_numpy(batch.points_cm), settings.learning_rate)
+        run.learn_from(batch, settings.learning_rate)
         if number >= _WARM_UP:
             loader_ms.append(1e3 * (made - start))
             step_ms.append(1e3 * (time.process_time() - made))
