@@ -29,7 +29,7 @@ from lanenet.errors import ConfigError, LanenetError, counted
 
 if TYPE_CHECKING:
     from datagen.fleet.engine import Engine
-    from datagen.fleet.run import FleetResult
+    from datagen.fleet.result import FleetResult
     from datagen.fleet.task import FleetDrive
 
 app = typer.Typer()
