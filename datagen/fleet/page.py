@@ -158,16 +158,17 @@ def _cost_rows(drives: Iterable[Labelled]) -> list[Row]:
     of_map = [drive.mapped for drive in drives if drive.mapped]
     of_labels = [drive.labelled for drive in drives if drive.labelled]
     driven_s = fsum(marker["driven_s"] for marker in of_map)
-    head = ("", "results", "time", "processor", "per hour driven", "memory, most", "storage")
-    rows: list[Row] = [head]
+    columns: list[Row] = [
+        ("", "results", "time", "processor time", "the same, per hour driven", "most memory", "storage")
+    ]
     for name, markers in (("maps", of_map), ("labels", of_labels), ("together", of_map + of_labels)):
         wall_s, cpu_s = (fsum(marker["took"][key] for marker in markers) for key in ("wall_s", "cpu_s"))
         most = max((int(marker["took"]["peak_bytes"]) for marker in markers), default=0)
         stored = sum(int(marker["bytes"]) for marker in markers)
         rate = _text_of_time(3600.0 * cpu_s / driven_s) if driven_s else "-"
         times = (_text_of_time(wall_s), _text_of_time(cpu_s), rate)
-        rows.append((name, str(len(markers)), *times, f"{most / 1e6:,.0f} MB", f"{stored / 1e6:,.1f} MB"))
-    return rows
+        columns.append((name, str(len(markers)), *times, f"{most / 1e6:,.0f} MB", f"{stored / 1e6:,.1f} MB"))
+    return list(zip(*columns, strict=True))
 
 
 def _machine_rows(drives: Iterable[Labelled]) -> list[Row]:

@@ -53,8 +53,9 @@ def test_drives_reasons_hours_and_cost_are_counted():
     # Two maps are rejected for the same thing.
     assert "rejected tub-60: the lines lie 3.5 cm off 2 refused the car stands still 1" in said
     # 63 maps of 30 s and 60 label sets of 6 s, for 63 minutes of driving.
-    assert "maps 63 63 min 32 min 30 min 500 MB 94.5 MB" in said
-    assert "together 123 75 min 38 min 36 min 500 MB 184.5 MB" in said
+    assert "maps labels together results 63 60 123 time 63 min 12 min 75 min" in said
+    assert "processor time 32 min 6 min 38 min the same, per hour driven 30 min 6 min 36 min" in said
+    assert "most memory 500 MB 500 MB 500 MB storage 94.5 MB 90.0 MB 184.5 MB" in said
     assert "host-a 122 37 min" in said and "host-b 1 30 s" in said
 
 
