@@ -16,7 +16,7 @@ from datagen.world.world import SimulationSettings
 #: Width of the lane in each real tub, [cm], as a user would give it.
 TUBS_CM = {"donkey_circuit": 59.0, "usi_mat": 37.0, "garage_tape": 60.0, "blue_tape": 45.0}
 #: Drives of each kind, and frames of each.
-SIMULATED, CUTS, WITH_GAPS, FRAMES = 36, 12, 12, 80
+SIMULATED, CUTS, WITH_GAPS, FRAMES = 44, 8, 8, 80
 _SIMULATED_CM = 40.0
 
 
