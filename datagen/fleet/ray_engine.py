@@ -25,8 +25,9 @@ _MOST_GIVEN = 1000
 #: Of Ray's store of objects, [bytes], which it would else give 30 % of the memory; tasks return a few words.
 #: Ray takes no less than 75 MB.
 _STORE_BYTES = 80_000_000
-#: What a worker of Ray takes beside the work, [bytes]. Measured: 173 MB more at the peak than without it.
-_WORKER_BYTES = 200_000_000
+#: What a worker of Ray takes beside the work, [bytes]. Measured for 1200 frames: 972 MB in a worker with its
+#: second drive, 695 MB in a process of its own.
+_WORKER_BYTES = 300_000_000
 #: How long a head node may take to answer, and workers to end when a run is given up, [s]. Chosen.
 _ANSWER_S, _END_S = 5.0, 30.0
 

@@ -45,6 +45,8 @@ class TwoMachines:
 @pytest.fixture
 def machines(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoMachines]:
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    # Else its workers have a niceness of 15, and hardly a core where others load the machine.
+    monkeypatch.setenv("RAY_worker_niceness", "0")
     two = TwoMachines()
     yield two
     two.cluster.shutdown()

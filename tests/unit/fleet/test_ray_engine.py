@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fleet_work import apply, die_or_wait, die_times, double, fail, is_alive, threads, together
+from fleet_work import apply, die_or_wait, die_times, double, fail, is_alive, never_end, threads, together
 
 from datagen.fleet.engine import MAX_RETRIES, Ended, Engine, Task
 from datagen.fleet.ray_engine import RayEngine, _most_bytes, _python_path
@@ -87,6 +87,16 @@ def test_closing_ends_the_workers(tmp_path: Path):
     while is_alive(pid) and time.monotonic() < end_s:
         time.sleep(0.01)
     assert not is_alive(pid)
+
+
+@pytest.mark.slow
+def test_a_task_that_is_always_ended_for_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Ray ends workers wherever a machine has less left than this; by itself it would begin again for ever."""
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.001")
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    (ended,) = RayEngine(workers=1).run(never_end, tasks_of(tmp_path))
+    assert ended.result is None and f"lost {MAX_RETRIES + 1} times" in ended.error
+    assert "OutOfMemoryError" in ended.error
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
