@@ -159,7 +159,7 @@ def main() -> None:
     parser.add_argument("--pictures", action="store_true")
     args = parser.parse_args()
     # Else 15: where others load the machine, its workers get less of a core than plain processes.
-    os.environ["RAY_worker_niceness"] = "0"
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112
     drives = simulate(args.folder, args.drives, args.seconds)
     # Compiles the loops, if they are not.
     measure("local", 1, simulate(args.folder, 1, 4.0), args.folder / "warm", args.pictures)

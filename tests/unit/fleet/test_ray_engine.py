@@ -91,7 +91,7 @@ def test_closing_ends_the_workers(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_task_that_is_always_ended_for_memory_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Ray ends workers wherever a machine has less left than this; by itself it would begin again for ever."""
+    """Ray ends workers where a machine has less left than this, and would begin again for ever."""
     monkeypatch.setenv("RAY_memory_usage_threshold", "0.001")
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
     (ended,) = RayEngine(workers=1).run(never_end, tasks_of(tmp_path))
