@@ -21,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train install env test test-slow test-base-install chain traps left-out judge screenshots golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
+.PHONY: help train install env test test-slow test-base-install chain traps left-out judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -34,6 +34,7 @@ help:
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
 	@echo "make screenshots  the report pages on a phone, in light and dark, into runs/screenshots (needs chromium)"
+	@echo "make fleet        sixty drives on a Ray cluster whose nodes are killed, against one process"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
@@ -94,6 +95,10 @@ judge: $(VENV)/.stamp-train
 # Needs chromium; into runs/screenshots, to be looked at.
 screenshots: $(VENV)/.stamp-dev
 	LANENET_SCREENSHOTS=$(abspath runs/screenshots) $(PYTEST) tests/contracts/test_pages_in_browser.py
+
+# Needs LANENET_SHARED_DATA.
+fleet: $(VENV)/.stamp-dev
+	$(PYTEST) -rs -m slow --numprocesses 0 tests/sim/test_fleet_on_a_cluster.py
 
 golden: $(VENV)/.stamp-dev
 	$(PYTEST) tests/golden

@@ -59,3 +59,8 @@ class Engine(Protocol):
             LanenetError: If the engine cannot be started.
         """
         ...
+
+
+def reason_of(error: BaseException) -> str:
+    """Say why a task failed that raised this."""
+    return f"{type(error).__name__}: {error}"

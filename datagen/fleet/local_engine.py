@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from datagen.fleet.engine import MAX_RETRIES, Ended, Task
+from datagen.fleet.engine import MAX_RETRIES, Ended, Task, reason_of
 from lanenet.processes import one_thread_each, prepare_process
 
 
@@ -79,7 +79,7 @@ class LocalEngine:
                             continue
                         ended = Ended(number, error=_lost(lost[number]))
                     except Exception as error:
-                        ended = Ended(number, error=f"{type(error).__name__}: {error}")
+                        ended = Ended(number, error=reason_of(error))
                     yield ended
         finally:
             for worker in [*idle, *(worker for worker, _ in running.values())]:

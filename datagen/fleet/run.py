@@ -12,19 +12,18 @@ from typing import Any
 
 from datagen.fleet.engine import Engine, Task
 from datagen.fleet.memory import memory_bytes
+from datagen.fleet.page import write_page
+from datagen.fleet.result import DUPLICATE, FAILED, LEFT, FleetResult, Labelled, standing, write_index
 from datagen.fleet.source import checksum, drive_files
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
-from datagen.fleet.work import LABELS_NAME, REFUSED, REJECTED, Job, Outcome, label_drive, version
+from datagen.fleet.work import REFUSED, REJECTED, Job, Outcome, label_drive, version
 from datagen.made import key_of
 from lanenet.data.files import json_text
 from lanenet.outputs import lock_output
 
-#: What became of the drives of a run, and the checksums of their files, beside the results.
-INDEX_NAME, CHECKSUMS_NAME = "drives.json", "checksums.json"
-_INDEX_FORMAT = "lanenet-fleet/1"
-#: Of a drive that has no result: it failed; the run ended before it was begun; it is there twice.
-FAILED, LEFT, DUPLICATE = "failed", "left", "duplicate"
+#: The checksums of the drives' files, beside the results.
+CHECKSUMS_NAME = "checksums.json"
 
 
 @dataclass(frozen=True)
@@ -44,54 +43,6 @@ class Counts:
 
 #: Called whenever a drive has ended.
 Progress = Callable[[Counts], None]
-
-
-@dataclass(frozen=True)
-class Labelled:
-    """What became of a drive.
-
-    Attributes:
-        drive: The drive.
-        verdict: ``good`` or ``usable`` if it has labels; ``reject``, ``refused``, ``failed``, ``left`` or
-            ``duplicate``.
-        reason: Why it has none.
-        new: Whether something was done for it in this run.
-        map_key: Of its map, in the storage.
-        labels_key: Of its labels.
-        mapped: What the marker of the map says; None without one.
-        labelled: What the marker of the labels says; None without one.
-    """
-
-    drive: FleetDrive
-    verdict: str
-    reason: str
-    new: bool
-    map_key: str
-    labels_key: str
-    mapped: dict[str, Any] | None = None
-    labelled: dict[str, Any] | None = None
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether there is a label set of it."""
-        return self.verdict not in (REJECTED, REFUSED, FAILED, LEFT, DUPLICATE)
-
-
-@dataclass(frozen=True)
-class FleetResult:
-    """What became of all drives of a run, in their order, and whether a full disk ended it."""
-
-    drives: tuple[Labelled, ...]
-    disk_full: str = ""
-
-    def of(self, *verdicts: str) -> list[Labelled]:
-        """Return the drives with one of the verdicts."""
-        return [drive for drive in self.drives if drive.verdict in verdicts]
-
-    @property
-    def with_labels(self) -> list[Labelled]:
-        """The drives that have labels."""
-        return [drive for drive in self.drives if drive.has_labels]
 
 
 def with_checksums(drives: Iterable[FleetDrive], storage: Storage) -> list[FleetDrive]:
@@ -155,7 +106,8 @@ def label_all(
                 run.sweep()
             found = run.look(ended)
         result = FleetResult(tuple(found), disk_full)
-        storage.write(INDEX_NAME, json_text(_index(result)).encode())
+        write_index(result, storage)
+        write_page(result, storage)
         return result
 
 
@@ -211,7 +163,7 @@ class _Run:
             elif outcome is not None and not outcome.verdict:
                 verdict, reason = FAILED, outcome.reason
             else:
-                verdict, reason = _standing(maps[k], labels[k])
+                verdict, reason = standing(maps[k], labels[k])
             keys = self.keys[MAPS][k], self.keys[LABELS][k]
             found.append(Labelled(drive, verdict, reason, outcome is not None, *keys, maps[k], labels[k]))
         return found
@@ -244,34 +196,8 @@ class _Run:
         return Task(drive.name, job, memory_bytes(drive.source))
 
 
-def _standing(mapped: dict[str, Any] | None, labelled: dict[str, Any] | None) -> tuple[str, str]:
-    """Return verdict and reason of a drive by what is finished of it."""
-    if mapped is not None and mapped["verdict"] in (REJECTED, REFUSED):
-        return str(mapped["verdict"]), str(mapped["reason"])
-    if mapped is None or labelled is None:
-        return LEFT, "the run ended before"
-    return str(labelled["verdict"] or mapped["verdict"]), str(labelled["reason"])
-
-
 def _tell(progress: Progress | None, verdicts: Iterable[str], total: int) -> None:
     if progress is not None:
         count = Counter(verdicts)
         refused, failed = count[REJECTED] + count[REFUSED], count[FAILED]
         progress(Counts(count.total() - count[LEFT] - refused - failed, refused, failed, total))
-
-
-def _index(result: FleetResult) -> dict[str, Any]:
-    """Return what a program wants to know of a run: the drives, and the paths of their results."""
-    return {
-        "format": _INDEX_FORMAT,
-        "drives": [
-            {
-                **vars(found.drive),
-                "verdict": found.verdict,
-                "reason": found.reason,
-                "map": None if found.mapped is None else f"{MAPS}/{found.map_key}",
-                "labels": f"{LABELS}/{found.labels_key}/{LABELS_NAME}" if found.has_labels else None,
-            }
-            for found in result.drives
-        ],
-    }

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from lanenet.data.files import require
+from lanenet.data.files import require, write_bytes
 from lanenet.errors import LanenetError
 from lanenet.outputs import make_folder, remove, sync_path
 from lanenet.reading import parsing
@@ -96,8 +96,17 @@ class Storage:
         except FileNotFoundError:
             return None
 
+    def read_all(self, kind: str, keys: Iterable[str], name: str) -> dict[str, bytes]:
+        """Return a file of each of several finished results, at once; those that lack it are left out."""
+        paths = {self._at(kind, key, name): key for key in keys}
+        found = self._system.cat(list(paths), on_error="omit") if paths else {}
+        return {paths[path]: data for path, data in found.items()}
+
     def write(self, name: str, data: bytes) -> None:
-        """Write a file beside the results."""
+        """Write a file beside the results, as a whole."""
+        if self.folder is not None:
+            write_bytes(self.folder / name, data)
+            return
         self._system.makedirs(self._root, exist_ok=True)
         self._system.pipe_file(self._at(name), data)
 

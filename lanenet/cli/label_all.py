@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import astuple
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -27,13 +28,21 @@ from lanenet.data.library.entry import name_of
 from lanenet.errors import ConfigError, LanenetError, counted
 
 if TYPE_CHECKING:
-    from datagen.fleet.run import FleetResult
+    from datagen.fleet.engine import Engine
+    from datagen.fleet.result import FleetResult
     from datagen.fleet.task import FleetDrive
 
 app = typer.Typer()
 
 #: The log, beside the results of a storage that is a folder.
 _LOG_NAME = "label-all.log"
+
+
+class EngineName(StrEnum):
+    """What spreads the drives over processes."""
+
+    local = "local"
+    ray = "ray"
 
 
 @app.command(epilog="Example: lanenet label-all my_tub other_tub --lane-width 40 --out runs/labelled")
@@ -68,7 +77,21 @@ def label_all(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes at a time on this machine; default: one per core.")
+        int | None,
+        typer.Option(min=1, help="Drives at a time; default: one per core of the machine or cluster."),
+    ] = None,
+    engine: Annotated[
+        EngineName | None,
+        typer.Option(
+            help="What spreads the drives: processes of this machine (default), or Ray (with --address)."
+        ),
+    ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT|auto",
+            help="Ray cluster that this machine is part of; default: a new one here.",
+        ),
     ] = None,
     pictures: Annotated[
         bool, typer.Option("--pictures", help="Draw the report of each map and the frames of each label set.")
@@ -78,7 +101,6 @@ def label_all(
     ] = False,
 ) -> None:
     """Map and label many drives; what is finished is used, and what fails stops nothing."""
-    from datagen.fleet.local_engine import LocalEngine
     from datagen.fleet.run import label_all as run
     from datagen.fleet.run import with_checksums
     from datagen.fleet.storage import Storage
@@ -97,7 +119,7 @@ def label_all(
     if not known:
         raise ConfigError("expected drives, or a --library that holds some")
     storage = Storage(_full(out))
-    engine = LocalEngine(workers or os.cpu_count() or 1)
+    chosen = engine_of(engine, address, workers)
     with ExitStack() as stack:
         if storage.folder is not None:
             storage.folder.mkdir(parents=True, exist_ok=True)
@@ -105,9 +127,25 @@ def label_all(
         checked = with_checksums(known, storage)
         with console.fleet_bar() as show:
             result = run(
-                checked, settings, storage, engine, lambda counts: show(*astuple(counts)), refused_again
+                checked, settings, storage, chosen, lambda counts: show(*astuple(counts)), refused_again
             )
         show_result(result, out)
+
+
+def engine_of(name: EngineName | None, address: str | None, workers: int | None) -> Engine:
+    """Return the engine that the command line names; an address is one of Ray.
+
+    Raises:
+        ConfigError: If an address is given to processes of this machine.
+    """
+    from datagen.fleet.local_engine import LocalEngine
+    from datagen.fleet.ray_engine import RayEngine
+
+    if name is EngineName.local and address is not None:
+        raise ConfigError("--address: expected --engine ray, found local, which knows no other machines")
+    if name is EngineName.ray or address is not None:
+        return RayEngine(address, workers)
+    return LocalEngine(workers or os.cpu_count() or 1)
 
 
 def show_result(result: FleetResult, out: str) -> None:

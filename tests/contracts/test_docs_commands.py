@@ -39,6 +39,7 @@ NOT_RUN = {
     r"(?!lanenet )": "not a command of lanenet: installs packages, changes the computer or takes minutes",
     r"lanenet (drive|stop|doctor) .*(picamera|\bcar\.yaml)": "needs a car",
     r"lanenet .*(--push|\bhf:)": "needs an account on the Hugging Face Hub; run with a folder in test_hub.py",
+    r"lanenet label-all .*--address": "needs a Ray cluster; run in tests/sim/test_fleet_on_a_cluster.py",
     r"lanenet join": "needs two drives of a closed road; run in tests/sim/test_join.py",
     r"lanenet calibrate drive": "needs two laps; run in tests/sim/test_calibrate_drive.py",
     r"lanenet .*--rerun live": "opens a viewer's window",

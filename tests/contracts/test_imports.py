@@ -23,6 +23,7 @@ HEAVY = (
 #: What may be imported by its name in a text, which the import rules cannot see, and where: a Parquet file is
 #: written, a bag read, a storage used, and a device of the car opened, only if its package is there.
 NAMED_IMPORTS = {
+    "datagen/fleet/ray_engine.py": {"ray"},
     "datagen/fleet/storage.py": {"fsspec"},
     "lanenet/data/": {"pyarrow"},
     "lanenet/data/hub.py": {"huggingface_hub"},

@@ -13,7 +13,12 @@ from pathlib import Path
 import cv2
 import pytest
 from chromium import PHONE_PX, Seen, see, take_screenshot
+from fleet_work import HereEngine
 
+from datagen.fleet.page import FLEET_PAGE_NAME
+from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.storage import Storage
+from datagen.fleet.task import FleetDrive, FleetSettings
 from datagen.judge.contest import judge
 from datagen.judge.page import write_page
 from datagen.judge.run import TRUTH, Entrant
@@ -73,18 +78,36 @@ def _of_judge(folder: Path) -> Path:
     return write_page(folder, settings, entrants, judge(settings, entrants, folder))
 
 
+def _of_fleet(folder: Path) -> Path:
+    drive, storage = _drive(folder, 80), Storage(str(folder / "fleet"))
+    other = _drive(folder / "other", 79)
+    drives = [FleetDrive("good", str(drive), "", 40.0), FleetDrive("narrow", str(other), "", 20.0)]
+    label_all(
+        with_checksums(drives, storage),
+        FleetSettings(map=MapSettings(find_bumper=False)),
+        storage,
+        HereEngine(),
+    )
+    return folder / "fleet" / FLEET_PAGE_NAME
+
+
 #: By page: what makes it, its first words, and how many pictures it has at least.
 PAGES: dict[str, tuple[Callable[[Path], Path], str, int]] = {
     "model": (_of_model, "On 20 frames it lies", 4),
     "judge": (_of_judge, "Painter stays in its lane on", 2),
     "map": (_of_map, "GOOD", 10),
     "refusal": (_of_refusal, "REFUSED", 17),
+    "fleet": (_of_fleet, "1 of 2 drives have labels", 1),
 }
 
 
 @pytest.fixture(
     scope="module",
-    params=["model", "judge", *(pytest.param(name, marks=pytest.mark.slow) for name in ("map", "refusal"))],
+    params=[
+        "model",
+        "judge",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("map", "refusal", "fleet")),
+    ],
 )
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     return request.param, PAGES[request.param][0](tmp_path_factory.mktemp(request.param))

@@ -36,6 +36,28 @@ def never_end(folder: Path) -> None:
     time.sleep(3600.0)
 
 
+def die_or_wait(job: tuple[Path, bool]) -> None:
+    """Leave a file and never end, or wait for the file of another one."""
+    folder, waits = job
+    if waits:
+        never_end(folder)
+    while not list(folder.iterdir()):
+        time.sleep(0.01)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def apply(job: tuple[Callable[[Any], Any], Any]) -> Any:
+    function, argument = job
+    return function(argument)
+
+
 def threads(_: object) -> list[object]:
     return [cv2.getNumThreads(), os.environ.get("OMP_NUM_THREADS"), os.environ.get("NUMBA_NUM_THREADS")]
 

@@ -12,9 +12,11 @@ from fleet_work import HereEngine
 from typer.testing import CliRunner
 
 from datagen.fleet import work
+from datagen.fleet.local_engine import LocalEngine
+from datagen.fleet.ray_engine import RayEngine
 from datagen.fleet.task import FleetDrive
 from lanenet.cli.app import app
-from lanenet.cli.label_all import Told, drives_of_library, found_in, named
+from lanenet.cli.label_all import EngineName, Told, drives_of_library, engine_of, found_in, named
 from lanenet.data.library import Library
 from lanenet.errors import ConfigError, TrackingLostError
 
@@ -58,6 +60,15 @@ def test_a_failed_drive_gives_code_1_and_its_reason(tmp_path: Path, faults: None
     assert re.search(
         r"error: 1 drive failed, the first: ZeroDivisionError: by zero; run .* again", found.output
     )
+
+
+def test_an_address_is_one_of_ray_and_without_it_processes_do_the_work():
+    assert engine_of(None, None, 3) == engine_of(EngineName.local, None, 3) == LocalEngine(3)
+    assert engine_of(EngineName.ray, None, 3) == RayEngine(None, 3)
+    assert engine_of(None, "host:6379", None) == engine_of(EngineName.ray, "host:6379", None)
+    assert engine_of(None, "host:6379", None) == RayEngine("host:6379", None)
+    with pytest.raises(ConfigError, match="--address: expected --engine ray, found local"):
+        engine_of(EngineName.local, "auto", None)
 
 
 def test_no_drives_are_refused(tmp_path: Path):

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from fleet_work import die_times, double, fail, never_end, threads, together
+from fleet_work import die_or_wait, die_times, double, fail, is_alive, threads, together
 
 from datagen.fleet.engine import MAX_RETRIES, Ended, Task
 from datagen.fleet.local_engine import LocalEngine
@@ -19,14 +19,6 @@ def tasks_of(*inputs: object, memory_bytes: int = 1) -> list[Task]:
 
 def by_number(ended: list[Ended]) -> list[Ended]:
     return sorted(ended, key=lambda each: each.number)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def test_each_task_ends_once_with_its_result():
@@ -81,11 +73,3 @@ def test_closing_ends_the_workers(tmp_path: Path):
     while is_alive(pids[0]) and time.monotonic() < end_s:
         time.sleep(0.01)
     assert not is_alive(pids[0])
-
-
-def die_or_wait(job: tuple[Path, bool]) -> None:
-    folder, waits = job
-    if waits:
-        never_end(folder)
-    while not list(folder.iterdir()):
-        time.sleep(0.01)

@@ -1,0 +1,107 @@
+"""Sixty drives on a cluster whose machines are killed meanwhile, against one process (``make fleet``)."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from fleet_drives import sixty_drives
+
+from datagen.fleet.local_engine import LocalEngine
+from datagen.fleet.ray_engine import RayEngine
+from datagen.fleet.run import Counts, label_all, with_checksums
+from datagen.fleet.storage import RESULT_NAME, Storage
+from datagen.fleet.task import FleetSettings
+
+pytestmark = pytest.mark.slow
+
+#: How often a machine is killed, and the seed of when and which.
+KILLS, SEED = 3, 26
+
+
+class TwoMachines:
+    """A head node that works on nothing, and two that have a core each; either may be killed."""
+
+    def __init__(self) -> None:
+        from ray.cluster_utils import Cluster
+
+        head = {"num_cpus": 0, "include_dashboard": False}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head)
+        self.nodes, self.killed = [self.cluster.add_node(num_cpus=1) for _ in range(2)], 0
+
+    def kill_one(self, place: int, after_s: float) -> None:
+        """End all processes of one machine at once, amid a drive, and put another in its place."""
+        time.sleep(after_s)
+        self.cluster.remove_node(self.nodes[place], allow_graceful=False)
+        self.killed += 1
+        self.nodes[place] = self.cluster.add_node(num_cpus=1)
+
+
+@pytest.fixture
+def machines(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoMachines]:
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    # Else its workers have a niceness of 15, and hardly a core where others load the machine.
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    two = TwoMachines()
+    yield two
+    two.cluster.shutdown()
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """Return what was made, by path; not the markers, which tell when and where."""
+    files = [path for kind in ("maps", "labels") for path in (out / kind).rglob("*") if path.is_file()]
+    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.name != RESULT_NAME}
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_sixty_drives_on_two_machines_of_which_three_are_killed(
+    shared_data: Path, tmp_path: Path, machines: TwoMachines, capsys: pytest.CaptureFixture[str]
+):
+    drives = sixty_drives(shared_data, tmp_path / "drives")
+    assert len(drives) == 60
+    storage, settings = Storage(str(tmp_path / "cluster")), FleetSettings()
+    checked = with_checksums(drives, storage)
+    rng = random.Random(SEED)
+    kill_at = rng.sample(range(3, 50), KILLS)
+
+    def maybe_kill(counts: Counts) -> None:
+        if counts.ended in kill_at:
+            machines.kill_one(rng.randrange(2), rng.uniform(0.0, 2.0))
+
+    engine = RayEngine(machines.cluster.address)
+    with ThreadPoolExecutor(1) as meanwhile:
+        in_one_process = meanwhile.submit(
+            label_all, checked, settings, Storage(str(tmp_path / "alone")), LocalEngine(1)
+        )
+        begun_s = time.monotonic()
+        result = label_all(checked, settings, storage, engine, maybe_kill)
+        took_s = time.monotonic() - begun_s
+        alone = in_one_process.result()
+    assert machines.killed == KILLS
+    verdicts = Counter(drive.verdict for drive in result.drives)
+    assert set(verdicts) <= {"good", "usable", "reject", "refused"} and verdicts["good"] > 0, verdicts
+    assert verdicts.total() == 60 and all(drive.new for drive in result.drives)
+
+    # None is there twice, and nothing else is there.
+    with_map = {drive.map_key for drive in result.drives}
+    with_labels = {drive.labels_key for drive in result.drives if drive.labelled is not None}
+    assert {path.name for path in (tmp_path / "cluster" / "maps").iterdir()} == with_map
+    assert {path.name for path in (tmp_path / "cluster" / "labels").iterdir()} == with_labels
+    assert len(with_map) == 60
+
+    begun_s = time.monotonic()
+    again = label_all(with_checksums(drives, storage), settings, storage, engine)
+    again_s = time.monotonic() - begun_s
+    assert not any(drive.new for drive in again.drives) and again_s < 10.0
+    assert [drive.verdict for drive in again.drives] == [drive.verdict for drive in result.drives]
+
+    assert [drive.verdict for drive in alone.drives] == [drive.verdict for drive in result.drives]
+    assert contents(tmp_path / "cluster") == contents(tmp_path / "alone")
+    said = f"60 drives, {dict(verdicts)}: {took_s:.0f} s with {KILLS} kills; again {again_s:.2f} s"
+    with capsys.disabled():
+        print(f"\n{said}")  # noqa: T201
