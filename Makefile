@@ -21,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train install env test test-slow test-base-install chain traps left-out judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
+.PHONY: help train install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -32,6 +32,7 @@ help:
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of every config; two processes"
 	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
+	@echo "make leaderboard  all detectors ranked by left-out track, from what make left-out measured"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
 	@echo "make screenshots  the report pages on a phone, in light and dark, into runs/screenshots (needs chromium)"
 	@echo "make fleet        sixty drives on a Ray cluster whose nodes are killed, against one process"
@@ -82,6 +83,10 @@ traps: $(VENV)/.stamp-dev
 # LEFT_OUT adds arguments, such as --start checkpoints/mine.
 left-out: $(VENV)/.stamp-train
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out $(LEFT_OUT)
+
+# From the table of the line above, or from its page.
+leaderboard: $(VENV)/.stamp-train
+	$(BIN)/python tests/bench/bench_leaderboard.py --folder runs/left-out
 
 # Two hours on two cores; JUDGE adds arguments, such as --workers 8. Of the road cameras each competition has its
 # own, hence --any-camera for the network that was trained with one.

@@ -406,9 +406,14 @@ class _Run:
         files: dict[str, str | bytes],
         results: dict[str, object],
     ) -> None:
+        from datagen.datasets.sheet import data_sheet
+        from datagen.datasets.sheet_text import sheet_files
         from lanenet.learn.checkpoint import publish
         from lanenet.page import PAGE_NAME
 
+        settings = self.settings
+        sheet = data_sheet(settings.name, settings.data, data, settings.work_folder, self.jobs)
+        files |= sheet_files(sheet)
         if data.camera is not None:
             files["camera.yaml"] = data.camera.read_bytes()
         if data.example is not None:

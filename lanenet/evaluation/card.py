@@ -81,7 +81,8 @@ def _training(meta: ModelMeta, metrics: Mapping[str, Any], training: Sequence[La
         f"{frames} of {counted(len(training), 'label set')}, labels from the {sources}; "
         f"{counted(count, 'camera')}; lanes of {widths}.\n{metrics['epochs']} epochs, the best "
         f"one ({metrics['best_epoch']}) chosen by {metrics['val_frames']} frames of other drives or laps "
-        f"(RMSE {show_cm(metrics['val_rmse_cm'])} cm).\nThe whole config is `run.yaml`."
+        f"(RMSE {show_cm(metrics['val_rmse_cm'])} cm).\nDrives, lanes, lenses and roads: `DATA_SHEET.md`; "
+        "the whole config: `run.yaml`."
     )
 
 

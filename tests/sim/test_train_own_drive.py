@@ -74,9 +74,15 @@ def test_one_command_goes_from_a_drive_to_a_network(here: Path, first: str) -> N
     parts = {role: read_labels(next(labels.glob(f"*.{role}.parquet"))) for role in ("train", "test")}
     assert parts["train"].frame[-1] + 40 < parts["test"].frame[0]
     assert "which it had not seen, it lies" in first
-    assert {"model.onnx", "run.yaml", "MODEL_CARD.md", "camera.yaml"} <= {
+    assert {"model.onnx", "run.yaml", "MODEL_CARD.md", "DATA_SHEET.md", "camera.yaml"} <= {
         path.name for path in (here / "checkpoints" / "mycar").iterdir()
     }
+    sheet = json.loads((here / "checkpoints" / "mycar" / "data_sheet.json").read_text())
+    assert sheet["parts"]["train"]["frames"] == len(parts["train"])
+    # 16 s at 20 Hz, less the gaps between the parts and what has no labels.
+    assert 0.1 < sum(part["minutes"] for part in sheet["parts"].values()) < 16.0 / 60.0
+    (drive,) = sheet["recorded"]
+    assert (drive["name"], drive["lane_width_cm"], drive["licence"]) == ("drive", 40.0, None)
     assert (here / "runs" / "mycar" / "test.mp4").stat().st_size > 10_000
     seen = np.loadtxt(here / "runs" / "mycar" / "test.csv", delimiter=",", skiprows=1, usecols=0)
     assert seen[0] == parts["test"].frame[0] and seen[-1] == parts["test"].frame[-1]

@@ -110,6 +110,7 @@ class Drive:
         rows: Row of each frame in ``images``.
         max_steering_rad: Steering angle at Donkeycar's angle -1; None if unknown.
         notes: Free text of the driver.
+        licence: Under what the recording may be used; empty if it does not say.
         standing_s: How long the car stood until each frame, in frames that were left out; None for never.
     """
 
@@ -130,6 +131,7 @@ class Drive:
     rows: Int[np.ndarray, "n"] = field(repr=False)
     max_steering_rad: float | None = None
     notes: str = ""
+    licence: str = ""
     standing_s: Float[np.ndarray, "n"] | None = None
 
     def __len__(self) -> int:
@@ -302,6 +304,7 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
         rows=rows,
         max_steering_rad=file.max_steering_rad,
         notes=file.notes,
+        licence=file.licence,
     )
 
 
@@ -315,6 +318,7 @@ class DriveFile(Settings):
         max_steering_rad: Steering angle at Donkeycar's angle -1.
         topics: Of a ROS 2 bag, those of the images and the commands to use; all if empty.
         notes: Free text.
+        licence: Under what the recording may be used, as in ``CC-BY-4.0``.
     """
 
     format: Literal["lanenet-drive/1"]
@@ -323,6 +327,7 @@ class DriveFile(Settings):
     max_steering_rad: float | None = Field(default=None, gt=0.0, lt=0.5 * math.pi)
     topics: tuple[str, ...] = ()
     notes: str = ""
+    licence: str = ""
 
 
 def drive_file_of(drive: Path) -> Path:

@@ -96,6 +96,15 @@ class Library:
         """Return where a drive is, absolute."""
         return self.folder / entry.source
 
+    def find(self, source: Path) -> Entry | None:
+        """Return the drive whose files are at a path; None if the library holds none there.
+
+        Raises:
+            LibraryError: If the file cannot be read.
+        """
+        wanted = source.resolve()
+        return next((entry for entry in self.entries() if self.path_of(entry).resolve() == wanted), None)
+
     def open_drive(self, name: str) -> Drive:
         """Open a drive.
 
@@ -146,7 +155,7 @@ class Library:
             copy: Copy it beside the library's file, instead of keeping where it is.
             force: Add it even if the library holds the same recording.
             progress: Called with (frames read, frames).
-            **told: ``car``, ``camera``, ``track``, ``licence``, ``notes``, ``lane_width_cm``; the last two
+            **told: ``car``, ``camera``, ``track``, ``licence``, ``notes``, ``lane_width_cm``; the last three
                 default to those of the drive's own ``drive.yaml``.
 
         Returns:
@@ -296,7 +305,7 @@ class Library:
             car="",
             camera="",
             track="",
-            licence="",
+            licence=drive.licence,
             notes=drive.notes,
             lane_width_cm=drive.lane_width_cm,
             frames=len(drive),
