@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from datagen.datasets.build import PreparedData
-from datagen.datasets.jobs import ROLES, Part, RecordedJob, Role, SyntheticJob
-from datagen.datasets.settings import DataSettings
+from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
+from datagen.datasets.settings import ROLES, DataSettings, Role
 from datagen.datasets.splits import chosen_split, driven_cm
 from lanenet.data.drives.recording import read_drive_file
 from lanenet.data.label_set import LabelSet, read_places

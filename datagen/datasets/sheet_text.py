@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from datagen.datasets.jobs import ROLES
+from datagen.datasets.settings import ROLES
 from datagen.datasets.sheet import Sheet
 from lanenet.data.files import json_text
 from lanenet.errors import counted
