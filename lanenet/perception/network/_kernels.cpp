@@ -47,7 +47,7 @@ struct Numbers {
 // Edge points within the label rows.
 struct Near {
   std::vector<double> x, y, normal_x, normal_y, yellow, red;
-  std::vector<double> off, agree;
+  std::vector<double> key, off, agree, chosen;
   std::vector<int> index;
   int count;
 };
@@ -101,22 +101,24 @@ WITHIN void times(const double (*matrix)[n], const double* vector, double* out) 
 
 template <class T>
 void take_near(const Numbers& s, const T* points, const T* normals, const T* hues, size_t n, Near& out) {
-  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red}) values->resize(n);
+  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red, &out.key, &out.off,
+                       &out.agree, &out.chosen})
+    values->resize(n);
+  out.index.resize(n);
+  // Every point is written, and the next one over it unless it counts: so there is no branch to guess.
   size_t count = 0;
   for (size_t i = 0; i < n; ++i) {
-    const double y = points[2 * i + 1];
-    if (!(y > s.near_cm && y < s.far_cm)) continue;
+    const double y = points[2 * i + 1], spread = count * s.golden;
     out.x[count] = points[2 * i];
     out.y[count] = y;
     out.normal_x[count] = normals[2 * i];
     out.normal_y[count] = normals[2 * i + 1];
     out.yellow[count] = hues ? hues[2 * i] : 0.0;
     out.red[count] = hues ? hues[2 * i + 1] : 0.0;
-    ++count;
+    out.key[count] = spread - static_cast<double>(static_cast<std::int64_t>(spread));
+    count += (y > s.near_cm) & (y < s.far_cm);
   }
   out.count = static_cast<int>(count);
-  out.off.resize(n);
-  out.agree.resize(n);
 }
 
 WIDE void measure_off(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
@@ -134,21 +136,26 @@ void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near,
   const int n = near.count;
   measure_off(near.x.data(), near.y.data(), near.normal_x.data(), near.normal_y.data(), n, line.a, line.b, line.c,
               near.off.data(), near.agree.data());
-  auto& index = near.index;
-  index.clear();
-  for (int i = 0; i < n; ++i)
-    if (std::abs(near.off[i]) < reach_cm && std::abs(near.agree[i]) > s.roughly) index.push_back(i);
-  if (index.size() > kMost) {
-    const auto key = [&](int i) {
-      const double spread = i * s.golden;
-      return spread - std::floor(spread);
-    };
-    std::nth_element(index.begin(), index.begin() + kMost, index.end(),
-                     [&](int i, int j) { return key(i) < key(j); });
-    index.resize(kMost);
-    std::sort(index.begin(), index.end());
+  int* index = near.index.data();
+  int count = 0;
+  for (int i = 0; i < n; ++i) {
+    index[count] = i;
+    count += (std::abs(near.off[i]) < reach_cm) & (std::abs(near.agree[i]) > s.roughly);
   }
-  out.n = static_cast<int>(index.size());
+  if (count > kMost) {
+    double* chosen = near.chosen.data();
+    for (int k = 0; k < count; ++k) chosen[k] = near.key[index[k]];
+    std::nth_element(chosen, chosen + kMost, chosen + count);
+    const double most = chosen[kMost];
+    int left = 0;
+    for (int k = 0; k < count; ++k) {
+      const int i = index[k];
+      index[left] = i;
+      left += near.key[i] < most;
+    }
+    count = left;
+  }
+  out.n = count;
   for (int k = 0; k < out.n; ++k) {
     const int i = index[k];
     out.x[k] = near.x[i];

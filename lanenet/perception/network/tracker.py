@@ -261,10 +261,12 @@ class LaneTracker:
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
             return
+        before_cm = self._last[0][:, _MIDDLE].tolist()
         for side in range(len(SIDES)):
             now_cm, was_cm, crossed_cm = (
-                points_cm[_MIDDLE]
-                for points_cm in (pair[1 - side].points_cm, *self._last[0][[1 - side, side]])
+                float(pair[1 - side].points_cm[_MIDDLE]),
+                before_cm[1 - side],
+                before_cm[side],
             )
             if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
                 self.looks.cross(side)
