@@ -5,6 +5,7 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstring>
@@ -17,6 +18,8 @@
 #endif
 
 namespace {
+
+constexpr size_t kMost = 1024;  // widths that are told apart
 
 // The memory of an argument; released at the end.
 struct Buffer {
@@ -76,19 +79,34 @@ WIDE void spread(const double* probability, const double* kernel, size_t n, doub
   }
 }
 
-PyObject* blur(PyObject*, PyObject* args) {
-  Buffer probability, kernel, out;
-  if (!PyArg_ParseTuple(args, "y*y*w*", &probability.view, &kernel.view, &out.view)) return nullptr;
-  const size_t n = probability.view.len / sizeof(double);
-  if (n < 1 || !probability.holds(n) || !kernel.holds(2 * n - 1) || !out.holds(n))
+PyObject* match(PyObject*, PyObject* args) {
+  Buffer probability, kernel, logs, widths;
+  double step;
+  if (!PyArg_ParseTuple(args, "y*y*y*y*d", &probability.view, &kernel.view, &logs.view, &widths.view, &step))
+    return nullptr;
+  const size_t n = probability.view.len / sizeof(double), m = widths.view.len / sizeof(double);
+  if (n < 2 || n > kMost || !probability.holds(n) || !kernel.holds(2 * n - 1) || !logs.holds(n) || !widths.holds(m))
     return refuse("belief: arrays differ in number");
-  spread(probability.data(), kernel.data(), n, out.data());
-  Py_RETURN_NONE;
+  double density[kMost];
+  spread(probability.data(), kernel.data(), n, density);
+  const double most = *std::max_element(density, density + n), *grid = logs.data();
+  PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * sizeof(double));
+  if (!result) return nullptr;
+  double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
+  for (size_t i = 0; i < m; ++i) {
+    // Written so that NaN gives the first.
+    double x = std::log(widths.data()[i]);
+    x = x > grid[0] ? std::min(x, grid[n - 1]) : grid[0];
+    const size_t below = std::min(static_cast<size_t>((x - grid[0]) / step), n - 2);
+    const double share = (x - grid[below]) / (grid[below + 1] - grid[below]);
+    out[i] = (density[below] + (density[below + 1] - density[below]) * share) / most;
+  }
+  return result;
 }
 
 PyMethodDef methods[] = {
     {"learn", learn, METH_VARARGS, nullptr},
-    {"blur", blur, METH_VARARGS, nullptr},
+    {"match", match, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

@@ -61,7 +61,6 @@ class WidthBelief:
         """
         low, high = (math.log(width_cm) for width_cm in common_cm)
         sigma = max(0.5 * (high - low) / _QUANTILE, _LEAST_PRIOR)
-        self._density = np.empty_like(_LOG_CM)
         self._prior = -0.5 * ((_LOG_CM - 0.5 * (low + high)) / sigma) ** 2
         self.forget()
 
@@ -110,13 +109,19 @@ class WidthBelief:
             widths_cm: Positive.
             sigma: Standard deviation by which the logarithm of a lane's width varies along it.
         """
-        density, kernel = self._density, _kernel(sigma)
+        kernel = _kernel(sigma)
         if _kernels is not None:
-            _kernels.blur(self._probability, kernel, density)
-        else:
-            shifted = np.lib.stride_tricks.sliding_window_view(kernel, len(_LOG_CM))[::-1]
-            density = _sum(shifted * self._probability[:, None])
-        return np.interp(np.log(widths_cm), _LOG_CM, density / density.max())
+            rates = _kernels.match(self._probability, kernel, _LOG_CM, np.ascontiguousarray(widths_cm), _STEP)
+            return np.frombuffer(rates).reshape(widths_cm.shape)
+        shifted = np.lib.stride_tricks.sliding_window_view(kernel, len(_LOG_CM))[::-1]
+        density = _sum(shifted * self._probability[:, None])
+        log_widths = _each(math.log, widths_cm.reshape(-1))
+        # Written so that NaN gives the first.
+        log_widths = np.where(log_widths > _LOG_CM[0], np.minimum(log_widths, _LOG_CM[-1]), _LOG_CM[0])
+        below = np.minimum(((log_widths - _LOG_CM[0]) / _STEP).astype(np.int64), len(_LOG_CM) - 2)
+        share = (log_widths - _LOG_CM[below]) / (_LOG_CM[below + 1] - _LOG_CM[below])
+        rates = density[below] + (density[below + 1] - density[below]) * share
+        return (rates / density.max()).reshape(widths_cm.shape)
 
 
 @functools.lru_cache(maxsize=4)
