@@ -128,7 +128,9 @@ def time_paths(
 
     Returns:
         By size and path: ``median_ms`` and ``p99_ms`` of wall-clock time, ``cpu_median_ms`` and
-        ``cpu_p99_ms`` of the thread's CPU time, which depends less on the load of the machine.
+        ``cpu_p99_ms`` of the thread's CPU time, which depends less on the load of the machine, and
+        ``ratio_to_canny`` of the CPU medians. The path ``canny`` is the yardstick: plain Canny alone, in turn
+        with the others.
 
     Raises:
         ModelMismatchError: If a model cannot be used.
@@ -139,7 +141,9 @@ def time_paths(
     with _opencv_threads(threads):
         for used in (camera, smaller_camera(camera, 2)):
             frames = example_frames(used, _FRAMES, np.random.default_rng(0))
-            paths = {name: _Path(d, used) for name, d in _detectors(used, models, threads).items()}
+            paths = {"canny": _Path(plain_canny)}
+            for name, detector in _detectors(used, models, threads).items():
+                paths[name] = _Path(_Drive(detector, used).step)
             for path in paths.values():
                 path.run(frames, _PATH_WARM_UP)
                 path.forget()
@@ -150,7 +154,10 @@ def time_paths(
                     done += count
                     if progress is not None:
                         progress(done, 2 * len(paths) * rounds)
-            result[f"{used.width}x{used.height}"] = {name: path.figures() for name, path in paths.items()}
+            figures = {name: path.figures() for name, path in paths.items()}
+            for values in figures.values():
+                values["ratio_to_canny"] = values["cpu_median_ms"] / figures["canny"]["cpu_median_ms"]
+            result[f"{used.width}x{used.height}"] = figures
     return result
 
 
@@ -245,8 +252,7 @@ class _Stages:
         def mark(stage: str) -> None:
             marks.append((stage, time.perf_counter()))
 
-        # The yardstick.
-        cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
+        plain_canny(frame)
         mark("canny")
         table = self._extractor.table
         pixels = table.find(frame, self._extractor.settings.edges)
@@ -293,7 +299,12 @@ def _detectors(camera: Camera, models: Sequence[Path], threads: int) -> dict[str
     return networks | {name: build_detector(name, inputs) for name in without_model}
 
 
-class _Path:
+def plain_canny(frame: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Do what all times are compared with."""
+    cv2.Canny(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), 40.0, 100.0, L2gradient=True)
+
+
+class _Drive:
     """One detector with the controller and the limiter that follow it in the drive loop."""
 
     def __init__(self, detector: Detector, camera: Camera) -> None:
@@ -302,6 +313,20 @@ class _Path:
         self._controller = LaneController(ControlSettings(steering=steering))
         self._limiter = CommandLimiter(LimitSettings())
         self._t_s = 0.0
+
+    def step(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Go from a frame to a limited command."""
+        estimate = self._detector.detect(frame)
+        target = self._controller.target(estimate, self._t_s, 60.0, self._limiter.steering_rad)
+        self._limiter.limit(target.steering_rad, 0.2, self._t_s)
+        self._t_s += _PERIOD_S
+
+
+class _Path:
+    """What is done with every frame, and how long that took."""
+
+    def __init__(self, step: Callable[[UInt8[np.ndarray, "h w 3"]], None]) -> None:
+        self._step = step
         self.forget()
 
     def forget(self) -> None:
@@ -312,12 +337,9 @@ class _Path:
     def run(self, frames: Sequence[UInt8[np.ndarray, "h w 3"]], count: int) -> None:
         for i in range(count):
             wall_s, cpu_s = time.perf_counter(), time.thread_time()
-            estimate = self._detector.detect(frames[i % len(frames)])
-            target = self._controller.target(estimate, self._t_s, 60.0, self._limiter.steering_rad)
-            self._limiter.limit(target.steering_rad, 0.2, self._t_s)
+            self._step(frames[i % len(frames)])
             self._cpu_s.append(time.thread_time() - cpu_s)
             self._wall_s.append(time.perf_counter() - wall_s)
-            self._t_s += _PERIOD_S
 
     def figures(self) -> dict[str, float]:
         times_ms = {"": 1e3 * np.array(self._wall_s), "cpu_": 1e3 * np.array(self._cpu_s)}

@@ -290,9 +290,10 @@ class LaneMemory:
             Points and standard deviations, changed for the missing line only.
         """
         width_cm = self.width_cm
-        if width_cm is None or (presence < SEEN).sum() != 1:
+        left, right = presence.tolist()
+        if width_cm is None or (left < SEEN) == (right < SEEN):
             return points_cm, sigma_cm
-        missing = int(np.argmin(presence))
+        missing = 0 if left < SEEN else 1
         # The right line, 1, lies to the right of the left one, 0.
         side = 1.0 if missing == 1 else -1.0
         lines, sigmas = points_cm.reshape(2, 3).copy(), sigma_cm.reshape(2, 3).copy()

@@ -45,11 +45,11 @@ def bench(
     console.show_table(title, ("stage", "median ms", "p99 ms", "x canny"), rows)
     keys = ("median_ms", "p99_ms", "cpu_median_ms", "cpu_p99_ms")
     rows = [
-        [f"{size} {path}", *(f"{values[key]:.3f}" for key in keys)]
+        [f"{size} {path}", *(f"{values[key]:.3f}" for key in keys), f"{values['ratio_to_canny']:.2f}"]
         for size, paths in report["paths"].items()
         for path, values in paths.items()
     ]
-    columns = ("path", "median ms", "p99 ms", "CPU median", "CPU p99")
+    columns = ("path", "median ms", "p99 ms", "CPU median", "CPU p99", "x canny")
     console.show_table("frame to steering", columns, rows)
     if out is not None:
         write_json(out, report)

@@ -89,17 +89,7 @@ def find_edges(
     if directional and sample is None:
         sample = sample_pixels(np.ones(check_frame(frame_bgr).shape[:2], np.uint8) if keep is None else keep)
     if compiled.finds_in(check_frame(frame_bgr)):
-        return compiled.find(
-            frame_bgr,
-            keep,
-            sample,
-            blur_px=settings.blur_px,
-            thresholds=(settings.low, settings.high),
-            colour_weight=settings.colour_weight if directional else 0.0,
-            contrast_share=settings.contrast_share if directional else 0.0,
-            subpixel=directional,
-            raising=(_DIM, _LEAST_RAISED, _CLEAR),
-        )
+        return compiled.find(frame_bgr, keep, sample, search_of(settings))
     gray = to_gray(frame_bgr)
     dx, dy = gradients(gray, settings.blur_px)
     raised = 1.0
@@ -122,6 +112,20 @@ def find_edges(
     if keep is not None:
         cv2.bitwise_and(edges, keep, dst=edges)
     return edge_pixels(edges, dx, dy, subpixel=directional, hues=hues)
+
+
+def search_of(settings: EdgeSettings) -> compiled.Search:
+    """Return the settings as the compiled loops take them."""
+    directional = settings.method == "directional"
+    return compiled.Search(
+        settings.blur_px,
+        settings.low,
+        settings.high,
+        settings.colour_weight if directional else 0.0,
+        settings.contrast_share if directional else 0.0,
+        directional,
+        (_DIM, _LEAST_RAISED, _CLEAR),
+    )
 
 
 def sample_pixels(keep: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " n"]:

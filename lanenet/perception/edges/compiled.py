@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -50,47 +51,85 @@ def finds_in(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> bool:
     return is_here() and min(frame_bgr.shape[:2]) >= _LEAST_PX
 
 
-def find(
-    frame_bgr: UInt8[np.ndarray, "h w *c"],
-    keep: UInt8[np.ndarray, "h w"] | None,
-    sample: Int[np.ndarray, " n"] | None,
-    *,
-    blur_px: int,
-    thresholds: tuple[float, float],
-    colour_weight: float,
-    contrast_share: float,
-    subpixel: bool,
-    raising: tuple[float, float, float],
-) -> EdgePixels:
-    """Find edges as :func:`lanenet.perception.edges.canny.find_edges` does, but for the method ``colour``.
+class Search(NamedTuple):
+    """How edges are found, for all methods but ``colour``.
 
-    Args:
-        frame_bgr: Colour or gray image of at least 3 x 3 pixels.
-        keep: Mask of pixels that may be edges; None for all.
-        sample: Flat indices of the pixels whose contrast counts; may be None if ``contrast_share`` is 0.
+    Attributes:
         blur_px: Size of the Gauss kernel, 3 or 5; 0 for none.
-        thresholds: Of the hysteresis, lower and upper.
+        low: Lower threshold of the hysteresis.
+        high: Upper one.
         colour_weight: Of yellow and red; 0 to leave them out.
         contrast_share: As in the settings; 0 fixes the thresholds.
         subpixel: Move each edge to where the gradient peaks.
         raising: How far the thresholds fall in dim frames: the three constants of ``canny``.
     """
-    rows, columns = frame_bgr.shape[:2]
-    found = _kernels.find(
-        np.ascontiguousarray(frame_bgr),
-        rows,
-        columns,
-        None if keep is None else np.ascontiguousarray(keep),
-        None if sample is None else np.ascontiguousarray(sample, np.int64),
-        blur_px,
-        *thresholds,
-        colour_weight,
-        contrast_share,
-        subpixel,
-        raising,
-    )
-    coloured = frame_bgr.ndim == 3 and colour_weight > 0.0
-    return EdgePixels(*np.frombuffer(found).reshape(3 if coloured else 2, -1, 2))
+
+    blur_px: int
+    low: float
+    high: float
+    colour_weight: float
+    contrast_share: float
+    subpixel: bool
+    raising: tuple[float, float, float]
+
+
+def find(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    keep: UInt8[np.ndarray, "h w"] | None,
+    sample: Int[np.ndarray, " n"] | None,
+    search: Search,
+) -> EdgePixels:
+    """Find edges as :func:`lanenet.perception.edges.canny.find_edges` does.
+
+    Args:
+        frame_bgr: Colour or gray image of at least 3 x 3 pixels.
+        keep: Mask of pixels that may be edges; None for all.
+        sample: Flat indices of the pixels whose contrast counts; may be None if ``contrast_share`` is 0.
+        search: How.
+    """
+    found = _kernels.find(*_frame(frame_bgr, keep, sample), *search)
+    return EdgePixels(*np.frombuffer(found).reshape(_blocks(frame_bgr, search), -1, 2))
+
+
+def extract(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    keep: UInt8[np.ndarray, "h w"] | None,
+    sample: Int[np.ndarray, " n"] | None,
+    search: Search,
+    table: Float[np.ndarray, "p 6"],
+    rows: tuple[int, int],
+) -> tuple[np.ndarray, ...]:
+    """Find edges and move them to the road: :func:`find` and :func:`lift` without the numbers between them.
+
+    Args:
+        frame_bgr: Some rows of a frame.
+        keep: As for :func:`find`, of these rows.
+        sample: Likewise.
+        search: How.
+        table: As for :func:`lift`, of the whole image.
+        rows: The image's row with which these begin, and the number of its rows.
+
+    Returns:
+        Points, normals, and hues if there are any, n x 2 each, float32; all of them finite.
+    """
+    found = _kernels.extract(*_frame(frame_bgr, keep, sample), *search, table, *rows)
+    return tuple(np.frombuffer(found, np.float32).reshape(_blocks(frame_bgr, search), -1, 2))
+
+
+def _frame(
+    frame_bgr: UInt8[np.ndarray, "h w *c"],
+    keep: UInt8[np.ndarray, "h w"] | None,
+    sample: Int[np.ndarray, " n"] | None,
+) -> tuple[np.ndarray | int | None, ...]:
+    """Return a frame's arguments, contiguous."""
+    kept = None if keep is None else np.ascontiguousarray(keep)
+    sampled = None if sample is None else np.ascontiguousarray(sample, np.int64)
+    return np.ascontiguousarray(frame_bgr), *frame_bgr.shape[:2], kept, sampled
+
+
+def _blocks(frame_bgr: UInt8[np.ndarray, "h w *c"], search: Search) -> int:
+    """Return the number of arrays in a result: hues are found in colours, if they are wanted."""
+    return 3 if frame_bgr.ndim == 3 and search.colour_weight > 0.0 else 2
 
 
 def lift(

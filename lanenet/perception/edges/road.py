@@ -12,7 +12,14 @@ from lanenet.config import Settings, flat_settings
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges import compiled
-from lanenet.perception.edges.canny import EdgeSettings, check_frame, check_size, find_edges, sample_pixels
+from lanenet.perception.edges.canny import (
+    EdgeSettings,
+    check_frame,
+    check_size,
+    find_edges,
+    sample_pixels,
+    search_of,
+)
 from lanenet.perception.edges.markings_only import PixelScale
 from lanenet.perception.edges.pixels import EdgePixels
 
@@ -163,6 +170,15 @@ class RoadTable:
         found.uv_px[:, 1] += self.rows.start
         return found
 
+    def extract(self, frame_bgr: UInt8[np.ndarray, "h w *c"], search: compiled.Search) -> RoadEdges:
+        """Do :meth:`find` and :meth:`lift_single` in one go, by the compiled loops."""
+        rows = self.rows.start, self.height
+        return RoadEdges(
+            *compiled.extract(
+                frame_bgr[self.rows], self._keep_rows, self._sample_rows, search, self._rows, rows
+            )
+        )
+
     def lift(self, edges: EdgePixels) -> RoadEdges:
         """Move edge pixels to the road.
 
@@ -234,6 +250,10 @@ class RoadEdgeExtractor:
         self.camera = camera
         self.settings = settings
         self.table = RoadTable(camera, settings.range, mask)
+        loops_suffice = settings.edges.method != "colour" and compiled.finds_in(
+            self.table.keep[self.table.rows]
+        )
+        self._search = search_of(settings.edges) if loops_suffice else None
 
     def is_crowded(self, n_edges: int, max_share: float) -> bool:
         """Tell whether so many edges are more than this share of the pixels that see the road.
@@ -250,4 +270,6 @@ class RoadEdgeExtractor:
             DriveFormatError: If the array is no image.
         """
         check_size(check_frame(frame_bgr), self.camera)
+        if self._search is not None and compiled.is_here():
+            return self.table.extract(frame_bgr, self._search)
         return self.table.lift_single(self.table.find(frame_bgr, self.settings.edges))

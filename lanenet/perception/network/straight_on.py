@@ -44,7 +44,8 @@ _STEEPEST = 1.0
 
 def turns_away_cm(points_cm: Float[np.ndarray, "3"], side: int) -> float:
     """Return by how much a line turns away from its lane: the second difference of its points, [cm]."""
-    second = float(points_cm[2] - 2.0 * points_cm[1] + points_cm[0])
+    near, middle, far = points_cm.tolist()
+    second = float(far - 2.0 * middle + near)
     return second if side == 1 else -second
 
 
@@ -142,9 +143,11 @@ class StraightOn:
         self._frames += 1
         if not leaves and self._suspicious == 0 and _is_plain(lines, width_cm):
             # Their direction 15 cm ahead, as far as both are seen.
-            far, x = _FAR if lines.seen_at[:, _FAR].all() else _MIDDLE, lines.points_cm
-            slope = float(np.mean(x[:, far] - x[:, 0])) / ROWS_CM[far]
-            self._lines_cm = x[:, [_MIDDLE]] + slope * (_ROWS - _ROWS[_MIDDLE])
+            far = _FAR if lines.seen_at[:, _FAR].all() else _MIDDLE
+            left, right = lines.points_cm.tolist()
+            slope = 0.5 * (left[far] - left[0] + (right[far] - right[0])) / ROWS_CM[far]
+            ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]
+            self._lines_cm = np.array([[x[_MIDDLE] + dx for dx in ahead_cm] for x in (left, right)])
             self._driven_cm, self._frames = 0.0, 0
         elif self._frames > (_FRESH if self._told else _FRESH_UNTOLD):
             self._lines_cm = None
@@ -193,7 +196,10 @@ class StraightOn:
 
 def _is_plain(lines: SeenLines, width_cm: float) -> bool:
     """Return whether both lines of a lane are seen, and are nearly straight."""
-    if (lines.seen_cm < _PLAIN_CM).any():
+    # Plain numbers: for two lines arrays cost more than they save.
+    if min(lines.seen_cm.tolist()) < _PLAIN_CM:
         return False
-    off = np.abs((lines.points_cm[1] - lines.points_cm[0])[:_FAR] / width_cm - 1.0)
-    return bool(off.max() < _PLAIN_WIDTH and np.abs(lines.turn(width_cm)).max() < _PLAIN_TURN)
+    left, right = (x.tolist()[:_FAR] for x in lines.points_cm)
+    off = max(abs((b - a) / width_cm - 1.0) for a, b in zip(left, right, strict=True))
+    turn = max(abs(turns_away_cm(x, side) / width_cm) for side, x in enumerate(lines.points_cm))
+    return off < _PLAIN_WIDTH and turn < _PLAIN_TURN

@@ -173,14 +173,15 @@ class LaneTracker:
         """Collect what the left and the right line may be; the last of each is the network's, as it is."""
         starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
         by_presence_cm = _BY_PRESENCE_CM
-        if self._last is not None and np.abs(self._last[0][:, 0]).min() < _ON_LINE * self.lane.likely_cm:
+        beside_cm = () if self._last is None else (abs(float(self._last[0][side, 0])) for side in (0, 1))
+        if min(beside_cm, default=np.inf) < _ON_LINE * self.lane.likely_cm:
             by_presence_cm = _BY_PRESENCE_ON_LINE_CM
+        moved_cm = None if self._last is None else np.hypot(self._last[1], _MOVED_CM)
         for side in range(len(SIDES)):
             if presence[side] >= _LEAST_PRESENCE:
                 starts.append((side, own[0][side], own[1][side], by_presence_cm * float(presence[side])))
-            if self._last is not None:
-                moved_cm = np.hypot(self._last[1][side], _MOVED_CM)
-                starts.append((side, self._last[0][side], moved_cm, _BY_CONTINUING_CM))
+            if self._last is not None and moved_cm is not None:
+                starts.append((side, self._last[0][side], moved_cm[side], _BY_CONTINUING_CM))
         n_usual = len(starts)
         starts += self._beyond_a_crossed_line()
         # The next lane's lines need not look like those of this one.
@@ -214,9 +215,10 @@ class LaneTracker:
         if self._last is None or width_cm is None:
             return starts
         for side, outwards in ((0, -1.0), (1, 1.0)):
-            crossed_cm, sigma_cm = self._last[0][side], np.hypot(self._last[1][side], _MOVED_CM)
+            crossed_cm = self._last[0][side]
             if outwards * crossed_cm[0] >= 0.0:
                 continue
+            sigma_cm = np.hypot(self._last[1][side], _MOVED_CM)
             next_cm = parallel_points(crossed_cm, outwards * width_cm)
             if np.isfinite(next_cm).all():
                 starts.append((1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM))
@@ -271,10 +273,12 @@ class LaneTracker:
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
             return
+        before_cm = self._last[0][:, _MIDDLE].tolist()
         for side in range(len(SIDES)):
             now_cm, was_cm, crossed_cm = (
-                points_cm[_MIDDLE]
-                for points_cm in (pair[1 - side].points_cm, *self._last[0][[1 - side, side]])
+                float(pair[1 - side].points_cm[_MIDDLE]),
+                before_cm[1 - side],
+                before_cm[side],
             )
             if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
                 self.looks.cross(side)

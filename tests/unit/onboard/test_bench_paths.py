@@ -29,13 +29,15 @@ def test_every_path_is_timed_at_both_sizes() -> None:
     report = time_paths(
         example_camera(), [MODEL], rounds=10, progress=lambda done, total: turns.append((done, total))
     )
-    assert cv2.getNumThreads() == before and turns[-1] == (80, 80)
+    assert cv2.getNumThreads() == before and turns[-1] == (100, 100)
     assert list(report) == ["320x240", "160x120"]
     for paths in report.values():
-        assert list(paths) == [f"network {MODEL}", "lane-filter", "hough", "painter"]
+        assert list(paths) == ["canny", f"network {MODEL}", "lane-filter", "hough", "painter"]
+        assert paths["canny"]["ratio_to_canny"] == 1.0
         for figures in paths.values():
             assert 0.0 < figures["median_ms"] <= figures["p99_ms"]
             assert 0.0 < figures["cpu_median_ms"] <= figures["cpu_p99_ms"]
+            assert figures["ratio_to_canny"] > 0.0
 
 
 def test_a_missing_model_is_named() -> None:

@@ -138,6 +138,10 @@ def test_memory_beyond_the_arguments_is_not_read():
         with pytest.raises(ValueError, match=r"expected|not of|beyond"):
             compiled._kernels.find(*good[:at], wrong, *good[at + 1 :])
     points, table = np.zeros((2, 2)), np.zeros((20, 6))
+    assert len(compiled._kernels.extract(*good, table, 0, 4)) == 0
+    for wrong in ((table[1:], 0, 4), (table, 0, 5), (table[:0], 0, 0)):
+        with pytest.raises(ValueError, match="table: not of"):
+            compiled._kernels.extract(*good, *wrong)
     for arguments in (
         (points, points[:1], None, table),
         (points, points, points[:1], table),

@@ -1,0 +1,118 @@
+// What the lane's width is believed to be: lane_width.py, compiled. What a step means stands there. Exponentials and
+// logarithms are those of the C library, as Python's, and sums go from first to last, so that the bytes are equal
+// (build with -ffp-contract=off). Arrays come as contiguous buffers of doubles.
+
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstring>
+
+// On x86-64 the loops exist twice, and the processor chooses.
+#if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE
+#endif
+
+namespace {
+
+constexpr size_t kMost = 1024;  // widths that are told apart
+
+// The memory of an argument; released at the end.
+struct Buffer {
+  Py_buffer view{};
+  ~Buffer() { PyBuffer_Release(&view); }
+  double* data() const { return static_cast<double*>(view.buf); }
+  bool holds(size_t n) const { return static_cast<size_t>(view.len) == n * sizeof(double); }
+};
+
+PyObject* refuse(const char* what) {
+  PyErr_SetString(PyExc_ValueError, what);
+  return nullptr;
+}
+
+// WidthBelief._settle(): nats get their largest at 0; returns mean and variance of the logarithm.
+void settle(double* nats, const double* logs, size_t n, double* probability, double* mean, double* variance) {
+  double most = nats[0], total = 0.0;
+  for (size_t i = 1; i < n; ++i) most = nats[i] > most ? nats[i] : most;
+  for (size_t i = 0; i < n; ++i) {
+    nats[i] -= most;
+    probability[i] = std::exp(nats[i]);
+    total += probability[i];
+  }
+  *mean = *variance = 0.0;
+  for (size_t i = 0; i < n; ++i) {
+    probability[i] /= total;
+    *mean += probability[i] * logs[i];
+  }
+  for (size_t i = 0; i < n; ++i) *variance += probability[i] * ((logs[i] - *mean) * (logs[i] - *mean));
+}
+
+PyObject* learn(PyObject*, PyObject* args) {
+  Buffer nats, prior, logs, probability;
+  double log_width, sigma, own_share, others, kept, alike;
+  if (!PyArg_ParseTuple(args, "w*y*y*w*dddddd", &nats.view, &prior.view, &logs.view, &probability.view, &log_width,
+                        &sigma, &own_share, &others, &kept, &alike))
+    return nullptr;
+  const size_t n = nats.view.len / sizeof(double);
+  if (n < 1 || !nats.holds(n) || !prior.holds(n) || !logs.holds(n) || !probability.holds(n))
+    return refuse("belief: arrays differ in number");
+  for (size_t i = 0; i < n; ++i) {
+    const double off = (logs.data()[i] - log_width) / sigma;
+    const double likely = std::log(own_share * std::exp(-0.5 * (off * off)) + others);
+    const double told = kept * (nats.data()[i] - prior.data()[i]) + likely / alike;
+    nats.data()[i] = prior.data()[i] + told;
+  }
+  double mean, variance;
+  settle(nats.data(), logs.data(), n, probability.data(), &mean, &variance);
+  return Py_BuildValue("dd", mean, variance);
+}
+
+WIDE void spread(const double* probability, const double* kernel, size_t n, double* __restrict out) {
+  std::memset(out, 0, n * sizeof(double));
+  for (size_t j = 0; j < n; ++j) {
+    const double *shifted = kernel + (n - 1 - j), share = probability[j];
+    for (size_t i = 0; i < n; ++i) out[i] += shifted[i] * share;
+  }
+}
+
+PyObject* match(PyObject*, PyObject* args) {
+  Buffer probability, kernel, logs, widths;
+  double step;
+  if (!PyArg_ParseTuple(args, "y*y*y*y*d", &probability.view, &kernel.view, &logs.view, &widths.view, &step))
+    return nullptr;
+  const size_t n = probability.view.len / sizeof(double), m = widths.view.len / sizeof(double);
+  if (n < 2 || n > kMost || !probability.holds(n) || !kernel.holds(2 * n - 1) || !logs.holds(n) || !widths.holds(m))
+    return refuse("belief: arrays differ in number");
+  double density[kMost];
+  spread(probability.data(), kernel.data(), n, density);
+  const double most = *std::max_element(density, density + n), *grid = logs.data();
+  PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * sizeof(double));
+  if (!result) return nullptr;
+  double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
+  for (size_t i = 0; i < m; ++i) {
+    // Written so that NaN gives the first.
+    double x = std::log(widths.data()[i]);
+    x = x > grid[0] ? std::min(x, grid[n - 1]) : grid[0];
+    const size_t below = std::min(static_cast<size_t>((x - grid[0]) / step), n - 2);
+    const double share = (x - grid[below]) / (grid[below + 1] - grid[below]);
+    out[i] = (density[below] + (density[below + 1] - density[below]) * share) / most;
+  }
+  return result;
+}
+
+PyMethodDef methods[] = {
+    {"learn", learn, METH_VARARGS, nullptr},
+    {"match", match, METH_VARARGS, nullptr},
+    {nullptr, nullptr, 0, nullptr},
+};
+
+PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_kernels", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__kernels() { return PyModuleDef_Init(&module); }
