@@ -396,85 +396,6 @@ double distance_of(const double* left, const double* right, const double* y, int
   return std::sqrt((lower + upper) / 2.0);
 }
 
-// FirstLayer.fill(): the sums of cells that are not empty, in the order of the raster.
-constexpr int kLanes = 8;  // channels that are summed together
-using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
-
-struct Layer {
-  const float *weights, *bias, *scales;
-  const std::uint8_t* zeros;
-  int rows, columns, down, across, planes, channels, size, stride, pad;
-
-  // How many places along each side a cell adds to, and how many the sums have, with those beside the result.
-  int places() const { return size / stride; }
-  int high() const { return std::max((rows - 1 + pad) / stride + 1, down) + places() - 1; }
-  int wide() const { return std::max((columns - 1 + pad) / stride + 1, across) + places() - 1; }
-};
-
-WIDE void mark_cells(const std::uint8_t* __restrict plane, std::uint8_t zero, size_t n, std::uint8_t* __restrict out) {
-  for (size_t i = 0; i < n; ++i) out[i] |= plane[i] ^ zero;
-}
-
-// The cells that are not empty.
-void list_cells(const std::uint8_t* marks, size_t n, std::vector<int>& out) {
-  out.resize(n + 1);
-  size_t count = 0;
-  for (size_t begin = 0; begin < n; begin += sizeof(std::uint64_t)) {
-    const size_t end = std::min(begin + sizeof(std::uint64_t), n);
-    std::uint64_t word = 1;
-    if (end == begin + sizeof word) std::memcpy(&word, marks + begin, sizeof word);
-    for (size_t i = begin; word != 0 && i < end; ++i) {
-      out[count] = static_cast<int>(i);
-      count += marks[i] != 0;
-    }
-  }
-  out.resize(count);
-}
-
-// Each cell adds to the same number of places, some of them beside the result. The numbers of planes, channels and
-// places along each side are given where they are known beforehand, else 0.
-template <int known_planes, int known_channels, int known_places>
-WITHIN void add_cells(const Layer& l, const std::uint8_t* raster, const int* list, size_t count, float* values,
-                      float* sums) {
-  const int planes = known_planes ? known_planes : l.planes, channels = known_channels ? known_channels : l.channels;
-  const int places = known_places ? known_places : l.places();
-  const size_t cells = static_cast<size_t>(l.rows) * l.columns;
-  for (size_t n = 0; n < count; ++n) {
-    const int at = list[n], r = at / l.columns + l.pad, c = at % l.columns + l.pad;
-    for (int k = 0; k < planes; ++k)
-      values[k] = static_cast<float>(int(raster[k * cells + at]) - int(l.zeros[k])) * l.scales[k];
-    const int down = r / l.stride, across = c / l.stride;
-    for (int j = 0; j < places; ++j)
-      for (int i = 0; i < places; ++i) {
-        const int row = r - l.stride * (down - places + 1 + j), column = c - l.stride * (across - places + 1 + i);
-        const float* taps = l.weights + static_cast<size_t>(row * l.size + column) * planes * channels;
-        float* out = sums + (static_cast<size_t>(down + j) * l.wide() + across + i) * channels;
-        for (int begin = 0; begin < channels; begin += kLanes) {
-          Lanes tap, added, sum;
-          std::memcpy(&tap, taps + begin, sizeof tap);
-          added = values[0] * tap;
-          for (int k = 1; k < planes; ++k) {
-            std::memcpy(&tap, taps + k * channels + begin, sizeof tap);
-            added += values[k] * tap;
-          }
-          std::memcpy(&sum, out + begin, sizeof sum);
-          sum += added;
-          std::memcpy(out + begin, &sum, sizeof sum);
-        }
-      }
-  }
-}
-
-WIDE void add_up(const Layer& l, const std::uint8_t* raster, const int* list, size_t count, float* values,
-                 float* sums) {
-  if (l.planes == 5 && l.channels == 16 && l.places() == 2) add_cells<5, 16, 2>(l, raster, list, count, values, sums);
-  else add_cells<0, 0, 0>(l, raster, list, count, values, sums);
-}
-
-WIDE void rectify(float* values, size_t n) {
-  for (size_t i = 0; i < n; ++i) values[i] = values[i] > 0.0f ? values[i] : 0.0f;
-}
-
 // --- Python ---
 
 // The memory of an argument; released at the end.
@@ -583,57 +504,9 @@ PyObject* distances(PyObject*, PyObject* args) {
   }
 }
 
-PyObject* first_layer(PyObject*, PyObject* args) {
-  Buffer raster, weights, bias, scales, zeros, out;
-  Layer l;
-  if (!PyArg_ParseTuple(args, "y*y*y*y*y*w*iiiiiiiii", &raster.view, &weights.view, &bias.view, &scales.view,
-                        &zeros.view, &out.view, &l.rows, &l.columns, &l.down, &l.across, &l.planes, &l.channels,
-                        &l.size, &l.stride, &l.pad))
-    return nullptr;
-  for (const int number : {l.rows, l.columns, l.down, l.across, l.planes, l.channels, l.size, l.stride})
-    if (number < 1) return refuse("layer: expected numbers above 0");
-  const size_t cells = static_cast<size_t>(l.rows) * l.columns, places = static_cast<size_t>(l.down) * l.across;
-  const auto holds = [](const Buffer& buffer, size_t bytes) { return static_cast<size_t>(buffer.view.len) == bytes; };
-  if (l.pad < 0 || l.size % l.stride || l.channels % kLanes || !holds(raster, l.planes * cells) ||
-      !holds(weights, sizeof(float) * l.size * l.size * l.planes * l.channels) ||
-      !holds(bias, sizeof(float) * l.channels) || !holds(scales, sizeof(float) * l.planes) ||
-      !holds(zeros, l.planes) || !holds(out, sizeof(float) * l.channels * places))
-    return refuse("layer: raster, weights and result do not fit");
-  l.weights = weights.as<float>();
-  l.bias = bias.as<float>();
-  l.scales = scales.as<float>();
-  l.zeros = zeros.as<std::uint8_t>();
-  try {
-    static std::vector<float> sums, values;  // one caller at a time: the interpreter's lock is held
-    static std::vector<std::uint8_t> marks;
-    static std::vector<int> list;
-    const size_t all = static_cast<size_t>(l.high()) * l.wide();
-    sums.resize(l.channels * all);
-    values.resize(l.planes);
-    for (size_t i = 0; i < all; ++i) std::copy_n(l.bias, l.channels, &sums[i * l.channels]);
-    marks.assign(cells, 0);
-    for (int k = 0; k < l.planes; ++k)
-      mark_cells(raster.as<std::uint8_t>() + k * cells, l.zeros[k], cells, marks.data());
-    list_cells(marks.data(), cells, list);
-    add_up(l, raster.as<std::uint8_t>(), list.data(), list.size(), values.data(), sums.data());
-    rectify(sums.data(), sums.size());
-    float* result = static_cast<float*>(out.view.buf);
-    const int beside = l.places() - 1;
-    for (int y = 0; y < l.down; ++y) {
-      const float* row = &sums[(static_cast<size_t>(y + beside) * l.wide() + beside) * l.channels];
-      for (int x = 0; x < l.across; ++x)
-        for (int k = 0; k < l.channels; ++k) result[k * places + y * l.across + x] = row[x * l.channels + k];
-    }
-  } catch (const std::exception&) {
-    return PyErr_NoMemory();
-  }
-  Py_RETURN_NONE;
-}
-
 PyMethodDef methods[] = {
     {"refine", refine, METH_VARARGS, nullptr},
     {"distances", distances, METH_VARARGS, nullptr},
-    {"first_layer", first_layer, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

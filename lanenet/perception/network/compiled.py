@@ -6,7 +6,7 @@ As :mod:`lanenet.perception.edges.compiled`; the callers explain each step, and 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
 
 from lanenet.perception.edges.compiled import if_current
 from lanenet.perception.edges.road import RoadEdges
@@ -48,27 +48,6 @@ def refine(
     single = edges.points_cm.dtype == np.float32
     found = _kernels.refine(*given, points_cm, normals, hues, numbers, single)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
-
-
-def fill_first_layer(
-    raster: UInt8[np.ndarray, "p r q"],
-    layer: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    stride: int,
-    pad: int,
-    out: Float32[np.ndarray, "c y x"],
-) -> None:
-    """Answer a raster as :meth:`lanenet.perception.network.first_layer.FirstLayer.fill` does.
-
-    Args:
-        raster: Contiguous.
-        layer: Weights, bias, scales and zeros, contiguous.
-        stride: As the layer's.
-        pad: As the layer's.
-        out: Contiguous; written.
-    """
-    size, _, planes, channels = layer[0].shape
-    shape = *raster.shape[1:], *out.shape[1:], planes, channels, size, stride, pad
-    _kernels.first_layer(np.ascontiguousarray(raster), *layer, out, *shape)
 
 
 def distances(

@@ -405,8 +405,15 @@ def open_model(
     # A command that runs no network starts without it.
     import onnxruntime
 
-    data, path = read_model(path), find_model(path)
-    options = model_options(threads, frames)
+    path = find_model(path)
+    data = read_bytes(path, ModelMismatchError, _MAX_MODEL)
+    _check_seal(data, str(path))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    if frames is not None:
+        options.add_free_dimension_override_by_name(BATCH_NAME, frames)
     try:
         # The bytes, not the path: a model by its path may read further files.
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
@@ -433,31 +440,6 @@ def open_model(
         raise ModelMismatchError(f"{path}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
     _run_self_test(session, properties[SELF_TEST_NAME], shape, str(path))
     return session, meta
-
-
-def read_model(path: Path) -> bytes:
-    """Return the bytes of a model file.
-
-    Raises:
-        ModelMismatchError: If the file is missing, or was damaged.
-    """
-    path = find_model(path)
-    data = read_bytes(path, ModelMismatchError, _MAX_MODEL)
-    _check_seal(data, str(path))
-    return data
-
-
-def model_options(threads: int, frames: int | None) -> onnxruntime.SessionOptions:
-    """Return how onnxruntime runs a model; the arguments are those of :func:`open_model`."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    if frames is not None:
-        options.add_free_dimension_override_by_name(BATCH_NAME, frames)
-    return options
 
 
 def read_model_meta(path: Path) -> ModelMeta:
