@@ -117,9 +117,12 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
     figures = {"calibration": found.figures}
     doubt = ""
     if found.strain > MAX_STRAIN:
+        camera = found.camera
         doubt = (
             "the camera cannot be found from this drive: the one that fits best is unlike ordinary ones "
-            f"(principal point or roll {found.strain:.1f} standard deviations off)"
+            f"(principal point or roll {found.strain:.1f} standard deviations off: principal point at "
+            f"{camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f} px of {camera.width}x{camera.height}, rolled by "
+            f"{np.rad2deg(camera.mounting.roll_rad):.0f} degrees)"
         )
     notes = (found.note, *notes)
     return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
@@ -265,9 +268,9 @@ def fit_lanes(
         if doubt:
             why = str(reason).removeprefix(f"{drive.path}: ")
             raise CalibrationError(
-                f"{drive.path}: {doubt}, and with it {why}; calibrate it with photos of a chessboard "
-                "and points on the floor (lanenet calibrate chessboard, then lanenet calibrate ground), and "
-                "give it with --camera"
+                f"{drive.path}: {doubt}, and with it {why}; print a board and a floor sheet (lanenet "
+                "calibrate print), photograph them (lanenet calibrate chessboard, then lanenet calibrate "
+                "ground), and give the camera with --camera"
             ) from reason
         raise reason
     mapped.sort(key=lambda one: int(one.rows[0]))

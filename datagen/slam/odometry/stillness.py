@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from datagen.slam.commands import GAP_PERIODS
+from datagen.slam.odometry.edge_motion import edges_moved
 from lanenet.data.drives import Commands, Drive
 from lanenet.data.segments import true_runs
 from lanenet.errors import TrackingLostError
@@ -96,6 +97,9 @@ def following_frames(drive: Drive) -> tuple[Drive, list[str]]:
     notes: list[str] = []
     small = small_images(drive)
     standing, elsewhere = standing_frames(small), put_elsewhere(small)
+    for k in np.flatnonzero(standing).tolist():
+        # On a bare floor the mean change says little.
+        standing[k] = not edges_moved(drive.image(k - 1), drive.image(k))
     step_s = np.diff(drive.t_s, prepend=drive.t_s[:1])
     # Across a gap of the recording another image is no surprise.
     elsewhere &= step_s < GAP_PERIODS * np.median(step_s[1:])

@@ -14,8 +14,9 @@ from datagen.lanes.find import MappedSegment, check_lane
 from datagen.lanes.trace import TracedLane
 from datagen.segments import LanesOfDrive, SolvedDrive
 from datagen.settings import MapSettings
-from datagen.slam.adjustment.adjust import BundleResult
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult
 from datagen.slam.camera.coarse import guessed_camera
+from datagen.slam.camera.self_calibration import FoundCamera
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
@@ -159,6 +160,23 @@ def test_a_doubtful_camera_is_why_nothing_could_be_mapped(monkeypatch):
         CalibrationError, match="made-up: no such camera, and with it no pair of lines in 130 frames"
     ):
         _map(monkeypatch, made_up_drive(130), no_lane=(130,), doubt="no such camera")
+
+
+def test_an_unlikely_camera_is_described_and_an_ordinary_one_is_not_in_doubt(monkeypatch):
+    drive = made_up_drive(130)
+    camera = guessed_camera(160, 120, 80.0, 15.0, GuessSettings()).with_mounting(roll_rad=0.2094)
+    solved = replace(_solved(130), camera=camera)
+    sigma = dict.fromkeys(CAMERA_NAMES, 0.01)
+    monkeypatch.setattr(drive_segments, "check_edges", lambda *_: None)
+    prepared = replace(_prepared(drive), camera=None)
+    solver = SegmentSolver(MapSettings(), np.random.default_rng(0))
+    doubts = []
+    for strain in (1.9, 5.2):
+        found = FoundCamera(solved, [], sigma, refined=False, strain=strain)
+        monkeypatch.setattr(drive_segments, "find_camera", lambda *_, found=found: found)
+        doubts.append(drive_segments.camera_of_drive(prepared, solver).doubt)
+    assert doubts[0] == ""
+    assert "5.2 standard deviations off: principal point at 80, 60 px of 160x120, rolled by 12" in doubts[1]
 
 
 def test_marks_on_the_floor_that_were_joined_are_no_line(monkeypatch):
