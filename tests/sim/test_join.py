@@ -42,8 +42,10 @@ def laid_over(map_folder: Path, whole: Path, monkeypatch: pytest.MonkeyPatch) ->
     """Lay a map over another one rigidly."""
     first, second = read_shape(map_folder), read_shape(whole)
     best = alignments(first, second)[0]
-    monkeypatch.setattr("datagen.tracks.align._SCALE_SIGMA", 1e-9)
-    rigid = refined(first, second, best.move, best.opposite)
+    # The next map's alignments are to be found with their scale again.
+    with monkeypatch.context() as patch:
+        patch.setattr("datagen.tracks.align._SCALE_SIGMA", 1e-9)
+        rigid = refined(first, second, best.move, best.opposite)
     assert rigid is not None
     assert rigid.move.scale == pytest.approx(1.0, abs=1e-6)
     return rigid
