@@ -72,7 +72,7 @@ test-base-install: $(VENV)/.stamp-dev
 # Each file stays in one process, for its fixtures.
 chain: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow --dist loadfile tests/sim/test_chain.py tests/sim/test_train_own_drive.py \
-	  tests/contracts/test_configs.py tests/unit/learn/test_parallel.py::test_two_processes_train_as_one
+	  tests/contracts/test_configs.py tests/unit/learn/test_learn_parallel.py::test_two_processes_train_as_one
 
 # Most of an hour on one core; TRAPS adds arguments, such as --drives 0:20 --processes 2.
 traps: $(VENV)/.stamp-dev
