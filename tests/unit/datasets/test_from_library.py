@@ -11,7 +11,7 @@ from recordings import lap, write_recording
 from datagen.datasets.build import check_leaks
 from datagen.datasets.from_library import parts_of_tracks, with_library
 from datagen.datasets.settings import DataSettings, LibrarySettings
-from datagen.fleet.run import INDEX_NAME, FleetResult, Labelled, _index
+from datagen.fleet.result import INDEX_NAME, FleetResult, Labelled, _index
 from datagen.fleet.task import FleetDrive
 from lanenet.data.files import write_json
 from lanenet.data.library import Library
