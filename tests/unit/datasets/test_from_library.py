@@ -9,7 +9,7 @@ import pytest
 from recordings import lap, write_recording
 
 from datagen.datasets.build import check_leaks
-from datagen.datasets.from_library import parts_of_tracks, with_library
+from datagen.datasets.from_library import _labelled, parts_of_tracks, with_library
 from datagen.datasets.settings import DataSettings, LibrarySettings
 from datagen.fleet.result import INDEX_NAME, FleetResult, Labelled, _index
 from datagen.fleet.task import FleetDrive
@@ -82,6 +82,10 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
         tmp_path / "out" / "maps" / f"map-{name}" for name in ("a1", "b", "c")
     ]
     assert lines[0] == "left out: a2: stands still"
+    # Another drive that has the name of one by now, on another track, has no map yet.
+    paths, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "new"})
+    assert list(paths) == ["b"] and len(lines) == 1
+    assert f"left out: c: labelled from {tmp_path / 'c'}, but is {tmp_path / 'new'}" in lines[0]
     (tmp_path / "out" / INDEX_NAME).write_text("[]")
     with pytest.raises(ConfigError, match="expected what lanenet label-all writes"):
         with_library(_data(library, **chosen))
