@@ -179,6 +179,9 @@ class _Run:
                 verdict, reason = FAILED, outcome.reason
             else:
                 verdict, reason = standing(maps[k], labels[k])
+                if verdict == LEFT and outcome is not None:
+                    verdict = FAILED
+                    reason = f"its worker finished it, but not in the {self.storage.url} of this machine"
             keys = self.keys[MAPS][k], self.keys[LABELS][k]
             found.append(Labelled(drive, verdict, reason, outcome is not None, *keys, maps[k], labels[k]))
         return found

@@ -24,6 +24,7 @@ from datagen.fleet.run import label_all, with_checksums
 from datagen.fleet.source import checksum
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive, FleetSettings
+from datagen.fleet.work import Outcome
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -254,6 +255,16 @@ def test_a_task_that_the_engine_gave_up_is_a_failure(tiny: Path, tmp_path: Path)
     storage = Storage(str(tmp_path))
     result = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, Losing())
     assert [(drive.verdict, drive.reason) for drive in result.drives] == [("failed", "its machine was lost")]
+
+
+def test_results_that_went_to_another_storage_are_a_failure(tiny: Path, tmp_path: Path):
+    class Elsewhere:
+        def run(self, work: Callable[[Any], Any], tasks: Sequence[Task]) -> Generator[Ended, None, None]:
+            yield Ended(0, Outcome("good"))
+
+    storage = Storage(str(tmp_path / "out"))
+    (drive,) = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, Elsewhere()).drives
+    assert drive.verdict == "failed" and f"not in the {tmp_path / 'out'} of this machine" in drive.reason
 
 
 def test_a_worker_with_another_version_does_nothing(tiny: Path, tmp_path: Path):
