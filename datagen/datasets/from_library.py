@@ -113,6 +113,8 @@ def _recorded(library: Library, entry: Entry, path: Path, part: Role, *, finishe
             "camera": camera if camera is not None and camera.exists() else None,
             "split": part,
             "track": entry.track,
+            "licence": entry.licence,
+            "car": entry.car,
         }
     )
 

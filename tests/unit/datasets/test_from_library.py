@@ -24,7 +24,8 @@ TRACKS = {"a1": "hall", "a2": "hall", "b": "yard", "c": "club"}
 def library(tmp_path: Path) -> Library:
     made = Library.open(tmp_path / "drives.sqlite", create=True)
     for seed, (name, track) in enumerate(TRACKS.items()):
-        made.add(write_recording(tmp_path / name, lap(seed, 40)), track=track, lane_width_cm=40.0)
+        told = {"track": track, "licence": "CC0-1.0", "car": "red"}
+        made.add(write_recording(tmp_path / name, lap(seed, 40)), lane_width_cm=40.0, **told)
     return made
 
 
@@ -41,6 +42,7 @@ def test_all_drives_of_a_track_are_in_one_part(library: Library, tmp_path: Path)
         "b": ("train", "yard"),
         "c": ("validation", "club"),
     }
+    assert {(drive.licence, drive.car) for drive in data.drives} == {("CC0-1.0", "red")}
     assert data.library is None and with_library(data) == (data, [])
     assert "test: 2 drives of the tracks hall" in lines
     assert check_leaks(data, tmp_path / "work") == ()
