@@ -43,7 +43,7 @@ def with_library(data: DataSettings) -> tuple[DataSettings, list[str]]:
     paths = {entry.name: library.path_of(entry) for entry in entries}
     lines: list[str] = []
     if chosen.labelled is not None:
-        paths, lines = _labelled(chosen.labelled, entries)
+        paths, lines = _labelled(chosen.labelled, paths)
         entries = [entry for entry in entries if entry.name in paths]
     part_of = parts_of_tracks({entry.track for entry in entries}, chosen)
     drives = [
@@ -113,12 +113,18 @@ def _recorded(library: Library, entry: Entry, path: Path, part: Role, *, finishe
             "camera": camera if camera is not None and camera.exists() else None,
             "split": part,
             "track": entry.track,
+            "licence": entry.licence,
+            "car": entry.car,
         }
     )
 
 
-def _labelled(folder: Path, entries: list[Entry]) -> tuple[dict[str, Path], list[str]]:
+def _labelled(folder: Path, sources: dict[str, Path]) -> tuple[dict[str, Path], list[str]]:
     """Return the maps that ``label-all`` made of drives, and which drives have none.
+
+    Args:
+        folder: Its results.
+        sources: Where each drive lies: a name may be that of another drive by now, of another track.
 
     Raises:
         ConfigError: If the folder is not one of ``label-all``.
@@ -127,10 +133,20 @@ def _labelled(folder: Path, entries: list[Entry]) -> tuple[dict[str, Path], list
     if not isinstance(index, dict) or index.get("format") != _INDEX_FORMAT:
         raise ConfigError(f"{folder / _INDEX_NAME}: expected what lanenet label-all writes ({_INDEX_FORMAT})")
     made = {drive["name"]: drive for drive in index["drives"]}
-    names = [entry.name for entry in entries]
-    paths = {name: folder / made[name]["map"] for name in names if made.get(name, {}).get("labels")}
-    why = {name: made[name]["reason"] if name in made else "not labelled yet" for name in names}
-    return paths, [f"left out: {name}: {why[name]}" for name in names if name not in paths]
+    paths, lines = dict[str, Path](), list[str]()
+    for name, source in sources.items():
+        found = made.get(name)
+        if found is None:
+            lines.append(f"left out: {name}: not labelled yet")
+        elif found["source"] != str(source.resolve()):
+            lines.append(
+                f"left out: {name}: labelled from {found['source']}, but is {source}; label it again"
+            )
+        elif not found["labels"]:
+            lines.append(f"left out: {name}: {found['reason']}")
+        else:
+            paths[name] = folder / found["map"]
+    return paths, lines
 
 
 def _refuse_unknown(file: Path, what: str, option: str, names: list[str]) -> None:

@@ -282,8 +282,8 @@ class RecordedJob:
         files = [settings.path]
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
-        # The track's name changes no label.
-        known = settings.model_dump(mode="json", exclude={"track"})
+        # What people say for others changes no label.
+        known = settings.model_dump(mode="json", exclude={"track", "licence", "car"})
         key = key_of(known, data.window, data.colour_weight, *map(fingerprint, files))
         folder = self.folder / "labels"
         is_whole = len(settings.parts) == 1

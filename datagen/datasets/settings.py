@@ -69,6 +69,8 @@ class RecordedSettings(Settings):
             part, so that other drives must make up the others; ``none`` is the older word for ``train``.
         track: Name of the track. Drives of one track are all in one part, see :mod:`datagen.datasets.leaks`;
             empty if that is not asked.
+        licence, car: For the data sheet, beside the track: under what the recording may be used, and the name
+            of the car; empty if unknown.
         train_share: Share of the labelled frames, from the start, to learn from. Chosen, like the next.
         validation_share: Share of the following frames to choose the epoch by; the rest is for the test.
         gap_frames: Frames left out between the parts, so that neighbours are never on both sides. Chosen: 2 s
@@ -88,6 +90,8 @@ class RecordedSettings(Settings):
     frames: tuple[int, int] | None = None
     split: Literal["time", "lap", "auto", "train", "validation", "test", "none"] = "time"
     track: str = ""
+    licence: str = ""
+    car: str = ""
     train_share: float = Field(default=0.6, gt=0.0, lt=1.0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     gap_frames: int = Field(default=40, ge=0)

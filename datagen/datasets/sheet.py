@@ -19,7 +19,7 @@ import numpy as np
 
 from datagen.datasets.build import PreparedData
 from datagen.datasets.jobs import Part, RecordedJob, SyntheticJob
-from datagen.datasets.settings import ROLES, DataSettings, Role
+from datagen.datasets.settings import ROLES, DataSettings, RecordedSettings, Role
 from datagen.datasets.splits import chosen_split, driven_cm
 from lanenet.data.drives.recording import read_drive_file
 from lanenet.data.label_set import LabelSet, read_places
@@ -222,7 +222,7 @@ def _recorded(job: RecordedJob, data: PreparedData) -> Sheet:
     facts: Sheet = {
         "name": labels.drive[0] if len(labels) else source.name,
         "from": "label set" if job.is_labels else "map",
-        **_told(source),
+        **_told(recording, source),
         "lane_width_cm": recording.lane_width_cm,
         "marking_cm": labels.meta.marking_cm,
         "split": chosen_split(labels, recording),
@@ -252,12 +252,12 @@ def _mapped(drive_map: DriveMap) -> Sheet:
     }
 
 
-def _told(source: Path) -> Sheet:
-    """What people said about a drive: in the library of this folder, else in its own ``drive.yaml``."""
-    told: Sheet = dict.fromkeys(("licence", "car", "track"))
+def _told(recording: RecordedSettings, source: Path) -> Sheet:
+    """What people said of a drive: in the library of this folder, the config, or its own ``drive.yaml``."""
+    told: Sheet = {key: getattr(recording, key) or None for key in ("licence", "car", "track")}
     # A sheet comes at the end of a long training, which a damaged file of these must not spoil.
     with contextlib.suppress(LanenetError):
-        told["licence"] = read_drive_file(source)[0].licence or None
+        told["licence"] = told["licence"] or read_drive_file(source)[0].licence or None
     with contextlib.suppress(LanenetError):
         entry = Library.open(DEFAULT_LIBRARY).find(source) if DEFAULT_LIBRARY.is_file() else None
         if entry is not None:

@@ -20,6 +20,7 @@ from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
 from datagen.fleet.work import REFUSED, REJECTED, Job, Outcome, label_drive, version
 from datagen.made import key_of
 from lanenet.data.files import json_text
+from lanenet.errors import LanenetError
 from lanenet.outputs import lock_output
 
 #: The checksums of the drives' files, beside the results.
@@ -46,20 +47,21 @@ Progress = Callable[[Counts], None]
 
 
 def with_checksums(drives: Iterable[FleetDrive], storage: Storage) -> list[FleetDrive]:
-    """Return the drives with the checksums of their files.
+    """Return the drives with the checksums of their files; without one if they are not there or unreadable.
 
     Files that have the size and time of an earlier run are not read again.
-
-    Raises:
-        DriveFormatError: If a drive is not there.
     """
     known: dict[str, list[str]] = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
     found: dict[str, list[str]] = {}
     checked = []
     for drive in drives:
-        stamp = key_of(drive_files(drive.source))
         before = known.get(drive.source, ["", ""])
-        found[drive.source] = before if before[0] == stamp else [stamp, checksum(drive.source)]
+        try:
+            stamp = key_of(drive_files(drive.source))
+            found[drive.source] = before if before[0] == stamp else [stamp, checksum(drive.source)]
+        except (LanenetError, OSError):  # the run says why, and does the others
+            checked.append(replace(drive, checksum=""))
+            continue
         checked.append(replace(drive, checksum=found[drive.source][1]))
     if any(known.get(source) != pair for source, pair in found.items()):
         storage.write(CHECKSUMS_NAME, json_text({**known, **found}).encode())
@@ -76,8 +78,9 @@ def label_all(
 ) -> FleetResult:
     """Map and label drives, as far as that has not been done with the same settings.
 
-    A drive is one task. Drives that cannot be mapped, tasks that fail and workers that are lost stop nothing;
-    a full disk ends the run. What is finished is kept in any case, also at Ctrl-C.
+    A drive is one task. Drives that are gone, that cannot be mapped or whose camera cannot be read, tasks
+    that fail and workers that are lost stop nothing; a full disk ends the run. What is finished is kept in
+    any case, also at Ctrl-C.
 
     Args:
         drives: Drives with their checksums.
@@ -120,11 +123,21 @@ class _Run:
     storage: Storage
 
     @cached_property
+    def unusable(self) -> dict[int, str]:
+        """Why the work on drives cannot begin, by their places."""
+        reasons = {k: _why_not(drive, self.settings) for k, drive in enumerate(self.drives)}
+        return {k: reason for k, reason in reasons.items() if reason}
+
+    @cached_property
     def keys(self) -> dict[str, list[str]]:
-        """The keys of all maps and of all labels."""
+        """The keys of all maps and of all labels; those of unusable drives are of nothing."""
+        maps, labels = FleetDrive.map_key, FleetDrive.labels_key
         return {
-            MAPS: [drive.map_key(self.settings) for drive in self.drives],
-            LABELS: [drive.labels_key(self.settings) for drive in self.drives],
+            kind: [
+                f"unusable-{k}" if k in self.unusable else key(drive, self.settings)
+                for k, drive in enumerate(self.drives)
+            ]
+            for kind, key in ((MAPS, maps), (LABELS, labels))
         }
 
     def results(self, kind: str) -> list[dict[str, Any] | None]:
@@ -158,12 +171,17 @@ class _Run:
         for k, drive in enumerate(self.drives):
             first = self.keys[MAPS].index(self.keys[MAPS][k])
             outcome = None if ended is None else ended.get(k)
-            if first != k:
+            if k in self.unusable:
+                verdict, reason = FAILED, self.unusable[k]
+            elif first != k:
                 verdict, reason = DUPLICATE, f"is the same recording as {self.drives[first].name}"
             elif outcome is not None and not outcome.verdict:
                 verdict, reason = FAILED, outcome.reason
             else:
                 verdict, reason = standing(maps[k], labels[k])
+                if verdict == LEFT and outcome is not None:
+                    verdict = FAILED
+                    reason = f"its worker finished it, but not in the {self.storage.url} of this machine"
             keys = self.keys[MAPS][k], self.keys[LABELS][k]
             found.append(Labelled(drive, verdict, reason, outcome is not None, *keys, maps[k], labels[k]))
         return found
@@ -194,6 +212,18 @@ class _Run:
         drive = self.drives[k]
         job = Job(drive, self.settings, self.storage.url, version())
         return Task(drive.name, job, memory_bytes(drive.source))
+
+
+def _why_not(drive: FleetDrive, settings: FleetSettings) -> str:
+    """Say why the work on a drive cannot begin; nothing if it can."""
+    try:
+        if not drive.checksum:
+            checksum(drive.source)
+            return f"{drive.source}: could not be read when the run began"
+        drive.labels_key(settings)
+    except (LanenetError, OSError) as error:
+        return str(error)
+    return ""
 
 
 def _tell(progress: Progress | None, verdicts: Iterable[str], total: int) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.library.fingerprint import HASH_BYTES, Fingerprint
 
@@ -137,9 +137,24 @@ def find_overlaps(one: Recording, other: Recording) -> list[Overlap]:
         other: Another.
 
     Returns:
-        The runs, in the order of the one's frames. Where images are the same byte by byte, only those.
+        The runs, in the order of the one's frames; those whose images are the same byte by byte, and those
+        that go on beyond them or lie elsewhere: a copy may hold some of the images as they were.
     """
-    return _same_images(one.fingerprint, other.fingerprint) or _same_pictures(one, other)
+    same, frames = _same_images(one.fingerprint, other.fingerprint), one.fingerprint.frames
+    left = ~np.any([_inside(frames, run) for run in same], axis=0) if same else np.ones(len(frames), np.bool_)
+    if left.sum() < LEAST_FRAMES:
+        return same
+    more = [
+        run
+        for run in _same_pictures(one, other)
+        if (_inside(frames, run) & left).sum() >= LEAST_FRAMES or not same
+    ]
+    others = [run for run in same if not any(_inside(np.array(run.frames), larger).all() for larger in more)]
+    return sorted([*others, *more], key=lambda run: run.frames)
+
+
+def _inside(frames: Int[np.ndarray, "n"], run: Overlap) -> Bool[np.ndarray, "n"]:
+    return (frames >= run.frames[0]) & (frames <= run.frames[1])
 
 
 def _same_images(one: Fingerprint, other: Fingerprint) -> list[Overlap]:

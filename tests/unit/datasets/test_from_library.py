@@ -9,9 +9,9 @@ import pytest
 from recordings import lap, write_recording
 
 from datagen.datasets.build import check_leaks
-from datagen.datasets.from_library import parts_of_tracks, with_library
+from datagen.datasets.from_library import _labelled, parts_of_tracks, with_library
 from datagen.datasets.settings import DataSettings, LibrarySettings
-from datagen.fleet.run import INDEX_NAME, FleetResult, Labelled, _index
+from datagen.fleet.result import INDEX_NAME, FleetResult, Labelled, _index
 from datagen.fleet.task import FleetDrive
 from lanenet.data.files import write_json
 from lanenet.data.library import Library
@@ -24,7 +24,8 @@ TRACKS = {"a1": "hall", "a2": "hall", "b": "yard", "c": "club"}
 def library(tmp_path: Path) -> Library:
     made = Library.open(tmp_path / "drives.sqlite", create=True)
     for seed, (name, track) in enumerate(TRACKS.items()):
-        made.add(write_recording(tmp_path / name, lap(seed, 40)), track=track, lane_width_cm=40.0)
+        told = {"track": track, "licence": "CC0-1.0", "car": "red"}
+        made.add(write_recording(tmp_path / name, lap(seed, 40)), lane_width_cm=40.0, **told)
     return made
 
 
@@ -41,6 +42,7 @@ def test_all_drives_of_a_track_are_in_one_part(library: Library, tmp_path: Path)
         "b": ("train", "yard"),
         "c": ("validation", "club"),
     }
+    assert {(drive.licence, drive.car) for drive in data.drives} == {("CC0-1.0", "red")}
     assert data.library is None and with_library(data) == (data, [])
     assert "test: 2 drives of the tracks hall" in lines
     assert check_leaks(data, tmp_path / "work") == ()
@@ -82,6 +84,10 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
         tmp_path / "out" / "maps" / f"map-{name}" for name in ("a1", "b", "c")
     ]
     assert lines[0] == "left out: a2: stands still"
+    # Another drive that has the name of one by now, on another track, has no map yet.
+    paths, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "new"})
+    assert list(paths) == ["b"] and len(lines) == 1
+    assert f"left out: c: labelled from {tmp_path / 'c'}, but is {tmp_path / 'new'}" in lines[0]
     (tmp_path / "out" / INDEX_NAME).write_text("[]")
     with pytest.raises(ConfigError, match="expected what lanenet label-all writes"):
         with_library(_data(library, **chosen))

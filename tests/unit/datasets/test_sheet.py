@@ -130,6 +130,11 @@ def test_a_recorded_drive_has_its_licence_from_the_library_and_the_rest_from_map
         file.write("licence: CC0-1.0\n")
     (entry,) = sheet()["recorded"]
     assert (entry["licence"], entry["car"]) == ("CC0-1.0", None)
+    # A config says more, as one that was drawn from a library at another place.
+    told = {"licence": "MIT", "car": "blue", "track": "yard"}
+    said = replace(job, recording=job.recording.model_copy(update=told))
+    (entry,) = data_sheet("net", data, prepared, tmp_path, [said])["recorded"]
+    assert {key: entry[key] for key in told} == told
     library = Library.open(DEFAULT_LIBRARY, create=True)
     assert library.add(drive, car="red", track="garage").licence == "CC0-1.0"
     assert library.find(folder) is None

@@ -8,6 +8,7 @@ import math
 import shutil
 import uuid
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ from datagen.fleet.run import label_all, with_checksums
 from datagen.fleet.source import checksum
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive, FleetSettings
+from datagen.fleet.work import Outcome
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.label_set import read_labels
-from lanenet.errors import DriveFormatError, LanenetError, TrackingLostError
+from lanenet.errors import LanenetError, TrackingLostError
 
 SETTINGS = FleetSettings(map=MapSettings(find_bumper=False))
 LANE_CM = 40.0
@@ -255,6 +257,16 @@ def test_a_task_that_the_engine_gave_up_is_a_failure(tiny: Path, tmp_path: Path)
     assert [(drive.verdict, drive.reason) for drive in result.drives] == [("failed", "its machine was lost")]
 
 
+def test_results_that_went_to_another_storage_are_a_failure(tiny: Path, tmp_path: Path):
+    class Elsewhere:
+        def run(self, work: Callable[[Any], Any], tasks: Sequence[Task]) -> Generator[Ended, None, None]:
+            yield Ended(0, Outcome("good"))
+
+    storage = Storage(str(tmp_path / "out"))
+    (drive,) = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, Elsewhere()).drives
+    assert drive.verdict == "failed" and f"not in the {tmp_path / 'out'} of this machine" in drive.reason
+
+
 def test_a_worker_with_another_version_does_nothing(tiny: Path, tmp_path: Path):
     (drive,) = with_checksums(drives_of(tiny), Storage(str(tmp_path)))
     outcome = work.label_drive(work.Job(drive, SETTINGS, str(tmp_path), "lanenet 0.1"))
@@ -272,9 +284,26 @@ def test_a_drive_that_is_not_on_the_worker_has_failed_and_is_not_refused(tiny: P
     )
 
 
-def test_a_missing_drive_is_named(tmp_path: Path):
-    with pytest.raises(DriveFormatError, match="nowhere: no such drive"):
-        run(tmp_path, drives_of(tmp_path / "nowhere"))
+def test_drives_that_are_gone_and_broken_cameras_are_named_and_stop_nothing(
+    tiny: Path, tmp_path: Path, mapping: list[str]
+):
+    out, good, other = tmp_path / "out", copy_of(tiny, tmp_path / "tub"), copy_of(tiny, tmp_path / "other")
+    (tmp_path / "camera.yaml").write_text("junk")
+    drives = drives_of(tmp_path / "nowhere", good, tmp_path / "gone", other)
+    drives[3] = replace(drives[3], camera=str(tmp_path / "camera.yaml"))
+    result, names = run(out, drives)
+    assert names == ["tub"] == mapping
+    assert [drive.verdict for drive in result.drives] == ["failed", "good", "failed", "failed"]
+    reasons = [drive.reason for drive in result.drives]
+    assert "nowhere: no such drive" in reasons[0] and "gone: no such drive" in reasons[2]
+    assert "camera.yaml: expected a mapping" in reasons[3]
+    assert "nowhere: no such drive" in (out / "index.html").read_text()
+    index = json.loads((out / "drives.json").read_text())["drives"]
+    assert [drive["map"] is not None for drive in index] == [False, True, False, False]
+    # They are tried again once they are there.
+    copy_of(tiny, tmp_path / "nowhere")
+    result, names = run(out, drives)
+    assert names == ["nowhere"] and result.drives[0].verdict == "good"
 
 
 def test_files_are_read_again_only_if_they_changed(

@@ -114,6 +114,20 @@ def test_the_same_bytes_are_found_though_frames_were_left_out(pictures: list[np.
     assert find_overlaps(one, few) == []
 
 
+def test_a_copy_that_holds_some_images_as_they_were_is_found_whole(pictures: list[np.ndarray]) -> None:
+    one, coded = _taken(pictures), _taken(_again(pictures[50:])).fingerprint
+    for kept in (slice(0, 20), slice(40, 60)):
+        digests = coded.digests.copy()
+        digests[kept] = one.fingerprint.digests[50:][kept]
+        found = find_overlaps(one, Recording("", Fingerprint(coded.frames, digests, coded.hashes)))
+        assert not _only(found, (50, 149), (0, 99)).same_bytes
+    # What is the same byte by byte and no more is exact to its ends.
+    other = _taken([*pictures[50:100], *lap(9, 60, track=9)]).fingerprint
+    other.digests[:50] = one.fingerprint.digests[50:100]
+    found = _only(find_overlaps(one, Recording("", other)), (50, 99), (0, 49), 0)
+    assert found.same_bytes
+
+
 def test_images_that_cannot_be_read_are_no_match(tmp_path: Path, pictures: list[np.ndarray]) -> None:
     for name in ("a", "b"):
         path = write_recording(tmp_path / name, pictures[:20])
