@@ -214,6 +214,19 @@ def test_pictures_that_disagree_with_the_map_count(share, grade):
     assert any("disagree" in reason for reason in found.reasons) == (grade != "good")
 
 
+def test_what_exceeds_a_bound_by_little_does_not_read_like_it():
+    (reason,) = graded(GOOD, contradicted_share=0.0771).reasons
+    assert "disagree with 7.7 % of the frames' lines" in reason
+    assert "expected 7.5 % at most, rejected above 15 %" in reason
+
+
+def test_the_sentence_counts_what_it_leaves_to_the_reasons():
+    assert "more finding" not in graded(GOOD, p95_px=1.6).sentence
+    assert "(and 1 more finding): " in graded(GOOD, p95_px=1.6, contradicted_share=0.1).sentence
+    three = graded(GOOD, p95_px=1.6, contradicted_share=0.1, withheld_share=0.2)
+    assert "(and 2 more findings): " in three.sentence and len(three.reasons) == 3
+
+
 def test_a_lane_that_widens_in_bends_is_named_and_one_of_many_widths_has_no_scale():
     remarks = graded(GOOD, bend_lane_cm=49.3).remarks
     assert any("40.0 cm" in remark and "49.3 cm" in remark for remark in remarks)
