@@ -280,6 +280,8 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
     if e.given_height_cm is not None or e.given_tape_cm is not None:
         yield f"with the given lane width {follows}"
         return
+    if any(_other_width(e)):  # a finding, which asks already
+        return
     yield (
         f"is it so that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one thing "
         "that sets the scale: if it is wrong, every length is wrong by the same share, and no check here can "

@@ -75,6 +75,14 @@ def test_a_lane_width_that_makes_another_car_of_it_is_questioned(height_cm, tape
     assert graded(KNOWN, height_cm=height_cm, tape_cm=tape_cm).grade == "good"
 
 
+def test_a_lane_width_that_is_twice_another_cars_is_asked_about_once():
+    found = graded(GOOD, height_cm=25.1, tape_cm=3.3)
+    assert (
+        "the width of the whole road?" in found.sentence and "which half the lane width" in found.reasons[0]
+    )
+    assert not found.remarks
+
+
 @pytest.mark.parametrize(
     ("given", "bound"),
     [
