@@ -283,9 +283,9 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
     if any(_other_width(e)):  # a finding, which asks already
         return
     yield (
-        f"is it so that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one thing "
-        "that sets the scale: if it is wrong, every length is wrong by the same share, and no check here can "
-        "show it; --tape-width or --camera-height, measured with a ruler, would"
+        f"is it right that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one "
+        "thing that sets the scale: if it is wrong, every length is wrong by the same share, and no check "
+        "here can show it; --tape-width or --camera-height, measured with a ruler, would"
     )
 
 
