@@ -22,6 +22,7 @@ from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
 from datagen.slam.segment import SegmentSolver, StageProgress
 from lanenet.config import dump_settings
+from lanenet.data.camera_file import read_camera
 from lanenet.data.files import atomic_folder, check_replaceable, write_text
 from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
 from lanenet.data.tables import write_tum
@@ -61,6 +62,8 @@ def map_drive(
     # Before the work: another run may be writing there.
     with lock_output(out):
         check_replaceable(out, "map")
+        if request.camera_path is not None:
+            read_camera(request.camera_path)  # says nothing of the drive, so it has no report
         attempt = Attempt(request, settings)
         try:
             return _map_drive(attempt, map_key(request, settings), out, progress, pictures)

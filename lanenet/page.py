@@ -116,8 +116,9 @@ def _shown(text: str) -> str:
 
 
 def as_sentence(text: str) -> str:
-    """Begin with a capital letter and end with a full stop."""
-    return text[:1].upper() + text[1:].rstrip(".") + "."
+    """Begin with a capital letter, unless the first word is a file or a key, and end with a full stop."""
+    name = re.match(r"\S*[./_]\S*\w", text)
+    return (text[:1] if name else text[:1].upper()) + text[1:].rstrip(".") + "."
 
 
 def section(title: str) -> str:

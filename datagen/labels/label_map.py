@@ -22,6 +22,7 @@ from lanenet.data.maps.mapped_drive import (
     CONTRADICTED,
     DELETED,
     NO_LINE,
+    NOT_TO_LABEL,
     UNCERTAIN,
     label_frames,
     labelled_points,
@@ -134,13 +135,22 @@ def label_map(
         write_labels(stack.enter_context(atomic_file(out)), labels)
     residual = report["residual_cm"]
     text = [
-        f"{len(rows)} of {mapped_frames} frames labelled ({100 * report['labelled_share']:.0f} %)",
+        labelled_text(len(rows), mapped_frames, left_out),
         points_text(shares),
         *(f"{counted(count, 'frame')} left out: {reason}" for reason, count in left_out.items() if count),
         f"distance of markings from the projected lines: {residual['median']:.2f} cm (median), "
         f"{residual['p95']:.2f} cm (p95)",
     ]
     return Report(tuple(text), report)
+
+
+def labelled_text(labelled: int, mapped_frames: int, left_out: dict[str, int]) -> str:
+    """Say how many frames are labelled, and, as the map's verdict counts, of how many that should be."""
+    expected = mapped_frames - sum(left_out.get(reason, 0) for reason in NOT_TO_LABEL)
+    text = f"{labelled} of {mapped_frames} frames labelled ({100 * labelled / mapped_frames:.0f} %"
+    if labelled <= expected < mapped_frames:
+        text += f"; {100 * labelled / expected:.0f} % of those that should have labels"
+    return f"{text})"
 
 
 def _shown(residual_cm: Float[np.ndarray, "n"]) -> Int[np.ndarray, "s"]:

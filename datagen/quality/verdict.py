@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from lanenet.config import Settings
+from lanenet.errors import counted
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,7 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     withheld = _withheld_text(evidence.withheld)
     if found:
         worst = found[0]
-        more = f" ({len(found) - 1} more below)" if len(found) > 1 else ""
+        more = f" (and {counted(len(found) - 1, 'more finding')})" if len(found) > 1 else ""
         sentence = f"{worst.cause}{more}: {worst.remedy}"
         figures = [finding.figures for finding in found]
         figures += [text for text in (withheld, opened) if text]
@@ -279,10 +280,12 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
     if e.given_height_cm is not None or e.given_tape_cm is not None:
         yield f"with the given lane width {follows}"
         return
+    if any(_other_width(e)):  # a finding, which asks already
+        return
     yield (
-        f"is it so that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one thing "
-        "that sets the scale: if it is wrong, every length is wrong by the same share, and no check here can "
-        "show it; --tape-width or --camera-height, measured with a ruler, would"
+        f"is it right that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one "
+        "thing that sets the scale: if it is wrong, every length is wrong by the same share, and no check "
+        "here can show it; --tape-width or --camera-height, measured with a ruler, would"
     )
 
 
@@ -403,12 +406,16 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
 def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
     grade = _bounded(e.contradicted_share, s.max_contradicted, s)
     if grade != "good":
-        bound, most = (_percent(b * s.max_contradicted) for b in (1.0, s.usable))
+        # To a tenth: the bound is no whole number, and what exceeds it by little would read like it.
+        share, bound, most = (
+            f"{100.0 * each:.3g} %"
+            for each in (round(e.contradicted_share, 3), s.max_contradicted, s.usable * s.max_contradicted)
+        )
         yield Finding(
             grade,
             "in many frames the images disagree with the map",
             f"look at the worst frames of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
-            f"the images disagree with {_percent(e.contradicted_share)} of the frames' lines on the map, "
+            f"the images disagree with {share} of the frames' lines on the map, "
             f"expected {bound} at most, rejected above {most} (max_contradicted)",
         )
 
@@ -545,7 +552,7 @@ def _other_width(e: MapEvidence) -> _Findings:
 
     if e.given_height_cm is not None or e.given_tape_cm is not None or usual(1.0):
         return
-    for share, what in ((0.5, "of the whole road"), (2.0, "of half a lane")):
+    for share, times, what in ((0.5, "half", "of the whole road"), (2.0, "twice", "of half a lane")):
         if usual(share):
             made = f"camera {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide"
             instead = f"{share * e.height_cm:.1f} and {share * e.tape_cm:.1f} cm"
@@ -558,6 +565,6 @@ def _other_width(e: MapEvidence) -> _Findings:
                 f"{share * e.given_lane_cm:g} would make them {instead}, as on most cars",
                 "measure the lane between the middles of its two lines; if it is right, give the width of "
                 "the tape or the height of the camera as well (--tape-width, --camera-height)",
-                f"the {made}, usual are {ranges}, which {share:g} of the lane width gives",
+                f"the {made}, usual are {ranges}, which {times} the lane width gives",
             )
             return

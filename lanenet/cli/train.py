@@ -282,7 +282,9 @@ class _Run:
             console.show_lines([f"{job.frames}: a finished map, which is used"])
         refuse_rejected(job.frames, read_map(job.frames))
         verdict = verdict_of(job.frames)
-        console.show_lines([f"verdict: {verdict.grade}: {verdict.sentence}", *verdict.remarks])
+        # Of a map that is not good, the sentence counts what it leaves to the lines below it.
+        reasons = () if verdict.grade == "good" else verdict.reasons
+        console.show_lines([f"verdict: {verdict.grade}: {verdict.sentence}", *reasons, *verdict.remarks])
         console.show_lines([f"report: {job.frames / 'report.html'}"])
 
     def _label(self) -> PreparedData:

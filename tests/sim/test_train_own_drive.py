@@ -178,6 +178,23 @@ def test_a_refused_drive_stops_with_cause_remedy_and_report(here: Path) -> None:
     assert error.removeprefix("error: ") in (here / "runs" / "none" / "train.log").read_text()
 
 
+def test_of_a_map_that_is_not_good_all_findings_are_said(
+    here: Path, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    (found,) = here.glob("runs/mycar/drives/maps/drive-*")
+    doubtful = tmp_path / "doubtful"
+    shutil.copytree(found, doubtful)
+    report = json.loads((doubtful / "report.json").read_text())
+    report["verdict"] |= {"grade": "usable", "sentence": "so", "reasons": ["p95 1.6 px", "pitch open"]}
+    (doubtful / "report.json").write_text(json.dumps(report))
+    monkeypatch.setattr("datagen.datasets.build.prepare", stopped)
+    result = train(str(doubtful), "--name", "doubtful")
+    assert "  verdict: usable: so\n  p95 1.6 px\n  pitch open\n" in result.stdout
+
+
 def test_a_rejected_map_stops_with_its_verdict(here: Path, first: str, tmp_path: Path) -> None:
     (found,) = here.glob("runs/mycar/drives/maps/drive-*")
     bad = tmp_path / "bad"

@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lanenet.page import Picture, bullets, colour_key, details, gallery, page_of, photo, plot, remedy, table
+from lanenet.page import (
+    Picture,
+    as_sentence,
+    bullets,
+    colour_key,
+    details,
+    gallery,
+    page_of,
+    photo,
+    plot,
+    remedy,
+    table,
+)
 
 IMAGE = np.zeros((30, 1000, 3), np.uint8)
 
@@ -59,3 +71,17 @@ def test_text_columns_break_and_figures_do_not():
 
 def test_colours_are_those_of_the_picture():
     assert "background:#010203" in colour_key([((3, 2, 1), "the car")])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("found 3 frames", "Found 3 frames."),
+        ("closed.", "Closed."),
+        ("camera.yaml: key 'fu' is missing", "camera.yaml: key 'fu' is missing."),
+        ("runs/map is of another drive", "runs/map is of another drive."),
+        ("", "."),
+    ],
+)
+def test_a_sentence_begins_with_a_capital_letter_or_a_name(text, sentence):
+    assert as_sentence(text) == sentence

@@ -166,7 +166,7 @@ def training_bar() -> Iterator[ProgressCall]:
         def report(*args: Any) -> None:
             epoch, epochs, train_cm, validation_cm, samples_per_s = args
             errors = f"RMSE {train_cm:.2f} cm, validation {validation_cm:.2f} cm"
-            show("train", f"train  {errors}, {samples_per_s:.0f} samples/s", epoch, epochs)
+            show("train", f"train: {errors}, {samples_per_s:.0f} samples/s, epoch", epoch, epochs)
 
         yield report
 

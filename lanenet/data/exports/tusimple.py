@@ -21,7 +21,8 @@ _ROWS_PER_SAMPLE = 72
 READING = f"""Each line of `{LABELS_FILE}` is a picture: `raw_file`, `h_samples` (rows, px) and `lanes`,
 the left and the right line of the car's own lane as x at these rows, px, pixel centres at integers;
 {ABSENT} where a line has none. Other lanes are not labelled. A line that crosses a row twice has the
-crossing that is nearer to the car."""
+crossing that is nearer to the car. The tip of a corner that lies between two rows is cut off, by up to a
+pixel of x."""
 
 
 def fill(folder: Path, pictures: Pictures) -> int:

@@ -280,11 +280,13 @@ class MapVerdict(NamedTuple):
     Attributes:
         grade: ``good``, ``usable`` or ``reject``.
         sentence: What that comes from and what to do about it.
+        reasons: The figures behind it; none in a report of an older version.
         remarks: What a person should check.
     """
 
     grade: str
     sentence: str
+    reasons: tuple[str, ...]
     remarks: tuple[str, ...]
 
 
@@ -299,7 +301,10 @@ def verdict_of(folder: Path) -> MapVerdict:
     with parsing(f"{file}: key 'verdict'", MapFormatError):
         verdict = plain["verdict"]
         return MapVerdict(
-            str(verdict["grade"]), str(verdict["sentence"]), tuple(map(str, verdict["remarks"]))
+            str(verdict["grade"]),
+            str(verdict["sentence"]),
+            tuple(map(str, verdict.get("reasons", ()))),
+            tuple(map(str, verdict["remarks"])),
         )
 
 

@@ -38,7 +38,8 @@ def test_a_log_gets_a_line_at_once_now_and_then_and_at_the_end(capsys, monkeypat
 def test_a_log_of_a_training_has_its_errors(capsys):
     with console.training_bar() as progress:
         progress(1, 1, 2.5, 1.25, 1500.0)
-    assert capsys.readouterr().err == "train  RMSE 2.50 cm, validation 1.25 cm, 1500 samples/s: 1 of 1\n"
+    told = "train: RMSE 2.50 cm, validation 1.25 cm, 1500 samples/s, epoch: 1 of 1\n"
+    assert capsys.readouterr().err == told
 
 
 #: An escape that clears the screen, one of eight bits, a carriage return, a mark that turns the direction of

@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from datagen.labels.label_map import frame_residual_cm, label_report
+from datagen.labels.label_map import frame_residual_cm, label_report, labelled_text
 from lanenet.data.label_set import LabelMeta, LabelSet
 from lanenet.data.maps.frame_lines import FrameLines
+from lanenet.data.maps.mapped_drive import BETWEEN_LANES
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 
@@ -131,3 +132,9 @@ def test_report_without_any_residual_is_nan_not_zero():
     assert report["residual_cm"]["frames"] == 0
     assert np.isnan(report["residual_cm"]["median"])
     assert np.isnan(report["residual_cm"]["p95"])
+
+
+def test_deleted_frames_are_counted_as_the_verdict_of_the_map_counts_them():
+    assert labelled_text(80, 100, {"deleted": 0, "pose uncertain": 20}) == "80 of 100 frames labelled (80 %)"
+    told = labelled_text(72, 100, {"deleted": 10, BETWEEN_LANES: 10, "pose uncertain": 8})
+    assert told == "72 of 100 frames labelled (72 %; 90 % of those that should have labels)"

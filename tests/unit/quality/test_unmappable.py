@@ -104,6 +104,15 @@ def test_no_camera_is_found_from_a_drive_that_stands_still(tmp_path, both_lines)
         calibrate_drive(drive, 40.0, None, None, SETTINGS)
 
 
+def test_a_camera_file_that_is_not_there_is_no_fault_of_the_drive(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (60, 80, 3), dtype=np.uint8) for _ in range(20)]
+    drive, camera = written(tmp_path / "drive", frames), tmp_path / "absent.yaml"
+    with pytest.raises(CalibrationError, match=rf"^{camera}: no such file$"):
+        map_drive(MapRequest(drive, 40.0, camera_path=camera), SETTINGS, tmp_path / "map")
+    assert not (tmp_path / "map").exists()
+
+
 def older_map(folder: Path, verdict: str) -> Path:
     folder.mkdir()
     (folder / "map.yaml").write_text(f"format: lanenet-map/1\nverdict: {verdict}\n")

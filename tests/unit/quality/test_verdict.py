@@ -75,6 +75,14 @@ def test_a_lane_width_that_makes_another_car_of_it_is_questioned(height_cm, tape
     assert graded(KNOWN, height_cm=height_cm, tape_cm=tape_cm).grade == "good"
 
 
+def test_a_lane_width_that_is_twice_another_cars_is_asked_about_once():
+    found = graded(GOOD, height_cm=25.1, tape_cm=3.3)
+    assert (
+        "the width of the whole road?" in found.sentence and "which half the lane width" in found.reasons[0]
+    )
+    assert not found.remarks
+
+
 @pytest.mark.parametrize(
     ("given", "bound"),
     [
@@ -212,6 +220,19 @@ def test_pictures_that_disagree_with_the_map_count(share, grade):
     found = judge(replace(GOOD, contradicted_share=share), VerdictSettings())
     assert found.grade == grade
     assert any("disagree" in reason for reason in found.reasons) == (grade != "good")
+
+
+def test_what_exceeds_a_bound_by_little_does_not_read_like_it():
+    (reason,) = graded(GOOD, contradicted_share=0.0771).reasons
+    assert "disagree with 7.7 % of the frames' lines" in reason
+    assert "expected 7.5 % at most, rejected above 15 %" in reason
+
+
+def test_the_sentence_counts_what_it_leaves_to_the_reasons():
+    assert "more finding" not in graded(GOOD, p95_px=1.6).sentence
+    assert "(and 1 more finding): " in graded(GOOD, p95_px=1.6, contradicted_share=0.1).sentence
+    three = graded(GOOD, p95_px=1.6, contradicted_share=0.1, withheld_share=0.2)
+    assert "(and 2 more findings): " in three.sentence and len(three.reasons) == 3
 
 
 def test_a_lane_that_widens_in_bends_is_named_and_one_of_many_widths_has_no_scale():
