@@ -42,12 +42,13 @@ _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
 #: that it continues the last frame's; what its width costs at most, and sigma of the width's logarithm. The
 #: last two were tried: a lane may widen in plain sight, but the line of another lane is none of its own.
 _BY_PRESENCE_CM, _BY_CONTINUING_CM, _BY_WIDTH_CM, _WIDTH_SIGMA = 6.0, 3.0, 45.0, 0.2
-#: The same for presence while the front axle's middle is within this share of the lane's width of a line: the
-#: network has learned from the labels in which of two lanes a car on a line is. Tried: 6 to 24 cm, 0.12, 0.2.
-_BY_PRESENCE_ON_LINE_CM, _ON_LINE = 24.0, 0.12
+#: What speaks for the network's own pair, if it has the lane's width, while the front axle's middle is within
+#: this share of that width of a line: it has learned from the labels in which lane a car on a line is. Tried:
+#: 18 and 36 cm; and for each of its lines apart, which took dashes inside a lane for its border.
+_BY_BOTH_CM, _ON_LINE = 18.0, 0.12
 #: What it costs at most that the front axle's middle is not between the two, and how far beside them that is.
-#: Tried: 20, 40 and 60 cm, 1 to 3 cm; about what a line is worth that is seen all along.
-_BY_OUTSIDE_CM, _OUTSIDE_CM = 40.0, 1.0
+#: Chosen: more than what a network's opinion brings, less than a line that is not to be seen.
+_BY_OUTSIDE_CM, _OUTSIDE_CM = 20.0, 2.0
 #: Length in which a line beyond a crossed one has to be seen. A single border, as that of a mat, is seen over
 #: half of the 46 cm that count.
 _BEYOND_SEEN_CM = 26.0
@@ -80,7 +81,10 @@ Sees = Callable[[Float[np.ndarray, "3"]], bool]
 
 
 class _Candidate(NamedTuple):
-    """One line that may be the answer: its points, their sigmas, its marking, and what speaks for it."""
+    """One line that may be the answer: its points, their sigmas, its marking, and what speaks for it.
+
+    The presence is the network's, of the lines that it sees itself.
+    """
 
     points_cm: Float[np.ndarray, "3"]
     sigma_cm: Float[np.ndarray, "3"]
@@ -89,6 +93,7 @@ class _Candidate(NamedTuple):
     score_cm: float
     seen_at: Bool[np.ndarray, "3"]
     look: Float[np.ndarray, "3"]
+    presence: float = 0.0
 
 
 class LaneTracker:
@@ -172,18 +177,18 @@ class LaneTracker:
     ) -> tuple[list[_Candidate], list[_Candidate]]:
         """Collect what the left and the right line may be; the last of each is the network's, as it is."""
         starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
-        by_presence_cm = _BY_PRESENCE_CM
-        beside_cm = () if self._last is None else (abs(float(self._last[0][side, 0])) for side in (0, 1))
-        if min(beside_cm, default=np.inf) < _ON_LINE * self.lane.likely_cm:
-            by_presence_cm = _BY_PRESENCE_ON_LINE_CM
+        by_network: list[bool] = []
         moved_cm = None if self._last is None else np.hypot(self._last[1], _MOVED_CM)
         for side in range(len(SIDES)):
             if presence[side] >= _LEAST_PRESENCE:
-                starts.append((side, own[0][side], own[1][side], by_presence_cm * float(presence[side])))
+                starts.append((side, own[0][side], own[1][side], _BY_PRESENCE_CM * float(presence[side])))
+                by_network.append(True)
             if self._last is not None and moved_cm is not None:
                 starts.append((side, self._last[0][side], moved_cm[side], _BY_CONTINUING_CM))
+                by_network.append(False)
         n_usual = len(starts)
         starts += self._beyond_a_crossed_line()
+        by_network += [False] * (len(starts) - n_usual)
         # The next lane's lines need not look like those of this one.
         crossed = self._last is not None and (self._last[0][0, 0] > 0.0 or self._last[0][1, 0] < 0.0)
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
@@ -200,13 +205,21 @@ class LaneTracker:
                     continue
                 score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as[i], refined.look[i])
                 line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
+                present = float(presence[side]) if by_network[i] else 0.0
                 candidates[side].append(
-                    _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i])
+                    _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i], present)
                 )
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (float(presence[side]) - 0.5)
             lines.append(_Candidate(own[0][side], own[1][side], 0.0, 0.0, doubt_cm, _NOWHERE, _UNSEEN))
         return candidates
+
+    def _on_line(self) -> bool:
+        """Return whether the front axle's middle was on one of the lane's lines."""
+        if self._last is None:
+            return False
+        beside_cm = min(abs(float(self._last[0][side, 0])) for side in range(len(SIDES)))
+        return beside_cm < _ON_LINE * self.lane.likely_cm
 
     def _beyond_a_crossed_line(self) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
         """Return where the lines of the next lane are expected, once the front axle has crossed one."""
@@ -368,6 +381,9 @@ class LaneTracker:
         if outsides[best] <= 0.0 and min(line.seen_cm for line in shown) >= _TELLS_WIDTH_CM:
             self.lane.learn(np.concatenate([line.points_cm for line in shown]), np.ones(len(SIDES)))
         scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
+        if self._on_line():
+            both = [min(left.presence, right.presence) for left, right in pairs]
+            scores = [s + _BY_BOTH_CM * p * own for s, p, own in zip(scores, both, likely, strict=True)]
         return pairs[scores.index(max(scores))]
 
 
