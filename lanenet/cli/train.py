@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from datagen.datasets.build import PreparedData
     from datagen.datasets.jobs import Part, RecordedJob
     from lanenet.data.label_set import LabelSet
+    from lanenet.evaluation.comparison import SharedErrors
     from lanenet.evaluation.robustness import RobustRow
     from lanenet.evaluation.sources import Opened
 
@@ -341,6 +342,7 @@ class _Run:
         from lanenet.perception.network.model_file import MODEL_NAME, read_model_meta
 
         settings, model = self.settings, run_folder / MODEL_NAME
+        start = self._start_model()
         judged = data.of("test")
         if not judged:
             console.show_problems(["the data has no test part: the tables use the validation labels"])
@@ -354,7 +356,7 @@ class _Run:
                 # The config decides which camera made which test drive.
                 Compared(
                     default_names(sources, with_model=True),
-                    {"network": model},
+                    {"network": model, **start},
                     self._marking,
                     any_camera=True,
                 ),
@@ -363,7 +365,8 @@ class _Run:
                 progress,
             )
         where = self._where(judged)
-        val_cli.show(comparison, seen, where, ["network"], self._show_all)
+        val_cli.show(comparison, seen, where, ["network", *start], self._show_all)
+        console.show_lines([gain_line(name, comparison.shared[name]) for name in start])
         robustness = _robustness(model, sources)
         card = model_card(
             settings.name,
@@ -384,6 +387,17 @@ class _Run:
         if robustness:
             files["robustness.json"] = json_text(as_dict(robustness))
         return files, comparison.as_dict(), judged
+
+    def _start_model(self) -> dict[str, Path]:
+        """Return the model that the training started from, by its name, if it has one."""
+        from lanenet.perception.network.model_file import MODEL_NAME
+        from lanenet.perception.registry import compared_names
+
+        folder = self.settings.learn.start_from
+        if folder is None or not (folder / MODEL_NAME).is_file():
+            return {}
+        name = folder.resolve().name
+        return {f"{name} (start)" if name in compared_names() else name: folder / MODEL_NAME}
 
     def _where(self, judged: Sequence[Part]) -> str:
         """Say on what the network is measured."""
@@ -536,6 +550,26 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
     if how != wanted and how == "time":
         lines.append("there are no three complete laps: the drive is split along its time instead of by laps")
     return lines
+
+
+def gain_line(start: str, shared: SharedErrors) -> str:
+    """Say whether the trained network is better than the one that it started from.
+
+    Args:
+        start: Name of the one before.
+        shared: Its errors and those of the trained one, on the points that both answered.
+    """
+    before, after = shared.own, shared.first
+    better = after.rmse_cm < before.rmse_cm and after.median_cm <= before.median_cm
+    worse = after.rmse_cm > before.rmse_cm and after.median_cm >= before.median_cm
+    verdict = "neither is better in both"
+    if better or worse:
+        verdict = "the training has made it better" if better else "the training has not made it better"
+    return (
+        f"on the points that both answer, {start}, which it started from, has a median error of "
+        f"{before.median_cm:.2f} cm (RMSE {before.rmse_cm:.2f}), the trained network {after.median_cm:.2f} "
+        f"cm ({after.rmse_cm:.2f}): {verdict}"
+    )
 
 
 def _robustness(model: Path, sources: Sequence[Opened]) -> list[RobustRow]:

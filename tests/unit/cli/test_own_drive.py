@@ -31,11 +31,13 @@ from lanenet.cli.shared.own_drive import (
     sources_in,
 )
 from lanenet.cli.shared.stages import Stages, stopped_in
-from lanenet.cli.train import expected_s, run_settings_schema
+from lanenet.cli.train import expected_s, gain_line, run_settings_schema
 from lanenet.config import apply_overrides, check_settings
 from lanenet.data.label_set import write_labels
 from lanenet.data.maps.folder import write_map
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
+from lanenet.evaluation.comparison import SharedErrors
+from lanenet.evaluation.errors import error_stats
 
 GENERAL = Path(__file__).resolve().parents[3] / "checkpoints" / "general"
 
@@ -276,3 +278,20 @@ def test_the_config_of_another_drives_run_is_not_written_over(tmp_path: Path) ->
     check_name(tmp_path / "none", config, [one])
     with pytest.raises(LanenetError, match=r"taken by a network of .*one; .*--force"):
         check_name(tmp_path / "none", config, [other])
+
+
+@pytest.mark.parametrize(
+    ("after_cm", "said"),
+    [
+        ([0.1, 0.1, 0.4], "the training has made it better"),
+        ([0.3, 0.3, 2.0], "the training has not made it better"),
+        ([0.1, 0.1, 2.0], "neither is better in both"),
+    ],
+)
+def test_train_says_whether_it_was_worth_it(after_cm, said):
+    known = np.ones((1, 3), dtype=bool)
+    errors_cm = np.array([[[0.2, 0.2, 1.0]], [after_cm]])
+    before, after = (error_stats(error_cm, known, known) for error_cm in errors_cm)
+    line = gain_line("general", SharedErrors(own=before, first=after))
+    assert line.endswith(said)
+    assert "general, which it started from, has a median error of 0.20 cm (RMSE 0.60)" in line
