@@ -33,8 +33,7 @@ _LEAST_PRESENCE = 0.3
 _MOVED_CM = np.array([2.0, 3.0, 5.0])
 #: Width of a marking before any was seen, and its sigma; its sigma once so many were seen; so many count.
 _MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM, _ENOUGH, _LENGTH = 3.0, 2.0, 0.3, 10, 50
-#: Once markings are known, they are measured without that knowledge every so many frames. Chosen: costs a
-#: tenth of the refinement.
+#: Once markings are known, they are measured without that knowledge every so many frames. Chosen.
 _MEASURED_EVERY = 4
 #: Length along the road, [cm], in which a border has to be seen for a width to count, and for a line to.
 _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
@@ -115,7 +114,7 @@ class LaneTracker:
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
-        self._last = None
+        self._last, self._frames = None, 0
         self.straight_on.reset()
         self.looks.reset()
         for widths_cm in self._markings_cm:
