@@ -77,6 +77,11 @@ _MOST_LANES = 0.14
 _BY_LOOK_CM = 15.0
 #: A line is another one from this share of the lane's width away, and the same one within that share. Chosen.
 _CHANGED, _SAME = 0.5, 0.3
+#: Of a line that has moved by less than this share of the lane's width since the last frame, 15 cm ahead, the
+#: place beside the car is recalled where it is not seen; 1, 2 and 4 cm were tried for what it moves there. The
+#: 95th percentile of the errors of 139 simulated drives fell from 1.86 to 1.80 cm, on three real ones from
+#: 1.01, 1.81 and 1.65 to 0.99, 1.67 and 1.61, for lanes of 40 cm.
+_RECALLED = 0.15
 #: Presence below which a line may have ended. On `garage_tape` a blurred one that goes on has 0.67 and more.
 _ENDED = 0.62
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
@@ -163,6 +168,7 @@ class LaneTracker:
         found_cm = np.concatenate([line.points_cm for line in pair])
         found_sigma_cm = np.concatenate([_sigma_cm(line) for line in pair])
         seen_cm = np.array([line.seen_cm for line in pair])
+        self._recall_near(pair, found_cm, found_sigma_cm)
         # One line that is seen tells where the other one is.
         told = np.where(seen_cm >= _LINE_SEEN_CM, 1.0, 0.0)
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
@@ -172,6 +178,25 @@ class LaneTracker:
             found_sigma_cm[:] = np.inf
         apart_cm = np.repeat(np.abs(self._last[0] - own[0])[:, _MIDDLE], len(ROWS_CM))
         return (*self._known(found_cm, found_sigma_cm, apart_cm), seen_cm)
+
+    def _recall_near(
+        self,
+        pair: tuple[_Candidate, _Candidate],
+        found_cm: Float[np.ndarray, "6"],
+        found_sigma_cm: Float[np.ndarray, "6"],
+    ) -> None:
+        """Where a line passes out of view beside the car, fuse its place there with the last frame's."""
+        if self._last is None:
+            return
+        for side, line in enumerate(pair):
+            beside, ahead = len(ROWS_CM) * side, len(ROWS_CM) * side + _MIDDLE
+            off_cm = abs(self._last[0][side, _MIDDLE] - found_cm[ahead])
+            if line.seen_cm < _LINE_SEEN_CM or line.seen_at[0] or off_cm > _RECALLED * self.lane.likely_cm:
+                continue
+            found, recalled = found_sigma_cm[beside] ** 2, self._last[1][side, 0] ** 2 + _MOVED_CM[0] ** 2
+            gain = found / (found + recalled)
+            found_cm[beside] += gain * (self._last[0][side, 0] - found_cm[beside])
+            found_sigma_cm[beside] = math.sqrt(gain * recalled)
 
     def _known(
         self,

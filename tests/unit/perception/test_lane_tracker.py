@@ -192,6 +192,23 @@ def test_a_line_that_the_network_has_elsewhere_is_not_answered():
     np.testing.assert_allclose(points_cm[3:], BENT[3:], atol=0.2)
 
 
+def test_what_passed_out_of_view_beside_the_car_is_recalled():
+    lines = np.repeat([-20.0, 20.0], 3)
+    # A kink of the tape lies where the image does not reach: the network takes what it sees for straight.
+    edges, leaning = edges_of(lines), lines + np.array([6.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    far = RoadEdges(
+        edges.points_cm[edges.points_cm[:, 1] > 10.0], edges.normals[edges.points_cm[:, 1] > 10.0]
+    )
+    off_cm = []
+    for before in (0, 5):
+        tracker = LaneTracker(LaneMemory(LANE_CM))
+        for _ in range(before):
+            tracker.follow(lines, SURE, SEEN, edges)
+        points_cm, _, _ = tracker.follow(leaning, SURE, SEEN, far)
+        off_cm.append(abs(points_cm[0] - lines[0]))
+    assert off_cm[1] < 0.8 * off_cm[0]
+
+
 def test_the_distance_of_two_lines_is_measured_across_the_lane_in_a_corner_as_well():
     rows = np.array([0.0, 15.0, 30.0])
     # Around (60, 0): beside each other, the inner one turns away earlier than a row's width tells.
