@@ -78,9 +78,9 @@ _BY_LOOK_CM = 15.0
 #: A line is another one from this share of the lane's width away, and the same one within that share. Chosen.
 _CHANGED, _SAME = 0.5, 0.3
 #: Of a line that has moved by less than this share of the lane's width since the last frame, 15 cm ahead, the
-#: place beside the car is recalled where it is not seen; 1, 2 and 4 cm were tried for what it moves there. The
-#: 95th percentile of the errors of 139 simulated drives fell from 1.86 to 1.80 cm, on three real ones from
-#: 1.01, 1.81 and 1.65 to 0.99, 1.67 and 1.61, for lanes of 40 cm.
+#: place beside the car is recalled where it is not seen; 1, 2 and 4 cm were tried for what it moves there.
+#: The 95th percentile of the errors of 139 simulated drives fell from 1.86 to 1.80 cm, of three real ones
+#: from 1.01, 1.81 and 1.65 to 0.99, 1.67 and 1.61, for lanes of 40 cm.
 _RECALLED = 0.15
 #: Presence below which a line may have ended. On `garage_tape` a blurred one that goes on has 0.67 and more.
 _ENDED = 0.62
