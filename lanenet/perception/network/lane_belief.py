@@ -25,6 +25,9 @@ _LENGTH, _ENOUGH = 100, 10
 _YELLOWER, _MORE_GAPS = 0.4, 0.15
 #: From this share of what is plain, a line is the one between two lanes. Chosen.
 _BETWEEN = 0.5
+#: Least share of gaps of a line that is not solid. Of those tried, from 0.05 to 0.2, the one that tells best
+#: where a line turns away unseen: there a third of the points on `garage_tape` were more than 3 cm off.
+_SOLID = 0.05
 #: Log odds that a plain frame adds, and what a frame keeps of the sum: in the end 6, 400 to 1. Chosen:
 #: neighbouring frames show the same metre of road, so that each says little, and a second says enough.
 _PLAIN, _KEPT = 0.3, 0.95
@@ -96,6 +99,11 @@ class LineLooks:
         """Return whether a line is plainly one between two lanes: yellower than the other, or with gaps."""
         line, other = self._lines[side], self._lines[1 - side]
         return line.known and other.known and self._between_lanes(line, other) > _BETWEEN
+
+    def is_solid(self, side: int) -> bool:
+        """Return whether a line is known to have no gaps."""
+        line = self._lines[side]
+        return line.known and statistics.fmean(line.gaps) < _SOLID
 
     @staticmethod
     def _between_lanes(line: _Line, other: _Line) -> float:

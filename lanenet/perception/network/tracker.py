@@ -174,6 +174,10 @@ class LaneTracker:
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
         self._last = found_cm.reshape(2, 3), found_sigma_cm.reshape(2, 3).copy()
         found_sigma_cm[self.straight_on.doubts(found_cm, self.lane.width_cm)] = np.inf
+        for side, line in enumerate(pair):
+            # A solid line that is not seen ahead turns away there, or ends.
+            if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
+                found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = np.inf
         if not decided or self._astride(seen_cm):
             found_sigma_cm[:] = np.inf
         apart_cm = np.repeat(np.abs(self._last[0] - own[0])[:, _MIDDLE], len(ROWS_CM))

@@ -192,6 +192,20 @@ def test_a_line_that_the_network_has_elsewhere_is_not_answered():
     np.testing.assert_allclose(points_cm[3:], BENT[3:], atol=0.2)
 
 
+@pytest.mark.parametrize("solid", [True, False])
+def test_where_a_solid_line_is_not_seen_ahead_it_is_not_continued(solid):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    edges = edges_of(BENT)
+    gap = (edges.points_cm[:, 1] > 12.0) & (edges.points_cm[:, 1] < 24.0)
+    for _ in range(12):
+        shown = edges.rows() if solid else edges.rows()[~gap]
+        tracker.follow(BENT, SURE, SEEN, RoadEdges.of_rows(shown))
+    # The left one ends 21 cm ahead, since its tape turns there.
+    ended = edges.rows()[(edges.points_cm[:, 1] < 21.0) | (edges.points_cm[:, 0] > 0.0)]
+    points_cm, _, _ = tracker.follow(BENT, SURE, SEEN, RoadEdges.of_rows(ended))
+    assert np.isnan(points_cm).tolist() == [False, False, solid, False, False, False]
+
+
 def test_what_passed_out_of_view_beside_the_car_is_recalled():
     lines = np.repeat([-20.0, 20.0], 3)
     # A kink of the tape lies where the image does not reach: the network takes what it sees for straight.
