@@ -22,7 +22,8 @@ _EARLY, _AROUND = 0.25, 3
 #: Steps that are tried, relative to the typical one; and their spread about it, as a logarithm. Measured on
 #: ``blue_tape``: a tenth of a step, after one of two to three.
 _STEPS, _SPREAD = np.exp(np.linspace(np.log(0.1), np.log(3.0), 25)), 1.5
-#: Steps that are as good as typical ones: speed varies as much.
+#: Steps that are as good as typical ones: speed varies as much. After a longer one, an early image follows a
+#: miss; after another, the car comes to rest or sets off.
 _EVEN = (0.7, 1.4)
 
 
@@ -52,7 +53,6 @@ def measured_periods(
     Returns:
         Times in typical time steps, 1 where they are even; and where they are uneven, or may be.
     """
-    periods = np.ones(len(images))
     near = np.convolve(early, np.ones(2 * _AROUND + 1), mode="same") > 0.5
     frames = np.flatnonzero(near & (images.periods <= GAP_PERIODS))
     frames = frames[frames > 0]
@@ -65,9 +65,10 @@ def measured_periods(
         likely = s.temper * len(s.lags) * fit.max(axis=1) + usual
         return float(_STEPS[int(np.argmax(likely))])
 
-    found = np.array(list(in_threads(period_of, frames.tolist())))
-    if found.size:
-        periods[frames] = np.where((found > _EVEN[0]) & (found < _EVEN[1]), 1.0, found)
+    found = np.ones(len(images))
+    found[frames] = list(in_threads(period_of, frames.tolist()))
+    missed = early & (found < _EVEN[0]) & (np.roll(found, 1) > _EVEN[1])
     uneven = np.zeros(len(images), dtype=bool)
-    uneven[frames] = True
-    return periods, uneven
+    uneven[frames] = np.convolve(missed, np.ones(2 * _AROUND + 1), mode="same")[frames] > 0.5
+    other = uneven & ((found <= _EVEN[0]) | (found >= _EVEN[1]))
+    return np.where(other, found, 1.0), uneven

@@ -68,6 +68,18 @@ def test_an_even_drive_stays_as_it_is(fine):
     assert with_measured_periods(view) is view
 
 
+def test_an_early_image_without_a_miss_before_it_is_a_car_that_slows_down(fine):
+    steps = np.full(70, STEP)
+    steps[[0, *EARLY]] = 0, 1, 1
+    drive = fine.subset(np.cumsum(steps))
+    drive.t_s[:] = 0.05 * np.arange(len(drive))
+    assert early_frames(drive).any()
+    before = _view(drive)
+    view = with_measured_periods(before)
+    assert view.commands.uneven is not None and not view.commands.uneven.any()
+    np.testing.assert_array_equal(view.typical.relative, before.typical.relative)
+
+
 def test_nothing_is_assumed_of_the_steps_of_uneven_frames():
     poses = np.column_stack([np.arange(30) * 4.0, np.zeros(30), np.zeros(30)])
     poses[15:, 0] += 4.0
